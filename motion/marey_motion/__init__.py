@@ -1,0 +1,1 @@
+"""The mathematics of motion: arrays in, arrays out."""

@@ -1,0 +1,33 @@
+"""Fixtures that every test may use."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+MOCAP_VARIABLE = "MAREY_TEST_MOCAP"
+
+
+def pytest_report_header() -> str:
+    folder = os.environ.get(MOCAP_VARIABLE)
+    if folder:
+        return f"real motion capture: {folder}"
+    return f"real motion capture: none ({MOCAP_VARIABLE} is unset; tests that need it are deselected and counted)"
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what needs real motion capture where there is none, visibly: pytest counts it as deselected."""
+    if os.environ.get(MOCAP_VARIABLE):
+        return
+    needs_mocap = [item for item in items if "mocap" in getattr(item, "fixturenames", ())]
+    if needs_mocap:
+        config.hook.pytest_deselected(items=needs_mocap)
+        items[:] = [item for item in items if item not in set(needs_mocap)]
+
+
+@pytest.fixture(scope="session")
+def mocap() -> Path:
+    """The folder of real motion capture named by MAREY_TEST_MOCAP."""
+    folder = Path(os.environ[MOCAP_VARIABLE])
+    assert (folder / "MANIFEST.csv").is_file(), f"{MOCAP_VARIABLE}={folder} holds no MANIFEST.csv"
+    return folder

@@ -1,0 +1,1 @@
+"""The Marey worker: claims jobs, runs them in child processes, writes results back."""
