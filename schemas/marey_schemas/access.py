@@ -1,0 +1,162 @@
+"""Users, tokens, projects and members."""
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import Field, SecretStr, StringConstraints
+
+from marey_schemas.base import Answer, Request
+from marey_schemas.names import ProjectName, UserName
+
+
+class Role(StrEnum):
+    """What a member may do; each role includes the ones before it."""
+
+    READER = "reader"
+    CONTRIBUTOR = "contributor"
+    MAINTAINER = "maintainer"
+    OWNER = "owner"
+
+
+class Visibility(StrEnum):
+    """Who may read a project without being a member: nobody, or everybody with the address."""
+
+    PRIVATE = "private"
+    PUBLIC = "public"
+
+
+class Scope(StrEnum):
+    """What a token may be used for. A token never allows more than its user may do."""
+
+    READ = "read"
+    WRITE = "write"
+    JOBS = "jobs"
+    WORK = "work"
+    ADMIN = "admin"
+
+
+DisplayName = Annotated[str, StringConstraints(min_length=1, max_length=255)]
+Password = Annotated[SecretStr, Field(min_length=10, max_length=1024)]
+ScopeText = Annotated[str, StringConstraints(pattern=r"^(?:read|write|jobs|work|admin)(?:!project=[a-z0-9_-]{1,64})?$")]
+"""A scope, optionally bound to one project: `write!project=walk`."""
+
+
+class UserCreate(Request):
+    """A new user. Without a password the user can sign in with tokens only."""
+
+    name: UserName
+    display_name: DisplayName | None = None
+    password: Password | None = None
+    administrator: bool = False
+
+
+class UserChange(Request):
+    """Changes of a user; absent fields stay. Who changes their own password gives the current one."""
+
+    display_name: DisplayName | None = None
+    password: Password | None = None
+    current_password: SecretStr | None = None
+    administrator: bool | None = None
+    disabled: bool | None = None
+
+
+class User(Answer):
+    """A person or a service that signs in."""
+
+    id: str
+    name: str
+    display_name: str | None = None
+    administrator: bool
+    disabled: bool
+    created_at: datetime
+    rev: int
+
+
+class Me(Answer):
+    """Who the caller is and what the credential allows."""
+
+    user: User | None
+    scopes: tuple[str, ...]
+    job: str | None = Field(None, description="Set for the token of a job attempt.")
+
+
+class TokenCreate(Request):
+    """A new token for the caller."""
+
+    name: DisplayName
+    scopes: tuple[ScopeText, ...] = Field(("read", "write", "jobs"), min_length=1, max_length=32)
+    expires_in_s: int | None = Field(90 * 86400, ge=60, le=10 * 365 * 86400, description="null: never.")
+
+
+class Token(Answer):
+    """A token without its secret."""
+
+    id: str
+    name: str
+    prefix: str
+    scopes: tuple[str, ...]
+    created_at: datetime
+    expires_at: datetime | None
+    last_used_at: datetime | None = None
+
+
+class NewToken(Token):
+    """The answer that shows a token's secret, once."""
+
+    secret: str
+
+
+class Login(Request):
+    """Sign in with a name and a password."""
+
+    name: UserName
+    password: SecretStr
+    expires_in_s: int = Field(7 * 86400, ge=60, le=90 * 86400)
+
+
+class ProjectCreate(Request):
+    """A new project; the caller becomes its owner."""
+
+    name: ProjectName
+    title: DisplayName | None = None
+    description: str = Field("", max_length=10_000)
+    visibility: Visibility = Visibility.PRIVATE
+
+
+class ProjectChange(Request):
+    """Changes of a project; absent fields stay."""
+
+    title: DisplayName | None = None
+    description: str | None = Field(None, max_length=10_000)
+    visibility: Visibility | None = None
+
+
+class Project(Answer):
+    """A team's space."""
+
+    id: str
+    name: str
+    title: str | None = None
+    description: str = ""
+    visibility: Visibility
+    role: Role | None = Field(None, description="The caller's role; null for a guest of a public project.")
+    created_at: datetime
+    updated_at: datetime
+    deleted_at: datetime | None = None
+    rev: int
+
+
+class MemberChange(Request):
+    """The role a user gets in a project."""
+
+    role: Role
+
+
+class Member(Answer):
+    """A user's role in a project."""
+
+    user: str
+    role: Role
+    since: datetime
+    rev: int

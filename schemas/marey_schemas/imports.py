@@ -1,0 +1,71 @@
+"""Requests and answers of imports."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, StringConstraints
+
+from marey_schemas.base import Answer, Request
+from marey_schemas.documents import Check
+from marey_schemas.names import CollectionPath, Digest, Tag
+
+FileName = Annotated[str, StringConstraints(min_length=1, max_length=1024, pattern=r"^[^\x00-\x1f\x7f]+$")]
+"""May hold folders: they become collections below the target."""
+
+
+class ImportOptions(Request):
+    """What the caller knows and the files do not say. Absent: inferred from evidence, or asked for when ambiguous."""
+
+    collection: CollectionPath = ""
+    skeleton: str | None = Field(
+        None, description="Item id of the skeleton the clips must use; absent: found or created."
+    )
+    unit: Literal["m", "cm", "mm", "dm", "inch", "ft", "cmu"] | None = Field(None, description="cmu: 1/0.45 inch.")
+    unit_scale_m: float | None = Field(None, gt=1e-6, lt=1e3, description="Metres per unit, where no named unit fits.")
+    up_axis: Literal["x", "y", "z"] | None = None
+    frame_rate_hz: float | None = Field(None, gt=0, le=100_000)
+    trim_rest_pose: bool = False
+    tags: tuple[Tag, ...] = Field((), max_length=64)
+    subject: str | None = None
+    licence: str | None = None
+    capture_system: str | None = None
+
+
+class ImportFile(Request):
+    """A file whose bytes the server has already."""
+
+    name: FileName
+    blob: Digest
+
+
+class ImportRequest(ImportOptions):
+    """Import files by digest. More than the server's synchronous limit becomes a job (202)."""
+
+    files: tuple[ImportFile, ...] = Field(min_length=1, max_length=1000)
+
+
+class Refusal(Answer):
+    """Why a file was refused."""
+
+    code: str
+    detail: str
+    line: int | None = None
+    joint: str | None = None
+
+
+class ImportEntry(Answer):
+    """What became of one file."""
+
+    name: str
+    status: Literal["created", "unchanged", "failed", "companion"]
+    item: str | None = None
+    revision: int | None = None
+    skeleton: str | None = None
+    frames: int | None = None
+    warnings: tuple[Check, ...] = ()
+    error: Refusal | None = None
+
+
+class ImportAnswer(Answer):
+    """One entry per file, in the order sent."""
+
+    entries: tuple[ImportEntry, ...]

@@ -1,0 +1,159 @@
+"""Collections, items, revisions and lineage as they travel."""
+
+from datetime import datetime
+from typing import Any
+
+from pydantic import Field
+
+from marey_schemas.base import Answer, Request
+from marey_schemas.kinds import Kind
+from marey_schemas.names import CollectionPath, ItemName, Message, Tag
+
+
+class CollectionCreate(Request):
+    """A new folder; missing folders above it are made too."""
+
+    path: CollectionPath = Field(min_length=1)
+
+
+class CollectionChange(Request):
+    """Move or rename a folder with all it holds."""
+
+    path: CollectionPath = Field(min_length=1)
+
+
+class Collection(Answer):
+    """A folder in a project's tree."""
+
+    id: str
+    path: str
+    created_at: datetime
+    updated_at: datetime
+    deleted_at: datetime | None = None
+    rev: int
+
+
+class ItemCreate(Request):
+    """A new item with its first revision; each part is a document."""
+
+    name: ItemName
+    collection: CollectionPath = ""
+    tags: tuple[Tag, ...] = Field((), max_length=64)
+    parts: dict[str, Any] = Field(min_length=1)
+    message: Message = ""
+
+
+class ItemChange(Request):
+    """Rename, move or tag an item; absent fields stay."""
+
+    name: ItemName | None = None
+    collection: CollectionPath | None = None
+    tags: tuple[Tag, ...] | None = Field(None, max_length=64)
+
+
+class PartSummary(Answer):
+    """Which document a part is."""
+
+    document: str
+    schema_: str = Field(alias="schema")
+    size_bytes: int
+
+
+class Item(Answer):
+    """A named thing of one kind, at its newest revision."""
+
+    id: str
+    kind: Kind
+    name: str
+    collection: str
+    tags: tuple[str, ...] = ()
+    revision: int
+    parts: dict[str, PartSummary] = Field(default_factory=dict)
+    summary: dict[str, Any] = Field(
+        default_factory=dict,
+        description="What lists show and filter by: for clips frames, frame_rate_hz, duration_s, skeleton, warnings.",
+    )
+    created_at: datetime
+    updated_at: datetime
+    deleted_at: datetime | None = None
+    rev: int = Field(description="Counts every change of name, place, tags and revision; the number in the ETag.")
+
+
+class Revision(Answer):
+    """One immutable state of an item."""
+
+    item: str
+    revision: int
+    author: str | None
+    message: str
+    job: str | None
+    created_at: datetime
+    parts: dict[str, PartSummary]
+
+
+class LineageEdge(Answer):
+    """One step of an item's history: what a revision was made from, or what was made from it."""
+
+    item: str
+    kind: Kind
+    name: str
+    revision: int
+    job: str | None
+    role: str = Field(description="The job input the revision was used as.")
+
+
+class Lineage(Answer):
+    """Where a revision comes from and what was made of it."""
+
+    item: str
+    revision: int
+    job_kind: str | None = None
+    params: dict[str, Any] | None = None
+    seed: int | None = None
+    code_version: str | None = None
+    environment: dict[str, str] = Field(default_factory=dict)
+    inputs: tuple[LineageEdge, ...] = ()
+    outputs: tuple[LineageEdge, ...] = ()
+
+
+class Staleness(Answer):
+    """Whether something an item was made from has a newer revision."""
+
+    item: str
+    revision: int
+    stale: bool
+    because: tuple[LineageEdge, ...] = Field(
+        (), description="Inputs used, at the revision used, that have newer revisions now."
+    )
+
+
+class Page(Answer):
+    """One page of a list."""
+
+    items: tuple[Any, ...]
+    next_cursor: str | None = None
+    count: int | None = None
+
+
+class BlobsQuery(Request):
+    """Which of these does the server lack, as far as the caller may know?"""
+
+    digests: tuple[str, ...] = Field(max_length=10_000)
+
+
+class BlobsMissing(Answer):
+    """The digests that must be sent."""
+
+    missing: tuple[str, ...]
+
+
+class Event(Answer):
+    """One thing that happened, in the order it became visible."""
+
+    seq: int
+    at: datetime
+    project: str | None
+    kind: str
+    subject: str
+    actor: str | None
+    body: dict[str, Any] = Field(default_factory=dict)

@@ -1,0 +1,330 @@
+"""Job kinds, jobs, and what workers and the server say to each other."""
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Any, Literal
+
+from pydantic import Field
+
+from marey_schemas.base import Answer, Request
+from marey_schemas.imports import ImportFile, ImportOptions
+from marey_schemas.kinds import Kind
+from marey_schemas.names import CollectionPath, ItemName, Message, Tag
+
+PROTOCOL_VERSION = 1
+"""Version of the worker protocol; sent with every claim."""
+
+
+class JobState(StrEnum):
+    """waiting -> queued -> running -> succeeded, failed or cancelled; the last three never change."""
+
+    WAITING = "waiting"
+    QUEUED = "queued"
+    RUNNING = "running"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+    @property
+    def terminal(self) -> bool:
+        """Whether the state is final."""
+        return self in (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED)
+
+
+class FailureReason(StrEnum):
+    """Why a job failed for good."""
+
+    ERROR = "error"
+    TIMEOUT = "timeout"
+    ATTEMPTS_EXHAUSTED = "attempts_exhausted"
+    POISON = "poison"
+    DEPENDENCY_FAILED = "dependency_failed"
+
+
+# --- parameters and declarations of the built-in kinds ---------------------------------------------------------------
+
+
+class ImportParams(ImportOptions):
+    """Parameters of `import`."""
+
+    files: tuple[ImportFile, ...] = Field(min_length=1, max_length=10_000)
+
+
+class RetargetParams(Request):
+    """Parameters of `retarget`."""
+
+    scale: float | None = Field(None, gt=0, lt=1000, description="Root scale; absent: ratio of the hip heights.")
+    suffix: str = Field("", max_length=64, description="Appended to the names of the results.")
+    tags: tuple[Tag, ...] = Field((), max_length=64)
+
+
+class ExportParams(Request):
+    """Parameters of `export`: one archive of files."""
+
+    format: Literal["bvh", "npz", "predecessor", "json", "original"] = "bvh"
+    unit: Literal["m", "cm"] = "cm"
+
+
+class InputSpec(Answer):
+    """One named input of a kind."""
+
+    kind: Kind
+    many: bool = False
+    required: bool = True
+    description: str = ""
+
+
+class JobKind(Answer):
+    """What a kind of job takes and makes."""
+
+    name: str
+    description: str
+    params_schema: dict[str, Any]
+    inputs: dict[str, InputSpec]
+    outputs: dict[str, Kind | Literal["file"]]
+    fan_out: str | None = Field(None, description="The input whose items are spread over many workers.")
+    batch_size: int = Field(1, description="Items a single task of a fan-out takes.")
+    deterministic: bool = Field(
+        True, description="Same inputs, parameters and seed give the same bytes: results may be cached."
+    )
+
+
+# --- jobs as users see them ------------------------------------------------------------------------------------------
+
+
+class ItemInput(Request):
+    """An item, pinned to a revision; without one, its newest at the moment of submission."""
+
+    item: str
+    revision: int | None = Field(None, ge=1)
+
+
+class CollectionInput(Request):
+    """Every item of the input's kind in a collection and below it, pinned at the moment of submission."""
+
+    collection: CollectionPath
+
+
+class Resources(Request):
+    """Limits of one attempt."""
+
+    time_limit_s: int = Field(3600, ge=1, le=7 * 86400)
+    memory_limit_mb: int = Field(4096, ge=64, le=1_048_576)
+
+
+class JobCreate(Request):
+    """Submit a job."""
+
+    kind: str = Field(min_length=1, max_length=64)
+    inputs: dict[str, ItemInput | CollectionInput | tuple[ItemInput | CollectionInput, ...]] = Field(
+        default_factory=dict
+    )
+    params: dict[str, Any] = Field(default_factory=dict)
+    into: CollectionPath = Field("", description="The collection the results go to.")
+    priority: int = Field(0, ge=-100, le=100)
+    after: tuple[str, ...] = Field((), max_length=1000, description="Jobs that must succeed first.")
+    on_failure: Literal["fail", "skip"] = Field(
+        "fail", description="What to do when a job in `after` does not succeed."
+    )
+    concurrency_key: str | None = Field(
+        None, max_length=255, description="At most one job of a project runs with this key."
+    )
+    cache: Literal["use", "refresh", "off"] = "use"
+    seed: int = Field(0, ge=0, lt=2**63)
+    max_attempts: int = Field(3, ge=1, le=20)
+    labels: dict[str, str] = Field(default_factory=dict, description="A worker must carry all of them.")
+    resources: Resources = Resources()
+    message: Message = ""
+
+
+class Progress(Request):
+    """How far an attempt is."""
+
+    done: float = Field(ge=0)
+    total: float | None = Field(None, gt=0)
+    note: str = Field("", max_length=500)
+
+
+class JobFailure(Answer):
+    """Why a job failed, for the person who reads it."""
+
+    reason: FailureReason
+    code: str
+    detail: str
+
+
+class JobOutput(Answer):
+    """A revision that a job made."""
+
+    name: str
+    item: str
+    kind: Kind
+    revision: int
+    created: bool = Field(description="False where the same content stood there before.")
+
+
+class Job(Answer):
+    """A job and how it stands."""
+
+    id: str
+    project: str
+    kind: str
+    state: JobState
+    params: dict[str, Any]
+    inputs: dict[str, Any]
+    into: str
+    priority: int
+    seed: int
+    attempt: int
+    fence: int
+    max_attempts: int
+    interruptions: int = 0
+    parent: str | None = None
+    size: int | None = Field(None, description="Tasks of a fan-out.")
+    children: dict[str, int] = Field(default_factory=dict, description="Tasks by state.")
+    retry_of: str | None = None
+    cached_from: str | None = Field(None, description="The job whose result this one shares.")
+    progress: Progress | None = None
+    failure: JobFailure | None = None
+    result: dict[str, Any] | None = None
+    cancel_requested: bool = False
+    publish_conflict: dict[str, Any] | None = None
+    author: str | None
+    created_at: datetime
+    run_at: datetime
+    started_at: datetime | None = None
+    finished_at: datetime | None = None
+    rev: int
+
+
+class Attempt(Answer):
+    """One try at a job."""
+
+    job: str
+    fence: int
+    worker: str
+    started_at: datetime
+    ended_at: datetime | None
+    outcome: str | None = Field(None, description="succeeded, failed, interrupted, lost, cancelled or timeout.")
+    detail: str | None = None
+
+
+# --- worker protocol -------------------------------------------------------------------------------------------------
+
+
+class ClaimRequest(Request):
+    """A worker asks for work."""
+
+    worker: str = Field(min_length=1, max_length=255, description="Name of the worker, for people.")
+    kinds: tuple[str, ...] = Field(min_length=1, max_length=256)
+    labels: dict[str, str] = Field(default_factory=dict)
+    max: int = Field(1, ge=1, le=256)
+    wait_s: float = Field(0, ge=0, le=30)
+    protocol: int = PROTOCOL_VERSION
+    job: str | None = Field(None, description="Only this job.")
+
+
+class PinnedInput(Answer):
+    """An input as the worker reads it."""
+
+    item: str
+    revision: int
+    kind: Kind
+    name: str
+    collection: str
+
+
+class Lease(Answer):
+    """The right to work on a job until the lease ends."""
+
+    job: str
+    project: str
+    kind: str
+    params: dict[str, Any]
+    inputs: dict[str, tuple[PinnedInput, ...]]
+    into: str
+    seed: int
+    resources: Resources
+    fence: int
+    attempt: int
+    attempt_token: str
+    lease_ttl_s: float
+    heartbeat_s: float
+
+
+class LeaseList(Answer):
+    """The leases a claim got; empty if there was no work."""
+
+    leases: tuple[Lease, ...] = ()
+
+
+class Heartbeat(Request):
+    """The worker is alive."""
+
+    progress: Progress | None = None
+
+
+class HeartbeatAnswer(Answer):
+    """How long the lease lasts now, and whether to stop."""
+
+    lease_ttl_s: float
+    cancel_requested: bool
+    deadline_s: float | None = Field(None, description="Seconds left of the job's time limit.")
+
+
+class StagedOutput(Request):
+    """One result, staged: invisible until the attempt completes."""
+
+    name: str = Field(
+        min_length=1, max_length=1500, description="Unique within the attempt; other outputs refer to it."
+    )
+    kind: Kind
+    item_name: ItemName
+    collection: CollectionPath = Field("", description="Below the job's `into`.")
+    tags: tuple[Tag, ...] = Field((), max_length=64)
+    parts: dict[str, Any] = Field(min_length=1)
+    sources: dict[str, tuple[ItemInput, ...]] = Field(
+        default_factory=dict, description="Inputs this result was made from, by input name."
+    )
+    reuse: Literal["by_name", "by_content"] = Field(
+        "by_name", description="by_content: an item of the project with equal parts serves instead of a new one."
+    )
+
+
+class StageRequest(Request):
+    """Stage results."""
+
+    outputs: tuple[StagedOutput, ...] = Field(min_length=1, max_length=256)
+
+
+class CompleteRequest(Request):
+    """Publish what is staged and end the job. The same `write_id` again gives the same answer."""
+
+    write_id: str = Field(min_length=8, max_length=64)
+    result: dict[str, Any] = Field(default_factory=dict)
+    code_version: str | None = Field(None, max_length=255)
+    environment: dict[str, str] = Field(default_factory=dict)
+
+
+class FailRequest(Request):
+    """The attempt did not succeed."""
+
+    write_id: str = Field(min_length=8, max_length=64)
+    code: str = Field(min_length=1, max_length=128)
+    detail: str = Field("", max_length=20_000)
+    signature: str | None = Field(None, max_length=255, description="Two attempts with the same signature are poison.")
+    retryable: bool = True
+    interrupted: bool = Field(False, description="The worker was stopped; counts as no attempt.")
+
+
+class BatchCompletion(CompleteRequest):
+    """One completion of a batch."""
+
+    job: str
+    fence: int
+
+
+class BatchCompleteRequest(Request):
+    """Complete many jobs that stage no outputs beyond those staged already."""
+
+    completions: tuple[BatchCompletion, ...] = Field(min_length=1, max_length=256)

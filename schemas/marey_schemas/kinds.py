@@ -1,0 +1,60 @@
+"""The kinds of item a project holds, and the parts each is made of."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Kind(StrEnum):
+    """What an item is. The value is used in ids and documents; `plural` in URLs."""
+
+    SKELETON = "skeleton"
+    CLIP = "clip"
+    ANNOTATION = "annotation"
+    PROCESSED = "processed"
+    MODEL = "model"
+    GRAPH = "graph"
+    CHARACTER = "character"
+    EDIT = "edit"
+    EVALUATION = "evaluation"
+    METRIC = "metric"
+    STUDY = "study"
+
+    @property
+    def plural(self) -> str:
+        """The collection name in URLs, for example `clips`."""
+        return "processed" if self is Kind.PROCESSED else ("studies" if self is Kind.STUDY else f"{self.value}s")
+
+    @classmethod
+    def from_plural(cls, plural: str) -> "Kind":
+        """The kind a URL segment names; `KeyError` if none."""
+        return _BY_PLURAL[plural]
+
+
+_BY_PLURAL = {kind.plural: kind for kind in Kind}
+
+
+@dataclass(frozen=True)
+class PartSpec:
+    """One part of a kind: the schema its documents have, and whether a revision must hold it."""
+
+    schema: str
+    required: bool
+
+
+PARTS: dict[Kind, dict[str, PartSpec]] = {
+    Kind.SKELETON: {
+        "hierarchy": PartSpec("marey/skeleton@1", True),
+        "mapping": PartSpec("marey/skeleton-mapping@1", False),
+    },
+    Kind.CLIP: {"motion": PartSpec("marey/motion@1", True), "info": PartSpec("marey/clip-info@1", False)},
+    Kind.ANNOTATION: {"annotation": PartSpec("marey/annotation@1", True)},
+    Kind.PROCESSED: {"motion": PartSpec("marey/document@1", True), "info": PartSpec("marey/document@1", False)},
+    Kind.MODEL: {"model": PartSpec("marey/document@1", True), "tree": PartSpec("marey/document@1", False)},
+    Kind.GRAPH: {"graph": PartSpec("marey/document@1", True)},
+    Kind.CHARACTER: {"character": PartSpec("marey/document@1", True)},
+    Kind.EDIT: {"edit": PartSpec("marey/document@1", True)},
+    Kind.EVALUATION: {"evaluation": PartSpec("marey/document@1", True), "report": PartSpec("marey/document@1", False)},
+    Kind.METRIC: {"metric": PartSpec("marey/document@1", True)},
+    Kind.STUDY: {"study": PartSpec("marey/document@1", True)},
+}
+"""Parts by kind. `marey/document@1` is the open document of kinds whose own schema is not fixed yet."""

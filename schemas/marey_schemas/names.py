@@ -1,0 +1,25 @@
+"""Constrained strings used in many documents."""
+
+from typing import Annotated
+
+from pydantic import StringConstraints
+
+ProjectName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?$")]
+"""Lower-case letters, digits, `-` and `_`; it is part of URLs."""
+
+UserName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9._-]{0,62}[a-z0-9])?$")]
+
+ItemName = Annotated[str, StringConstraints(min_length=1, max_length=255, pattern=r"^[^/\x00-\x1f\x7f]+$")]
+"""Any printable name without a slash."""
+
+CollectionPath = Annotated[
+    str, StringConstraints(max_length=1024, pattern=r"^(?:[^/\x00-\x1f\x7f]{1,255}(?:/[^/\x00-\x1f\x7f]{1,255})*)?$")
+]
+"""Names joined by `/`, without a leading or trailing slash; the empty path is the project's root."""
+
+Tag = Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=r"^[^,\x00-\x1f\x7f]+$")]
+
+Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
+"""The name of bytes: `sha256:` and 64 hexadecimal digits."""
+
+Message = Annotated[str, StringConstraints(max_length=2000)]

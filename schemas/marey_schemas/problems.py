@@ -1,0 +1,32 @@
+"""Error answers: RFC 9457 `application/problem+json`."""
+
+from typing import Any
+
+from pydantic import Field
+
+from marey_schemas.base import Answer
+
+MEDIA_TYPE = "application/problem+json"
+
+
+class FieldError(Answer):
+    """One thing that is wrong with a request, and where."""
+
+    pointer: str = Field(description="JSON Pointer into the body, or the name of a query parameter or header.")
+    code: str
+    detail: str
+
+
+class Problem(Answer):
+    """What went wrong, for people (`title`, `detail`) and for programs (`code`)."""
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    instance: str = Field(description="The request id; quote it when asking for help.")
+    code: str = Field(description="Stable; documented in docs/reference/errors.md.")
+    errors: tuple[FieldError, ...] = ()
+    context: dict[str, Any] = Field(
+        default_factory=dict, description="Facts of this code, such as the current revision."
+    )
