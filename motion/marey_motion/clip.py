@@ -1,0 +1,131 @@
+"""A recorded or made motion of one skeleton, sampled at a constant rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import ClipError
+from marey_motion.skeleton import UNIT_TOLERANCE, Skeleton
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """Poses of a skeleton over time.
+
+    Arrays are taken over without a copy where their type fits, and are read-only afterwards.
+
+    Parameters
+    ----------
+    skeleton : the joints the poses are of
+    frame_rate_hz : frames per second
+    poses : (F, 3 + 4·J) float32    absolute root translation in metres, which replaces the root's offset, then one
+        unit local rotation (w, x, y, z) per joint in the skeleton's order
+    translations : (F, k, 3) float32    metres in the parent's frame; replace the offsets of `translated_joints`.
+        None where only the root moves.
+    translated_joints : increasing indices of those k joints, never the root
+
+    Raises
+    ------
+    ClipError    naming the field, frame and joint that is wrong
+    """
+
+    skeleton: Skeleton
+    frame_rate_hz: float
+    poses: NDArray[np.float32]
+    translations: NDArray[np.float32] | None = None
+    translated_joints: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        set_field = object.__setattr__
+        if not (np.isfinite(self.frame_rate_hz) and self.frame_rate_hz > 0):
+            raise ClipError(
+                f"the frame rate is {self.frame_rate_hz}, a positive number is needed", where="frame_rate_hz"
+            )
+        set_field(self, "frame_rate_hz", float(self.frame_rate_hz))
+        set_field(self, "poses", _frozen(self.poses, "poses", 2))
+        width = 3 + 4 * self.skeleton.joint_count
+        if self.poses.shape[1] != width:
+            raise ClipError(
+                f"{self.poses.shape[1]} columns where 3 + 4 × {self.skeleton.joint_count} joints = {width} are needed",
+                where="poses",
+            )
+        self._check_rotations()
+        set_field(self, "translated_joints", tuple(int(joint) for joint in self.translated_joints))
+        if self.translations is not None:
+            set_field(self, "translations", _frozen(self.translations, "translations", 3))
+        self._check_translations()
+
+    def _check_rotations(self) -> None:
+        squares = np.einsum("fjc,fjc->fj", self.rotations, self.rotations)
+        wrong = np.abs(squares - 1.0) > 2 * UNIT_TOLERANCE
+        if wrong.any():
+            frame, joint = (int(index) for index in np.argwhere(wrong)[0])
+            raise ClipError(
+                f"frame {frame} has a rotation of length {np.sqrt(squares[frame, joint]):.6g}, "
+                "a unit quaternion (w, x, y, z) is needed",
+                where=f"poses, joint {self.skeleton.joint_names[joint]}",
+            )
+
+    def _check_translations(self) -> None:
+        joints, where = self.translated_joints, "translated_joints"
+        if self.translations is None:
+            if joints:
+                raise ClipError("joints are named but there are no translations for them", where=where)
+            return
+        if self.translations.shape != (self.frame_count, len(joints), 3):
+            needed = (self.frame_count, len(joints), 3)
+            raise ClipError(f"shape {self.translations.shape} where {needed} is needed", where="translations")
+        if not joints:
+            raise ClipError("translations without joints; leave both out", where=where)
+        in_order = all(a < b for a, b in pairwise(joints))
+        if not in_order or joints[0] < 1 or joints[-1] >= self.skeleton.joint_count:
+            raise ClipError(f"indices must increase within 1 to {self.skeleton.joint_count - 1}", where=where)
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames."""
+        return int(self.poses.shape[0])
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds the clip lasts when each frame is held for one period, so that consecutive slices add up."""
+        return self.frame_count / self.frame_rate_hz
+
+    @property
+    def root_translations(self) -> NDArray[np.float32]:
+        """(F, 3) read-only view of the root's absolute positions, metres."""
+        return self.poses[:, :3]
+
+    @property
+    def rotations(self) -> NDArray[np.float32]:
+        """(F, J, 4) read-only view of the local rotations (w, x, y, z)."""
+        return self.poses[:, 3:].reshape(self.frame_count, -1, 4)
+
+    def sliced(self, start: int, stop: int) -> Clip:
+        """Frames [start, stop) as a clip that shares this one's memory; `ClipError` unless 0 <= start < stop <= F."""
+        if not 0 <= start < stop <= self.frame_count:
+            raise ClipError(
+                f"frames {start}:{stop} are not a part of 0:{self.frame_count}; start must come before stop",
+                where="slice",
+            )
+        translations = None if self.translations is None else self.translations[start:stop]
+        return replace(self, poses=self.poses[start:stop], translations=translations)
+
+
+def _frozen(values: NDArray[np.generic], field: str, ndim: int) -> NDArray[np.float32]:
+    """A read-only float32 view of `values`; the caller's own array keeps its flags."""
+    array = np.asarray(values)
+    if array.ndim != ndim or array.shape[0] == 0:
+        raise ClipError(f"shape {array.shape} where {ndim} axes and at least one frame are needed", where=field)
+    if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
+        raise ClipError(f"numbers are needed, not {array.dtype}", where=field)
+    view = np.asarray(array, dtype=np.float32).view()
+    finite = np.isfinite(view).reshape(len(view), -1).all(axis=1)
+    if not finite.all():
+        raise ClipError(f"frame {int(np.argmin(finite))} has a number that is not finite", where=field)
+    view.setflags(write=False)
+    return view

@@ -1,0 +1,219 @@
+"""The joint hierarchy that clips move: names, parents, offsets and rest pose.
+
+Right-handed, Y up, metres; quaternions are (w, x, y, z).
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from marey_motion import quaternions
+from marey_motion.errors import SkeletonError, UnknownJoint
+
+UNIT_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class EndSite:
+    """The tip of a chain: a point without a rotation of its own.
+
+    Parameters
+    ----------
+    joint : index of the joint that carries it
+    offset : (3,) float64    metres, in that joint's frame
+    """
+
+    joint: int
+    offset: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "offset", _frozen(self.offset, np.float64, (3,), "end site offset"))
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """A tree of joints in an order where parents come before their children.
+
+    Arrays are taken over without a copy where their type fits, and are read-only afterwards.
+
+    Parameters
+    ----------
+    joint_names : unique names; joint 0 is the root
+    parents : (J,) int32    index of the parent, smaller than the joint's own; -1 for the root
+    offsets : (J, 3) float64    metres, in the parent's frame; for the root its rest position
+    rest_rotations : (J, 4) float64    unit local rotation at rest. A clip's rotation replaces it.
+    end_sites : tips of chains
+    display_names : names as in the source file, where they may repeat; `joint_names` when left out
+
+    Raises
+    ------
+    SkeletonError    naming the joint and field that is wrong
+    """
+
+    joint_names: tuple[str, ...]
+    parents: NDArray[np.int32]
+    offsets: NDArray[np.float64]
+    rest_rotations: NDArray[np.float64]
+    end_sites: tuple[EndSite, ...] = ()
+    display_names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        names = _checked_names(self.joint_names)
+        count = len(names)
+        set_field = object.__setattr__
+        set_field(self, "joint_names", names)
+        set_field(self, "display_names", tuple(self.display_names) or names)
+        set_field(self, "parents", _frozen(self.parents, np.int32, (count,), "parents"))
+        set_field(self, "offsets", _frozen(self.offsets, np.float64, (count, 3), "offsets"))
+        set_field(self, "rest_rotations", _frozen(self.rest_rotations, np.float64, (count, 4), "rest_rotations"))
+        set_field(self, "end_sites", tuple(self.end_sites))
+        if len(self.display_names) != count:
+            raise SkeletonError(f"{len(self.display_names)} names for {count} joints", where="display_names")
+        self._check_tree()
+        self._check_rest_rotations()
+
+    def _check_tree(self) -> None:
+        if self.parents[0] != -1:
+            raise SkeletonError("the first joint must be the root, with parent -1", where=self.joint_names[0])
+        wrong = np.flatnonzero((self.parents[1:] < 0) | (self.parents[1:] >= np.arange(1, self.joint_count)))
+        if wrong.size:
+            joint = int(wrong[0]) + 1
+            raise SkeletonError(
+                f"parent {self.parents[joint]} of joint {joint} must be an earlier joint (0 to {joint - 1})",
+                where=self.joint_names[joint],
+            )
+        for site in self.end_sites:
+            if not 0 <= site.joint < self.joint_count:
+                raise SkeletonError(f"end site on joint {site.joint} of {self.joint_count}", where="end_sites")
+
+    def _check_rest_rotations(self) -> None:
+        norms = np.linalg.norm(self.rest_rotations, axis=1)
+        wrong = np.flatnonzero(np.abs(norms - 1.0) > UNIT_TOLERANCE)
+        if wrong.size:
+            joint = int(wrong[0])
+            raise SkeletonError(
+                f"rest rotation has length {norms[joint]:.6g}, a unit quaternion (w, x, y, z) is needed",
+                where=self.joint_names[joint],
+            )
+
+    @property
+    def joint_count(self) -> int:
+        """Number of joints, end sites not counted."""
+        return len(self.joint_names)
+
+    @cached_property
+    def children(self) -> tuple[tuple[int, ...], ...]:
+        """Indices of each joint's children, in order."""
+        lists: list[list[int]] = [[] for _ in self.joint_names]
+        for joint, parent in enumerate(self.parents.tolist()):
+            if parent >= 0:
+                lists[parent].append(joint)
+        return tuple(tuple(one) for one in lists)
+
+    @cached_property
+    def is_depth_first(self) -> bool:
+        """Whether each joint follows its parent or a descendant of it, as nested formats such as BVH write them."""
+        open_chain: list[int] = []
+        for joint, parent in enumerate(self.parents.tolist()):
+            while open_chain and open_chain[-1] != parent:
+                open_chain.pop()
+            if parent >= 0 and not open_chain:
+                return False
+            open_chain.append(joint)
+        return True
+
+    @cached_property
+    def _indices(self) -> dict[str, int]:
+        return {name: joint for joint, name in enumerate(self.joint_names)}
+
+    def index_of(self, name: str) -> int:
+        """Index of the joint called `name`; `UnknownJoint`, with the nearest names, when there is none."""
+        joint = self._indices.get(name)
+        if joint is None:
+            near = difflib.get_close_matches(name, self.joint_names, n=3)
+            hint = f"; did you mean {' or '.join(near)}?" if near else f"; the root is {self.joint_names[0]}"
+            raise UnknownJoint(f"no joint is called {name!r}{hint}", where=name)
+        return joint
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._indices
+
+    def path_to_root(self, joint: int) -> tuple[int, ...]:
+        """Indices from `joint` to the root, both included."""
+        path = [joint]
+        while (parent := int(self.parents[path[-1]])) >= 0:
+            path.append(parent)
+        return tuple(path)
+
+    @cached_property
+    def rest_global_rotations(self) -> NDArray[np.float64]:
+        """(J, 4) global rotation of each joint in the rest pose."""
+        result = self.rest_rotations.copy()
+        for joint, parent in enumerate(self.parents.tolist()):
+            if parent >= 0:
+                result[joint] = quaternions.multiply(result[parent], result[joint])
+        result.setflags(write=False)
+        return result
+
+    @cached_property
+    def rest_global_positions(self) -> NDArray[np.float64]:
+        """(J, 3) global position of each joint in the rest pose, metres."""
+        result = self.offsets.copy()
+        rotations = self.rest_global_rotations
+        for joint, parent in enumerate(self.parents.tolist()):
+            if parent >= 0:
+                result[joint] = result[parent] + quaternions.rotate_vectors(rotations[parent], result[joint])
+        result.setflags(write=False)
+        return result
+
+
+def same_hierarchy(a: Skeleton, b: Skeleton, *, tolerance_m: float = 0.0) -> bool:
+    """Whether clips of one skeleton are clips of the other: same joints, parents, offsets, rest pose and end sites.
+
+    `tolerance_m` allows each component of an offset to differ by so many metres. Display names do not matter.
+    """
+    if a is b:
+        return True
+    if a.joint_names != b.joint_names or not np.array_equal(a.parents, b.parents):
+        return False
+    if [site.joint for site in a.end_sites] != [site.joint for site in b.end_sites]:
+        return False
+    offsets = [(a.offsets, b.offsets)] + [(s.offset, t.offset) for s, t in zip(a.end_sites, b.end_sites, strict=True)]
+    if not all(np.all(np.abs(left - right) <= tolerance_m) for left, right in offsets):
+        return False
+    aligned = np.abs(np.sum(a.rest_rotations * b.rest_rotations, axis=1))
+    return bool(np.all(aligned >= 1.0 - 1e-9))
+
+
+def _checked_names(names: Sequence[str]) -> tuple[str, ...]:
+    names = tuple(names)
+    if not names:
+        raise SkeletonError("a skeleton needs at least one joint", where="joint_names")
+    for joint, name in enumerate(names):
+        if not isinstance(name, str) or not name:
+            raise SkeletonError(f"the name of joint {joint} is {name!r}, text is needed", where="joint_names")
+    repeated = [name for name, count in Counter(names).items() if count > 1]
+    if repeated:
+        raise SkeletonError(f"joint names must be unique, {repeated[0]!r} repeats", where="joint_names")
+    return names
+
+
+def _frozen(values: ArrayLike, dtype: DTypeLike, shape: tuple[int, ...], field: str) -> NDArray[np.generic]:
+    """A read-only view of `values` as `dtype`; the caller's own array keeps its flags."""
+    array = np.asarray(values)
+    if array.shape != shape:
+        raise SkeletonError(f"shape {array.shape} where {shape} is needed", where=field)
+    if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
+        raise SkeletonError(f"numbers are needed, not {array.dtype}", where=field)
+    if not np.all(np.isfinite(array)):
+        raise SkeletonError("all numbers must be finite", where=field)
+    view: NDArray[np.generic] = np.asarray(array, dtype=dtype).view()
+    view.setflags(write=False)
+    return view
