@@ -1,0 +1,35 @@
+"""The caller of a service function."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True, slots=True)
+class Principal:
+    """Who asks, and how far the credential reaches.
+
+    `scopes` are texts such as `write` or `write!project=walk`. An attempt is a job's running try: it reads its project
+    and writes only through its own attempt's endpoints.
+    """
+
+    kind: Literal["anonymous", "user", "attempt", "system"]
+    user_id: str | None = None
+    user_name: str | None = None
+    administrator: bool = False
+    scopes: tuple[str, ...] = ()
+    token_id: str | None = None
+    job_id: str | None = None
+    fence: int | None = None
+    project_id: str | None = None
+
+    @property
+    def actor(self) -> str | None:
+        """The name that authorship and events show."""
+        return self.user_name if self.kind != "attempt" else f"job:{self.job_id}"
+
+
+ANONYMOUS = Principal("anonymous")
+SYSTEM = Principal("system", administrator=True, scopes=("read", "write", "jobs", "work", "admin"))
+"""The server itself: reaper, garbage collection, first start."""

@@ -1,0 +1,1 @@
+"""Where workers run: beside the server, or on a cluster."""

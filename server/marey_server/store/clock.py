@@ -1,0 +1,59 @@
+"""The database's clock: the only one that leases are compared with."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Protocol
+
+from sqlalchemy import Connection, insert, select, text, update
+
+from marey_server.store.tables import server_state
+
+_HIGH_WATER = "clock_high_water_us"
+_SAVE_EVERY_US = 1_000_000
+
+
+class Clock(Protocol):
+    """Tells the time inside a transaction."""
+
+    def now_us(self, connection: Connection) -> int:
+        """Microseconds since the epoch, never going back."""
+        ...
+
+
+class DatabaseClock:
+    """Postgres: the server's own clock. SQLite: wall clock or stored high-water mark, whichever is later, sampled once and
+    then advanced by the monotonic clock, so that a jump of the wall clock neither revives nor kills a lease.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._start_us: int | None = None
+        self._start_monotonic_ns = 0
+
+    def now_us(self, connection: Connection) -> int:
+        """Microseconds since the epoch."""
+        if connection.dialect.name == "postgresql":
+            now = text("SELECT (extract(epoch FROM clock_timestamp()) * 1000000)::bigint")
+            return int(connection.execute(now).scalar_one())
+        with self._lock:
+            if self._start_us is None:
+                self._start_us = max(time.time_ns() // 1000, stored_high_water_us(connection))
+                self._start_monotonic_ns = time.monotonic_ns()
+            return self._start_us + (time.monotonic_ns() - self._start_monotonic_ns) // 1000
+
+
+def stored_high_water_us(connection: Connection) -> int:
+    """The latest time known to have been used, 0 in a new database."""
+    statement = select(server_state.c.value).where(server_state.c.key == _HIGH_WATER)
+    return int(connection.execute(statement).scalar() or 0)
+
+
+def save_high_water(connection: Connection, now_us: int) -> None:
+    """Remember `now_us`, at most once a second, so that a restart cannot go back behind it."""
+    stored = stored_high_water_us(connection)
+    if stored == 0:
+        connection.execute(insert(server_state).values(key=_HIGH_WATER, value=now_us))
+    elif now_us - stored >= _SAVE_EVERY_US:
+        connection.execute(update(server_state).where(server_state.c.key == _HIGH_WATER).values(value=now_us))

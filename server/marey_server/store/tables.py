@@ -1,0 +1,397 @@
+"""Every table, once, for SQLite and Postgres. Times are integer microseconds since the epoch, UTC, named `_us`."""
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Boolean,
+    Column,
+    ForeignKey,
+    ForeignKeyConstraint,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    Text,
+    text,
+)
+from sqlalchemy.dialects.postgresql import JSONB
+
+NAMING = {
+    "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+    "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+    "ck": "ck_%(table_name)s_%(constraint_name)s",
+    "fk": "fk_%(table_name)s_%(column_0_N_name)s_%(referred_table_name)s",
+    "pk": "pk_%(table_name)s",
+}
+metadata = MetaData(naming_convention=NAMING)
+
+Document = JSON().with_variant(JSONB(), "postgresql")
+Micros = BigInteger
+Sequence64 = BigInteger().with_variant(Integer(), "sqlite")  # SQLite numbers rows by itself only for INTEGER keys
+ID = String(40)
+DIGEST = String(71)
+
+
+def _alive(table: str, *columns: str) -> Index:
+    """Unique among what is not deleted, so that a deleted name can be used again."""
+    condition = text("deleted_us IS NULL")
+    return Index(f"uq_{table}_alive", *columns, unique=True, sqlite_where=condition, postgresql_where=condition)
+
+
+user = Table(
+    "user",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("name", String(64), nullable=False, unique=True),
+    Column("display_name", String(255)),
+    Column("password_hash", Text),
+    Column("administrator", Boolean, nullable=False, default=False),
+    Column("disabled", Boolean, nullable=False, default=False),
+    Column("created_us", Micros, nullable=False),
+    Column("rev", Integer, nullable=False, default=1),
+)
+
+token = Table(
+    "token",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("user_id", ID, ForeignKey("user.id"), nullable=False, index=True),
+    Column("name", String(255), nullable=False),
+    Column("prefix", String(16), nullable=False, unique=True),
+    Column("secret_hash", String(64), nullable=False),
+    Column("scopes", Document, nullable=False),
+    Column("created_us", Micros, nullable=False),
+    Column("expires_us", Micros),
+    Column("last_used_us", Micros),
+)
+
+project = Table(
+    "project",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("name", String(64), nullable=False),
+    Column("title", String(255)),
+    Column("description", Text, nullable=False, default=""),
+    Column("visibility", String(16), nullable=False),
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False),
+    Column("deleted_us", Micros),
+    Column("rev", Integer, nullable=False, default=1),
+    _alive("project", "name"),
+)
+
+member = Table(
+    "member",
+    metadata,
+    Column("project_id", ID, ForeignKey("project.id"), primary_key=True),
+    Column("user_id", ID, ForeignKey("user.id"), primary_key=True, index=True),
+    Column("role", String(16), nullable=False),
+    Column("since_us", Micros, nullable=False),
+    Column("rev", Integer, nullable=False, default=1),
+)
+
+collection = Table(
+    "collection",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("project_id", ID, ForeignKey("project.id"), nullable=False),
+    Column("path", String(1024), nullable=False),
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False),
+    Column("deleted_us", Micros),
+    Column("rev", Integer, nullable=False, default=1),
+    _alive("collection", "project_id", "path"),
+)
+
+item = Table(
+    "item",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("project_id", ID, ForeignKey("project.id"), nullable=False),
+    Column("collection_id", ID, ForeignKey("collection.id"), nullable=False, index=True),
+    Column("kind", String(16), nullable=False),
+    Column("name", String(255), nullable=False),
+    Column("head", Integer, nullable=False),
+    Column("summary", Document, nullable=False),
+    Column("frames", Integer),
+    Column("skeleton_id", ID, index=True),
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False),
+    Column("deleted_us", Micros),
+    Column("rev", Integer, nullable=False, default=1),
+    _alive("item", "collection_id", "kind", "name"),
+    Index("ix_item_listing", "project_id", "kind", "id"),
+)
+
+item_tag = Table(
+    "item_tag",
+    metadata,
+    Column("item_id", ID, ForeignKey("item.id"), primary_key=True),
+    Column("tag", String(64), primary_key=True, index=True),
+)
+
+revision = Table(
+    "revision",
+    metadata,
+    Column("item_id", ID, ForeignKey("item.id"), primary_key=True),
+    Column("number", Integer, primary_key=True),
+    Column("author_id", ID, ForeignKey("user.id")),
+    Column("message", Text, nullable=False, default=""),
+    Column("job_id", ID, index=True),
+    Column("created_us", Micros, nullable=False),
+)
+
+revision_part = Table(
+    "revision_part",
+    metadata,
+    Column("item_id", ID, primary_key=True),
+    Column("number", Integer, primary_key=True),
+    Column("part", String(32), primary_key=True),
+    Column("document_digest", DIGEST, ForeignKey("document.digest"), nullable=False, index=True),
+    ForeignKeyConstraint(["item_id", "number"], ["revision.item_id", "revision.number"]),
+)
+
+document = Table(
+    "document",
+    metadata,
+    Column("digest", DIGEST, primary_key=True),
+    Column("schema", String(128), nullable=False),
+    Column("body", Document, nullable=False),  # array leaves stand as {"dtype", "shape", "content"}
+    Column("size_bytes", BigInteger, nullable=False),
+    Column("created_us", Micros, nullable=False),
+)
+
+document_blob = Table(
+    "document_blob",
+    metadata,
+    Column("document_digest", DIGEST, ForeignKey("document.digest"), primary_key=True),
+    Column("pointer", String(512), primary_key=True),  # JSON Pointer of the array leaf or of the digest in `body`
+    Column("blob_digest", DIGEST, ForeignKey("blob.digest"), nullable=False, index=True),
+)
+
+blob = Table(
+    "blob",
+    metadata,
+    Column("digest", DIGEST, primary_key=True),
+    Column("size_bytes", BigInteger, nullable=False),
+    Column("created_us", Micros, nullable=False, index=True),
+)
+
+blob_chunk = Table(
+    "blob_chunk",
+    metadata,
+    Column("digest", DIGEST, ForeignKey("blob.digest"), primary_key=True),
+    Column("position", Integer, primary_key=True),
+    Column("data", LargeBinary, nullable=False),
+)
+
+blob_holder = Table(  # who has shown to possess the bytes, and so may refer to them by name
+    "blob_holder",
+    metadata,
+    Column("digest", DIGEST, ForeignKey("blob.digest"), primary_key=True),
+    Column("user_id", ID, ForeignKey("user.id"), primary_key=True),
+    Column("created_us", Micros, nullable=False),
+)
+
+lineage = Table(
+    "lineage",
+    metadata,
+    Column("item_id", ID, primary_key=True),
+    Column("number", Integer, primary_key=True),
+    Column("role", String(64), primary_key=True),
+    Column("position", Integer, primary_key=True),
+    Column("input_item_id", ID, nullable=False),
+    Column("input_number", Integer, nullable=False),
+    Column("job_id", ID, index=True),
+    ForeignKeyConstraint(["item_id", "number"], ["revision.item_id", "revision.number"]),
+    ForeignKeyConstraint(
+        ["input_item_id", "input_number"], ["revision.item_id", "revision.number"], name="fk_lineage_input"
+    ),
+    Index("ix_lineage_input", "input_item_id", "input_number"),
+)
+
+job = Table(
+    "job",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("project_id", ID, ForeignKey("project.id"), nullable=False),
+    Column("kind", String(64), nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("params", Document, nullable=False),
+    Column("inputs", Document, nullable=False),  # {name: [{item, revision, kind, name, collection}]}, pinned
+    Column("into_path", String(1024), nullable=False, default=""),
+    Column("priority", Integer, nullable=False, default=0),
+    Column("seed", BigInteger, nullable=False, default=0),
+    Column("labels_key", String(512), nullable=False, default=""),  # "a=1,b=2", sorted; a worker enumerates its subsets
+    Column("time_limit_s", Integer, nullable=False),
+    Column("memory_limit_mb", Integer, nullable=False),
+    Column("max_attempts", Integer, nullable=False, default=3),
+    Column("attempt", Integer, nullable=False, default=0),
+    Column("interruptions", Integer, nullable=False, default=0),
+    Column("fence", Integer, nullable=False, default=0),
+    Column("run_at_us", Micros, nullable=False),
+    Column("lease_expires_us", Micros),
+    Column("deadline_us", Micros),
+    Column("cancel_requested_us", Micros),
+    Column("write_id", String(64)),
+    Column("answer", Document),  # what `complete` or `fail` answered, for the same write_id again
+    Column("result", Document),
+    Column("failure", Document),
+    Column("progress", Document),
+    Column("publish_conflict", Document),
+    Column("parent_id", ID, ForeignKey("job.id"), index=True),
+    Column("position", Integer),
+    Column("size", Integer),  # set for the gathering job of a fan-out, which depends on its tasks and does no work
+    Column("dependencies_left", Integer, nullable=False, default=0),
+    Column("on_failure", String(8), nullable=False, default="fail"),
+    Column("concurrency_key", String(255)),
+    Column("cache_mode", String(8), nullable=False, default="use"),
+    Column("cache_key", DIGEST),
+    Column("cached_from", ID),
+    Column("retry_of", ID),
+    Column("code_version", String(255)),
+    Column("environment", Document),
+    Column("author_id", ID, ForeignKey("user.id")),
+    Column("message", Text, nullable=False, default=""),
+    Column("created_us", Micros, nullable=False),
+    Column("started_us", Micros),
+    Column("finished_us", Micros),
+    Column("rev", Integer, nullable=False, default=1),
+    Index("ix_job_listing", "project_id", "id"),
+    Index(
+        "ix_job_claim",
+        "kind",
+        text("priority DESC"),
+        "run_at_us",
+        "id",
+        sqlite_where=text("state = 'queued'"),
+        postgresql_where=text("state = 'queued'"),
+    ),
+    Index(
+        "ix_job_expiry",
+        "lease_expires_us",
+        sqlite_where=text("state = 'running'"),
+        postgresql_where=text("state = 'running'"),
+    ),
+    Index(
+        "uq_job_concurrency",
+        "project_id",
+        "concurrency_key",
+        unique=True,
+        sqlite_where=text("state = 'running' AND concurrency_key IS NOT NULL"),
+        postgresql_where=text("state = 'running' AND concurrency_key IS NOT NULL"),
+    ),
+    Index("ix_job_cache", "project_id", "cache_key"),
+)
+
+job_dependency = Table(
+    "job_dependency",
+    metadata,
+    Column("job_id", ID, ForeignKey("job.id"), primary_key=True),
+    Column("on_job_id", ID, ForeignKey("job.id"), primary_key=True, index=True),
+    Column("satisfied", Boolean, nullable=False, default=False),
+)
+
+attempt = Table(
+    "attempt",
+    metadata,
+    Column("job_id", ID, ForeignKey("job.id"), primary_key=True),
+    Column("fence", Integer, primary_key=True),
+    Column("worker", String(255), nullable=False),
+    Column("claimed_by", ID),  # the token that claimed
+    Column("token_hash", String(64), nullable=False, unique=True),
+    Column("started_us", Micros, nullable=False),
+    Column("ended_us", Micros),
+    Column("outcome", String(16)),
+    Column("detail", Text),
+    Column("signature", String(255)),
+    Column("log_bytes", BigInteger, nullable=False, default=0),
+)
+
+job_log = Table(
+    "job_log",
+    metadata,
+    Column("job_id", ID, primary_key=True),
+    Column("fence", Integer, primary_key=True),
+    Column("offset", BigInteger, primary_key=True),
+    Column("data", LargeBinary, nullable=False),
+    ForeignKeyConstraint(["job_id", "fence"], ["attempt.job_id", "attempt.fence"]),
+)
+
+staged_output = Table(
+    "staged_output",
+    metadata,
+    Column("job_id", ID, primary_key=True),
+    Column("fence", Integer, primary_key=True),
+    Column("name", String(1500), primary_key=True),
+    Column("position", Integer, nullable=False),
+    Column(
+        "draft", Document, nullable=False
+    ),  # a store draft: documents by digest, or bodies that refer to other outputs
+    ForeignKeyConstraint(["job_id", "fence"], ["attempt.job_id", "attempt.fence"]),
+)
+
+event = Table(
+    "event",
+    metadata,
+    Column("seq", Sequence64, primary_key=True, autoincrement=True),
+    Column("xid", BigInteger, nullable=False, default=0),  # Postgres transaction: readers order by (xid, seq)
+    Column("at_us", Micros, nullable=False),
+    Column("project_id", ID, index=True),
+    Column("kind", String(64), nullable=False),
+    Column("subject", String(64), nullable=False, index=True),
+    Column("actor", String(255)),
+    Column("body", Document, nullable=False),
+    sqlite_autoincrement=True,
+)
+
+idempotency_key = Table(
+    "idempotency_key",
+    metadata,
+    Column("principal", String(64), primary_key=True),
+    Column("key", String(255), primary_key=True),
+    Column("fingerprint", String(71), nullable=False),
+    Column("status", Integer),  # null while the first request is under way
+    Column("headers", Document),
+    Column("body", LargeBinary),
+    Column("created_us", Micros, nullable=False, index=True),
+)
+
+upload = Table(
+    "upload",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("user_id", ID, ForeignKey("user.id"), nullable=False, index=True),
+    Column("length", BigInteger, nullable=False),
+    Column("offset", BigInteger, nullable=False, default=0),
+    Column("digest", DIGEST),  # expected, checked at the end
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False, index=True),
+    Column("finished_digest", DIGEST),
+)
+
+upload_chunk = Table(
+    "upload_chunk",
+    metadata,
+    Column("upload_id", ID, ForeignKey("upload.id"), primary_key=True),
+    Column("offset", BigInteger, primary_key=True),
+    Column("data", LargeBinary, nullable=False),
+)
+
+leader = Table(
+    "leader",
+    metadata,
+    Column("name", String(32), primary_key=True),
+    Column("holder", String(64), nullable=False),
+    Column("fence", Integer, nullable=False),
+    Column("expires_us", Micros, nullable=False),
+)
+
+server_state = Table(
+    "server_state",
+    metadata,
+    Column("key", String(64), primary_key=True),
+    Column("value", Document, nullable=False),
+)
