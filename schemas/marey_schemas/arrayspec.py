@@ -1,0 +1,93 @@
+"""Which arrays may travel: the dtypes, shapes and sizes that every codec accepts."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+DTYPES = ("<f4", "<f8", "|i1", "<i2", "<i4", "<i8", "|u1", "<u2", "<u4", "<u8", "|b1")
+MAX_DIMENSIONS = 8
+MAX_ELEMENTS = 1 << 40  # keeps every product of sizes inside 64 bits, whatever a document claims
+
+
+class ArrayError(ValueError):
+    """An array, or the leaf that claims to be one, cannot travel."""
+
+    def __init__(self, code: str, detail: str) -> None:
+        super().__init__(detail)
+        self.code = code
+        self.detail = detail
+
+
+@dataclass(frozen=True, slots=True)
+class ArraySpec:
+    """Dtype and shape of an array, checked before anything is allocated for it.
+
+    `dtype` is one of `DTYPES` (numpy's spelling, little-endian). Raises `ArrayError`.
+    """
+
+    dtype: str
+    shape: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if self.dtype not in DTYPES:
+            raise ArrayError("bad-dtype", f"dtype {self.dtype!r} is not one of {', '.join(DTYPES)}")
+        if len(self.shape) > MAX_DIMENSIONS:
+            raise ArrayError("bad-shape", f"{len(self.shape)} dimensions; at most {MAX_DIMENSIONS} are allowed")
+        if any(size < 0 for size in self.shape):
+            raise ArrayError("bad-shape", f"shape {list(self.shape)} has a negative size")
+        # Empty sizes count as one: [10**12, 0] holds no numbers, yet would be 10**12 lists in JSON.
+        if math.prod(max(size, 1) for size in self.shape) > MAX_ELEMENTS:
+            raise ArrayError("too-large", f"shape {list(self.shape)} has more than {MAX_ELEMENTS} elements")
+
+    @classmethod
+    def of(cls, array: NDArray[Any]) -> "ArraySpec":
+        """Spec of `array` once its bytes are little-endian."""
+        return cls(array.dtype.newbyteorder("<").str, array.shape)
+
+    @classmethod
+    def parse(cls, dtype: object, shape: object) -> "ArraySpec":
+        """Spec from the two members of a leaf, as they came out of a parser."""
+        if not isinstance(dtype, str):
+            raise ArrayError("bad-dtype", f"dtype must be a string, not {type(dtype).__name__}")
+        if not isinstance(shape, Sequence) or isinstance(shape, str | bytes):
+            raise ArrayError("bad-shape", f"shape must be a list of integers, not {type(shape).__name__}")
+        if not all(isinstance(size, int) and not isinstance(size, bool) for size in shape):
+            raise ArrayError("bad-shape", "shape must be a list of integers")
+        return cls(dtype, tuple(int(size) for size in shape))
+
+    def __str__(self) -> str:
+        return f"{self.dtype} {list(self.shape)}"
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the plain array; an empty size counts as one."""
+        return int(np.dtype(self.dtype).itemsize * math.prod(max(size, 1) for size in self.shape))
+
+    def require(self, max_bytes: int) -> None:
+        """Raise `ArrayError` unless the array fits in `max_bytes`."""
+        if self.nbytes > max_bytes:
+            detail = (
+                f"an array of dtype {self.dtype} and shape {list(self.shape)} exceeds the {max_bytes} bytes allowed"
+            )
+            raise ArrayError("too-large", detail)
+
+
+def little_endian(array: NDArray[Any]) -> NDArray[Any]:
+    """The same numbers as a C-contiguous little-endian array, copied only where needed. Raises `ArrayError`."""
+    spec = ArraySpec.of(array)
+    return np.ascontiguousarray(array, dtype=spec.dtype).reshape(spec.shape)
+
+
+def require_finite(array: NDArray[Any]) -> NDArray[Any]:
+    """Return `array`, or raise `ArrayError` naming its first NaN or infinity."""
+    if array.dtype.kind == "f":
+        finite = np.isfinite(array)
+        if not finite.all():
+            index = np.unravel_index(int(np.argmin(finite)), array.shape)
+            where = [int(i) for i in index]
+            raise ArrayError("not-finite", f"element {where} is {array[index]}; only finite numbers may travel")
+    return array
