@@ -1,0 +1,61 @@
+# `make demo` and `make test` need nothing but Python 3.11 or newer; they install into .venv.
+
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+DATA   ?=
+PIP    := $(BIN)/python -m pip --disable-pip-version-check -q
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint format dev bench fuzz docs clean
+
+help: ## Show what can be made
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Marey needs Python 3.11 or newer; say which with make PYTHON=..."; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed-all: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) install -c constraints.txt -e '.[all]'
+	@touch $@
+
+$(VENV)/.installed-dev: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) install -c constraints.txt -e '.[dev]'
+	@touch $@ $(VENV)/.installed-all
+
+$(VENV)/.installed-bench: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) install -c constraints.txt -e '.[dev,bench]'
+	@touch $@ $(VENV)/.installed-dev $(VENV)/.installed-all
+
+demo: $(VENV)/.installed-all ## From takes to retargeted clips; DATA=folder for your own motion
+	$(BIN)/marey demo $(if $(DATA),"$(DATA)")
+
+dev: $(VENV)/.installed-dev ## A server and a worker on this machine, with data in ./marey-data
+	$(BIN)/marey serve
+
+test: $(VENV)/.installed-dev lint ## Everything a change can break, on SQLite and on Postgres
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal tests
+
+lint: $(VENV)/.installed-dev ## Style, types and the arrows between rooms
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(VENV)/.installed-dev ## Put the code in house style
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(VENV)/.installed-bench ## Speed against peers, as ratios
+	$(BIN)/python -m benchmarks
+
+fuzz: $(VENV)/.installed-dev ## An hour of malformed motion files and twenty minutes of malformed requests
+	$(BIN)/python -m benchmarks.fuzz_formats 3600
+	$(BIN)/python -m benchmarks.fuzz_api 1200
+
+docs: $(VENV)/.installed-dev ## Write the reference pages that come from the code
+	$(BIN)/python -m docs.generate
+
+clean: ## Remove the environment and what tools leave behind
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis marey-demo
