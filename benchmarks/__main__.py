@@ -1,0 +1,71 @@
+"""Run every benchmark, or those named: `python -m benchmarks bvh kinematics`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import pkgutil
+import platform
+import sys
+from dataclasses import asdict
+
+from rich.console import Console
+from rich.table import Table
+
+import benchmarks
+from benchmarks.timing import Row
+
+
+def main() -> int:
+    """Print a table of ratios; exit status 1 if a goal was missed and `--strict` was given."""
+    names = sorted(
+        module.name.removeprefix("bench_")
+        for module in pkgutil.iter_modules(benchmarks.__path__)
+        if module.name.startswith("bench_")
+    )
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="name", help=f"of {', '.join(names)}; all when absent")
+    parser.add_argument("--json", metavar="FILE", help="write the rows as JSON too")
+    parser.add_argument("--strict", action="store_true", help="fail when a goal is missed")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.names) - set(names):
+        parser.error(f"no benchmark {', '.join(sorted(unknown))}; there are {', '.join(names)}")
+
+    console = Console(width=150)
+    console.print(
+        f"{platform.python_implementation()} {platform.python_version()}, {platform.machine()}, {platform.system()}"
+    )
+    rows: list[Row] = []
+    for name in arguments.names or names:
+        console.print(f"running {name} …")
+        rows += importlib.import_module(f"benchmarks.bench_{name}").run()
+    console.print(_table(rows))
+    if arguments.json:
+        with open(arguments.json, "w", encoding="utf-8") as file:
+            json.dump([asdict(row) for row in rows], file, indent=2)
+    return int(arguments.strict and not all(row.met for row in rows))
+
+
+def _table(rows: list[Row]) -> Table:
+    table = Table(title="Marey beside its peers", title_justify="left")
+    for heading, justify in (
+        ("job", "left"),
+        ("size", "left"),
+        ("Marey", "right"),
+        ("peer", "right"),
+        ("ratio", "right"),
+        ("goal", "left"),
+        ("", "left"),
+    ):
+        table.add_column(heading, justify=justify)  # type: ignore[arg-type]
+    for row in rows:
+        ratio = f"{row.ratio:.1f}x" if row.ratio is not None else ""
+        table.add_row(
+            row.job, row.size, row.ours, row.peer, ratio, row.goal, "met" if row.met else "[bold]missed[/bold]"
+        )
+    return table
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,76 @@
+"""A loopback TCP proxy that can go wrong on purpose: swallow one direction, cut connections, lose an answer."""
+
+from __future__ import annotations
+
+import contextlib
+import selectors
+import socket
+import threading
+from typing import Self
+
+
+class TcpProxy:
+    """Forwards connections to `target_port` on loopback.
+
+    `drop_requests` and `drop_answers` swallow bytes of that direction while set; `cut_after_request` closes the connection
+    of the next exchange as soon as the server starts to answer, so that the server has done the work and the client never
+    hears of it.
+    """
+
+    def __init__(self, target_port: int) -> None:
+        self.target_port = target_port
+        self.drop_requests = threading.Event()
+        self.drop_answers = threading.Event()
+        self.cut_after_request = threading.Event()
+        self.cuts = 0
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._listener.getsockname()[1]
+        self._stopping = threading.Event()
+        self._threads: list[threading.Thread] = []
+
+    def __enter__(self) -> Self:
+        accepting = threading.Thread(target=self._accept, daemon=True)
+        accepting.start()
+        self._threads.append(accepting)
+        return self
+
+    def __exit__(self, *_exc: object) -> None:
+        self._stopping.set()
+        self._listener.close()
+        for thread in self._threads:
+            thread.join(5)
+
+    def _accept(self) -> None:
+        self._listener.settimeout(0.2)
+        while not self._stopping.is_set():
+            try:
+                client, _ = self._listener.accept()
+            except TimeoutError:
+                continue
+            except OSError:
+                return
+            thread = threading.Thread(target=self._forward, args=(client,), daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def _forward(self, client: socket.socket) -> None:
+        with (
+            client,
+            contextlib.suppress(OSError),
+            socket.create_connection(("127.0.0.1", self.target_port), 5) as server,
+        ):
+            selector = selectors.DefaultSelector()
+            selector.register(client, selectors.EVENT_READ, (server, self.drop_requests))
+            selector.register(server, selectors.EVENT_READ, (client, self.drop_answers))
+            while not self._stopping.is_set():
+                for key, _ in selector.select(0.2):
+                    peer, dropping = key.data
+                    data = key.fileobj.recv(65536)  # type: ignore[union-attr]
+                    if not data:
+                        return
+                    if key.fileobj is server and self.cut_after_request.is_set():
+                        self.cut_after_request.clear()
+                        self.cuts += 1
+                        return
+                    if not dropping.is_set():
+                        peer.sendall(data)
