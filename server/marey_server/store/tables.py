@@ -235,9 +235,8 @@ job = Table(
     Column("lease_expires_us", Micros),
     Column("deadline_us", Micros),
     Column("cancel_requested_us", Micros),
-    Column("write_id", String(64)),
-    Column("answer", Document),  # what `complete` or `fail` answered, for the same write_id again
     Column("result", Document),
+    Column("outputs", Document),  # [{name, item, kind, revision, created}], what the job published
     Column("failure", Document),
     Column("progress", Document),
     Column("publish_conflict", Document),
@@ -249,7 +248,7 @@ job = Table(
     Column("concurrency_key", String(255)),
     Column("cache_mode", String(8), nullable=False, default="use"),
     Column("cache_key", DIGEST),
-    Column("cached_from", ID),
+    Column("cached_from", ID),  # the job whose result this one shares, or waits to share
     Column("retry_of", ID),
     Column("code_version", String(255)),
     Column("environment", Document),
@@ -261,13 +260,30 @@ job = Table(
     Column("rev", Integer, nullable=False, default=1),
     Index("ix_job_listing", "project_id", "id"),
     Index(
-        "ix_job_claim",
-        "kind",
+        "ix_job_claim",  # in pick order; what follows the id lets the scan pass over jobs for other workers
         text("priority DESC"),
         "run_at_us",
         "id",
+        "kind",
+        "labels_key",
         sqlite_where=text("state = 'queued'"),
         postgresql_where=text("state = 'queued'"),
+    ),
+    Index(
+        "ix_job_concurrency",
+        "project_id",
+        "concurrency_key",
+        text("priority DESC"),
+        "run_at_us",
+        "id",
+        sqlite_where=text("state = 'queued' AND concurrency_key IS NOT NULL"),
+        postgresql_where=text("state = 'queued' AND concurrency_key IS NOT NULL"),
+    ),
+    Index(
+        "ix_job_sharing",
+        "cached_from",
+        sqlite_where=text("state = 'waiting' AND cached_from IS NOT NULL"),
+        postgresql_where=text("state = 'waiting' AND cached_from IS NOT NULL"),
     ),
     Index(
         "ix_job_expiry",
@@ -307,6 +323,8 @@ attempt = Table(
     Column("outcome", String(16)),
     Column("detail", Text),
     Column("signature", String(255)),
+    Column("write_id", String(64)),  # of the worker's last word
+    Column("answer", Document),  # what it was answered, for the same write_id again
     Column("log_bytes", BigInteger, nullable=False, default=0),
 )
 

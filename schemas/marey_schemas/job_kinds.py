@@ -1,0 +1,134 @@
+"""What each kind of job takes and makes, declared once for server, client and worker.
+
+The server checks submissions against these declarations and publishes their JSON Schema; only the worker imports the
+function behind one. Other distributions add kinds with an entry point of the group `marey.job_kinds` that names a
+`KindDeclaration`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import entry_points
+from types import MappingProxyType
+from typing import Any, Literal
+
+from marey_schemas.base import Request
+from marey_schemas.jobs import ExportParams, ImportParams, InputSpec, JobKind, RetargetParams
+from marey_schemas.kinds import Kind
+
+ENTRY_POINT_GROUP = "marey.job_kinds"
+
+
+@dataclass(frozen=True)
+class KindDeclaration:
+    """A kind of job.
+
+    `version` changes whenever the same inputs, parameters and seed may give other results; cached results of another
+    version are not used. `implementation` names the worker's function `run(context, params)` as `module:function`.
+    """
+
+    name: str
+    description: str
+    params: type[Request]
+    implementation: str
+    version: int
+    outputs: Mapping[str, Kind | Literal["file"]]
+    inputs: Mapping[str, InputSpec] = field(default_factory=dict)
+    fan_out: str | None = None
+    batch_size: int = 1
+    deterministic: bool = True
+
+    def __post_init__(self) -> None:
+        if self.fan_out is not None and not (self.fan_out in self.inputs and self.inputs[self.fan_out].many):
+            raise ValueError(f"{self.name}: fan_out {self.fan_out!r} must be an input that takes many items")
+        if self.batch_size < 1:
+            raise ValueError(f"{self.name}: batch_size must be at least 1, not {self.batch_size}")
+
+    @property
+    def code_version(self) -> str:
+        """What results are cached and recorded under."""
+        return f"{self.name}@{self.version}"
+
+    def document(self) -> JobKind:
+        """The declaration as it travels."""
+        return JobKind(
+            name=self.name,
+            description=self.description,
+            params_schema=_params_schema(self.params),
+            inputs=dict(self.inputs),
+            outputs=dict(self.outputs),
+            fan_out=self.fan_out,
+            batch_size=self.batch_size,
+            deterministic=self.deterministic,
+        )
+
+
+@cache
+def _params_schema(params: type[Request]) -> dict[str, Any]:
+    return params.model_json_schema()
+
+
+IMPORT = KindDeclaration(
+    name="import",
+    description="Reads motion files the server already has and makes clips and skeletons of them.",
+    params=ImportParams,
+    implementation="marey_worker.kinds.imports:run",
+    version=1,
+    outputs={"clips": Kind.CLIP, "skeletons": Kind.SKELETON},
+)
+
+RETARGET = KindDeclaration(
+    name="retarget",
+    description="Carries the motion of clips over to another skeleton.",
+    params=RetargetParams,
+    implementation="marey_worker.kinds.retarget:run",
+    version=1,
+    inputs={
+        "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to carry over."),
+        "skeleton": InputSpec(kind=Kind.SKELETON, description="The skeleton that shall move."),
+    },
+    outputs={"clips": Kind.CLIP},
+    fan_out="clips",
+    batch_size=16,
+)
+
+EXPORT = KindDeclaration(
+    name="export",
+    description="Writes clips as files of one format into one archive.",
+    params=ExportParams,
+    implementation="marey_worker.kinds.export:run",
+    version=1,
+    inputs={"clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to write.")},
+    outputs={"archive": "file"},
+)
+
+BUILT_IN = (IMPORT, RETARGET, EXPORT)
+
+
+class UnknownKind(LookupError):
+    """No kind of job has this name."""
+
+
+@cache
+def job_kinds() -> Mapping[str, KindDeclaration]:
+    """Every kind by name: the built-in ones and those of installed distributions.
+
+    Raises `TypeError` for an entry point that is no declaration, `ValueError` for a name that is taken.
+    """
+    kinds = {kind.name: kind for kind in BUILT_IN}
+    for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
+        kind = entry.load()
+        if not isinstance(kind, KindDeclaration):
+            raise TypeError(f"entry point {entry.value} of {ENTRY_POINT_GROUP} must be a KindDeclaration")
+        if kind.name in kinds:
+            raise ValueError(f"entry point {entry.value} declares the job kind {kind.name!r}, which exists already")
+        kinds[kind.name] = kind
+    return MappingProxyType(kinds)
+
+
+def find_kind(name: str) -> KindDeclaration:
+    """The kind called `name`; `UnknownKind` if there is none."""
+    try:
+        return job_kinds()[name]
+    except KeyError:
+        raise UnknownKind(f"there is no kind of job called {name!r}; known: {', '.join(job_kinds())}") from None
