@@ -6,6 +6,8 @@ axes are right-handed with Y up (docs/explanation/conventions.md).
 
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from marey_schemas.arrays import ArrayOf
@@ -100,12 +102,12 @@ class Motion(Request):
     skeleton: RevisionRef | OutputRef
     frame_rate_hz: float = Field(gt=0, le=MAX_FRAME_RATE_HZ, allow_inf_nan=False)
     joints: tuple[JointName, ...] = Field(min_length=1, max_length=MAX_JOINTS, description="Order of the rotations.")
-    poses: ArrayOf("<f4", 2) = Field(
+    poses: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=2)] = Field(
         description="[frames, 3 + 4*joints]: root translation (m), then local quaternions."
-    )  # type: ignore[valid-type]
-    translations: ArrayOf("<f4", 3) | None = Field(
+    )
+    translations: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=3, columns=3)] | None = Field(
         None, description="[frames, k, 3] local translations (m) that replace offsets."
-    )  # type: ignore[valid-type]
+    )
     translated_joints: tuple[JointName, ...] = ()
 
     @model_validator(mode="after")
