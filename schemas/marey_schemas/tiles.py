@@ -1,0 +1,239 @@
+"""One tile of the block codec: some frames of some columns as one zstd frame, exact to the bit.
+
+What makes motion small is prediction, done on integers so that it is exact: float bits become integers that grow
+with the number, each column is differenced up to three times, and the largest component of a unit quaternion follows
+from the other three but for a few units in the last place. docs/reference/block-format.md has the layout.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+Bytes = NDArray[np.uint8]
+Integers = NDArray[Any]  # (channels, frames) unsigned, as wide as the numbers they stand for
+
+RAW, DIFFERENCES, QUATERNIONS = 0, 1, 2
+MAX_ORDER = 3
+_UNIT_TOLERANCE = 1e-3  # of the squared norm: what is further from one is not a rotation
+
+
+class TileError(ValueError):
+    """The bytes are not a tile of the expected size."""
+
+
+def pack(tile: NDArray[Any], lead: int | None) -> bytes:
+    """Compress a (frames, columns) little-endian array.
+
+    `lead` is the number of columns before the first quaternion, None where the columns hold none. A form that does
+    not decode to the same bits, or does not make the tile smaller, gives way to the next simpler one.
+    """
+    raw = np.ascontiguousarray(tile).view(np.uint8).reshape(-1)
+    for sections in _candidates(tile, lead):
+        content = np.concatenate(sections)
+        restored = np.ascontiguousarray(_restore(content, tile.dtype, *tile.shape)).view(np.uint8).reshape(-1)
+        if np.array_equal(restored, raw):
+            packed = _compress(content, [section.size for section in sections])
+            if len(packed) < raw.size:
+                return packed
+    return _compress(np.concatenate([np.array([RAW], np.uint8), raw]), [1 + raw.size])
+
+
+def unpack(data: bytes | memoryview, dtype: np.dtype[Any], frames: int, columns: int) -> NDArray[Any]:
+    """The (frames, columns) array of a tile. Raises `TileError`, before allocating more than such a tile needs."""
+    try:
+        size = zstandard.frame_content_size(data)
+        if not 0 < size <= 2 + 2 * columns + frames * columns * dtype.itemsize:
+            raise TileError(f"{size} bytes are claimed for {frames} frames of {columns} columns of {dtype.str}")
+        content = zstandard.ZstdDecompressor().decompress(data, max_output_size=size, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise TileError(str(error)) from error
+    return _restore(np.frombuffer(content, np.uint8), dtype, frames, columns)
+
+
+def _compress(content: Bytes, section_sizes: list[int]) -> bytes:
+    """One zstd frame in which every section ends a block, so that each has entropy tables of its own."""
+    stream = zstandard.ZstdCompressor(level=1, write_checksum=True).compressobj(size=content.size)
+    parts, start = [], 0
+    for size in section_sizes:
+        parts += [stream.compress(content[start : start + size].data), stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
+        start += size
+    return b"".join([*parts, stream.flush()])
+
+
+def _candidates(tile: NDArray[Any], lead: int | None) -> Iterator[list[Bytes]]:
+    channels = _to_integers(np.ascontiguousarray(tile.T))
+    if lead is not None and _holds_rotations(tile, lead):
+        yield [np.array([QUATERNIONS, lead], np.uint8), *_predict_quaternions(channels, lead)]
+    yield [np.array([DIFFERENCES], np.uint8), *_difference(channels)]
+
+
+def _restore(content: Bytes, dtype: np.dtype[Any], frames: int, columns: int) -> NDArray[Any]:
+    form, body = content[0], _Sections(content[1:])
+    if form == RAW:
+        tile = body.take(frames * columns * dtype.itemsize).view(dtype).reshape(frames, columns)
+    elif form == DIFFERENCES:
+        tile = _from_integers(_undo_difference(body, dtype.itemsize, columns, frames), dtype).T
+    elif form == QUATERNIONS and dtype == np.dtype("<f4"):
+        tile = _from_integers(_undo_prediction(body, columns, frames), dtype).T
+    else:
+        raise TileError(f"form {form} is not one of dtype {dtype.str}")
+    body.require_end()
+    return tile
+
+
+class _Sections:
+    """The sections of a tile's content, taken one after the other."""
+
+    def __init__(self, content: Bytes) -> None:
+        self._rest = content
+
+    def take(self, size: int) -> Bytes:
+        if size > self._rest.size:
+            raise TileError(f"{size} more bytes are expected, {self._rest.size} are left")
+        taken, self._rest = self._rest[:size], self._rest[size:]
+        return taken
+
+    def require_end(self) -> None:
+        if self._rest.size:
+            raise TileError(f"{self._rest.size} bytes are left over")
+
+
+# Floats as integers
+
+
+def _to_integers(channels: NDArray[Any]) -> Integers:
+    """Unsigned integers; those of floats, read as signed, are in the order of the numbers."""
+    bits = channels.view(f"<u{channels.dtype.itemsize}")
+    return _order(bits) if channels.dtype.kind == "f" else bits
+
+
+def _from_integers(integers: Integers, dtype: np.dtype[Any]) -> NDArray[Any]:
+    return (_order(integers) if dtype.kind == "f" else integers).view(dtype)
+
+
+def _order(bits: Integers) -> Integers:
+    """Flip all but the sign bit of negative floats; its own inverse."""
+    width = 8 * bits.itemsize
+    signs = bits.view(f"<i{bits.itemsize}") >> (width - 1)
+    ordered: Integers = bits ^ (signs.view(bits.dtype) >> 1)
+    return ordered
+
+
+def _fold_sign(integers: Integers) -> Integers:
+    """0, -1, 1, -2, ... as 0, 1, 2, 3, ..., so that small differences have empty high bytes."""
+    signs = integers.view(f"<i{integers.itemsize}") >> (8 * integers.itemsize - 1)
+    folded: Integers = (integers << 1) ^ signs.view(integers.dtype)
+    return folded
+
+
+def _unfold_sign(folded: Integers) -> Integers:
+    unfolded: Integers = (folded >> 1) ^ (0 - (folded & 1))
+    return unfolded
+
+
+# Differences
+
+
+def _difference(channels: Integers) -> list[Bytes]:
+    """Orders (one byte per channel), then the byte planes of the differences, lowest byte first."""
+    best = _fold_sign(channels)
+    cost = _bits_needed(best)
+    orders = np.zeros(len(channels), np.uint8)
+    step = channels
+    for order in range(1, min(MAX_ORDER, channels.shape[1] - 1) + 1):
+        step = np.concatenate([step[:, :order], step[:, order:] - step[:, order - 1 : -1]], axis=1)
+        folded = _fold_sign(step)
+        folded_cost = _bits_needed(folded)
+        better = folded_cost < cost
+        cost[better], orders[better], best[better] = folded_cost[better], order, folded[better]
+    return [orders, *_split_planes(best)]
+
+
+def _bits_needed(folded: Integers) -> NDArray[np.int64]:
+    """Per channel, about the sum of log2 of the numbers: a float's bits grow with its logarithm."""
+    logarithms = (folded | 1).astype(np.float32).view(np.int32)
+    cost: NDArray[np.int64] = logarithms.sum(axis=1, dtype=np.int64)
+    return cost
+
+
+def _undo_difference(body: _Sections, itemsize: int, channels: int, frames: int) -> Integers:
+    orders = body.take(channels)
+    integers = _unfold_sign(_join_planes(body, itemsize, channels, frames))
+    for order in range(MAX_ORDER, 0, -1):
+        rows = np.flatnonzero(orders >= order)
+        integers[rows, order - 1 :] = np.add.accumulate(integers[rows, order - 1 :], axis=1)
+    return integers
+
+
+def _split_planes(integers: Integers) -> list[Bytes]:
+    return [(integers >> (8 * byte)).astype(np.uint8).reshape(-1) for byte in range(integers.itemsize)]
+
+
+def _join_planes(body: _Sections, itemsize: int, channels: int, frames: int) -> Integers:
+    integers = np.empty((channels, frames), f"<u{itemsize}")
+    in_bytes = integers.view(np.uint8).reshape(channels, frames, itemsize)
+    for byte in range(itemsize):
+        in_bytes[:, :, byte] = body.take(channels * frames).reshape(channels, frames)
+    return integers
+
+
+# Quaternions
+
+
+def _holds_rotations(tile: NDArray[np.float32], lead: int) -> bool:
+    count = (tile.shape[1] - lead) // 4
+    if count < 1:
+        return False
+    quaternions = tile[:, lead : lead + 4 * count].reshape(len(tile), count, 4)
+    squared = np.einsum("fjc,fjc->fj", quaternions, quaternions)
+    return bool((np.abs(squared - 1) < _UNIT_TOLERANCE).all())
+
+
+def _predict_quaternions(channels: Integers, lead: int) -> list[Bytes]:
+    """For each quaternion the component furthest from zero in the tile is predicted from the other three."""
+    count = (len(channels) - lead) // 4
+    values = _from_integers(channels, np.dtype("<f4"))
+    quaternions = values[lead : lead + 4 * count].reshape(count, 4, -1)
+    chosen = np.abs(quaternions).min(axis=2).argmax(axis=1)
+    predicted_rows, other_rows = _rows(chosen, len(channels), lead)
+    negative = np.signbit(values[predicted_rows]).mean(axis=1) > 0.5
+    residuals = channels[predicted_rows] - _prediction(channels[other_rows], lead, count, negative)
+    choice = chosen.astype(np.uint8) | (negative.astype(np.uint8) << 2)
+    return [choice, *_difference(channels[other_rows]), *_split_planes(_fold_sign(residuals))]
+
+
+def _undo_prediction(body: _Sections, columns: int, frames: int) -> Integers:
+    lead = int(body.take(1)[0])
+    count = max(columns - lead, 0) // 4
+    choice = body.take(count)
+    if (choice > 7).any():
+        raise TileError("a quaternion has no such component")
+    predicted_rows, other_rows = _rows(choice & 3, columns, lead)
+    channels = np.empty((columns, frames), np.uint32)
+    channels[other_rows] = others = _undo_difference(body, 4, columns - count, frames)
+    residuals = _unfold_sign(_join_planes(body, 4, count, frames))
+    channels[predicted_rows] = _prediction(others, lead, count, choice > 3) + residuals
+    return channels
+
+
+def _rows(chosen: NDArray[Any], columns: int, lead: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Indices of the predicted channels and, in order, of all others."""
+    predicted = lead + 4 * np.arange(len(chosen)) + chosen
+    return predicted.astype(np.intp), np.delete(np.arange(columns), predicted)
+
+
+def _prediction(others: Integers, lead: int, count: int, negative: NDArray[np.bool_]) -> Integers:
+    """Integers of ±sqrt(1 - a² - b² - c²), in double precision.
+
+    Products of two float32 are exact in double precision, so a fused multiply-add changes nothing: every machine with
+    IEEE 754 arithmetic computes the same bits.
+    """
+    three = _from_integers(others[lead : lead + 3 * count], np.dtype("<f4")).reshape(count, 3, -1)
+    with np.errstate(all="ignore"):  # corrupt bytes may hold anything
+        squared = np.square(three.astype(np.float64))
+        rest = 1.0 - squared[:, 0] - squared[:, 1] - squared[:, 2]
+        length = np.sqrt(np.maximum(rest, 0.0)).astype(np.float32)
+    return _to_integers(np.where(negative[:, None], -length, length))
