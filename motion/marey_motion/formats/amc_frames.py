@@ -1,0 +1,239 @@
+"""Frames of an AMC file, scanned.
+
+A frame is a line with its number, then one line per bone, in any order: its name and a value per degree of freedom.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NoReturn
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from marey_motion.formats.asf import AsfSkeleton, Bone
+from marey_motion.formats.numeric_text import EXACT, LONG, excerpt, parse_number
+from marey_motion.formats.text_lines import TextLines, number_problem
+
+# What stopped the scanner.
+_END, _BUFFER_FULL, _BAD_NUMBER, _UNKNOWN_BONE, _WRONG_WIDTH, _REPEATED_BONE, _MISSING_BONE = range(7)
+# Slots of its state, which survives between calls; _BONE and _FOUND describe the line it stopped at.
+_POSITION, _LINE, _FRAME, _SEEN, _NUMBER, _GAPS, _BONE, _FOUND, _LONG_TOKENS = range(9)
+_LONG_TOKENS_PER_CALL = 1 << 14
+
+
+@dataclass(frozen=True)
+class BoneTable:
+    """The bones as the scanner needs them: names end to end, where each ends, and which columns are its own."""
+
+    names: NDArray[np.uint8]
+    name_ends: NDArray[np.int64]
+    first_columns: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, bones: list[Bone]) -> BoneTable:
+        names = [bone.name.encode() for bone in bones]
+        widths = [len(bone.channels) for bone in bones]
+        return cls(
+            np.frombuffer(b"".join(names), np.uint8),
+            np.cumsum([len(name) for name in names]),
+            np.cumsum([0, *widths]),
+        )
+
+
+def scan_frames(lines: TextLines, skeleton: AsfSkeleton) -> tuple[NDArray[np.float64], int]:
+    """Read every frame from where `lines` stands.
+
+    Returns
+    -------
+    (F, C) float64 values, the bones' channels side by side, and the number of gaps in the frames' numbers
+
+    Raises
+    ------
+    FormatError    with line and bone
+    """
+    text = np.frombuffer(lines.data, np.uint8)
+    table = BoneTable.of(skeleton.bones)
+    # Sized by what the text can hold: a frame takes at least its names and two bytes a value.
+    shortest = int(table.name_ends[-1] + 2 * table.first_columns[-1] + 2)
+    values = np.zeros(((len(lines.data) - lines.position) // shortest + 1, int(table.first_columns[-1])))
+    seen = np.full(len(skeleton.bones), -1, np.int64)
+    long_tokens = np.empty((_LONG_TOKENS_PER_CALL, 5), np.int64)
+    state = np.zeros(9, np.int64)
+    state[_POSITION], state[_LINE], state[_FRAME] = lines.position, lines.number + 1, -1
+    stopped = _BUFFER_FULL
+    while stopped == _BUFFER_FULL:
+        stopped = _scan(text, table.names, table.name_ends, table.first_columns, values, seen, long_tokens, state)
+        lines.number = int(state[_LINE])
+        _read_long_tokens(text, long_tokens[: state[_LONG_TOKENS]], values, skeleton, lines)
+        state[_LONG_TOKENS] = 0
+    if stopped != _END:
+        _fail(stopped, lines, skeleton, seen, state)
+    return values[: state[_FRAME] + 1], int(state[_GAPS])
+
+
+@njit(cache=True, nogil=True)
+def _scan(text, names, name_ends, first_columns, values, seen, long_tokens, state):  # type: ignore[no-untyped-def]
+    end = text.size
+    bones = name_ends.size
+    moving = np.sum(first_columns[1:] > first_columns[:-1])
+    while True:
+        i = _next_word(text, state)
+        if i >= end:
+            return _END if state[_SEEN] == moving else _MISSING_BONE
+        stop = i
+        while stop < end and text[stop] > 32:
+            stop += 1
+        if text[i] == 35:
+            while stop < end and text[stop] != 10 and text[stop] != 13:
+                stop += 1
+        elif _is_frame_number(text, i, stop):
+            if state[_FRAME] >= 0 and state[_SEEN] < moving:
+                return _MISSING_BONE
+            _begin_frame(text, i, stop, state)
+        else:
+            bone = _bone_called(text, i, stop, names, name_ends, state[_BONE])
+            if bone < 0 or state[_FRAME] < 0:
+                return _UNKNOWN_BONE
+            state[_BONE] = bone
+            if seen[bone] == state[_FRAME]:
+                return _REPEATED_BONE
+            width = first_columns[bone + 1] - first_columns[bone]
+            if state[_LONG_TOKENS] + width > long_tokens.shape[0]:
+                return _BUFFER_FULL
+            stop = _read_bone(text, stop, first_columns, values, long_tokens, state)
+            if stop < 0:
+                return _BAD_NUMBER
+            if state[_FOUND] != width:
+                return _WRONG_WIDTH
+            seen[bone] = state[_FRAME]
+            state[_SEEN] += width > 0
+            state[_BONE] = (bone + 1) % bones
+        state[_POSITION] = stop
+
+
+@njit(cache=True, nogil=True)
+def _next_word(text, state):  # type: ignore[no-untyped-def]
+    """The first byte of the next word, counting the lines on the way."""
+    i = state[_POSITION]
+    while i < text.size and text[i] <= 32:
+        if text[i] == 10 or (text[i] == 13 and not (i + 1 < text.size and text[i + 1] == 10)):
+            state[_LINE] += 1
+        i += 1
+    state[_POSITION] = i
+    return i
+
+
+@njit(cache=True, nogil=True)
+def _is_frame_number(text, start, stop):  # type: ignore[no-untyped-def]
+    for i in range(start, stop):
+        if not 48 <= text[i] <= 57:
+            return False
+    return stop - start <= 18
+
+
+@njit(cache=True, nogil=True)
+def _begin_frame(text, start, stop, state):  # type: ignore[no-untyped-def]
+    number = np.int64(0)
+    for i in range(start, stop):
+        number = number * 10 + np.uint8(text[i] - 48)
+    if state[_FRAME] >= 0 and number != state[_NUMBER] + 1:
+        state[_GAPS] += 1
+    state[_NUMBER] = number
+    state[_FRAME] += 1
+    state[_SEEN] = 0
+    state[_BONE] = 0
+
+
+@njit(cache=True, nogil=True)
+def _bone_called(text, start, stop, names, name_ends, expected):  # type: ignore[no-untyped-def]
+    """Index of the bone named at `text[start:stop]`, tried from `expected` on; -1 when there is none."""
+    bones = name_ends.size
+    for step in range(bones):
+        bone = expected + step
+        if bone >= bones:
+            bone -= bones
+        first = name_ends[bone - 1] if bone > 0 else 0
+        if name_ends[bone] - first != stop - start:
+            continue
+        same = True
+        for k in range(stop - start):
+            if text[start + k] != names[first + k]:
+                same = False
+                break
+        if same:
+            return bone
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def _read_bone(text, i, first_columns, values, long_tokens, state):  # type: ignore[no-untyped-def]
+    """Read the numbers up to the end of the line; where they end, or -1 at one that is malformed."""
+    bone, frame = state[_BONE], state[_FRAME]
+    state[_FOUND] = 0
+    while i < text.size and text[i] != 10 and text[i] != 13:
+        if text[i] <= 32:
+            i += 1
+            continue
+        kind, value, stop = parse_number(text, i, text.size)
+        if kind != EXACT and kind != LONG:
+            state[_POSITION] = i
+            return -1
+        column = first_columns[bone] + state[_FOUND]
+        if column < first_columns[bone + 1]:
+            values[frame, column] = value
+            if kind == LONG:
+                row = long_tokens[state[_LONG_TOKENS]]
+                row[0], row[1], row[2], row[3], row[4] = i, stop, state[_LINE], frame, column
+                state[_LONG_TOKENS] += 1
+        state[_FOUND] += 1
+        i = stop
+    return i
+
+
+def _read_long_tokens(
+    text: NDArray[np.uint8],
+    tokens: NDArray[np.int64],
+    values: NDArray[np.float64],
+    skeleton: AsfSkeleton,
+    lines: TextLines,
+) -> None:
+    for start, stop, line, frame, column in tokens.tolist():
+        value = float(text[start:stop].tobytes())
+        if abs(value) == float("inf"):
+            ends = np.cumsum([len(bone.channels) for bone in skeleton.bones])
+            bone = int(np.searchsorted(ends, column, side="right"))
+            lines.number = line
+            problem = number_problem(excerpt(text[start:stop].tobytes()))
+            raise lines.error(problem, code="bad_number", joint=skeleton.bones[bone].name)
+        values[frame, column] = value
+
+
+def _fail(
+    stopped: int, lines: TextLines, skeleton: AsfSkeleton, seen: NDArray[np.int64], state: NDArray[np.int64]
+) -> NoReturn:
+    """Raise what stopped the scanner, at the line where it stopped."""
+    bone = skeleton.bones[state[_BONE]]
+    word = lines.data[state[_POSITION] : state[_POSITION] + 64].split(maxsplit=1)[:1] or [b""]
+    if stopped == _BAD_NUMBER:
+        raise lines.error(number_problem(excerpt(word[0])), code="bad_number", joint=bone.name)
+    if stopped == _UNKNOWN_BONE:
+        raise lines.error(f"the skeleton has no bone {excerpt(word[0])!r}; is this the AMC's own ASF?", code="unknown_bone")
+    if stopped == _REPEATED_BONE:
+        raise lines.error(f"the bone stands twice in frame {state[_NUMBER]}", joint=bone.name)
+    if stopped == _WRONG_WIDTH:
+        cut = state[_FOUND] < len(bone.channels) and not lines.data[state[_POSITION] :].strip(b"\r\n\t ").count(b"\n")
+        raise lines.error(
+            f"{state[_FOUND]} values for {len(bone.channels)} degrees of freedom" + ("; the file is cut off" if cut else ""),
+            code="file_truncated" if cut else "frame_width",
+            joint=bone.name,
+        )
+    moving = np.array([len(bone.channels) > 0 for bone in skeleton.bones])
+    missing = skeleton.bones[int(np.argmax(moving & (seen < state[_FRAME])))]
+    at_end = not lines.data[state[_POSITION] :].strip()
+    raise lines.error(
+        f"frame {state[_NUMBER]} lacks this bone" + ("; the file is cut off" if at_end else ""),
+        code="file_truncated" if at_end else "frame_width",
+        joint=missing.name,
+    )

@@ -1,0 +1,211 @@
+"""ASF (Acclaim skeleton file): reading.
+
+A bone has a direction and a length in world axes at rest, and an `axis`, the frame its angles are measured in. With C
+the rotation of that frame and M the one of the angles, the bone turns by C · M · C⁻¹ against its parent. Joints here
+keep world-aligned frames at rest (identity rest rotations, as in BVH): each sits at the start of its bone, so its
+offset is its parent's bone vector, and bones that end the hierarchy leave an end site.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import quaternions
+from marey_motion.errors import FormatLimit
+from marey_motion.formats.joint_names import MAX_JOINTS, MAX_NAME_LENGTH
+from marey_motion.formats.numeric_text import excerpt
+from marey_motion.formats.text_lines import TextLines, decode_name
+
+ROOT = "root"
+_AXES = "xyz"
+
+
+@dataclass
+class Bone:
+    """A bone as the file has it.
+
+    `vector` is direction times length in the file's unit, world axes; `frame` the quaternion of its `axis`;
+    `channels` its degrees of freedom in order ("rx", "tz"); `line` where it stands.
+    """
+
+    name: str
+    line: int
+    direction: list[float] | None = None
+    length: float = 0.0
+    frame: NDArray[np.float64] = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+    channels: tuple[str, ...] = ()
+
+    @property
+    def vector(self) -> NDArray[np.float64]:
+        direction = np.array(self.direction or [0.0, 0.0, 0.0])
+        norm = np.linalg.norm(direction)
+        return direction / norm * self.length if norm > 0 else direction
+
+
+@dataclass
+class AsfSkeleton:
+    """An ASF file: bones in depth-first order, the root first.
+
+    `parents` are indices; `length_unit` is the file's `units length` (CMU: 0.45), None when it gives none;
+    `root_position` is where the root stands before any motion.
+    """
+
+    bones: list[Bone]
+    parents: NDArray[np.int32]
+    length_unit: float | None
+    root_position: NDArray[np.float64]
+
+    def offsets(self) -> NDArray[np.float64]:
+        """(J, 3) offset of each joint from its parent, the file's unit."""
+        vectors = np.array([bone.vector for bone in self.bones])
+        offsets = vectors[self.parents]
+        offsets[0] = self.root_position
+        return offsets
+
+    def end_sites(self) -> tuple[tuple[int, NDArray[np.float64]], ...]:
+        """The tips of the bones that end the hierarchy."""
+        inner = set(self.parents.tolist())
+        return tuple((j, bone.vector) for j, bone in enumerate(self.bones) if j not in inner)
+
+
+def read_asf(data: bytes, file: str) -> AsfSkeleton:
+    """Read an ASF file; `FormatError` with the line, and the bone where there is one."""
+    return _AsfReader(TextLines(data, file)).read()
+
+
+class _AsfReader:
+    """Reads section by section; a section is every line after a keyword that begins with a colon."""
+
+    def __init__(self, lines: TextLines) -> None:
+        self.lines = lines
+        self.degrees = True
+        self.length_unit: float | None = None
+        self.root = Bone(ROOT, line=1, channels=("tx", "ty", "tz", "rx", "ry", "rz"))
+        self.root_position = [0.0, 0.0, 0.0]
+        self.root_axis, self.root_orientation = "xyz", [0.0, 0.0, 0.0]
+        self.bones: dict[str, Bone] = {}
+        self.bone: Bone | None = None
+        self.children: dict[str, list[str]] = {}
+
+    def read(self) -> AsfSkeleton:
+        sections = {b"units": self._units, b"root": self._root, b"bonedata": self._bone, b"hierarchy": self._hierarchy}
+        section = None
+        known = False
+        for line in self.lines:
+            text = line.partition(b"#")[0].strip()
+            if not text:
+                continue
+            if text.startswith(b":"):
+                keyword = text[1:].split()[0].lower() if len(text) > 1 else b""
+                known = known or keyword in (b"version", b"name", *sections)
+                section = sections.get(keyword)
+            elif not known:
+                raise self.lines.error(f"an ASF file begins with :version, not {excerpt(text)!r}", code="not_asf")
+            elif section:
+                section(text.split())
+        if not self.children:
+            raise self.lines.error("the file has no :hierarchy", code="file_truncated")
+        return self._assembled()
+
+    def _units(self, words: list[bytes]) -> None:
+        if words[0].lower() == b"length":
+            self.length_unit = self.lines.numbers(words[1:], 1, "length")[0]
+            if self.length_unit <= 0:
+                raise self.lines.error(f"a unit of length of {self.length_unit}; a positive number is needed")
+        elif words[0].lower() == b"angle":
+            if words[1:] not in ([b"deg"], [b"rad"]):
+                raise self.lines.error("angle must be deg or rad")
+            self.degrees = words[1] == b"deg"
+
+    def _root(self, words: list[bytes]) -> None:
+        keyword = words[0].lower()
+        if keyword == b"order":
+            self.root.channels = self._channels(words[1:])
+        elif keyword == b"axis":
+            self.root_axis = self._order(words[1:])
+        elif keyword == b"position":
+            self.root_position = self.lines.numbers(words[1:], 3, "position", ROOT)
+        elif keyword == b"orientation":
+            self.root_orientation = self.lines.numbers(words[1:], 3, "orientation", ROOT)
+
+    def _bone(self, words: list[bytes]) -> None:
+        keyword, bone = words[0].lower(), self.bone
+        if keyword == b"begin":
+            self.bone = Bone("", self.lines.number)
+        elif bone is None:
+            raise self.lines.error(f"{excerpt(words[0])!r} outside of begin … end")
+        elif keyword == b"end":
+            self._end_bone(bone)
+        elif keyword == b"name":
+            bone.name = decode_name(b" ".join(words[1:]))
+        elif keyword == b"direction":
+            bone.direction = self.lines.numbers(words[1:], 3, "direction", bone.name)
+        elif keyword == b"length":
+            bone.length = self.lines.numbers(words[1:], 1, "length", bone.name)[0]
+        elif keyword == b"axis":
+            bone.frame = self._frame(self.lines.numbers(words[1:4], 3, "axis", bone.name), self._order(words[4:]))
+        elif keyword == b"dof":
+            bone.channels = self._channels(words[1:])
+            if any(channel[0] != "r" for channel in bone.channels):
+                raise self.lines.error("only the root may have other degrees of freedom than rx, ry, rz", joint=bone.name)
+
+    def _end_bone(self, bone: Bone) -> None:
+        if not bone.name or len(bone.name) > MAX_NAME_LENGTH:
+            raise self.lines.error(f"a bone needs a name of at most {MAX_NAME_LENGTH} characters")
+        if bone.name in self.bones or bone.name == ROOT:
+            raise self.lines.error("a second bone of this name", joint=bone.name)
+        if bone.direction is None:
+            raise self.lines.error("the bone has no direction", joint=bone.name)
+        if len(self.bones) + 1 == MAX_JOINTS:
+            raise FormatLimit(f"more than {MAX_JOINTS} bones", file=self.lines.file, line=self.lines.number)
+        self.bones[bone.name] = bone
+        self.bone = None
+
+    def _hierarchy(self, words: list[bytes]) -> None:
+        if words in ([b"begin"], [b"end"]):
+            return
+        parent, *children = map(decode_name, words)
+        for name in (parent, *children):
+            if name != ROOT and name not in self.bones:
+                raise self.lines.error("the hierarchy names a bone that :bonedata does not have", joint=name)
+        self.children.setdefault(parent, []).extend(children)
+
+    def _channels(self, words: list[bytes]) -> tuple[str, ...]:
+        channels = tuple(word.lower().decode("latin-1") for word in words)
+        if any(len(c) != 2 or c[0] not in "rt" or c[1] not in _AXES for c in channels) or len(set(channels)) < len(words):
+            raise self.lines.error(f"{excerpt(b' '.join(words))!r} are no different ones of TX TY TZ RX RY RZ")
+        return channels
+
+    def _order(self, words: list[bytes]) -> str:
+        order = words[0].lower().decode("latin-1") if len(words) == 1 else ""
+        if sorted(order) != list(_AXES):
+            raise self.lines.error(f"an order of axes such as XYZ is needed, not {excerpt(b' '.join(words))!r}")
+        return order
+
+    def _frame(self, angles: list[float], order: str) -> NDArray[np.float64]:
+        """The quaternion of three turns about fixed axes, the first named being made first."""
+        radians = np.radians(angles) if self.degrees else np.array(angles)
+        frame = np.array([1.0, 0.0, 0.0, 0.0])
+        for axis, angle in zip(order, radians, strict=True):
+            frame = quaternions.multiply(quaternions.from_axis_angle(np.eye(3)[_AXES.index(axis)], angle), frame)
+        return frame
+
+    def _assembled(self) -> AsfSkeleton:
+        self.root.frame = self._frame(self.root_orientation, self.root_axis)
+        bones, parents, waiting = [], [], [(ROOT, -1)]
+        placed: set[str] = set()
+        while waiting:
+            name, parent = waiting.pop()
+            if name in placed:
+                raise self.lines.error("the hierarchy gives the bone two parents", joint=name)
+            placed.add(name)
+            waiting.extend((child, len(bones)) for child in reversed(self.children.get(name, ())))
+            bones.append(self.root if name == ROOT else self.bones[name])
+            parents.append(parent)
+        loose = next((name for name in self.bones if name not in placed), None)
+        if loose is not None:
+            raise self.lines.error("the hierarchy does not connect the bone to the root", joint=loose)
+        return AsfSkeleton(bones, np.array(parents, np.int32), self.length_unit, np.array(self.root_position))

@@ -1,0 +1,159 @@
+"""BVH (Biovision hierarchy): reading.
+
+Rotations are intrinsic in the order of a joint's CHANNELS, in degrees, whatever their number and wherever its
+position channels stand. Position channels replace the joint's OFFSET, axis by axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.formats.bvh_hierarchy import BvhHeader, read_header
+from marey_motion.formats.euler import NO_COLUMN, rotations_from_euler
+from marey_motion.formats.frame_times import frame_rate_of
+from marey_motion.formats.joint_names import unique_names
+from marey_motion.formats.numeric_text import BadToken, scan_numbers
+from marey_motion.formats.source import CheckWarning, SourceMotion
+from marey_motion.formats.text_lines import TextLines, number_problem
+
+FORMAT = "bvh"
+
+
+@dataclass(frozen=True)
+class ChannelColumns:
+    """Which column of the numbers is what.
+
+    `turns` and `axes` are (J, 3): column and axis of each joint's turns; `positions` is (J, 3): column of x, y, z.
+    `NO_COLUMN` stands where a joint has no such channel. `labels` name each column for messages.
+    """
+
+    turns: NDArray[np.int64]
+    axes: NDArray[np.int64]
+    positions: NDArray[np.int64]
+    labels: tuple[tuple[int, str], ...]
+
+
+def read_bvh(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> SourceMotion:
+    """Read a BVH file as it stands, in its own unit and axes.
+
+    Parameters
+    ----------
+    data : the file
+    file : its name, for messages
+    frame_rate_hz : replaces the rate that follows from the file's Frame Time
+
+    Raises
+    ------
+    FormatError    with the line, and the joint where there is one
+    """
+    lines = TextLines(data, file)
+    header = read_header(lines)
+    channels = tuple(names or () for names in header.channels)
+    warnings: list[CheckWarning] = []
+    values = _read_frames(data, header, channel_columns(channels), lines, warnings)
+    offsets = np.array(header.offsets, np.float64)
+    source = SourceMotion(
+        format=FORMAT,
+        joint_names=unique_names(header.names, header.parents),
+        display_names=tuple(header.names),
+        parents=np.array(header.parents, np.int32),
+        offsets=offsets,
+        rest_rotations=np.tile([1.0, 0.0, 0.0, 0.0], (len(offsets), 1)),
+        end_sites=tuple((joint, np.array(offset)) for joint, offset in header.end_sites),
+        channels=channels,
+        warnings=warnings,
+        declared_frame_time_s=header.frame_time_s,
+    )
+    if len(values):
+        _fill_motion(source, values, channel_columns(channels))
+        source.frame_rate_hz = frame_rate_hz or frame_rate_of(header.frame_time_s, file, warnings)
+    return source
+
+
+def channel_columns(channels: tuple[tuple[str, ...], ...]) -> ChannelColumns:
+    """Lay the channels of all joints out as the columns of a line of numbers."""
+    shape = (len(channels), 3)
+    turns, axes, positions = np.full(shape, NO_COLUMN), np.zeros(shape, np.int64), np.full(shape, NO_COLUMN)
+    labels: list[tuple[int, str]] = []
+    for joint, names in enumerate(channels):
+        turn = 0
+        for name in names:
+            axis = "XYZ".index(name[0])
+            if name.endswith("rotation"):
+                turns[joint, turn], axes[joint, turn] = len(labels), axis
+                turn += 1
+            else:
+                positions[joint, axis] = len(labels)
+            labels.append((joint, name))
+    return ChannelColumns(turns, axes, positions, tuple(labels))
+
+
+def _read_frames(
+    data: bytes, header: BvhHeader, columns: ChannelColumns, lines: TextLines, warnings: list[CheckWarning]
+) -> NDArray[np.float64]:
+    """(F, C) channel values."""
+    width = len(columns.labels)
+    text = np.frombuffer(data, np.uint8, offset=min(header.data_start, len(data)))
+    try:
+        table = scan_numbers(text, width, header.data_line)
+    except BadToken as bad:
+        lines.number = bad.line
+        joint, channel = columns.labels[bad.index % width] if width else (0, "value")
+        raise lines.error(
+            f"{channel}: {number_problem(bad.token)}", code="bad_number", joint=header.names[joint]
+        ) from None
+    frames, rest = divmod(table.values.size, width) if width else (0, table.values.size)
+    wrapped = table.ragged_line > 0
+    if rest or (wrapped and frames != header.declared_frames):
+        lines.number = table.ragged_line
+        cut = table.ragged_line == table.last_line and table.ragged_count < width
+        raise lines.error(
+            f"{table.ragged_count} values where the channels need {width}"
+            + ("; the file is cut off in its last line" if cut else ""),
+            code="file_truncated" if cut else "frame_width",
+        )
+    if frames == 0 and header.declared_frames:
+        lines.number = header.data_line
+        raise lines.error(f"{header.declared_frames} frames are declared and none follows", code="file_truncated")
+    _warn_of_layout(header, frames, wrapped, warnings)
+    return table.values.reshape(frames, width) if frames else np.empty((0, width))
+
+
+def _warn_of_layout(header: BvhHeader, frames: int, wrapped: bool, warnings: list[CheckWarning]) -> None:
+    if frames != header.declared_frames:
+        warnings.append(
+            CheckWarning(
+                "frame-count-mismatch",
+                f"the header declares {header.declared_frames} frames, the file holds {frames}; all {frames} are read",
+                values={"declared": header.declared_frames, "found": frames},
+            )
+        )
+    if wrapped:
+        warnings.append(CheckWarning("frames-wrapped", "frames run over several lines; they were joined by their count"))
+    if frames == 0:
+        warnings.append(CheckWarning("no-frames", "the file holds no frames; its skeleton is read"))
+
+
+def _fill_motion(source: SourceMotion, values: NDArray[np.float64], columns: ChannelColumns) -> None:
+    rotations = np.empty((len(values), len(source.parents), 4), np.float32)
+    rotations_from_euler(values, columns.turns, columns.axes, rotations)
+    source.rotations = rotations
+    source.root_positions = _positions_of(0, values, columns, source.offsets)
+    moved = [joint for joint in range(1, len(source.parents)) if (columns.positions[joint] != NO_COLUMN).any()]
+    if moved:
+        source.translated_joints = tuple(moved)
+        source.translations = np.stack([_positions_of(j, values, columns, source.offsets) for j in moved], axis=1)
+
+
+def _positions_of(
+    joint: int, values: NDArray[np.float64], columns: ChannelColumns, offsets: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(F, 3) local positions of one joint: its position channels, and its OFFSET on the axes that have none."""
+    positions = np.tile(offsets[joint], (len(values), 1))
+    for axis, column in enumerate(columns.positions[joint].tolist()):
+        if column != NO_COLUMN:
+            positions[:, axis] = values[:, column]
+    return positions

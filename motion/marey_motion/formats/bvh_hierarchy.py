@@ -1,0 +1,184 @@
+"""The HIERARCHY of a BVH file and the header of its MOTION section.
+
+Strict about what the data mean, tolerant of how exporters lay them out: any indentation, braces on the line of the
+joint or on their own, keywords in any case, end sites left out or named, channels in any number and order.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+
+from marey_motion.errors import FormatLimit
+from marey_motion.formats.joint_names import MAX_JOINTS, MAX_NAME_LENGTH
+from marey_motion.formats.numeric_text import excerpt
+from marey_motion.formats.text_lines import TextLines, decode_name
+
+CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
+_CHANNEL_BY_KEY = {name.lower().encode(): name for name in CHANNELS}
+_FRAMES = re.compile(rb"frames\s*:?\s*(\S+)", re.IGNORECASE)
+_FRAME_TIME = re.compile(rb"frame\s*time\s*:?\s*(\S+)", re.IGNORECASE)
+_BRACES = re.compile(rb"([{}])")
+_END_SITE = -1
+
+
+@dataclass
+class BvhHeader:
+    """Everything in a BVH file before its numbers.
+
+    `offsets[joint]`, `channels[joint]` follow the order of the joints in the file; `data_start` is the byte and
+    `data_line` the line where the numbers begin.
+    """
+
+    names: list[str] = field(default_factory=list)
+    parents: list[int] = field(default_factory=list)
+    offsets: list[list[float] | None] = field(default_factory=list)
+    channels: list[tuple[str, ...] | None] = field(default_factory=list)
+    end_sites: list[tuple[int, list[float]]] = field(default_factory=list)
+    declared_frames: int = 0
+    frame_time_s: float = 0.0
+    data_start: int = 0
+    data_line: int = 1
+
+
+def read_header(lines: TextLines) -> BvhHeader:
+    """Read a BVH file up to its first line of numbers; `FormatError` with the line of whatever is wrong."""
+    first = next(iter(lines), b"")
+    if first.upper() != b"HIERARCHY":
+        shown = f"the file begins with {excerpt(first)!r}" if first else "the file is empty"
+        raise lines.error(f"a BVH file begins with HIERARCHY; {shown}", code="not_bvh")
+    header = _HierarchyReader(lines).read()
+    _read_motion_header(lines, header)
+    return header
+
+
+class _HierarchyReader:
+    """Reads joints piece by piece; the open joints are a list, not the call stack, so depth costs nothing."""
+
+    def __init__(self, lines: TextLines) -> None:
+        self.lines = lines
+        self.header = BvhHeader()
+        self.open: list[int] = []
+        self.brace_due = False
+
+    def read(self) -> BvhHeader:
+        for line in self.lines:
+            if line.upper() == b"MOTION" and self.header.names and not self.open and not self.brace_due:
+                return self._checked()
+            for piece in filter(None, map(bytes.strip, _BRACES.split(line))):
+                self._read_piece(piece)
+        raise self.lines.error("the file ends inside its HIERARCHY", code="file_truncated")
+
+    def _read_piece(self, piece: bytes) -> None:
+        if piece == b"{":
+            if not self.brace_due:
+                raise self.lines.error("{ without a joint before it", joint=self._joint_name())
+            self.brace_due = False
+        elif self.brace_due:
+            raise self.lines.error(f"{{ is needed here, not {excerpt(piece)!r}", joint=self._joint_name())
+        elif piece == b"}":
+            if not self.open:
+                raise self.lines.error("} without a joint to close")
+            self.open.pop()
+        else:
+            keyword, *rest = piece.split(maxsplit=1)
+            self._read_statement(piece, keyword.upper(), rest[0] if rest else b"")
+
+    def _read_statement(self, piece: bytes, keyword: bytes, rest: bytes) -> None:
+        if keyword in (b"ROOT", b"JOINT"):
+            self._begin_joint(keyword, rest)
+        elif keyword in (b"END", b"ENDSITE"):
+            self._begin_end_site()
+        elif keyword == b"OFFSET":
+            self._read_offset(rest.split())
+        elif keyword == b"CHANNELS":
+            self._read_channels(rest.split())
+        else:
+            raise self.lines.error(
+                f"{excerpt(piece)!r} stands where ROOT, JOINT, End Site, OFFSET, CHANNELS or a brace is needed",
+                joint=self._joint_name(),
+            )
+
+    def _begin_joint(self, keyword: bytes, rest: bytes) -> None:
+        header = self.header
+        if keyword == b"ROOT" and header.names:
+            raise self.lines.error(
+                "a second ROOT; a file holds one skeleton here, so split it into one file per ROOT", code="several_roots"
+            )
+        if not self.open and keyword == b"JOINT":
+            raise self.lines.error("a JOINT outside of any joint; the first one must be ROOT")
+        if self.open and self.open[-1] == _END_SITE:
+            raise self.lines.error("a JOINT inside an End Site", joint=self._joint_name())
+        if len(header.names) == MAX_JOINTS:
+            raise FormatLimit(f"more than {MAX_JOINTS} joints", file=self.lines.file, line=self.lines.number)
+        name = decode_name(rest) or f"joint{len(header.names)}"
+        if len(name) > MAX_NAME_LENGTH:
+            raise self.lines.error(f"a joint name of {len(name)} characters; {MAX_NAME_LENGTH} are the most")
+        self.brace_due = True
+        header.parents.append(self.open[-1] if self.open else -1)
+        self.open.append(len(header.names))
+        header.names.append(name)
+        header.offsets.append(None)
+        header.channels.append(None)
+
+    def _begin_end_site(self) -> None:
+        if not self.open or self.open[-1] == _END_SITE:
+            raise self.lines.error("an End Site outside of any joint", joint=self._joint_name())
+        self.brace_due = True
+        self.header.end_sites.append((self.open[-1], [0.0, 0.0, 0.0]))
+        self.open.append(_END_SITE)
+
+    def _read_offset(self, words: list[bytes]) -> None:
+        if not self.open:
+            raise self.lines.error("OFFSET outside of any joint")
+        offset = self.lines.numbers(words, 3, "OFFSET", self._joint_name())
+        if self.open[-1] == _END_SITE:
+            self.header.end_sites[-1] = (self.header.end_sites[-1][0], offset)
+        else:
+            self.header.offsets[self.open[-1]] = offset
+
+    def _read_channels(self, words: list[bytes]) -> None:
+        joint = self._joint_name()
+        if not self.open or self.open[-1] == _END_SITE:
+            raise self.lines.error("CHANNELS outside of any joint", joint=joint)
+        if not words or not words[0].isdigit():
+            raise self.lines.error("CHANNELS needs the number of channels", joint=joint)
+        names = [_CHANNEL_BY_KEY.get(word.lower(), "") for word in words[1:]]
+        if "" in names:
+            unknown = excerpt(words[1 + names.index("")])
+            raise self.lines.error(f"channel {unknown!r} is none of {', '.join(CHANNELS)}", joint=joint)
+        if len(words[0]) > 3 or int(words[0]) != len(names):
+            raise self.lines.error(f"CHANNELS says {excerpt(words[0])} and names {len(names)}", joint=joint)
+        if len(set(names)) != len(names):
+            raise self.lines.error("a channel is named twice", joint=joint)
+        self.header.channels[self.open[-1]] = tuple(names)
+
+    def _joint_name(self) -> str | None:
+        joint = next((joint for joint in reversed(self.open) if joint != _END_SITE), None)
+        return None if joint is None else self.header.names[joint]
+
+    def _checked(self) -> BvhHeader:
+        for name, offset in zip(self.header.names, self.header.offsets, strict=True):
+            if offset is None:
+                raise self.lines.error("the joint has no OFFSET", joint=name)
+        return self.header
+
+
+def _read_motion_header(lines: TextLines, header: BvhHeader) -> None:
+    frames, frame_time = None, None
+    while frames is None or frame_time is None:
+        line = next(iter(lines), None)
+        if line is None:
+            raise lines.error("the file ends before 'Frames:' and 'Frame Time:'", code="file_truncated")
+        if match := _FRAME_TIME.fullmatch(line):
+            frame_time = lines.number_in(match[1], "Frame Time")
+        elif match := _FRAMES.fullmatch(line):
+            frames = match[1]
+            if not frames.isdigit() or len(frames) > 18:
+                raise lines.error(f"Frames is {excerpt(frames)!r}, a count is needed")
+        else:
+            raise lines.error(f"'Frames:' and 'Frame Time:' must follow MOTION, not {excerpt(line)!r}")
+    header.declared_frames = int(frames)
+    header.frame_time_s = frame_time
+    header.data_start = lines.position
+    header.data_line = lines.number + 1

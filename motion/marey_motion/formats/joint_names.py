@@ -1,0 +1,30 @@
+"""Unique joint names out of the names a file has."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+MAX_JOINTS = 4096
+MAX_NAME_LENGTH = 255
+
+
+def unique_names(names: Sequence[str], parents: Sequence[int]) -> tuple[str, ...]:
+    """Names as they are where they are unique, else with the parent's name before them and, if need be, a number.
+
+    The same hierarchy always gets the same names.
+    """
+    counts = Counter(names)
+    taken = {name for name, count in counts.items() if count == 1}
+    numbers: Counter[str] = Counter()
+    result = []
+    for joint, name in enumerate(names):
+        if counts[name] > 1:
+            above = f"{names[parents[joint]]}/{name}" if parents[joint] >= 0 else name
+            name = above
+            while name in taken:
+                numbers[above] += 1
+                name = f"{above}#{numbers[above] + 1}"
+            taken.add(name)
+        result.append(name)
+    return tuple(result)

@@ -1,0 +1,206 @@
+"""Decimal numbers out of text, fast and bit for bit what Python's `float` gives.
+
+A number of at most 2**53 in its digits, scaled by at most 10**22, needs one correctly rounded multiplication or
+division of exact doubles (Clinger, "How to read floating point numbers accurately", PLDI 1990). Everything else,
+a vanishing part of real files, is handed to `float` token by token.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+# What `parse_number` found, besides a value.
+EXACT, LONG, MALFORMED = 0, 1, 2
+
+_EXACT_POWERS = np.array([float(f"1e{k}") for k in range(23)])
+_LARGEST_EXACT = 1 << 53
+_LONG_TOKENS_PER_CALL = 1 << 14
+
+# Slots of the scanner's state, which survives between calls of the kernel.
+_POSITION, _LINE, _VALUES, _IN_LINE, _ROWS, _RAGGED_LINE, _RAGGED_COUNT, _LONG_TOKENS = range(8)
+
+
+@dataclass(frozen=True)
+class NumberTable:
+    """Numbers of a text block, row after row.
+
+    `values` is flat; `rows` counts the lines that hold numbers. `ragged_line` is the first line (from 1) that does not
+    hold `ragged_count` = the wanted number of values, 0 when every line does; `last_line` is the last line with numbers.
+    """
+
+    values: NDArray[np.float64]
+    rows: int
+    ragged_line: int
+    ragged_count: int
+    last_line: int
+
+
+class BadToken(ValueError):  # noqa: N818 - carries a place in the text; the readers turn it into their own errors
+    """A token that is no finite decimal number: its text, its line and which value of the block it stands for."""
+
+    def __init__(self, token: str, line: int, index: int, in_line: int) -> None:
+        super().__init__(f"{token!r} in line {line} is not a finite decimal number")
+        self.token = token
+        self.line = line
+        self.index = index
+        self.in_line = in_line
+
+
+@njit(cache=True, nogil=True)
+def parse_number(text, start, end):  # type: ignore[no-untyped-def]
+    """Read one decimal number at `text[start:end]`.
+
+    Returns
+    -------
+    (kind, value, stop) : `stop` is one past the token; `value` holds only when `kind` is `EXACT`
+    """
+    i = start
+    negative = False
+    if text[i] == 45 or text[i] == 43:
+        negative = text[i] == 45
+        i += 1
+    first_digit = i
+    mantissa = np.int64(0)
+    exponent = 0
+    while i < end and np.uint8(text[i] - 48) < 10:
+        mantissa = mantissa * 10 + np.uint8(text[i] - 48)
+        i += 1
+    digits = i - first_digit
+    if i < end and text[i] == 46:
+        i += 1
+        first_decimal = i
+        while i < end and np.uint8(text[i] - 48) < 10:
+            mantissa = mantissa * 10 + np.uint8(text[i] - 48)
+            i += 1
+        exponent = first_decimal - i
+        digits -= exponent
+    well_formed = digits > 0
+    if well_formed and i < end and (text[i] == 101 or text[i] == 69):
+        i += 1
+        falling = False
+        if i < end and (text[i] == 45 or text[i] == 43):
+            falling = text[i] == 45
+            i += 1
+        first_power = i
+        power = 0
+        while i < end and np.uint8(text[i] - 48) < 10:
+            power = min(power * 10 + np.uint8(text[i] - 48), 100000)
+            i += 1
+        well_formed = i > first_power
+        exponent += -power if falling else power
+    if not well_formed or (i < end and text[i] > 32):
+        while i < end and text[i] > 32:
+            i += 1
+        return MALFORMED, 0.0, i
+    if digits > 18 or mantissa > _LARGEST_EXACT or exponent > 22 or exponent < -22:
+        return LONG, 0.0, i
+    value = np.float64(mantissa)
+    if exponent < 0:
+        value /= _EXACT_POWERS[-exponent]
+    else:
+        value *= _EXACT_POWERS[exponent]
+    return EXACT, -value if negative else value, i
+
+
+@njit(cache=True, nogil=True)
+def _scan(text, width, values, long_tokens, state):  # type: ignore[no-untyped-def]
+    """Read numbers until the text ends, `values` or `long_tokens` is full (0) or a token is malformed (1)."""
+    end = text.size
+    i, line, count, in_line, rows = state[_POSITION], state[_LINE], state[_VALUES], state[_IN_LINE], state[_ROWS]
+    long_count = 0
+    malformed = 0
+    while i < end:
+        byte = text[i]
+        if byte == 32 or byte == 9 or byte == 11 or byte == 12:
+            i += 1
+        elif byte == 10 or byte == 13:
+            if in_line > 0:
+                rows += 1
+                if in_line != width and state[_RAGGED_LINE] == 0:
+                    state[_RAGGED_LINE] = line
+                    state[_RAGGED_COUNT] = in_line
+                in_line = 0
+            line += 1
+            i += 2 if byte == 13 and i + 1 < end and text[i + 1] == 10 else 1
+        else:
+            if count == values.size or long_count == long_tokens.shape[0]:
+                break
+            kind, value, stop = parse_number(text, i, end)
+            if kind == MALFORMED:
+                malformed = 1
+                break
+            if kind == LONG:
+                long_tokens[long_count, 0] = i
+                long_tokens[long_count, 1] = stop
+                long_tokens[long_count, 2] = line
+                long_tokens[long_count, 3] = count
+                long_tokens[long_count, 4] = in_line
+                long_count += 1
+            values[count] = value
+            count += 1
+            in_line += 1
+            i = stop
+    state[_POSITION], state[_LINE], state[_VALUES], state[_IN_LINE], state[_ROWS] = i, line, count, in_line, rows
+    state[_LONG_TOKENS] = long_count
+    return malformed
+
+
+def scan_numbers(text: NDArray[np.uint8], width: int, first_line: int) -> NumberTable:
+    """Read a block of whitespace-separated numbers, one row a line.
+
+    Parameters
+    ----------
+    text : (bytes,) uint8
+    width : int    numbers expected in a line; other counts are reported, not refused
+    first_line : int    number of the first line of `text`, from 1
+
+    Raises
+    ------
+    BadToken    at the first token that is no finite decimal number
+    """
+    # Sized by what the text can hold, never by what a header declares; untouched pages cost nothing.
+    values = np.empty((text.size + 1) // 2, np.float64)
+    long_tokens = np.empty((_LONG_TOKENS_PER_CALL, 5), np.int64)
+    state = np.zeros(8, np.int64)
+    state[_LINE] = first_line
+    while state[_POSITION] < text.size:
+        malformed = _scan(text, width, values, long_tokens, state)
+        _read_long_tokens(text, long_tokens[: state[_LONG_TOKENS]], values)
+        state[_LONG_TOKENS] = 0
+        if malformed:
+            raise _bad_token_at(text, state)
+    if state[_IN_LINE] > 0:
+        state[_ROWS] += 1
+        if state[_IN_LINE] != width and state[_RAGGED_LINE] == 0:
+            state[_RAGGED_LINE], state[_RAGGED_COUNT] = state[_LINE], state[_IN_LINE]
+    return NumberTable(
+        values=values[: state[_VALUES]],
+        rows=int(state[_ROWS]),
+        ragged_line=int(state[_RAGGED_LINE]),
+        ragged_count=int(state[_RAGGED_COUNT]),
+        last_line=int(state[_LINE]),
+    )
+
+
+def _read_long_tokens(text: NDArray[np.uint8], tokens: NDArray[np.int64], values: NDArray[np.float64]) -> None:
+    for start, stop, line, index, in_line in tokens.tolist():
+        token = text[start:stop].tobytes()
+        value = float(token)
+        if value in (float("inf"), float("-inf")):
+            raise BadToken(excerpt(token), line, index, in_line)
+        values[index] = value
+
+
+def _bad_token_at(text: NDArray[np.uint8], state: NDArray[np.int64]) -> BadToken:
+    start = int(state[_POSITION])
+    words = text[start : start + 64].tobytes().split(maxsplit=1)
+    return BadToken(excerpt(words[0]), int(state[_LINE]), int(state[_VALUES]), int(state[_IN_LINE]))
+
+
+def excerpt(token: bytes) -> str:
+    """The token as it can stand in a message: short, one line, printable."""
+    text = token[:40].decode("utf-8", "replace")
+    shown = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+    return shown + ("…" if len(token) > 40 else "")

@@ -1,0 +1,96 @@
+"""Lines of a text file as its author numbered them, and the few things every text reader refuses."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+from marey_motion.errors import FormatError
+from marey_motion.formats.numeric_text import excerpt
+
+_LINE_END = re.compile(rb"\r\n|\n|\r")
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+_WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")
+
+
+class TextLines:
+    """The lines of `data`, with LF, CRLF or CR ends, each with its number; reads no further than it is asked to.
+
+    Attributes
+    ----------
+    number : number of the line last returned, from 1; 0 before the first
+    position : byte after that line's end
+    """
+
+    def __init__(self, data: bytes, file: str) -> None:
+        if data.startswith(_WIDE_MARKS):
+            raise FormatError("the text is UTF-16; save it as UTF-8", code="text_encoding", file=file, line=1)
+        self.data = data
+        self.file = file
+        self.number = 0
+        self.position = len(_BYTE_ORDER_MARK) if data.startswith(_BYTE_ORDER_MARK) else 0
+
+    def __iter__(self) -> Iterator[bytes]:
+        """Every further line that is not blank, without surrounding whitespace."""
+        while (line := self.next()) is not None:
+            if line:
+                yield line
+
+    def next(self) -> bytes | None:
+        """The next line without surrounding whitespace, None at the end of the file."""
+        if self.position >= len(self.data):
+            return None
+        end = _LINE_END.search(self.data, self.position)
+        start, self.position = self.position, end.end() if end else len(self.data)
+        self.number += 1
+        return self.data[start : end.start() if end else None].strip()
+
+    def error(self, message: str, *, code: str | None = None, joint: str | None = None) -> FormatError:
+        """An error that points at the current line."""
+        return FormatError(message, code=code, file=self.file, line=max(self.number, 1), joint=joint)
+
+    def numbers(self, words: list[bytes], count: int, what: str, joint: str | None = None) -> list[float]:
+        """Exactly `count` finite decimal numbers out of `words`."""
+        if len(words) != count:
+            raise self.error(f"{what} has {len(words)} values, {count} are needed", joint=joint)
+        return [self.number_in(word, what, joint) for word in words]
+
+    def number_in(self, word: bytes, what: str, joint: str | None = None) -> float:
+        """One finite decimal number."""
+        value = read_number(word)
+        if value is None:
+            raise self.error(f"{what}: {number_problem(excerpt(word))}", code="bad_number", joint=joint)
+        return value
+
+
+def read_number(word: bytes) -> float | None:
+    """A finite decimal number as `float` reads it, None for anything else (`float` also takes "nan" and "1_0")."""
+    if not word or not _NUMBER.fullmatch(word):
+        return None
+    value = float(word)
+    return value if abs(value) != float("inf") else None
+
+
+_NUMBER = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
+_NOT_FINITE = re.compile(r"[+-]?(?:nan|inf|infinity|\d+\.?\d*#\w+)", re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?,?")
+
+
+def number_problem(word: str) -> str:
+    """Why `word` is not a finite decimal number, and what to do about it."""
+    if _NOT_FINITE.match(word):
+        return f"{word} is not finite; repair or cut these frames"
+    if _DECIMAL_COMMA.fullmatch(word):
+        return f"{word} has a decimal comma; write numbers with a point"
+    if _NUMBER.fullmatch(word.encode("utf-8", "replace")):
+        return f"{word} is too large for a number"
+    return f"{word!r} is not a number"
+
+
+def decode_name(name: bytes) -> str:
+    """A joint name as text: UTF-8, or Latin-1 where it is not, without control characters."""
+    try:
+        text = name.decode("utf-8")
+    except UnicodeDecodeError:
+        text = name.decode("latin-1")
+    return "".join(character if character.isprintable() else " " for character in text).strip()
