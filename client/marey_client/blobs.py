@@ -1,0 +1,94 @@
+"""Bytes by digest: which does the server lack, send them, fetch them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+
+from marey_client.downloads import saved_atomically
+from marey_client.errors import DigestMismatch
+from marey_client.transport import Transport
+from marey_schemas.items import BlobsMissing, BlobsQuery
+
+CHUNK_BYTES = 1 << 20
+DIGESTS_PER_QUESTION = 10_000
+OCTETS = "application/octet-stream"
+
+
+def digest_of(data: bytes) -> str:
+    """The name of bytes: `sha256:` and 64 hexadecimal digits."""
+    return f"sha256:{hashlib.sha256(data).hexdigest()}"
+
+
+def digest_of_file(path: Path) -> str:
+    """The name of a file's bytes, without holding them."""
+    with path.open("rb") as file:
+        return f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
+
+
+@dataclass(frozen=True)
+class Blobs:
+    """The blobs that the token's user may read or has sent."""
+
+    transport: Transport
+
+    def missing(self, digests: Iterable[str]) -> set[str]:
+        """Those of `digests` that must be sent."""
+        wanted = list(dict.fromkeys(digests))
+        lacking: set[str] = set()
+        for start in range(0, len(wanted), DIGESTS_PER_QUESTION):
+            question = BlobsQuery(digests=tuple(wanted[start : start + DIGESTS_PER_QUESTION]))
+            answer = self.transport.post(BlobsMissing, "/blobs/missing", question)
+            lacking.update(answer.missing)
+        return lacking
+
+    def put(self, data: bytes, *, digest: str | None = None) -> str:
+        """Send bytes, whether the server has them or not; their digest."""
+        name = digest or digest_of(data)
+        self.transport.send("PUT", f"/blobs/{name}", content=data, media_type=OCTETS)
+        return name
+
+    def put_file(self, path: Path, *, digest: str | None = None) -> str:
+        """Stream a file to the server; its digest."""
+        name = digest or digest_of_file(path)
+        size = {"Content-Length": str(path.stat().st_size)}
+        self.transport.send("PUT", f"/blobs/{name}", content=lambda: _chunks(path), media_type=OCTETS, headers=size)
+        return name
+
+    def fetch(self, digest: str) -> bytes:
+        """The bytes of a blob. Raises `DigestMismatch` where others arrived."""
+        data: bytes = self.transport.send("GET", f"/blobs/{digest}", headers={"Accept": "*/*"}).content
+        if digest_of(data) != digest:
+            raise DigestMismatch(f"asked for {digest}, but {digest_of(data)} arrived")
+        return data
+
+    def fetch_to(self, digest: str, target: Path) -> Path:
+        """Write a blob to `target`, which appears only when it is whole; a lost connection costs no byte twice."""
+        with saved_atomically(target) as file:
+
+            def once() -> None:
+                start = file.tell()
+                ranged = {"Range": f"bytes={start}-"} if start else {}
+                with self.transport.stream(f"/blobs/{digest}", headers=ranged) as response:
+                    if start and response.status_code != httpx.codes.PARTIAL_CONTENT:
+                        file.seek(0)
+                        file.truncate()
+                    for chunk in response.iter_bytes(CHUNK_BYTES):
+                        file.write(chunk)
+
+            self.transport.repeat(once, repeatable=True, what=f"GET /blobs/{digest}")
+            file.seek(0)
+            arrived = f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
+            if arrived != digest:
+                raise DigestMismatch(f"asked for {digest}, but {arrived} arrived")
+        return target
+
+
+def _chunks(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        while chunk := file.read(CHUNK_BYTES):
+            yield chunk

@@ -1,0 +1,67 @@
+"""Files that arrive: written under a temporary name, renamed when they are whole."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from email.message import Message
+from io import BufferedRandom
+from pathlib import Path
+from typing import cast
+
+from marey_client.transport import Params, Transport
+
+_NOT_IN_A_NAME = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]+')
+
+
+@contextmanager
+def saved_atomically(target: Path) -> Iterator[BufferedRandom]:
+    """A file to write and read that becomes `target` at the end, and vanishes if the block fails."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{target.name[:32]}.", delete=False) as file:
+        temporary = Path(file.name)
+        try:
+            yield cast(BufferedRandom, file)
+            file.flush()
+            os.fsync(file.fileno())
+        except BaseException:
+            temporary.unlink()
+            raise
+    temporary.chmod(0o666 & ~_umask())
+    temporary.replace(target)
+
+
+def safe_file_name(name: str) -> str:
+    """`name` without anything that a file system could take for a path or refuse."""
+    return _NOT_IN_A_NAME.sub("_", name).strip(". ")[:200] or "unnamed"
+
+
+def download(transport: Transport, path: str, folder: Path, *, params: Params | None = None, name: str) -> Path:
+    """Fetch a file into `folder` under the name the server gives it, or `name`; answer where it is."""
+
+    def once() -> Path:
+        with transport.stream(path, params=params) as response:
+            target = folder / safe_file_name(_offered_name(response.headers.get("Content-Disposition")) or name)
+            with saved_atomically(target) as file:
+                for chunk in response.iter_bytes(1 << 20):
+                    file.write(chunk)
+        return target
+
+    return transport.repeat(once, repeatable=True, what=f"GET {path}")
+
+
+def _offered_name(disposition: str | None) -> str | None:
+    if not disposition:
+        return None
+    header = Message()
+    header["Content-Disposition"] = disposition
+    return header.get_filename()
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

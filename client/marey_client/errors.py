@@ -1,0 +1,212 @@
+"""Every error of the SDK. `RequestFailed` and its subclasses are answers of the server; the rest happened here."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from marey_schemas.problems import FieldError, Problem
+
+
+class MareyError(Exception):
+    """Something Marey's client could not do; the text is written for people."""
+
+
+# Nobody answered, or somebody else did
+
+
+class Unreachable(MareyError):
+    """The server cannot be reached, or the connection was lost before it answered."""
+
+
+class UnexpectedAnswer(MareyError):
+    """The answer is not one a Marey server gives."""
+
+
+# What happened on this machine
+
+
+class NoCredential(MareyError):
+    """No token was given and none is stored for this server."""
+
+
+class BadCredentialFile(MareyError):
+    """A file that should hold a token does not, or others may read it."""
+
+
+class DigestMismatch(MareyError):
+    """The bytes that arrived are not those that were asked for."""
+
+
+class NothingToUpload(MareyError):
+    """There are no motion files where some were expected."""
+
+
+# How jobs end
+
+
+class JobUnsuccessful(MareyError):
+    """A job that was waited for failed or was cancelled; `job` says how."""
+
+    def __init__(self, message: str, job: Any) -> None:
+        super().__init__(message)
+        self.job = job
+
+
+class WaitedTooLong(MareyError):
+    """A job had not ended when the time to wait was over; it goes on."""
+
+
+# The server's problem documents, by status
+
+
+class RequestFailed(MareyError):
+    """The server refused or failed a request."""
+
+    status: ClassVar[int] = 0
+
+    def __init__(self, problem: Problem, *, retry_after_s: float | None = None) -> None:
+        super().__init__(problem.detail)
+        self.problem = problem
+        self.retry_after_s = retry_after_s
+
+    @property
+    def code(self) -> str:
+        """The stable slug of what went wrong."""
+        return self.problem.code
+
+    @property
+    def detail(self) -> str:
+        """What went wrong, for people."""
+        return self.problem.detail
+
+    @property
+    def request_id(self) -> str:
+        """What to quote when asking for help."""
+        return self.problem.instance
+
+    @property
+    def errors(self) -> tuple[FieldError, ...]:
+        """One entry per wrong field."""
+        return self.problem.errors
+
+    @property
+    def context(self) -> dict[str, Any]:
+        """Facts of this code, such as the current revision."""
+        return self.problem.context
+
+
+class BadRequest(RequestFailed):
+    """The request is malformed."""
+
+    status = 400
+
+
+class Unauthenticated(RequestFailed):
+    """A valid token is needed."""
+
+    status = 401
+
+
+class Forbidden(RequestFailed):
+    """The token allows to see this, not to do that."""
+
+    status = 403
+
+
+class NotFound(RequestFailed):
+    """There is nothing here that the token allows to see."""
+
+    status = 404
+
+
+class Conflict(RequestFailed):
+    """The state of the resource does not allow this."""
+
+    status = 409
+
+
+class LeaseLost(Conflict):
+    """The lease is held by somebody else or has ended; stop working on the job."""
+
+
+class Gone(RequestFailed):
+    """This was deleted."""
+
+    status = 410
+
+
+class PreconditionFailed(RequestFailed):
+    """The resource has changed since it was read."""
+
+    status = 412
+
+
+class TooLarge(RequestFailed):
+    """The request is larger than the server takes."""
+
+    status = 413
+
+
+class Invalid(RequestFailed):
+    """What was asked for makes no sense."""
+
+    status = 422
+
+
+class Locked(RequestFailed):
+    """The resource is read-only."""
+
+    status = 423
+
+
+class TooManyRequests(RequestFailed):
+    """The server asks to wait."""
+
+    status = 429
+
+
+class ServerFailed(RequestFailed):
+    """The server failed; the request id helps to find out why."""
+
+    status = 500
+
+
+class Unavailable(ServerFailed):
+    """The server cannot answer just now."""
+
+    status = 503
+
+
+class StorageFull(ServerFailed):
+    """The server has no room left."""
+
+    status = 507
+
+
+_BY_STATUS: dict[int, type[RequestFailed]] = {
+    error.status: error
+    for error in (
+        BadRequest,
+        Unauthenticated,
+        Forbidden,
+        NotFound,
+        Conflict,
+        Gone,
+        PreconditionFailed,
+        TooLarge,
+        Invalid,
+        Locked,
+        TooManyRequests,
+        ServerFailed,
+        Unavailable,
+        StorageFull,
+    )
+}
+_BY_CODE: dict[str, type[RequestFailed]] = {"lease-lost": LeaseLost}
+
+
+def error_of(problem: Problem, *, retry_after_s: float | None = None) -> RequestFailed:
+    """The exception for a problem document; its class is found by code, then by status."""
+    known = _BY_CODE.get(problem.code) or _BY_STATUS.get(problem.status)
+    kind = known or (ServerFailed if problem.status >= 500 else RequestFailed)
+    return kind(problem, retry_after_s=retry_after_s)

@@ -1,0 +1,154 @@
+"""Folders of motion files in: digests in threads, one question which bytes are missing, uploads side by side."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from marey_client.blobs import Blobs, digest_of_file
+from marey_client.errors import NothingToUpload
+from marey_client.jobs import Jobs
+from marey_client.transport import Transport, as_json, read_model
+from marey_schemas.imports import ImportAnswer, ImportEntry, ImportFile, ImportOptions, ImportRequest
+from marey_schemas.jobs import Job
+
+MOTION_SUFFIXES = frozenset({".bvh", ".asf", ".amc", ".c3d", ".npz", ".json"})
+COMPANION_SUFFIX = ".asf"
+FILES_PER_IMPORT = 100
+BYTES_PER_IMPORT = 64 << 20
+UPLOADS_AT_ONCE = 8
+
+Notice = Callable[[str, int, int], None]
+"""Told what is going on: `hashing`, `sending` or `importing`, how many files are done, and of how many."""
+
+
+@dataclass(frozen=True)
+class LocalFile:
+    """A file to import and the name it gets: its path below the folder it was found in."""
+
+    name: str
+    path: Path
+    size_bytes: int
+
+
+@dataclass(frozen=True)
+class FoundFiles:
+    """What stands in the places somebody named: files to import, and others that are left out."""
+
+    files: tuple[LocalFile, ...]
+    left_out: tuple[Path, ...]
+
+
+def find_files(places: Iterable[Path]) -> FoundFiles:
+    """Motion files in folders and below, hidden ones left out; files named themselves are taken whatever they are.
+
+    Raises `NothingToUpload` where a place does not exist or none holds a motion file.
+    """
+    files: dict[str, LocalFile] = {}
+    left_out: list[Path] = []
+    for place in places:
+        if place.is_file():
+            files[place.name] = LocalFile(place.name, place, place.stat().st_size)
+            continue
+        if not place.is_dir():
+            raise NothingToUpload(f"{place} does not exist")
+        for path in sorted(place.rglob("*")):
+            below = path.relative_to(place)
+            if not path.is_file() or any(part.startswith(".") for part in below.parts):
+                continue
+            if path.suffix.lower() in MOTION_SUFFIXES:
+                files[below.as_posix()] = LocalFile(below.as_posix(), path, path.stat().st_size)
+            else:
+                left_out.append(path)
+    if not files:
+        raise NothingToUpload(f"no motion files ({', '.join(sorted(MOTION_SUFFIXES))}) in {_listed(places)}")
+    return FoundFiles(tuple(files.values()), tuple(left_out))
+
+
+def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
+    """Files in portions that one request can import; each AMC comes with the ASF files of its folder."""
+    companions: defaultdict[str, list[LocalFile]] = defaultdict(list)
+    for file in files:
+        if _suffix(file) == COMPANION_SUFFIX:
+            companions[_folder(file)].append(file)
+    portion: dict[str, LocalFile] = {}
+    for file in files:
+        together = [*(companions[_folder(file)] if _suffix(file) == ".amc" else []), file]
+        new = [one for one in together if one.name not in portion]
+        size = sum(one.size_bytes for one in portion.values()) + sum(one.size_bytes for one in new)
+        if portion and (len(portion) + len(new) > FILES_PER_IMPORT or size > BYTES_PER_IMPORT):
+            yield list(portion.values())
+            portion = {}
+        portion.update((one.name, one) for one in together)
+    if portion:
+        yield list(portion.values())
+
+
+@dataclass(frozen=True)
+class Imports:
+    """Imports into one project."""
+
+    transport: Transport
+    project: str
+    blobs: Blobs
+    jobs: Jobs
+
+    def upload(
+        self, files: Sequence[LocalFile], options: ImportOptions | None = None, *, notice: Notice | None = None
+    ) -> list[ImportEntry]:
+        """Import files; one entry per file, in order. A file that is refused keeps no other from going in."""
+        tell = notice or _say_nothing
+        digests = self._send_missing(files, tell)
+        entries: dict[str, ImportEntry] = {}
+        for portion in batches(files):
+            named = tuple(ImportFile(name=file.name, blob=digests[file.name]) for file in portion)
+            for entry in self.run(named, options):
+                entries.setdefault(entry.name, entry)
+            tell("importing", len(entries), len(files))
+        return list(entries.values())
+
+    def run(self, files: tuple[ImportFile, ...], options: ImportOptions | None = None) -> tuple[ImportEntry, ...]:
+        """Import up to 1000 files whose bytes the server has; waits where the server makes a job of it."""
+        given = options.model_dump(exclude_unset=True) if options else {}
+        request = ImportRequest(files=files, **given)
+        response = self.transport.send(
+            "POST", f"/projects/{self.project}/imports", content=as_json(request), timeout_s=600.0
+        )
+        if response.status_code != 202:
+            return read_model(ImportAnswer, response).entries
+        job = self.jobs.wait(read_model(Job, response).id)
+        return ImportAnswer.model_validate(job.result or {}).entries
+
+    def _send_missing(self, files: Sequence[LocalFile], tell: Notice) -> dict[str, str]:
+        """Digest by name, once the server has all the bytes."""
+        digests: dict[str, str] = {}
+        with ThreadPoolExecutor(UPLOADS_AT_ONCE, thread_name_prefix="marey-upload") as pool:
+            for file, digest in zip(files, pool.map(lambda file: digest_of_file(file.path), files), strict=True):
+                digests[file.name] = digest
+                tell("hashing", len(digests), len(files))
+            lacking = self.blobs.missing(digests.values())
+            by_digest = {digests[file.name]: file for file in files if digests[file.name] in lacking}
+            sending = (pool.submit(self.blobs.put_file, file.path, digest=digest) for digest, file in by_digest.items())
+            for done, upload in enumerate(list(sending), start=1):
+                upload.result()
+                tell("sending", done, len(by_digest))
+        return digests
+
+
+def _say_nothing(_stage: str, _done: int, _total: int) -> None:
+    pass
+
+
+def _folder(file: LocalFile) -> str:
+    return PurePosixPath(file.name).parent.as_posix()
+
+
+def _suffix(file: LocalFile) -> str:
+    return PurePosixPath(file.name).suffix.lower()
+
+
+def _listed(places: Iterable[Path]) -> str:
+    return ", ".join(str(place) for place in places)

@@ -1,0 +1,153 @@
+"""Items of every kind: find, make, change, read their parts and history."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from marey_client.downloads import download
+from marey_client.paging import pages
+from marey_client.transport import Params, Transport, as_json, read_model
+from marey_schemas.items import Item, ItemChange, ItemCreate, Lineage, Revision, Staleness
+from marey_schemas.kinds import Kind
+
+
+class ItemHandle:
+    """One item as it was when it was read; its methods ask the server."""
+
+    def __init__(self, transport: Transport, project: str, item: Item) -> None:
+        self.transport = transport
+        self.project = project
+        self.item = item
+
+    def __repr__(self) -> str:
+        return f"<{self.item.kind} {self.path!r} {self.item.id} revision {self.item.revision}>"
+
+    @property
+    def id(self) -> str:
+        """The id, which never changes."""
+        return self.item.id
+
+    @property
+    def name(self) -> str:
+        """The name within its collection."""
+        return self.item.name
+
+    @property
+    def path(self) -> str:
+        """Collection and name."""
+        return f"{self.item.collection}/{self.item.name}".lstrip("/")
+
+    @property
+    def url(self) -> str:
+        """The path below the API's root."""
+        return f"/projects/{self.project}/{self.item.kind.plural}/{self.item.id}"
+
+    def part(self, part: str, *, revision: int | None = None, **query: str | None) -> dict[str, Any]:
+        """The document of a part; arrays are numpy arrays."""
+        tree, _ = self.transport.get_tree(f"{self.url}/parts/{part}", {"revision": revision, **query})
+        return dict(tree)
+
+    def put_part(self, part: str, document: Mapping[str, Any]) -> Item:
+        """Make a new revision in which `part` is `document`; `PreconditionFailed` if the item was changed since."""
+        response = self.transport.send_tree("PUT", f"{self.url}/parts/{part}", document, headers=self._if_match())
+        return self._renewed(read_model(Item, response))
+
+    def change(self, change: ItemChange) -> Item:
+        """Rename, move or tag; `PreconditionFailed` if somebody changed the item since it was read."""
+        response = self.transport.send("PATCH", self.url, content=as_json(change), headers=self._if_match())
+        return self._renewed(read_model(Item, response))
+
+    def delete(self) -> None:
+        """Hide the item; `restore` brings it back."""
+        self.transport.send("DELETE", self.url, headers=self._if_match())
+
+    def restore(self) -> Item:
+        """Bring a deleted item back."""
+        return self._renewed(self.transport.post(Item, f"{self.url}/restore"))
+
+    def revisions(self) -> Iterator[Revision]:
+        """Every state of the item, newest first."""
+        return pages(self.transport, Revision, f"{self.url}/revisions")
+
+    def revision(self, number: int) -> Revision:
+        """One state of the item."""
+        return self.transport.get(Revision, f"{self.url}/revisions/{number}")
+
+    def lineage(self) -> Lineage:
+        """What the newest revision was made from, and what was made of it."""
+        return self.transport.get(Lineage, f"{self.url}/lineage")
+
+    def staleness(self) -> Staleness:
+        """Whether something it was made from has changed."""
+        return self.transport.get(Staleness, f"{self.url}/stale")
+
+    def export(self, folder: Path, *, format: str = "original", **options: str | None) -> Path:  # noqa: A002
+        """Write the item to `folder` as a file of `format`; answer where it is."""
+        params = {"format": format, **options}
+        return download(self.transport, f"{self.url}/export", folder, params=params, name=f"{self.name}.{format}")
+
+    def _if_match(self) -> dict[str, str]:
+        return {"If-Match": f'"{self.item.rev}.json"'}
+
+    def _renewed(self, item: Item) -> Item:
+        self.item = item
+        return item
+
+
+Handle = TypeVar("Handle", bound=ItemHandle)
+
+
+@dataclass(frozen=True)
+class Items(Generic[Handle]):
+    """The items of one kind in a project."""
+
+    transport: Transport
+    project: str
+    kind: Kind
+    handle: type[Handle]
+
+    @property
+    def url(self) -> str:
+        """The path below the API's root."""
+        return f"/projects/{self.project}/{self.kind.plural}"
+
+    def list(
+        self,
+        *,
+        collection: str | None = None,
+        path: str | None = None,
+        sort: str | None = None,
+        filters: Params | None = None,
+        page_size: int = 500,
+    ) -> Iterator[Handle]:
+        """Items in order, fetched page by page.
+
+        `collection` names one folder, `path` a folder and everything below it; `filters` are the server's, such as
+        `{"frames.gte": 120, "tag.in": "walk,run"}`.
+        """
+        params = {"collection": collection, "path": path, "sort": sort, "limit": page_size, **(filters or {})}
+        return (self._handle(item) for item in pages(self.transport, Item, self.url, params))
+
+    def get(self, item_id: str) -> Handle:
+        """One item by its id."""
+        return self._handle(self.transport.get(Item, f"{self.url}/{item_id}"))
+
+    def create(
+        self,
+        name: str,
+        parts: Mapping[str, Mapping[str, Any]],
+        *,
+        collection: str = "",
+        tags: tuple[str, ...] = (),
+        message: str = "",
+    ) -> Handle:
+        """Make an item from its parts; numpy arrays are taken as they are. `Conflict` if the name is taken."""
+        wanted = ItemCreate(name=name, collection=collection, tags=tags, parts=dict(parts), message=message)
+        response = self.transport.send_tree("POST", self.url, wanted.model_dump(by_alias=True))
+        return self._handle(read_model(Item, response))
+
+    def _handle(self, item: Item) -> Handle:
+        return self.handle(self.transport, self.project, item)

@@ -1,0 +1,104 @@
+"""Jobs as users see them: submit, wait, cancel, retry, read the log."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from marey_client.errors import JobUnsuccessful, WaitedTooLong
+from marey_client.paging import pages
+from marey_client.transport import Params, Transport
+from marey_schemas.jobs import Attempt, Job, JobCreate, JobKind, JobOutput, JobState
+
+LONGEST_WAIT_S = 20.0
+"""How long one question may stay open at the server."""
+
+SHORTEST_PAUSE_S = 0.05
+
+
+@dataclass(frozen=True)
+class Jobs:
+    """Every job the caller may see, by id."""
+
+    transport: Transport
+
+    def kinds(self) -> Iterator[JobKind]:
+        """What can be asked for, with the parameters it takes."""
+        return pages(self.transport, JobKind, "/job-kinds")
+
+    def submit(self, project: str, job: JobCreate) -> Job:
+        """Hand in a job."""
+        return self.transport.post(Job, f"/projects/{project}/jobs", job)
+
+    def list(self, project: str, *, limit: int = 100, filters: Params | None = None) -> Iterator[Job]:
+        """Jobs of a project, newest first."""
+        params = {"limit": limit, **(filters or {})}
+        return pages(self.transport, Job, f"/projects/{project}/jobs", params)
+
+    def get(self, job_id: str, *, wait_s: float = 0.0) -> Job:
+        """How a job stands; with `wait_s` the server answers later if the job ends within that time."""
+        if wait_s <= 0:
+            return self.transport.get(Job, f"/jobs/{job_id}")
+        return self.transport.get(
+            Job, f"/jobs/{job_id}", headers={"Prefer": f"wait={max(1, round(min(wait_s, LONGEST_WAIT_S)))}"}
+        )
+
+    def wait(
+        self,
+        job_id: str,
+        *,
+        timeout_s: float | None = None,
+        on_progress: Callable[[Job], None] | None = None,
+        require_success: bool = True,
+    ) -> Job:
+        """Wait until a job has ended; `on_progress` sees it about once a second.
+
+        Raises `JobUnsuccessful` where it failed or was cancelled and success is required, `WaitedTooLong` after
+        `timeout_s`.
+        """
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        pause_s = SHORTEST_PAUSE_S
+        while True:
+            asked = time.monotonic()
+            left_s = LONGEST_WAIT_S if deadline is None else deadline - asked
+            job = self.get(job_id, wait_s=min(left_s, 1.0 if on_progress else LONGEST_WAIT_S))
+            if on_progress is not None:
+                on_progress(job)
+            if job.state.terminal:
+                return self._ended(job, require_success)
+            if deadline is not None and time.monotonic() >= deadline:
+                raise WaitedTooLong(f"job {job_id} is still {job.state} after {timeout_s:g} s; it goes on")
+            if time.monotonic() - asked < pause_s:  # the server answered at once
+                time.sleep(pause_s)
+                pause_s = min(2 * pause_s, 1.0)
+
+    def cancel(self, job_id: str) -> Job:
+        """Ask a job to stop; a queued one is cancelled at once."""
+        return self.transport.post(Job, f"/jobs/{job_id}/cancel")
+
+    def retry(self, job_id: str) -> Job:
+        """Submit a job that ended without success again; the new job."""
+        return self.transport.post(Job, f"/jobs/{job_id}/retry")
+
+    def attempts(self, job_id: str) -> Iterator[Attempt]:
+        """Every try at a job."""
+        return pages(self.transport, Attempt, f"/jobs/{job_id}/attempts")
+
+    def outputs(self, job_id: str) -> Iterator[JobOutput]:
+        """The revisions a job made."""
+        return pages(self.transport, JobOutput, f"/jobs/{job_id}/outputs")
+
+    def log(self, job_id: str, *, offset: int = 0) -> str:
+        """What the newest attempt wrote, from byte `offset` on."""
+        response = self.transport.send(
+            "GET", f"/jobs/{job_id}/log", params={"offset": offset or None}, headers={"Accept": "text/plain"}
+        )
+        return response.content.decode(errors="replace")
+
+    def _ended(self, job: Job, require_success: bool) -> Job:
+        if not require_success or job.state is JobState.SUCCEEDED:
+            return job
+        if job.failure is None:
+            raise JobUnsuccessful(f"job {job.id} was cancelled", job)
+        raise JobUnsuccessful(f"job {job.id} failed ({job.failure.code}): {job.failure.detail}", job)

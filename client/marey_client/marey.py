@@ -1,0 +1,94 @@
+"""The way in: one server, one token."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from types import TracebackType
+from typing import Self
+
+import httpx
+
+from marey_client.access import Tokens, Users
+from marey_client.blobs import Blobs
+from marey_client.jobs import Jobs
+from marey_client.paging import pages
+from marey_client.project import ProjectHandle
+from marey_client.retries import Retries
+from marey_client.transport import Transport
+from marey_schemas.access import Me, Project, ProjectCreate
+
+
+class Marey:
+    """A Marey server. May be used by several threads; close it, or use it in a `with` block.
+
+    Parameters
+    ----------
+    url : address of the server, such as `https://marey.example.org`
+    token : a personal token; None reads public projects only
+    retries : how often and how long requests that cannot harm are sent again
+    timeout_s : how long the server may stay silent
+    http : replaces the network in tests
+    """
+
+    def __init__(
+        self,
+        url: str,
+        token: str | None = None,
+        *,
+        retries: Retries | None = None,
+        timeout_s: float = 60.0,
+        http: httpx.BaseTransport | None = None,
+    ) -> None:
+        self.transport = Transport(url, token, retries=retries, timeout_s=timeout_s, http=http)
+
+    def __repr__(self) -> str:
+        return f"<Marey {self.transport.url}>"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close every connection."""
+        self.transport.close()
+
+    def me(self) -> Me:
+        """Whom the token belongs to, and what it allows."""
+        return self.transport.get(Me, "/me")
+
+    def project(self, name: str) -> ProjectHandle:
+        """A project by its name; nothing is asked yet."""
+        return ProjectHandle(self.transport, name)
+
+    def projects(self) -> Iterator[Project]:
+        """Every project the token allows to see."""
+        return pages(self.transport, Project, "/projects")
+
+    def create_project(self, project: ProjectCreate) -> ProjectHandle:
+        """Make a project; the caller becomes its owner."""
+        return self.project(self.transport.post(Project, "/projects", project).name)
+
+    @cached_property
+    def jobs(self) -> Jobs:
+        """Jobs by id."""
+        return Jobs(self.transport)
+
+    @cached_property
+    def blobs(self) -> Blobs:
+        """Bytes by digest."""
+        return Blobs(self.transport)
+
+    @cached_property
+    def users(self) -> Users:
+        """Who can sign in."""
+        return Users(self.transport)
+
+    @cached_property
+    def tokens(self) -> Tokens:
+        """The caller's tokens."""
+        return Tokens(self.transport)

@@ -1,0 +1,84 @@
+"""Clips and skeletons: the items whose parts have names of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict
+
+from marey_client.items import ItemHandle
+from marey_schemas.documents import ClipInfo, Motion, SkeletonHierarchy, SkeletonMapping
+from marey_schemas.items import Item
+
+
+class MotionArrays(Motion):
+    """The poses of a clip, or of some of its frames and joints.
+
+    Metres, right-handed with Y up; quaternions w, x, y, z. Members a newer server adds are ignored.
+    """
+
+    model_config = ConfigDict(extra="ignore")
+
+    @property
+    def root_translations(self) -> NDArray[np.float32]:
+        """(frames, 3) root positions, metres."""
+        return self.poses[:, :3]
+
+    @property
+    def rotations(self) -> NDArray[np.float32]:
+        """(frames, joints, 4) local rotations in the order of `joints`."""
+        return self.poses[:, 3:].reshape(len(self.poses), -1, 4)
+
+
+class ClipHandle(ItemHandle):
+    """One clip."""
+
+    def motion(
+        self,
+        *,
+        frames: slice | None = None,
+        joints: Sequence[str] | None = None,
+        revision: int | None = None,
+    ) -> MotionArrays:
+        """The poses as numpy arrays; only the blocks that hold `frames` and `joints` are read and sent."""
+        query = {"frames": frames_text(frames), "joints": ",".join(joints) if joints is not None else None}
+        return MotionArrays.model_validate(self.part("motion", revision=revision, **query))
+
+    def info(self) -> ClipInfo:
+        """What people and importers say about the clip."""
+        return ClipInfo.model_validate(self.part("info"))
+
+    def put_info(self, info: ClipInfo) -> Item:
+        """Make a revision with another description; the poses are shared."""
+        return self.put_part("info", info.model_dump(mode="json", by_alias=True))
+
+
+class SkeletonHandle(ItemHandle):
+    """One skeleton."""
+
+    def hierarchy(self) -> SkeletonHierarchy:
+        """Joints, offsets and rest pose."""
+        return SkeletonHierarchy.model_validate(self.part("hierarchy"))
+
+    def mapping(self) -> SkeletonMapping:
+        """Which joint plays which standard joint, and its axes."""
+        return SkeletonMapping.model_validate(self.part("mapping"))
+
+    def put_mapping(self, mapping: SkeletonMapping) -> Item:
+        """Make a revision with another mapping."""
+        return self.put_part("mapping", mapping.model_dump(mode="json", by_alias=True))
+
+
+def frames_text(frames: slice | None) -> str | None:
+    """A slice as the query `a:b`; None for all frames. Raises `ValueError` for what a query cannot say."""
+    if frames is None:
+        return None
+    if frames.step not in (None, 1):
+        raise ValueError(f"frames go one by one, not in steps of {frames.step}; slice the arrays instead")
+    bounds: tuple[Any, Any] = (frames.start, frames.stop)
+    if any(bound is not None and bound < 0 for bound in bounds):
+        raise ValueError("frames count from the start; a negative bound is not understood")
+    return ":".join("" if bound is None else str(bound) for bound in bounds)

@@ -1,0 +1,20 @@
+"""Lists that come in pages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from marey_client.transport import Model, Params, Transport
+from marey_schemas.items import Page
+
+
+def pages(transport: Transport, entry: type[Model], path: str, params: Params | None = None) -> Iterator[Model]:
+    """Every entry of a list, fetched page by page as the caller goes on."""
+    query: dict[str, Any] = dict(params or {})
+    while True:
+        page = transport.get(Page, path, query)
+        yield from map(entry.model_validate, page.items)
+        if page.next_cursor is None:
+            return
+        query["cursor"] = page.next_cursor

@@ -1,0 +1,136 @@
+"""One project: its items, collections, members, imports and jobs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from marey_client.access import Members
+from marey_client.blobs import Blobs
+from marey_client.imports import Imports
+from marey_client.items import ItemHandle, Items
+from marey_client.jobs import Jobs
+from marey_client.motions import ClipHandle, SkeletonHandle
+from marey_client.paging import pages
+from marey_client.transport import Params, Transport, as_json, read_model
+from marey_schemas.access import Project, ProjectChange
+from marey_schemas.items import Collection, CollectionChange, CollectionCreate
+from marey_schemas.jobs import Job, JobCreate
+from marey_schemas.kinds import Kind
+
+
+class ProjectHandle:
+    """A project by its name; nothing is asked until a method is called."""
+
+    def __init__(self, transport: Transport, name: str) -> None:
+        self.transport = transport
+        self.name = name
+
+    def __repr__(self) -> str:
+        return f"<project {self.name!r} at {self.transport.url}>"
+
+    @property
+    def url(self) -> str:
+        """The path below the API's root."""
+        return f"/projects/{self.name}"
+
+    def read(self) -> Project:
+        """Title, visibility and the caller's role."""
+        return self.transport.get(Project, self.url)
+
+    def change(self, change: ProjectChange) -> Project:
+        """Change title, description or visibility."""
+        return read_model(
+            Project, self.transport.send("PATCH", self.url, content=as_json(change), headers={"If-Match": "*"})
+        )
+
+    def delete(self) -> None:
+        """Hide the project; `restore` brings it back."""
+        self.transport.send("DELETE", self.url, headers={"If-Match": "*"})
+
+    def restore(self) -> Project:
+        """Bring a deleted project back."""
+        return self.transport.post(Project, f"{self.url}/restore")
+
+    # -- what it holds -------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def clips(self) -> Items[ClipHandle]:
+        """Its clips."""
+        return Items(self.transport, self.name, Kind.CLIP, ClipHandle)
+
+    @cached_property
+    def skeletons(self) -> Items[SkeletonHandle]:
+        """Its skeletons."""
+        return Items(self.transport, self.name, Kind.SKELETON, SkeletonHandle)
+
+    def items(self, kind: Kind) -> Items[Any]:
+        """Its items of any kind."""
+        if kind is Kind.CLIP:
+            return self.clips
+        return self.skeletons if kind is Kind.SKELETON else Items(self.transport, self.name, kind, ItemHandle)
+
+    @cached_property
+    def collections(self) -> Collections:
+        """Its tree of folders."""
+        return Collections(self.transport, self.name)
+
+    @cached_property
+    def members(self) -> Members:
+        """Who may do what."""
+        return Members(self.transport, self.name)
+
+    @cached_property
+    def imports(self) -> Imports:
+        """Files in."""
+        return Imports(self.transport, self.name, Blobs(self.transport), Jobs(self.transport))
+
+    # -- jobs ----------------------------------------------------------------------------------------------------------
+
+    def submit(self, job: JobCreate) -> Job:
+        """Hand in a job."""
+        return Jobs(self.transport).submit(self.name, job)
+
+    def jobs(self, *, filters: Params | None = None) -> Iterator[Job]:
+        """Its jobs, newest first."""
+        return Jobs(self.transport).list(self.name, filters=filters)
+
+
+@dataclass(frozen=True)
+class Collections:
+    """The tree of folders of a project."""
+
+    transport: Transport
+    project: str
+
+    @property
+    def url(self) -> str:
+        """The path below the API's root."""
+        return f"/projects/{self.project}/collections"
+
+    def list(self, *, filters: Params | None = None) -> Iterator[Collection]:
+        """Every folder, by path."""
+        return pages(self.transport, Collection, self.url, filters)
+
+    def create(self, path: str) -> Collection:
+        """Make a folder and those above it."""
+        return self.transport.post(Collection, self.url, CollectionCreate(path=path))
+
+    def move(self, collection: Collection, path: str) -> Collection:
+        """Move or rename a folder with all it holds."""
+        state = {"If-Match": f'"{collection.rev}.json"'}
+        body = as_json(CollectionChange(path=path))
+        return read_model(
+            Collection, self.transport.send("PATCH", f"{self.url}/{collection.id}", content=body, headers=state)
+        )
+
+    def delete(self, collection: Collection) -> None:
+        """Hide a folder with all it holds."""
+        state = {"If-Match": f'"{collection.rev}.json"'}
+        self.transport.send("DELETE", f"{self.url}/{collection.id}", headers=state)
+
+    def restore(self, collection: Collection) -> Collection:
+        """Bring a deleted folder back with all it held."""
+        return self.transport.post(Collection, f"{self.url}/{collection.id}/restore")

@@ -1,0 +1,245 @@
+"""Requests and answers: authentication, safe repetition, problem documents, media types."""
+
+from __future__ import annotations
+
+import logging
+import time
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import httpx
+from pydantic import BaseModel, ValidationError
+
+from marey_client.errors import RequestFailed, UnexpectedAnswer, Unreachable, error_of
+from marey_client.retries import BUSY_STATUSES, NEVER_ARRIVED, Retries, retry_after_s
+from marey_schemas.codecs import CodecError, decode_tree, encode_tree
+from marey_schemas.problems import MEDIA_TYPE as PROBLEM
+from marey_schemas.problems import Problem
+
+Model = TypeVar("Model", bound=BaseModel)
+T = TypeVar("T")
+Params = Mapping[str, str | int | float | bool | None]
+
+JSON = "application/json"
+BLOCKS = "application/msgpack; arrays=blocks"
+API = "/api/v1"
+MAX_ANSWER_BYTES = 1 << 28
+
+log = logging.getLogger(__name__)
+
+
+class BearerToken(httpx.Auth):
+    """Adds the token to requests; shows it nowhere else."""
+
+    def __init__(self, token: str) -> None:
+        self._token = token
+
+    def auth_flow(self, request: httpx.Request) -> Iterator[httpx.Request]:  # type: ignore[override]
+        """Set the header."""
+        request.headers["Authorization"] = f"Bearer {self._token}"
+        yield request
+
+    def __repr__(self) -> str:
+        return "BearerToken(...)"
+
+
+class Transport:
+    """One server as HTTP sees it. May be used by several threads."""
+
+    def __init__(
+        self,
+        url: str,
+        token: str | None = None,
+        *,
+        retries: Retries | None = None,
+        timeout_s: float = 60.0,
+        http: httpx.BaseTransport | None = None,
+    ) -> None:
+        self.url = url.rstrip("/")
+        self.retries = retries or Retries()
+        self._client = httpx.Client(
+            base_url=self.url + API,
+            auth=BearerToken(token) if token else None,
+            timeout=httpx.Timeout(timeout_s, connect=10.0),
+            limits=httpx.Limits(max_connections=32, max_keepalive_connections=16),
+            headers={"User-Agent": "marey-client"},
+            transport=http,
+            trust_env=False,
+        )
+
+    def close(self) -> None:
+        """Close every connection."""
+        self._client.close()
+
+    # -- models --------------------------------------------------------------------------------------------------------
+
+    def get(
+        self,
+        answer: type[Model],
+        path: str,
+        params: Params | None = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> Model:
+        """GET one JSON document."""
+        return read_model(answer, self.send("GET", path, params=params, headers=headers))
+
+    def post(self, answer: type[Model], path: str, body: BaseModel | None = None, **options: Any) -> Model:
+        """POST one JSON document, with an idempotency key; answer another."""
+        return read_model(answer, self.send("POST", path, content=as_json(body), **options))
+
+    def send(
+        self,
+        method: str,
+        path: str,
+        *,
+        params: Params | None = None,
+        content: bytes | Callable[[], Iterable[bytes]] | None = None,
+        media_type: str = JSON,
+        headers: Mapping[str, str] | None = None,
+        repeatable: bool | None = None,
+        timeout_s: float | None = None,
+    ) -> httpx.Response:
+        """Send a request until it is answered, and return the answer, read whole.
+
+        A POST carries an idempotency key unless `repeatable` is given. Where it is False, or the method changes things,
+        a request whose connection broke is not sent twice. A streamed `content` is a function that starts it afresh.
+
+        Raises `RequestFailed` for a problem document, `Unreachable` without an answer.
+        """
+        sent_headers = {"Accept": JSON, **(headers or {})}
+        if content is not None:
+            sent_headers.setdefault("Content-Type", media_type)
+        if repeatable is None:
+            repeatable = method in ("GET", "HEAD", "POST") or "If-Match" not in sent_headers
+            if method == "POST":
+                sent_headers.setdefault("Idempotency-Key", uuid.uuid4().hex)
+
+        def once() -> httpx.Response:
+            response = self._client.request(
+                method,
+                path,
+                params=_present(params),
+                content=content() if callable(content) else content,
+                headers=sent_headers,
+                timeout=httpx.Timeout(timeout_s, connect=10.0) if timeout_s else httpx.USE_CLIENT_DEFAULT,
+            )
+            raise_for_problem(response)
+            return response
+
+        return self.repeat(once, repeatable=repeatable, what=f"{method} {path}")
+
+    def repeat(self, once: Callable[[], T], *, repeatable: bool, what: str) -> T:
+        """Call `once` until it succeeds, or fails in a way that another try would not mend."""
+        started = time.monotonic()
+        for tried in range(1, self.retries.tries + 1):
+            try:
+                return once()
+            except RequestFailed as error:
+                failure: Exception = error
+                again, wait_s = error.problem.status in BUSY_STATUSES or error.code == "in-flight", error.retry_after_s
+            except httpx.TransportError as error:
+                failure = Unreachable(f"{self.url} does not answer: {_sentence(error)}")
+                failure.__cause__ = error
+                again, wait_s = repeatable or isinstance(error, NEVER_ARRIVED), None
+            delay_s = self.retries.delay_s(tried, wait_s)
+            late = time.monotonic() - started + delay_s > self.retries.total_s
+            if not again or late or tried == self.retries.tries:
+                raise failure
+            log.info("%s: %s; trying again in %.1f s", what, failure, delay_s)
+            self.retries.sleep(delay_s)
+        raise AssertionError("unreachable")
+
+    # -- documents with arrays -----------------------------------------------------------------------------------------
+
+    def get_tree(self, path: str, params: Params | None = None) -> tuple[Any, str | None]:
+        """GET a document; its arrays as numpy arrays, and its ETag."""
+        response = self.send("GET", path, params=params, headers={"Accept": BLOCKS})
+        return read_tree(response), response.headers.get("ETag")
+
+    def send_tree(self, method: str, path: str, tree: Any, **options: Any) -> httpx.Response:
+        """Send a document; numpy arrays in it travel as blocks."""
+        body = encode_tree(tree, "application/msgpack", arrays="blocks")
+        return self.send(method, path, content=body, media_type=BLOCKS, **options)
+
+    # -- bytes ---------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def stream(
+        self, path: str, *, params: Params | None = None, headers: Mapping[str, str] | None = None
+    ) -> Iterator[httpx.Response]:
+        """GET an answer whose bytes are read while they arrive. Not repeated: the caller knows how far it came."""
+        sent_headers = {"Accept": "*/*", **(headers or {})}
+        with self._client.stream("GET", path, params=_present(params), headers=sent_headers) as response:
+            if response.status_code >= 400:
+                response.read()
+            raise_for_problem(response)
+            yield response
+
+
+def as_json(model: BaseModel | None) -> bytes | None:
+    """The fields of `model` that were given, as JSON; secrets included, which pydantic's own JSON hides."""
+    if model is None:
+        return None
+    return encode_tree(_revealed(model.model_dump(exclude_unset=True, by_alias=True)), JSON)
+
+
+def _revealed(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _revealed(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_revealed(item) for item in value]
+    return value.get_secret_value() if hasattr(value, "get_secret_value") else value
+
+
+def read_model(answer: type[Model], response: httpx.Response) -> Model:
+    """The body of `response` as a model; `UnexpectedAnswer` if it is none."""
+    try:
+        return answer.model_validate_json(response.content)
+    except ValidationError as error:
+        raise UnexpectedAnswer(
+            f"{response.request.method} {response.request.url.path}: not a {answer.__name__} ({error.error_count()} "
+            "fields differ). Is the client older than the server?"
+        ) from error
+
+
+def read_tree(response: httpx.Response) -> Any:
+    """The body of `response` as a tree with numpy arrays."""
+    media_type = response.headers.get("Content-Type", "").partition(";")[0].strip()
+    try:
+        return decode_tree(response.content, media_type, max_bytes=MAX_ANSWER_BYTES)
+    except CodecError as error:
+        raise UnexpectedAnswer(f"{response.request.url.path}: {error}") from error
+
+
+def raise_for_problem(response: httpx.Response) -> None:
+    """Raise the error an answer stands for, if it stands for one."""
+    if response.status_code < 400:
+        return
+    if response.headers.get("Content-Type", "").startswith(PROBLEM) and response.content:
+        raise error_of(Problem.model_validate_json(response.content), retry_after_s=retry_after_s(response))
+    problem = Problem(
+        type="about:blank",
+        title=response.reason_phrase,
+        status=response.status_code,
+        detail=f"the server answered {response.status_code} {response.reason_phrase}".rstrip(),
+        instance=response.headers.get("X-Request-Id", "unknown"),
+        code=f"http-{response.status_code}",
+    )
+    raise error_of(problem, retry_after_s=retry_after_s(response))
+
+
+def _present(params: Params | None) -> dict[str, str] | None:
+    """Query parameters without those that are None; booleans as the server spells them."""
+    if not params:
+        return None
+    return {
+        name: str(value).lower() if isinstance(value, bool) else str(value)
+        for name, value in params.items()
+        if value is not None
+    }
+
+
+def _sentence(error: httpx.TransportError) -> str:
+    return str(error) or ("no answer in time" if isinstance(error, httpx.TimeoutException) else type(error).__name__)
