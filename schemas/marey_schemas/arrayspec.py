@@ -17,9 +17,12 @@ class ArrayError(ValueError):
     """An array, or the leaf that claims to be one, cannot travel."""
 
     def __init__(self, code: str, detail: str) -> None:
-        super().__init__(detail)
+        super().__init__(code, detail)
         self.code = code
         self.detail = detail
+
+    def __str__(self) -> str:
+        return self.detail
 
 
 @dataclass(frozen=True, slots=True)

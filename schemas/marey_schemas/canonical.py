@@ -21,7 +21,7 @@ def array_digest(array: NDArray[Any] | EncodedArray) -> str:
     plain = little_endian(array.decode() if isinstance(array, EncodedArray) else array)
     spec = ArraySpec.of(plain)
     head = f"{spec.dtype} [{','.join(map(str, spec.shape))}]\n"
-    return _name(head.encode(), plain.tobytes())
+    return _name(head.encode(), plain.reshape(-1).view(np.uint8).data)
 
 
 def canonical_json(tree: Any) -> bytes:
@@ -80,7 +80,7 @@ def _canonical(value: Any) -> Any:
     return value
 
 
-def _name(*parts: bytes) -> str:
+def _name(*parts: bytes | memoryview) -> str:
     digest = hashlib.sha256()
     for part in parts:
         digest.update(part)

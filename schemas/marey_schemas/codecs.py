@@ -38,10 +38,13 @@ class CodecError(ValueError):
     """A document cannot be written or read; `pointer` (RFC 6901) says where, `code` is a stable slug."""
 
     def __init__(self, code: str, pointer: str, detail: str) -> None:
-        super().__init__(f"{pointer or 'document'}: {detail}")
+        super().__init__(code, pointer, detail)
         self.code = code
         self.pointer = pointer
         self.detail = detail
+
+    def __str__(self) -> str:
+        return f"{self.pointer or 'document'}: {self.detail}"
 
 
 def encode_tree(tree: Any, media_type: str, *, arrays: ArrayForm = "plain") -> bytes:
@@ -63,9 +66,16 @@ def encode_tree(tree: Any, media_type: str, *, arrays: ArrayForm = "plain") -> b
     if media_type == MSGPACK:
         packed: bytes = msgpack.packb(plain)
         return packed
+    return _write_bson(plain)
+
+
+def _write_bson(plain: Any) -> bytes:
     if not isinstance(plain, dict):
         raise CodecError("bad-type", "", "a BSON document must be an object; use JSON or MessagePack for lists")
-    return bson.encode(plain)
+    try:
+        return bson.encode(plain)
+    except (bson.errors.BSONError, OverflowError) as error:
+        raise CodecError("too-large", "", f"a BSON document is smaller than 2 GiB: {error}") from error
 
 
 def decode_tree(data: bytes, media_type: str, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DEPTH) -> Any:
@@ -81,7 +91,7 @@ def decode_tree(data: bytes, media_type: str, *, max_bytes: int = MAX_BYTES, max
         return walk.visit(_PARSERS[media_type](data))
     except CodecError:
         raise
-    except RecursionError as error:
+    except (RecursionError, msgpack.StackError) as error:
         raise CodecError("too-deep", "", f"nested deeper than {max_depth} levels") from error
     except (ValueError, bson.errors.BSONError, msgpack.UnpackException) as error:
         raise CodecError("bad-syntax", walk.pointer, f"not valid {media_type}: {error}") from error
@@ -114,7 +124,8 @@ def _parse_json(data: bytes) -> Any:
 
 
 def _parse_msgpack(data: bytes) -> Any:
-    return msgpack.unpackb(data, raw=False, strict_map_key=True, object_pairs_hook=_unique, max_array_len=MAX_LIST)
+    # The parser allocates what a header claims before it reads on, so claims are limited.
+    return msgpack.unpackb(data, object_pairs_hook=_unique, max_array_len=MAX_LIST, max_map_len=MAX_LIST)
 
 
 _PARSERS: dict[str, Callable[[bytes], Any]] = {JSON: _parse_json, MSGPACK: _parse_msgpack, BSON: RawBSONDocument}
@@ -130,6 +141,10 @@ def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
 
 def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not JSON")
+
+
+# Values of one format only, though Python takes them for a str or a tuple.
+_FOREIGN = (bson.Code, msgpack.ExtType)
 
 
 class _Walk:
@@ -157,6 +172,8 @@ class _Walk:
 
     def visit(self, value: Any) -> Any:
         """The checked and converted value. Raises `CodecError`."""
+        if isinstance(value, _FOREIGN):
+            raise self._error("bad-type", f"a value of type {type(value).__name__} cannot travel")
         if isinstance(value, str):
             return self._text(value)
         if value is None or isinstance(value, bool):
@@ -167,7 +184,7 @@ class _Walk:
             return self._float(value)
         if isinstance(value, Mapping):
             return self._object(value)
-        if isinstance(value, list | tuple) and not isinstance(value, msgpack.ExtType):
+        if isinstance(value, list | tuple):
             return self._list(value)
         if isinstance(value, np.ndarray | EncodedArray) and self._on_array is not None:
             return self._array(self._on_array, value)
@@ -183,7 +200,7 @@ class _Walk:
                 raise self._error("reserved-keys", "dtype, shape and data together are an array; pass an ndarray")
             return self._array(self._take_leaf, value)
         members = {}
-        for key, member in value.items():
+        for key, member in zip(keys, value.values(), strict=True):
             self._path.append(key)
             members[key] = self.visit(member)
             self._path.pop()
@@ -223,7 +240,7 @@ class _Walk:
             text.encode()
         except UnicodeEncodeError as error:
             raise self._error("bad-text", "a string contains half of a surrogate pair") from error
-        return text
+        return str.__str__(text)
 
     def _integer(self, number: int) -> int:
         if not -(1 << 63) <= number < 1 << 63:
