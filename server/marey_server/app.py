@@ -1,0 +1,137 @@
+"""The application: what it is made of, how it starts, and how it stops."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from tornado.httpserver import HTTPServer
+from tornado.netutil import bind_sockets
+from tornado.routing import AnyMatches, Rule
+from tornado.web import Application as TornadoApplication
+from tornado.web import RequestHandler
+
+from marey_server.handlers.catalogue import RESOURCES
+from marey_server.handlers.resource import Resource
+from marey_server.handlers.routes import RouteTable
+from marey_server.observe import access_log, configure_logging
+from marey_server.services import Services
+from marey_server.settings import Settings
+from marey_server.store.database import Database
+
+log = logging.getLogger(__name__)
+
+READ_CHUNK_BYTES = 256 * 1024
+READ_BUFFER_BYTES = 1024 * 1024
+
+
+class Application(TornadoApplication):
+    """Every route, and what their handlers share."""
+
+    def __init__(self, services: Services) -> None:
+        self.services = services
+        self.routes = RouteTable(self, RESOURCES)
+        super().__init__([Rule(AnyMatches(), self.routes)], log_function=self.record_request)
+
+    def record_request(self, handler: RequestHandler) -> None:
+        """Log and count a request whose answer is on its way."""
+        if not isinstance(handler, Resource):
+            return
+        duration_s = handler.request.request_time()
+        route = handler.template()
+        status = handler.get_status()
+        method = handler.request.method or ""
+        self.services.metrics.count_request(method, route, status, duration_s, handler.received_bytes)
+        level = logging.INFO if status < 500 else logging.ERROR
+        if access_log.isEnabledFor(level):
+            access_log.log(level, "%s %s %d", method, route, status, extra=_fields(handler, route, status, duration_s))
+
+
+def _fields(handler: Resource, route: str, status: int, duration_s: float) -> dict[str, Any]:
+    return {
+        "request_id": handler.request_id,
+        "principal": handler.principal_name,
+        "method": handler.request.method,
+        "route": route,
+        "status": status,
+        "duration_ms": round(duration_s * 1000, 2),
+        "bytes_in": handler.received_bytes,
+        "remote": handler.request.remote_ip,
+    }
+
+
+def create_app(settings: Settings, database: Database) -> Application:
+    """An application over a database whose schema is current."""
+    return Application(Services(settings, database))
+
+
+@dataclass(frozen=True)
+class Running:
+    """A server that takes requests."""
+
+    app: Application
+    address: str
+    server: HTTPServer
+
+
+@asynccontextmanager
+async def listening(app: Application) -> AsyncIterator[Running]:
+    """Take requests until the block ends; then drain: refuse new ones, finish those under way, close."""
+    settings = app.services.settings
+    sockets = bind_sockets(settings.port, settings.host)
+    server = HTTPServer(
+        app,
+        xheaders=settings.trust_proxy,
+        idle_connection_timeout=settings.header_timeout_s,
+        body_timeout=settings.body_timeout_s,
+        max_header_size=settings.max_header_bytes,
+        max_body_size=2**62,
+        chunk_size=READ_CHUNK_BYTES,
+        max_buffer_size=READ_BUFFER_BYTES,
+    )
+    server.add_sockets(sockets)
+    host, port = sockets[0].getsockname()[:2]
+    shown = f"[{host}]" if ":" in host else host
+    try:
+        yield Running(app, f"http://{shown}:{port}", server)
+    finally:
+        await _drain(app.services, server)
+
+
+async def _drain(services: Services, server: HTTPServer) -> None:
+    services.draining.set()
+    services.metrics.draining.set(1)
+    server.stop()
+    deadline = time.monotonic() + services.settings.drain_s
+    while services.in_flight and time.monotonic() < deadline:
+        await asyncio.sleep(0.02)
+    if services.in_flight:
+        log.warning("%d requests were cut off", len(services.in_flight))
+    await server.close_all_connections()
+    services.close()
+
+
+def prepare_database(settings: Settings) -> Database:
+    """The database of a server: its folder made, its schema current, its administrator there."""
+    settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
+    return Database(settings.resolved_database_url, readers=settings.database_threads)
+
+
+async def serve(settings: Settings) -> None:
+    """Run a server until SIGTERM or SIGINT."""
+    configure_logging(settings.log_form, settings.log_level)
+    database = prepare_database(settings)
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    async with listening(create_app(settings, database)) as running:
+        log.info("listening on %s", running.address)
+        await stop.wait()
+        log.info("stopping")

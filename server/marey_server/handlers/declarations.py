@@ -1,0 +1,174 @@
+"""What handler methods say about themselves.
+
+`@reads` and `@writes` attach an `Operation` to a method. Everything else follows from it: checks before the method
+runs, the OpenAPI document, the documentation page, and the table that the access test walks through.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Literal, TypeVar
+
+from pydantic import BaseModel
+
+from marey_schemas.base import Answer, Request
+
+KIB = 1024
+MIB = 1024 * KIB
+
+Method = TypeVar("Method", bound=Callable[..., Awaitable[Any]])
+
+
+class Access(StrEnum):
+    """Who may do it at least. Roles are roles in the project of the path, including every higher role."""
+
+    ANYONE = "anyone"
+    SIGNED_IN = "signed_in"
+    USER = "user"
+    ADMINISTRATOR = "administrator"
+    READER = "reader"
+    CONTRIBUTOR = "contributor"
+    MAINTAINER = "maintainer"
+    OWNER = "owner"
+    WORKER = "worker"
+    ATTEMPT = "attempt"
+
+    @property
+    def is_role(self) -> bool:
+        """Whether it is a role in a project."""
+        return self in (Access.READER, Access.CONTRIBUTOR, Access.MAINTAINER, Access.OWNER)
+
+
+class Document:
+    """Marks a body or an answer that is a document: a tree with arrays, of the schema it names."""
+
+
+class Bytes:
+    """Marks a body or an answer that is bytes as they are."""
+
+
+class Files:
+    """Marks a body that is `multipart/form-data` with files and form fields."""
+
+
+Content = type[BaseModel] | type[Document] | type[Bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """A body that a method takes: a model, a document, bytes or files.
+
+    `streamed` bodies are given to the resource piece by piece, as they come.
+    """
+
+    content: Content | type[Files]
+    max_bytes: int = MIB
+    alternative: type[Request] | None = None
+    streamed: bool = False
+    required: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """One method of one resource, as declared."""
+
+    method: str
+    summary: str
+    description: str
+    access: Access
+    scope: str | None
+    query: type[Request] | None
+    body: Body | None
+    answer: Content | None
+    status: int
+    paged: bool
+    etag: bool
+    precondition: Literal["none", "required", "create", "optional"]
+    idempotency: Literal["key", "nature"]
+    answer_types: tuple[str, ...]
+    also: tuple[tuple[int, type[Answer] | None], ...]
+    public: bool
+
+    @property
+    def may_create(self) -> bool:
+        """Whether `If-None-Match: *` is a precondition of it."""
+        return self.precondition in ("create", "optional")
+
+
+def reads(
+    *,
+    access: Access,
+    query: type[Request] | None = None,
+    answer: Content | None = None,
+    paged: bool = False,
+    etag: bool = False,
+    scope: str | None = "read",
+    status: int = 200,
+    answer_types: tuple[str, ...] = (),
+    also: tuple[tuple[int, type[Answer] | None], ...] = (),
+    public: bool = True,
+) -> Callable[[Method], Method]:
+    """Declare a method that changes nothing.
+
+    `answer` is what one answer holds, or with `paged` one element of a page; `answer_types` are the media types where
+    they are not those of models and documents. `public=False`: guests of a public project may not.
+    """
+    return _declare(
+        access=access, scope=scope, query=query, answer=answer, paged=paged, etag=etag, status=status,
+        answer_types=answer_types, also=also, public=public,
+    )  # fmt: skip
+
+
+def writes(
+    *,
+    access: Access,
+    body: Content | Body | None = None,
+    answer: Content | None = None,
+    status: int | None = None,
+    query: type[Request] | None = None,
+    precondition: Literal["none", "required", "create", "optional"] = "none",
+    idempotency: Literal["key", "nature"] = "nature",
+    etag: bool = False,
+    scope: str | None = "write",
+    also: tuple[tuple[int, type[Answer] | None], ...] = (),
+) -> Callable[[Method], Method]:
+    """Declare a method that changes something.
+
+    `precondition`: `required` demands If-Match; `create` demands If-Match or `If-None-Match: *`; `optional` takes
+    either or none. `idempotency="key"`: honours Idempotency-Key; `nature`: doing it twice does it once anyway.
+    """
+    return _declare(
+        access=access, scope=scope, query=query, body=body if body is None or isinstance(body, Body) else Body(body),
+        answer=answer, status=status or (200 if answer else 204), precondition=precondition, idempotency=idempotency,
+        etag=etag, also=also,
+    )  # fmt: skip
+
+
+def _declare(
+    *,
+    access: Access,
+    scope: str | None,
+    query: type[Request] | None,
+    answer: Content | None,
+    status: int,
+    etag: bool,
+    also: tuple[tuple[int, type[Answer] | None], ...],
+    body: Body | None = None,
+    paged: bool = False,
+    precondition: Literal["none", "required", "create", "optional"] = "none",
+    idempotency: Literal["key", "nature"] = "nature",
+    answer_types: tuple[str, ...] = (),
+    public: bool = True,
+) -> Callable[[Method], Method]:
+    def attach(method: Method) -> Method:
+        summary, _, description = (inspect.getdoc(method) or "").partition("\n")
+        method.operation = Operation(  # type: ignore[attr-defined]
+            method.__name__.upper(), summary.rstrip("."), description.strip(), access, scope, query, body, answer,
+            status, paged, etag, precondition, idempotency, answer_types, also, public,
+        )  # fmt: skip
+        return method
+
+    return attach

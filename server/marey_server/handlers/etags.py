@@ -1,0 +1,89 @@
+"""Entity tags and preconditions (RFC 9110, section 13).
+
+A tag is `"<rev>.<form>"`: the state of a thing and the form it was sent in. A precondition of a write compares states
+only, so that what was read as MessagePack can be changed with JSON.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from marey_server.errors import BadRequest, PreconditionFailed, PreconditionRequired
+
+_TAG = re.compile(r'\s*(W/)?"([\x21\x23-\x7e\x80-\xff]*)"\s*')
+
+
+@dataclass(frozen=True, slots=True)
+class Precondition:
+    """What a writer believes about the thing: its state, any state (`*`), or that there is none."""
+
+    revs: tuple[int, ...] | None = None
+    absent: bool = False
+
+    @property
+    def expected_rev(self) -> int | None:
+        """The state to require in the UPDATE; None for any."""
+        return None if self.revs is None else self.revs[0]
+
+
+ANY_STATE = Precondition()
+"""`If-Match: *`."""
+
+ABSENT = Precondition(absent=True)
+"""`If-None-Match: *`: only create."""
+
+
+def entity_tag(state: int | str, form: str) -> str:
+    """The ETag header of a state in a form."""
+    return f'"{state}.{form}"'
+
+
+def parse_tags(header: str) -> list[str]:
+    """The opaque values of a list of tags, weak or strong; `["*"]` for the star. Raises `BadRequest`."""
+    if header.strip() == "*":
+        return ["*"]
+    tags = []
+    position = 0
+    while position < len(header):
+        match = _TAG.match(header, position)
+        if match is None:
+            raise BadRequest(f'Entity tags stand in quotation marks, as in "7.json"; this does not: {header[:200]}')
+        tags.append(match[2])
+        position = match.end()
+        if position < len(header) and header[position] != ",":
+            raise BadRequest(f"Entity tags are separated by commas: {header[:200]}")
+        position += 1
+    return tags
+
+
+def matches(if_none_match: str | None, tag: str) -> bool:
+    """Whether the caller holds `tag` already, so that 304 is the answer."""
+    if not if_none_match:
+        return False
+    held = parse_tags(if_none_match)
+    return held == ["*"] or tag.strip('"') in held
+
+
+def write_precondition(if_match: str | None, if_none_match: str | None, *, may_create: bool = False) -> Precondition:
+    """The precondition of a change.
+
+    Raises `PreconditionRequired` where the caller sent none, `PreconditionFailed` where none of the tags can ever
+    match, `BadRequest` where they are malformed.
+    """
+    if if_none_match is not None and may_create:
+        if if_none_match.strip() != "*":
+            raise BadRequest("If-None-Match of a change can only be *: create, never replace.")
+        return ABSENT
+    if if_match is None:
+        hint = "If-Match with the ETag you read, or *" + (", or If-None-Match: * to create" if may_create else "")
+        raise PreconditionRequired(f"Say which state you are changing: {hint}.")
+    tags = parse_tags(if_match)
+    if tags == ["*"]:
+        return ANY_STATE
+    revs = tuple(sorted({int(rev) for tag in tags if (rev := tag.partition(".")[0]).isdigit() and len(rev) < 10}))
+    if not revs:
+        raise PreconditionFailed(f"{if_match[:200]} is no state of this; read it again.")
+    if len(revs) > 1:
+        raise BadRequest("Send one state in If-Match: the ETag you read.")
+    return Precondition(revs)

@@ -1,0 +1,61 @@
+"""Is the process alive, can it serve, and how is it doing: for orchestrators and Prometheus. Outside the API's root."""
+
+from __future__ import annotations
+
+from marey_schemas.base import Answer
+from marey_server.errors import Unavailable
+from marey_server.handlers.declarations import Access, Bytes, reads
+from marey_server.handlers.reply import Reply
+from marey_server.handlers.resource import Resource
+from marey_server.store import readiness
+
+
+class Health(Answer):
+    """The state of the server."""
+
+    status: str
+
+
+class Healthz(Resource):
+    """Whether the process answers at all."""
+
+    path = "/healthz"
+    root = ""
+    tag = "Operations"
+
+    @reads(access=Access.ANYONE, scope=None, answer=Health)
+    async def get(self) -> Reply:
+        """Is the process alive."""
+        return Reply(Health(status="ok"), headers={"Cache-Control": "no-store"})
+
+
+class Readyz(Resource):
+    """Whether requests should be sent here."""
+
+    path = "/readyz"
+    root = ""
+    tag = "Operations"
+
+    @reads(access=Access.ANYONE, scope=None, answer=Health, also=((503, None),))
+    async def get(self) -> Reply:
+        """Can the server serve: database reachable, its schema current, blobs writable, not draining."""
+        if self.services.draining.is_set():
+            raise Unavailable("The server is stopping.", code="draining", headers={"Retry-After": "5"})
+        faults = await self.look_up(readiness.find_faults)
+        if faults:
+            raise Unavailable("; ".join(faults), code="not-ready", headers={"Retry-After": "5"})
+        return Reply(Health(status="ready"), headers={"Cache-Control": "no-store"})
+
+
+class MetricsPage(Resource):
+    """What Prometheus scrapes."""
+
+    path = "/metrics"
+    root = ""
+    tag = "Operations"
+
+    @reads(access=Access.ANYONE, scope=None, answer=Bytes, answer_types=("text/plain",))
+    async def get(self) -> Reply:
+        """Figures in the text format of Prometheus."""
+        text, media_type = self.services.metrics.exposition()
+        return Reply(text, media_type=media_type, headers={"Cache-Control": "no-store"})

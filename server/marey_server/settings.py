@@ -1,0 +1,65 @@
+"""Settings of a server: flags, then `MAREY_*` variables, then `marey.toml`, then the defaults here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
+
+MIB = 1024 * 1024
+
+
+class Settings(BaseSettings):
+    """Every setting, documented. The variable of `data` is MAREY_DATA, and so on."""
+
+    model_config = SettingsConfigDict(env_prefix="MAREY_", toml_file="marey.toml", extra="forbid", frozen=True)
+
+    data: Path = Field(
+        Path("marey-data"), description="Folder of the database file, the administrator's token, and blobs."
+    )
+    host: str = Field("127.0.0.1", description="Address to listen on; 0.0.0.0 for every network.")
+    port: int = Field(8460, ge=0, le=65535, description="Port to listen on; 0 for any free one.")
+    database_url: str | None = Field(
+        None, description="SQLAlchemy URL; absent: the file marey.db in the data folder. postgresql://... for Postgres."
+    )
+    database_threads: int = Field(8, ge=2, le=128, description="Reading transactions that run at the same time.")
+    blobs: Literal["database", "directory"] = Field(
+        "database", description="Where bytes are kept: in the database, or in the folder blobs of the data folder."
+    )
+    trust_proxy: bool = Field(
+        False, description="Believe X-Forwarded-For and X-Forwarded-Proto. Only behind a proxy that sets them."
+    )
+    log_form: Literal["json", "text"] = Field("json", description="One JSON object per line, or lines for people.")
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    drain_s: float = Field(25.0, ge=0, le=600, description="Seconds that running requests get to finish on SIGTERM.")
+    header_timeout_s: float = Field(
+        75.0, gt=0, description="An idle connection, or one that sends its headers slowly, is closed."
+    )
+    body_timeout_s: float = Field(60.0, gt=0, description="Seconds a whole ordinary request body may take.")
+    upload_timeout_s: float = Field(6 * 3600.0, gt=0, description="Seconds a streamed body may take.")
+    max_header_bytes: int = Field(32 * 1024, ge=4096, description="Longest head of a request.")
+    login_tries_per_minute: int = Field(
+        10, ge=1, description="Sign-in attempts per user name, and ten times that per address."
+    )
+    import_files_now: int = Field(64, ge=0, description="Imports of more files become a job.")
+    import_bytes_now: int = Field(64 * MIB, ge=0, description="Imports of more bytes become a job.")
+    local_workers: int = Field(0, ge=0, le=256, description="Worker processes to start beside the server.")
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003 - no .env files
+        file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003 - no secret folders
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Flags win over variables, variables over the file."""
+        return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
+
+    @property
+    def resolved_database_url(self) -> str:
+        """The database that is used."""
+        return self.database_url or f"sqlite:///{(self.data / 'marey.db').absolute()}"
