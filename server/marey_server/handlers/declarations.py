@@ -7,10 +7,11 @@ runs, the OpenAPI document, the documentation page, and the table that the acces
 from __future__ import annotations
 
 import inspect
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Literal, TypeVar
+from functools import wraps
+from typing import Any, Literal
 
 from pydantic import BaseModel
 
@@ -19,7 +20,9 @@ from marey_schemas.base import Answer, Request
 KIB = 1024
 MIB = 1024 * KIB
 
-Method = TypeVar("Method", bound=Callable[..., Awaitable[Any]])
+Method = Callable[..., Awaitable[Any]]
+Declared = Callable[..., Coroutine[Any, Any, None]]
+"""What Tornado calls: it performs the method as its declaration says."""
 
 
 class Access(StrEnum):
@@ -110,7 +113,7 @@ def reads(
     answer_types: tuple[str, ...] = (),
     also: tuple[tuple[int, type[Answer] | None], ...] = (),
     public: bool = True,
-) -> Callable[[Method], Method]:
+) -> Callable[[Method], Declared]:
     """Declare a method that changes nothing.
 
     `answer` is what one answer holds, or with `paged` one element of a page; `answer_types` are the media types where
@@ -134,7 +137,7 @@ def writes(
     etag: bool = False,
     scope: str | None = "write",
     also: tuple[tuple[int, type[Answer] | None], ...] = (),
-) -> Callable[[Method], Method]:
+) -> Callable[[Method], Declared]:
     """Declare a method that changes something.
 
     `precondition`: `required` demands If-Match; `create` demands If-Match or `If-None-Match: *`; `optional` takes
@@ -162,13 +165,17 @@ def _declare(
     idempotency: Literal["key", "nature"] = "nature",
     answer_types: tuple[str, ...] = (),
     public: bool = True,
-) -> Callable[[Method], Method]:
-    def attach(method: Method) -> Method:
+) -> Callable[[Method], Declared]:
+    def attach(method: Method) -> Declared:
+        @wraps(method)
+        async def perform(self: Any, **_path: str) -> None:
+            await self.perform(method)
+
         summary, _, description = (inspect.getdoc(method) or "").partition("\n")
-        method.operation = Operation(  # type: ignore[attr-defined]
+        perform.operation = Operation(  # type: ignore[attr-defined]
             method.__name__.upper(), summary.rstrip("."), description.strip(), access, scope, query, body, answer,
             status, paged, etag, precondition, idempotency, answer_types, also, public,
         )  # fmt: skip
-        return method
+        return perform
 
     return attach

@@ -32,7 +32,7 @@ from marey_server.access.principal import ANONYMOUS
 from marey_server.errors import BadRequest, MareyError, MethodNotAllowed, TooLarge, Unauthenticated
 from marey_server.handlers import negotiation, problem
 from marey_server.handlers.calls import CHALLENGE, Call, Caller, run_call, run_plain
-from marey_server.handlers.declarations import Bytes, Document, Operation
+from marey_server.handlers.declarations import Bytes, Declared, Document, Operation
 from marey_server.handlers.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.handlers.reply import API, Form, Rendered, Reply, render
 from marey_server.handlers.validation import decode_body, parse_query, validate_body
@@ -77,10 +77,8 @@ class Resource(RequestHandler):
     def __init_subclass__(cls) -> None:
         methods = {name: getattr(cls, name) for name in _METHODS if hasattr(vars(cls).get(name), "operation")}
         cls.operations = {name.upper(): method.operation for name, method in methods.items()}
-        for name, method in methods.items():
-            setattr(cls, name, _performing(method))
         if "get" in methods:
-            cls.head = cls.get  # type: ignore[method-assign,assignment]
+            cls.head = cls.get
 
     @classmethod
     def template(cls) -> str:
@@ -112,12 +110,12 @@ class Resource(RequestHandler):
     async def look_up(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         """What `function(tx, ...)` returns, on behalf of the caller, in a read-only transaction."""
         future = self.services.database.submit_read(ANONYMOUS, run_plain, self.caller, function, *args, **kwargs)
-        return await asyncio.wrap_future(future)  # type: ignore[no-any-return]
+        return await asyncio.wrap_future(future)
 
     async def change(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         """What `function(tx, ...)` returns, on behalf of the caller, committed."""
         future = self.services.database.submit_write(ANONYMOUS, run_plain, self.caller, function, *args, **kwargs)
-        return await asyncio.wrap_future(future)  # type: ignore[no-any-return]
+        return await asyncio.wrap_future(future)
 
     async def answer(
         self,
@@ -319,7 +317,13 @@ class Resource(RequestHandler):
     async def _undeclared(self, **_path: str) -> None:
         """Methods without a declaration are refused before they are called."""
 
-    get = head = post = put = patch = delete = options = _undeclared  # type: ignore[assignment]
+    get: Declared = _undeclared
+    head: Declared = _undeclared
+    post: Declared = _undeclared
+    put: Declared = _undeclared
+    patch: Declared = _undeclared
+    delete: Declared = _undeclared
+    options: Declared = _undeclared
 
     # -- what Tornado asks for ----------------------------------------------------------------------------------------
 
@@ -372,10 +376,3 @@ def _decode(data: bytes, media_type: str, content: Any) -> Any:
 
 def _nothing(tx: Transaction) -> None:
     """Only look the credential up."""
-
-
-def _performing(method: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[None]]:
-    async def run(self: Resource, **_path: str) -> None:
-        await self.perform(method)
-
-    return run
