@@ -128,7 +128,14 @@ def _parse_msgpack(data: bytes) -> Any:
     return msgpack.unpackb(data, object_pairs_hook=_unique, max_array_len=MAX_LIST, max_map_len=MAX_LIST)
 
 
-_PARSERS: dict[str, Callable[[bytes], Any]] = {JSON: _parse_json, MSGPACK: _parse_msgpack, BSON: RawBSONDocument}
+def _parse_bson(data: bytes) -> Any:
+    # Read lazily, object by object: an eager read would turn {"$ref", "$id"} into a database reference.
+    if int.from_bytes(data[:4], "little", signed=True) != len(data):
+        raise ValueError(f"its size is not the {len(data)} bytes that were given")
+    return RawBSONDocument(data)
+
+
+_PARSERS: dict[str, Callable[[bytes], Any]] = {JSON: _parse_json, MSGPACK: _parse_msgpack, BSON: _parse_bson}
 
 
 def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
