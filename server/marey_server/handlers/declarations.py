@@ -94,6 +94,7 @@ class Operation:
     answer_types: tuple[str, ...]
     also: tuple[tuple[int, type[Answer] | None], ...]
     public: bool
+    headers: tuple[str, ...]
 
     @property
     def may_create(self) -> bool:
@@ -113,6 +114,7 @@ def reads(
     answer_types: tuple[str, ...] = (),
     also: tuple[tuple[int, type[Answer] | None], ...] = (),
     public: bool = True,
+    headers: tuple[str, ...] = (),
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes nothing.
 
@@ -121,7 +123,7 @@ def reads(
     """
     return _declare(
         access=access, scope=scope, query=query, answer=answer, paged=paged, etag=etag, status=status,
-        answer_types=answer_types, also=also, public=public,
+        answer_types=answer_types, also=also, public=public, headers=headers,
     )  # fmt: skip
 
 
@@ -137,6 +139,7 @@ def writes(
     etag: bool = False,
     scope: str | None = "write",
     also: tuple[tuple[int, type[Answer] | None], ...] = (),
+    headers: tuple[str, ...] = (),
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes something.
 
@@ -146,7 +149,7 @@ def writes(
     return _declare(
         access=access, scope=scope, query=query, body=body if body is None or isinstance(body, Body) else Body(body),
         answer=answer, status=status or (200 if answer else 204), precondition=precondition, idempotency=idempotency,
-        etag=etag, also=also,
+        etag=etag, also=also, headers=headers,
     )  # fmt: skip
 
 
@@ -165,6 +168,7 @@ def _declare(
     idempotency: Literal["key", "nature"] = "nature",
     answer_types: tuple[str, ...] = (),
     public: bool = True,
+    headers: tuple[str, ...] = (),
 ) -> Callable[[Method], Declared]:
     def attach(method: Method) -> Declared:
         @wraps(method)
@@ -174,7 +178,7 @@ def _declare(
         summary, _, description = (inspect.getdoc(method) or "").partition("\n")
         perform.operation = Operation(  # type: ignore[attr-defined]
             method.__name__.upper(), summary.rstrip("."), description.strip(), access, scope, query, body, answer,
-            status, paged, etag, precondition, idempotency, answer_types, also, public,
+            status, paged, etag, precondition, idempotency, answer_types, also, public, headers,
         )  # fmt: skip
         return perform
 
