@@ -1,0 +1,186 @@
+"""Finding the body in a skeleton whose names say nothing: two legs, two arms, a head.
+
+Only lengths and branching are used where possible, because the rest pose of many files is no pose of a body at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations, pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.rigs.names import parse_name
+from marey_motion.rigs.standard import SIDES
+from marey_motion.skeleton import Skeleton
+
+# Two limbs belong together when their bones differ by less than this share of their length.
+ASYMMETRY_LIMIT = 0.15
+# Limbs whose two long bones are shorter than this share of the longest pair's are fingers, ears or armour.
+SHORTEST_ARM = 0.3
+
+
+@dataclass(frozen=True)
+class Limb:
+    """The chain from a branching joint to the farthest tip."""
+
+    chain: tuple[int, ...]
+    bones: tuple[float, ...]  # length from each joint of the chain to the next; the last to its end site, or 0
+
+    @cached_property
+    def upper(self) -> int:
+        """Position in the chain of the joint that carries the two long bones."""
+        pairs = [a + b for a, b in pairwise(self.bones)]
+        return int(np.argmax(pairs)) if pairs else 0
+
+    @property
+    def long_bones(self) -> float:
+        """Length of the thigh and shank, or of the upper arm and forearm."""
+        return sum(self.bones[self.upper : self.upper + 2])
+
+    def joint(self, position: int) -> int | None:
+        """The joint so many places after the one that carries the long bones."""
+        at = self.upper + position
+        return self.chain[at] if 0 <= at < len(self.chain) else None
+
+
+@dataclass(frozen=True)
+class LimbPair:
+    """Two limbs of equal build on one joint."""
+
+    parent: int
+    limbs: tuple[Limb, Limb]
+    asymmetry: float
+
+
+@dataclass(frozen=True)
+class GeometryMatch:
+    """Standard joints found by geometry (by index), how sure that is, and what was assumed."""
+
+    joints: dict[str, int]
+    confidence: float
+    notes: tuple[str, ...]
+
+
+def find_body(skeleton: Skeleton) -> GeometryMatch | None:
+    """Legs, arms and head by symmetry, branching and lengths; None when there are no two pairs of limbs."""
+    tree = _Tree(skeleton)
+    pairs = sorted(tree.limb_pairs(), key=lambda pair: -pair.limbs[0].long_bones)
+    if not pairs:
+        return None
+    legs = pairs[0]
+    arms = next((pair for pair in pairs[1:] if tree.are_apart(legs, pair)), None)
+    if arms is None or arms.limbs[0].long_bones < SHORTEST_ARM * legs.limbs[0].long_bones:
+        return None
+    joints = {"pelvis": tree.common_ancestor(legs.parent, arms.parent)}
+    neck, head = tree.neck_and_head(arms, legs)
+    if head is not None:
+        joints |= {"head": head} | ({"neck": neck} if neck is not None else {})
+    left = _left_direction(skeleton, legs, joints)
+    notes = ["the names are not known: joints were found by symmetry, branching and bone lengths"]
+    for pair, names in ((legs, ("hip", "knee", "ankle", "toe")), (arms, ("shoulder", "elbow", "wrist"))):
+        limbs, by_name = _left_and_right(skeleton, pair, left)
+        if not by_name:
+            notes.append(f"left and right of {names[0]} to {names[-1]} were told apart by the rest pose alone")
+        for side, limb in zip(SIDES, limbs, strict=True):
+            named = {f"{side}_{joint}": limb.joint(place) for place, joint in enumerate(names)}
+            if pair is arms:
+                named[f"{side}_clavicle"] = limb.joint(-1)
+            joints |= {name: index for name, index in named.items() if index is not None}
+    confidence = (0.7 if head is not None else 0.5) * (1.0 - max(legs.asymmetry, arms.asymmetry))
+    return GeometryMatch(joints, confidence, tuple(notes))
+
+
+def _left_direction(skeleton: Skeleton, legs: LimbPair, joints: dict[str, int]) -> NDArray[np.float64]:
+    """Up crossed with where the toes point, in the rest pose; +x where that pose is too degenerate to tell."""
+    positions = skeleton.rest_global_positions
+    up = positions[joints.get("head", joints["pelvis"])] - positions[joints["pelvis"]]
+    toes = [(limb.joint(2), limb.joint(3)) for limb in legs.limbs]
+    forward = sum(
+        (positions[toe] - positions[ankle] for ankle, toe in toes if ankle is not None and toe is not None),
+        start=np.zeros(3),
+    )
+    left: NDArray[np.float64] = np.cross(up, forward)
+    scale = float(np.linalg.norm(up) * np.linalg.norm(forward))
+    return left if np.linalg.norm(left) > 0.2 * scale > 0.0 else np.array((1.0, 0.0, 0.0))
+
+
+def _left_and_right(skeleton: Skeleton, pair: LimbPair, left: NDArray[np.float64]) -> tuple[tuple[Limb, Limb], bool]:
+    """The limbs of a pair, left one first, and whether their names say so."""
+    first, second = pair.limbs
+    sides = [{parse_name(skeleton.display_names[joint]).side for joint in limb.chain} - {""} for limb in pair.limbs]
+    if sides in ([{"left"}, {"right"}], [{"right"}, {"left"}]):
+        return ((first, second) if sides[0] == {"left"} else (second, first)), True
+    positions = skeleton.rest_global_positions
+    across = positions[first.chain[first.upper]] - positions[second.chain[second.upper]]
+    return ((first, second) if across @ left >= 0.0 else (second, first)), False
+
+
+class _Tree:
+    """A skeleton's branching and lengths."""
+
+    def __init__(self, skeleton: Skeleton) -> None:
+        self.skeleton = skeleton
+        self.lengths = np.linalg.norm(skeleton.offsets, axis=1)
+        self.tips = np.zeros(skeleton.joint_count)
+        for site in skeleton.end_sites:
+            self.tips[site.joint] = max(self.tips[site.joint], float(np.linalg.norm(site.offset)))
+        self.reach = self.tips.copy()
+        for joint in range(skeleton.joint_count - 1, 0, -1):
+            parent = skeleton.parents[joint]
+            self.reach[parent] = max(self.reach[parent], self.lengths[joint] + self.reach[joint])
+
+    def limb(self, start: int) -> Limb:
+        """The farthest-reaching chain from a joint."""
+        chain = [start]
+        while children := self.skeleton.children[chain[-1]]:
+            chain.append(max(children, key=lambda joint: self.lengths[joint] + self.reach[joint]))
+        bones = [float(self.lengths[joint]) for joint in chain[1:]] + [float(self.tips[chain[-1]])]
+        return Limb(tuple(chain), tuple(bones))
+
+    def limb_pairs(self) -> list[LimbPair]:
+        """All pairs of sibling chains of equal build, two long bones each."""
+        pairs = []
+        for parent, children in enumerate(self.skeleton.children):
+            limbs = [limb for limb in map(self.limb, children) if len(limb.chain) >= 3]
+            for first, second in combinations(limbs, 2):
+                asymmetry = _asymmetry(first, second)
+                if asymmetry <= ASYMMETRY_LIMIT:
+                    pairs.append(LimbPair(parent, (first, second), asymmetry))
+        return pairs
+
+    def are_apart(self, legs: LimbPair, arms: LimbPair) -> bool:
+        """Whether two pairs sit on different joints, neither on the limbs of the other."""
+        above_legs, above_arms = (self.skeleton.path_to_root(pair.parent) for pair in (legs, arms))
+        nested = any(limb.chain[0] in above_arms for limb in legs.limbs) or any(
+            limb.chain[0] in above_legs for limb in arms.limbs
+        )
+        return legs.parent != arms.parent and not nested
+
+    def common_ancestor(self, a: int, b: int) -> int:
+        """The lowest joint that both descend from, or are."""
+        above = set(self.skeleton.path_to_root(a))
+        return next(joint for joint in self.skeleton.path_to_root(b) if joint in above)
+
+    def neck_and_head(self, arms: LimbPair, legs: LimbPair) -> tuple[int | None, int | None]:
+        """The chain that goes on where the arms branch off, up to its last joint with anything beyond it."""
+        paired = {limb.chain[0] for pair in self.limb_pairs() if pair.parent == arms.parent for limb in pair.limbs}
+        towards_legs = self.skeleton.path_to_root(legs.parent)
+        starts = [joint for joint in self.skeleton.children[arms.parent] if joint not in paired | set(towards_legs)]
+        if not starts:
+            return None, None
+        chain = [max(starts, key=lambda joint: self.lengths[joint] + self.reach[joint])]
+        while len(children := self.skeleton.children[chain[-1]]) == 1 and self.reach[children[0]] > 0.0:
+            chain.append(children[0])
+        return (chain[0], chain[-1]) if len(chain) > 1 else (None, chain[0])
+
+
+def _asymmetry(first: Limb, second: Limb) -> float:
+    """Difference of two chains' bones as a share of their length; infinite where they differ in build."""
+    if len(first.bones) != len(second.bones):
+        return float("inf")
+    a, b = np.array(first.bones), np.array(second.bones)
+    total = float(np.sum(a + b)) / 2
+    return float(np.sum(np.abs(a - b))) / total if total > 0.0 else float("inf")

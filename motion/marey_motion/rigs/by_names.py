@@ -1,0 +1,111 @@
+"""Recognising a rig by the names of its joints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+from marey_motion.rigs.known import KNOWN_RIGS, KnownRig
+from marey_motion.rigs.names import JointName, parse_name
+from marey_motion.rigs.standard import CHAINS, ESSENTIAL_JOINTS
+from marey_motion.skeleton import Skeleton
+
+
+@dataclass(frozen=True)
+class NameMatch:
+    """How well a known rig's names fit a skeleton, and which joints (by index) they name."""
+
+    rig: str
+    joints: dict[str, int]
+    signature_share: float
+
+    @property
+    def essential_count(self) -> int:
+        """How many of the joints that no body can do without were found."""
+        return sum(joint in self.joints for joint in ESSENTIAL_JOINTS)
+
+    @property
+    def essential_share(self) -> float:
+        """The same as a share."""
+        return self.essential_count / len(ESSENTIAL_JOINTS)
+
+    @property
+    def rank(self) -> tuple[float, float, int]:
+        """Better matches have greater ranks."""
+        return self.essential_share, self.signature_share, len(self.joints)
+
+
+def best_match(skeleton: Skeleton) -> NameMatch | None:
+    """The known rig whose names fit best; of equals, the one listed first. None when no rig's pelvis is found."""
+    joints: dict[JointName, int] = {}
+    # Of "UpLeg_L" and its helper "__UpLeg_L", the plainer name is the joint.
+    for index in sorted(range(skeleton.joint_count), key=lambda joint: len(skeleton.display_names[joint])):
+        joints.setdefault(parse_name(skeleton.display_names[index]), index)
+    matches = [match for rig in KNOWN_RIGS for match in _matches(rig, joints, skeleton)]
+    return max(matches, key=lambda match: match.rank, default=None)
+
+
+def _matches(rig: KnownRig, joints: dict[JointName, int], skeleton: Skeleton) -> Iterator[NameMatch]:
+    names = _parsed_names(rig)
+    for prefix in _prefixes(dict(names)["pelvis"], joints):
+        signature = _signature_share(rig, prefix, joints, skeleton)
+        if rig.signature and signature <= 0.5:
+            continue
+        found = {
+            standard: index
+            for standard, alternatives in names
+            if (index := _first(alternatives, prefix, joints)) is not None
+        }
+        _drop_misplaced(found, skeleton)
+        yield NameMatch(rig.name, found, signature)
+
+
+@cache
+def _parsed_names(rig: KnownRig) -> tuple[tuple[str, tuple[JointName, ...]], ...]:
+    return tuple((standard, tuple(map(parse_name, alternatives))) for standard, alternatives in rig.names())
+
+
+def _prefixes(pelvis: tuple[JointName, ...], joints: dict[JointName, int]) -> list[str]:
+    """What all bases of a file may begin with, read off the joints whose name ends like the rig's pelvis."""
+    prefixes = {
+        joint.base[: len(joint.base) - len(name.base)]
+        for name in pelvis
+        for joint in joints
+        if joint.side == name.side and joint.base.endswith(name.base)
+    }
+    return sorted(prefixes, key=lambda prefix: (len(prefix), prefix))
+
+
+def _first(alternatives: tuple[JointName, ...], prefix: str, joints: dict[JointName, int]) -> int | None:
+    for name in alternatives:
+        index = joints.get(JointName(name.side, prefix + name.base))
+        if index is not None:
+            return index
+    return None
+
+
+def _signature_share(rig: KnownRig, prefix: str, joints: dict[JointName, int], skeleton: Skeleton) -> float:
+    """Share of the signature that is there; 0 for rigs without one."""
+    there = 0
+    for mark in rig.signature:
+        if mark.endswith("*"):
+            begun = sum(name.lower().startswith(mark[:-1]) for name in skeleton.display_names)
+            there += 2 * begun > skeleton.joint_count
+        else:
+            there += _first((parse_name(mark),), prefix, joints) is not None
+    return there / max(1, len(rig.signature))
+
+
+def _drop_misplaced(found: dict[str, int], skeleton: Skeleton) -> None:
+    """Remove joints that do not descend from the joint they should hang on."""
+    for chain in CHAINS:
+        above: int | None = None
+        for standard in chain:
+            index = found.get(standard)
+            if index is None:
+                continue
+            if above is not None and (index == above or above not in skeleton.path_to_root(index)):
+                del found[standard]
+            else:
+                above = index

@@ -1,0 +1,149 @@
+"""Giving a skeleton's joints their standard names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MappingError
+from marey_motion.rigs import by_geometry, by_names
+from marey_motion.rigs.names import parse_name
+from marey_motion.rigs.standard import ESSENTIAL_JOINTS, SIDES, mirrored
+from marey_motion.skeleton import Skeleton
+
+Method = Literal["names", "geometry", "manual"]
+
+# Names that cover less of the body than this are tried against geometry.
+TRUSTED_SHARE = 0.75
+# What a mapping of something that seems to have four legs is worth.
+ANIMAL_CONFIDENCE = 0.2
+_ANIMAL_WORDS = ("tail", "paw", "hoof", "hock", "fetlock", "snout", "muzzle")
+
+
+@dataclass(frozen=True)
+class JointMapping:
+    """Which joint of a skeleton plays which standard joint.
+
+    Parameters
+    ----------
+    rig : the known rig whose names were recognised, if any
+    joints : standard name to joint name; one joint may play several, as hips that are root and pelvis
+    confidence : 0 to 1; below 0.5 a person should look before it is used
+    method : how it came about
+    notes : what was assumed or is missing, in sentences for people
+    """
+
+    rig: str | None
+    joints: Mapping[str, str]
+    confidence: float
+    method: Method
+    notes: tuple[str, ...] = ()
+
+    def indices(self, skeleton: Skeleton, standard_names: Iterable[str]) -> tuple[int, ...]:
+        """Indices of these standard joints; `MappingError` that names the ones this mapping lacks."""
+        names = tuple(standard_names)
+        missing = [name for name in names if name not in self.joints]
+        if missing:
+            raise MappingError(f"the mapping names no joint for {', '.join(missing)}; add them to it", where=missing[0])
+        return tuple(skeleton.index_of(self.joints[name]) for name in names)
+
+
+def map_joints(skeleton: Skeleton) -> JointMapping:
+    """Standard joints of a skeleton: by the names of a known rig or, where those say too little, by its build.
+
+    Never fails: what cannot be found is left out and said in the notes, and the confidence tells how much to trust it.
+    """
+    match = by_names.best_match(skeleton)
+    body = by_geometry.find_body(skeleton) if match is None or match.essential_share < TRUSTED_SHARE else None
+    if body is not None and (match is None or len(body.joints.keys() & set(ESSENTIAL_JOINTS)) > match.essential_count):
+        rig, joints, confidence, notes = None, dict(body.joints), body.confidence, list(body.notes)
+        method: Method = "geometry"
+    elif match is not None:
+        rig, joints, confidence, notes = match.rig, dict(match.joints), match.essential_share, []
+        method = "names"
+        if match.essential_share < TRUSTED_SHARE:
+            rig = None
+    else:
+        note = "no known names and no two pairs of limbs: this does not look like a body"
+        return JointMapping(None, {"root": skeleton.joint_names[0]}, 0.0, "geometry", (note,))
+    joints["root"] = 0
+    joints |= _spine(skeleton, joints)
+    missing = [joint for joint in ESSENTIAL_JOINTS if joint not in joints]
+    if missing:
+        notes.append(f"not found: {', '.join(missing)}")
+    signs = _animal_signs(skeleton, joints)
+    if signs:
+        confidence = min(confidence, ANIMAL_CONFIDENCE)
+        notes.append(f"{signs}; hind and front legs were taken for legs and arms, check before use")
+    named = {standard: skeleton.joint_names[index] for standard, index in joints.items()}
+    return JointMapping(rig, named, round(confidence, 3), method, tuple(notes))
+
+
+def symmetric_joints(skeleton: Skeleton, mapping: JointMapping) -> NDArray[np.int32]:
+    """(J,) index of each joint's partner on the other side; its own for joints of the centre.
+
+    From the mapping where it knows both sides, else from names that differ in their side alone.
+    """
+    partners = np.arange(skeleton.joint_count, dtype=np.int32)
+    by_name = {parse_name(name): index for index, name in enumerate(skeleton.joint_names)}
+    for (side, base), index in by_name.items():
+        if side:
+            other = by_name.get(parse_name(f"{mirrored(f'{side}_')}{base}"))
+            partners[index] = index if other is None else other
+    for standard, name in mapping.joints.items():
+        other_name = mapping.joints.get(mirrored(standard))
+        if other_name is not None:
+            partners[skeleton.index_of(name)] = skeleton.index_of(other_name)
+    return partners
+
+
+def _spine(skeleton: Skeleton, joints: Mapping[str, int]) -> dict[str, int]:
+    """The joints between pelvis and arms: the lowest, the middle and the one that carries the arms.
+
+    Rigs have one to six of them under all kinds of names; a single one is the chest, because the arms hang on it.
+    """
+    tops = [joints.get(f"{side}_clavicle", joints.get(f"{side}_shoulder")) for side in SIDES]
+    if None in tops or "pelvis" not in joints:
+        return {}
+    left, right = (skeleton.path_to_root(int(top))[1:] for top in tops if top is not None)
+    shared = [joint for joint in left if joint in right]
+    if joints["pelvis"] not in shared:
+        return {}
+    upwards = shared[: shared.index(joints["pelvis"])][::-1]
+    if joints.get("neck") in upwards:
+        upwards = upwards[: upwards.index(joints["neck"])]
+    if not upwards:
+        return {}
+    spine = {"spine_2": upwards[-1]}
+    if len(upwards) > 1:
+        spine = {"spine": upwards[0]} | spine
+    if len(upwards) > 2:
+        spine["spine_1"] = upwards[(len(upwards) - 1) // 2]
+    return spine
+
+
+def _animal_signs(skeleton: Skeleton, joints: Mapping[str, int]) -> str:
+    """What speaks for four legs, in words; nothing for a human."""
+    for index, name in enumerate(skeleton.display_names):
+        # Hair in a pony tail grows on heads.
+        is_hair = joints.get("head") in skeleton.path_to_root(index)
+        if not is_hair and any(word in parse_name(name).base for word in _ANIMAL_WORDS):
+            return f"a joint such as {name} belongs to an animal"
+    if not set(ESSENTIAL_JOINTS) | {"spine_2"} <= joints.keys():
+        return ""
+    positions = skeleton.rest_global_positions
+
+    def direction(start: str, end: str) -> NDArray[np.float64]:
+        way = positions[joints[end]] - positions[joints[start]]
+        length = float(np.linalg.norm(way))
+        return way / length if length > 0.0 else way
+
+    spine = direction("pelvis", "spine_2")
+    hind = [direction(f"{side}_hip", f"{side}_ankle") for side in SIDES]
+    front = [direction(f"{side}_shoulder", f"{side}_wrist") for side in SIDES]
+    stands_on_all = all(leg @ hind[0] > 0.8 for leg in hind + front) and abs(spine @ hind[0]) < 0.5
+    return "the rest pose stands on arms and legs" if stands_on_all else ""

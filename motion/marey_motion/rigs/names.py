@@ -1,0 +1,41 @@
+"""Reading joint names: namespaces, words, and the side of the body they speak of."""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+_WORDS = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
+_SIDE_WORDS = {"l": "left", "left": "left", "r": "right", "right": "right"}
+
+
+class JointName(NamedTuple):
+    """A name reduced to what it says: the side, "" for the centre, and the rest in lower case without separators."""
+
+    side: str
+    base: str
+
+
+def parse_name(name: str) -> JointName:
+    """Side and base of a joint name, whatever its style.
+
+    "mixamorig:LeftUpLeg", "L_UpLeg", "upLeg.l" and "UpLeg_L" have one side and differ at most by a prefix of the base.
+    A namespace, up to the last ":" or "|", is dropped.
+
+    >>> parse_name("mixamorig:LeftUpLeg")
+    JointName(side='left', base='upleg')
+    >>> parse_name("CC_Base_R_Thigh")
+    JointName(side='right', base='ccbasethigh')
+    >>> parse_name("L5")
+    JointName(side='', base='l5')
+    """
+    words = [word.lower() for word in _WORDS.findall(re.split(r"[:|]", name)[-1])]
+    for at, word in enumerate(words):
+        rest = words[:at] + words[at + 1 :]
+        if word in _SIDE_WORDS and any(part.isalpha() for part in rest):
+            return JointName(_SIDE_WORDS[word], "".join(rest))
+    if words:
+        for side in ("left", "right"):
+            if words[0].startswith(side) and len(words[0]) > len(side):
+                return JointName(side, "".join(words)[len(side) :])
+    return JointName("", "".join(words))

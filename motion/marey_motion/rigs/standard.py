@@ -1,0 +1,51 @@
+"""The standard joints: one name for the same anatomical joint of every rig.
+
+A joint is named for the articulation at its origin: `left_hip` is where the left thigh turns, `left_shoulder` where the
+upper arm does (rigs often call that joint "arm" and the clavicle "shoulder").
+"""
+
+from __future__ import annotations
+
+SIDES = ("left", "right")
+FINGERS = ("index", "middle", "ring", "pinky")
+
+CENTRE_JOINTS = ("root", "pelvis", "spine", "spine_1", "spine_2", "neck", "head")
+SIDE_JOINTS = (
+    "clavicle",
+    "shoulder",
+    "elbow",
+    "wrist",
+    "finger",
+    "hip",
+    "knee",
+    "ankle",
+    "toe",
+    "heel",
+    "hold_point",
+    *(f"thumb_{part}" for part in ("base", "mid", "tip", "end")),
+    *(f"{finger}_finger_{part}" for finger in FINGERS for part in ("root", "base", "mid", "tip", "end")),
+)
+STANDARD_JOINTS = (*CENTRE_JOINTS, *(f"{side}_{joint}" for side in SIDES for joint in SIDE_JOINTS))
+
+# Without these a body cannot be read or retargeted as a human's.
+ESSENTIAL_JOINTS = (
+    "pelvis",
+    "head",
+    *(f"{side}_{joint}" for side in SIDES for joint in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")),
+)
+
+# Chains along which each standard joint must be a descendant of the one before it.
+CHAINS = (
+    ("pelvis", "spine", "spine_1", "spine_2"),
+    ("pelvis", "neck", "head"),
+    *(tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "toe")) for side in SIDES),
+    *(tuple(f"{side}_{joint}" for joint in ("clavicle", "shoulder", "elbow", "wrist")) for side in SIDES),
+)
+
+
+def mirrored(name: str) -> str:
+    """The standard joint on the other side of the body; joints of the centre are their own."""
+    for side, other in (SIDES, SIDES[::-1]):
+        if name.startswith(f"{side}_"):
+            return other + name[len(side) :]
+    return name
