@@ -2,7 +2,7 @@
 
     from marey_client import Marey
 
-    lab = Marey("http://127.0.0.1:8700").project("lab")
+    lab = Marey("http://127.0.0.1:8460").project("lab")
     for clip in lab.clips.list(collection="raw"):
         motion = clip.motion(frames=slice(0, 120), joints=["Hips", "LeftFoot"])
         motion.rotations  # (120, 2, 4) float32

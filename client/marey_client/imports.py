@@ -17,7 +17,7 @@ from marey_schemas.jobs import Job
 
 MOTION_SUFFIXES = frozenset({".bvh", ".asf", ".amc", ".c3d", ".npz", ".json"})
 COMPANION_SUFFIX = ".asf"
-FILES_PER_IMPORT = 100
+FILES_PER_IMPORT = 50
 BYTES_PER_IMPORT = 64 << 20
 UPLOADS_AT_ONCE = 8
 

@@ -16,7 +16,7 @@ from marey_client.paging import pages
 from marey_client.project import ProjectHandle
 from marey_client.retries import Retries
 from marey_client.transport import Transport
-from marey_schemas.access import Me, Project, ProjectCreate
+from marey_schemas.access import Login, Me, NewToken, Project, ProjectCreate
 
 
 class Marey:
@@ -56,6 +56,10 @@ class Marey:
     def close(self) -> None:
         """Close every connection."""
         self.transport.close()
+
+    def sign_in(self, login: Login) -> NewToken:
+        """A token for a name and a password."""
+        return self.transport.post(NewToken, "/login", login)
 
     def me(self) -> Me:
         """Whom the token belongs to, and what it allows."""

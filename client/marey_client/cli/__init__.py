@@ -1,0 +1,35 @@
+"""The `marey` command. Modules here import nothing heavy before a command runs."""
+
+from __future__ import annotations
+
+import sys
+
+GLOBAL_SWITCHES = ("-v", "--verbose")
+GLOBAL_OPTIONS = ("--server", "--token-file")
+
+
+def main() -> None:
+    """Run the command line and exit: 0 success, 1 refused or failed, 2 wrong usage."""
+    from marey_client.cli.app import app
+    from marey_client.cli.failures import reported
+
+    arguments = with_global_options_first(sys.argv[1:])
+    with reported(verbose=any(switch in arguments for switch in GLOBAL_SWITCHES)):
+        app(args=arguments, prog_name="marey")
+
+
+def with_global_options_first(arguments: list[str]) -> list[str]:
+    """Options of `marey` itself may stand anywhere, as in `marey ls lab --server URL`; typer wants them in front."""
+    first: list[str] = []
+    rest: list[str] = []
+    left = iter(arguments)
+    for argument in left:
+        if argument == "--":
+            rest += [argument, *left]
+        elif argument in GLOBAL_SWITCHES or argument.startswith(tuple(f"{name}=" for name in GLOBAL_OPTIONS)):
+            first.append(argument)
+        elif argument in GLOBAL_OPTIONS:
+            first += [argument, *([value] if (value := next(left, None)) is not None else [])]
+        else:
+            rest.append(argument)
+    return first + rest

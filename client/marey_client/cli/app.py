@@ -1,0 +1,43 @@
+"""The commands, gathered. Each group stands in a module of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from marey_client.cli import accounts, files, jobs, processes, projects, skeletons
+from marey_client.cli.invocation import Invocation
+
+app = typer.Typer(
+    name="marey",
+    help="Motion data and model management.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.callback()
+def marey(
+    context: typer.Context,
+    server: Annotated[
+        str | None, typer.Option(envvar="MAREY_URL", help="Address of the server; default: where you logged in last.")
+    ] = None,
+    token_file: Annotated[Path | None, typer.Option(help="File that holds a token and nothing else.")] = None,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell details, also of errors.")] = False,
+    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
+) -> None:
+    """Motion capture goes in; it is versioned, checked, retargeted, and comes out right."""
+    if version:
+        from importlib.metadata import version as installed
+
+        typer.echo(f"marey {installed('marey')}")
+        raise typer.Exit
+    context.obj = Invocation(server, token_file, verbose)
+
+
+for register in (processes, accounts, projects, files, skeletons, jobs):
+    register.add_to(app)

@@ -1,0 +1,60 @@
+"""How the command line fails: one line, with the request id; the whole story with `-v`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+FAILED, WRONG_USAGE = 1, 2
+
+
+class Refused(Exception):
+    """Something was refused that has been told already; only the exit status is left to say it."""
+
+
+class WrongUsage(Exception):
+    """The command makes no sense; the text says why."""
+
+
+@contextmanager
+def reported(*, verbose: bool) -> Iterator[None]:
+    """Turn errors that users can understand into a line and an exit status. Others keep their traceback."""
+    try:
+        yield
+    except Refused:
+        sys.exit(FAILED)
+    except WrongUsage as error:
+        _exit(WRONG_USAGE, str(error), verbose)
+    except Exception as error:
+        from pydantic import ValidationError
+
+        from marey_client.errors import MareyError
+
+        if isinstance(error, ValidationError):
+            first = error.errors(include_url=False)[0]
+            where = ".".join(str(step) for step in first["loc"])
+            _exit(WRONG_USAGE, f"{where}: {first['msg']}" if where else first["msg"], verbose)
+        if isinstance(error, MareyError | OSError):
+            _exit(FAILED, sentence(error), verbose)
+        raise
+
+
+def sentence(error: BaseException) -> str:
+    """An error in one line, with what is needed to ask for help."""
+    from marey_client.errors import RequestFailed
+
+    text = " ".join(str(error).split()) or type(error).__name__
+    if not isinstance(error, RequestFailed):
+        return text
+    fields = "".join(f"; {field.pointer}: {field.detail}" for field in error.errors)
+    return f"{text}{fields} ({error.code}, request {error.request_id})"
+
+
+def _exit(status: int, text: str, verbose: bool) -> None:
+    if verbose:
+        import traceback
+
+        traceback.print_exc()
+    print(f"marey: {text}", file=sys.stderr)  # noqa: T201 - the error line itself
+    sys.exit(status)

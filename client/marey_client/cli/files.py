@@ -1,0 +1,259 @@
+"""`upload`, `ls`, `show` and `download`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from marey_client.cli.addresses import Address, find_item, require_item
+from marey_client.cli.failures import Refused, WrongUsage
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.output import print_json, print_pairs, print_table, progress, tell
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from marey_client.items import ItemHandle
+    from marey_client.marey import Marey
+    from marey_schemas.imports import ImportEntry
+    from marey_schemas.kinds import Kind
+
+DOWNLOADS_AT_ONCE = 4
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    for command in (upload, ls, show, download):
+        app.command()(command)
+
+
+def upload(
+    context: typer.Context,
+    places: Annotated[list[Path], typer.Argument(help="Motion files, or folders of them.")],
+    project: Annotated[str, typer.Option(help="The project they go to.")],
+    collection: Annotated[str, typer.Option(help="The folder in the project.")] = "",
+    unit: Annotated[str | None, typer.Option(help="m, dm, cm, mm, inch, ft or cmu; default: found out.")] = None,
+    unit_scale_m: Annotated[float | None, typer.Option(help="Metres per unit, where no named unit fits.")] = None,
+    up_axis: Annotated[str | None, typer.Option(help="x, y or z; default: found out.")] = None,
+    frame_rate_hz: Annotated[
+        float | None, typer.Option("--fps", help="Frames per second; default: the file's.")
+    ] = None,
+    skeleton: Annotated[str | None, typer.Option(help="Id of the skeleton the clips must use.")] = None,
+    trim_rest_pose: Annotated[bool, typer.Option("--trim-rest-pose", help="Drop rest poses at the ends.")] = False,
+    tag: Annotated[list[str] | None, typer.Option(help="Tag of every clip; may be repeated.")] = None,
+    subject: Annotated[str | None, typer.Option(help="Who moves.")] = None,
+    licence: Annotated[str | None, typer.Option(help="What the data may be used for.")] = None,
+    capture_system: Annotated[str | None, typer.Option(help="What recorded it.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Import motion files. Each goes in or is refused with a reason; the same file again makes nothing new."""
+    from marey_client.imports import find_files
+    from marey_schemas.imports import ImportOptions
+
+    given = {
+        "collection": collection, "unit": unit, "unit_scale_m": unit_scale_m, "up_axis": up_axis,
+        "frame_rate_hz": frame_rate_hz, "skeleton": skeleton, "trim_rest_pose": trim_rest_pose or None,
+        "tags": tuple(tag) if tag else None, "subject": subject, "licence": licence, "capture_system": capture_system,
+    }  # fmt: skip
+    options = ImportOptions.model_validate({key: value for key, value in given.items() if value is not None})
+    found = find_files(places)
+    if found.left_out:
+        tell(f"left out {len(found.left_out)} files that are no motion, such as {found.left_out[0].name}")
+    with connect(context) as marey, progress() as advance:
+        entries = marey.project(project).imports.upload(found.files, options, notice=advance)
+    if as_json:
+        print_json(entries)
+    else:
+        _print_entries(entries)
+    if any(entry.status == "failed" for entry in entries):
+        raise Refused
+
+
+def _print_entries(entries: Sequence[ImportEntry]) -> None:
+    for entry in entries:
+        if entry.error is not None:
+            line = f", line {entry.error.line}" if entry.error.line else ""
+            joint = f", joint {entry.error.joint}" if entry.error.joint else ""
+            tell(f"{entry.name}{line}{joint}: {entry.error.detail} ({entry.error.code})")
+        for warning in entry.warnings:
+            tell(f"{entry.name}: warning: {warning.message} ({warning.code})")
+    counts = Counter(entry.status for entry in entries)
+    frames = sum(entry.frames or 0 for entry in entries)
+    told = ", ".join(
+        f"{counts[status]} {status}" for status in ("created", "unchanged", "companion", "failed") if counts[status]
+    )
+    typer.echo(f"{len(entries)} files: {told}; {frames} frames")
+
+
+def ls(
+    context: typer.Context,
+    place: Annotated[str | None, typer.Argument(help="project, or project/folder; left out: the projects.")] = None,
+    recursive: Annotated[bool, typer.Option("--recursive", "-r", help="Folders below, too.")] = False,
+    kind: Annotated[list[str] | None, typer.Option(help="Only items of this kind; may be repeated.")] = None,
+    tag: Annotated[str | None, typer.Option(help="Only items with one of these tags, separated by commas.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show what a folder holds."""
+    if place is None:
+        from marey_client.cli.projects import list_projects
+
+        return list_projects(context, as_json)
+    address = Address.parse(place)
+    with connect(context) as marey:
+        folders = [] if recursive else _folders_in(marey, address)
+        items = _items_in(marey, address, recursive=recursive, kinds=kind, tag=tag)
+    if as_json:
+        return print_json({"collections": folders, "items": [one.item for one in items]})
+    rows: list[tuple[object, ...]] = [(f"{name}/", "collection", "", "", "", "") for name in folders]
+    for one in items:
+        summary = one.item.summary
+        rows.append(
+            (
+                one.path if recursive else one.name,
+                one.item.kind,
+                one.item.revision,
+                summary.get("frames"),
+                summary.get("frame_rate_hz"),
+                " ".join(one.item.tags),
+            )
+        )
+    return print_table(("name", "kind", "revision", "frames", "Hz", "tags"), rows, right=("revision", "frames", "Hz"))
+
+
+def _folders_in(marey: Marey, address: Address) -> list[str]:
+    """Names of the folders directly in the folder an address names."""
+    prefix = f"{address.path}/" if address.path else ""
+    paths = (one.path for one in marey.project(address.project).collections.list())
+    return sorted({path[len(prefix) :].partition("/")[0] for path in paths if path.startswith(prefix) and path != ""})
+
+
+def _items_in(
+    marey: Marey, address: Address, *, recursive: bool, kinds: Sequence[str] | None, tag: str | None
+) -> list[ItemHandle]:
+    from marey_schemas.kinds import Kind
+
+    wanted = [_kind_named(name) for name in kinds] if kinds else list(Kind)
+    where = {"path": address.path or None} if recursive else {"collection": address.path}
+    project = marey.project(address.project)
+
+    def of_kind(kind: Kind) -> list[ItemHandle]:
+        return list(project.items(kind).list(sort="name", filters={**where, "tag.in": tag}))
+
+    with ThreadPoolExecutor(4) as pool:
+        return [item for items in pool.map(of_kind, wanted) for item in items]
+
+
+def _kind_named(name: str) -> Kind:
+    from marey_schemas.kinds import Kind
+
+    try:
+        return Kind(name)
+    except ValueError:
+        raise WrongUsage(f"{name!r} is no kind; there are {', '.join(Kind)}") from None
+
+
+def show(
+    context: typer.Context,
+    place: Annotated[str, typer.Argument(help="project/folder/name, or project/id.")],
+    part: Annotated[str | None, typer.Option(help="Print the document of this part instead, as JSON.")] = None,
+    history: Annotated[bool, typer.Option("--history", help="Every revision, and what it was made from.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Show an item: its parts, its place, what was found when it was imported."""
+    from marey_schemas.kinds import Kind
+
+    with connect(context) as marey:
+        item = require_item(marey, Address.parse(place), list(Kind))
+        if part is not None:
+            from marey_schemas.codecs import encode_tree
+
+            return typer.echo(encode_tree(item.part(part), "application/json"))
+        if history:
+            return _show_history(item, as_json)
+    if as_json:
+        return print_json(item.item)
+    shown = item.item.model_dump(mode="json", exclude={"parts", "summary", "rev"})
+    print_pairs(shown.items())
+    print_pairs(item.item.summary.items())
+    return print_pairs(
+        (f"part {name}", f"{one.size_bytes} bytes, {one.schema_}, {one.document}")
+        for name, one in item.item.parts.items()
+    )
+
+
+def _show_history(item: ItemHandle, as_json: bool) -> None:
+    revisions, lineage = list(item.revisions()), item.lineage()
+    if as_json:
+        return print_json({"revisions": revisions, "lineage": lineage})
+    rows = [(one.revision, one.created_at, one.author, one.job, one.message) for one in revisions]
+    print_table(("revision", "made", "author", "job", "message"), rows)
+    for edge in lineage.inputs:
+        typer.echo(f"made from {edge.kind} {edge.name} ({edge.item} revision {edge.revision}) as {edge.role}")
+    for edge in lineage.outputs:
+        typer.echo(f"used for  {edge.kind} {edge.name} ({edge.item} revision {edge.revision}) as {edge.role}")
+    return None
+
+
+def download(
+    context: typer.Context,
+    place: Annotated[str, typer.Argument(help="A clip, or a folder of them: project/folder[/name].")],
+    format: Annotated[str, typer.Option(help="original, bvh, npz, predecessor or json.")] = "original",  # noqa: A002
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write to.")] = Path(),
+    unit: Annotated[str | None, typer.Option(help="Unit of a BVH file: cm or m.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write clips to files. A folder comes with the folders below it."""
+    from marey_schemas.kinds import Kind
+
+    address = Address.parse(place)
+    with connect(context) as marey:
+        single = find_item(marey, address, [Kind.CLIP, Kind.SKELETON])
+        if single is not None:
+            clips, base = [single], single.item.collection
+        else:
+            clips, base = list(marey.project(address.project).clips.list(path=address.path or None)), address.path
+        if not clips:
+            raise WrongUsage(f"there is no clip at {address}; marey ls {address.project} shows what there is")
+        written, refused = _download_all(clips, base, output, format, unit)
+    if as_json:
+        print_json({"files": [str(path) for path in written], "refused": refused})
+    else:
+        typer.echo(f"wrote {len(written)} files to {output}")
+        for name, reason in refused.items():
+            tell(f"{name}: {reason}")
+    if refused:
+        raise Refused
+
+
+def _download_all(
+    clips: Sequence[ItemHandle], base: str, output: Path, file_format: str, unit: str | None
+) -> tuple[list[Path], dict[str, str]]:
+    from marey_client.cli.failures import sentence
+    from marey_client.downloads import safe_file_name
+    from marey_client.errors import RequestFailed
+
+    written: list[Path] = []
+    refused: dict[str, str] = {}
+
+    def one(clip: ItemHandle) -> Path | str:
+        below = clip.item.collection.removeprefix(base).strip("/")
+        try:
+            folder = output.joinpath(*(safe_file_name(name) for name in below.split("/") if name))
+            return clip.export(folder, format=file_format, unit=unit)
+        except RequestFailed as error:
+            if error.status >= 500 or error.status == 401:
+                raise
+            return sentence(error)
+
+    with ThreadPoolExecutor(DOWNLOADS_AT_ONCE) as pool, progress() as advance:
+        for clip, outcome in zip(clips, pool.map(one, clips), strict=True):
+            if isinstance(outcome, Path):
+                written.append(outcome)
+            else:
+                refused[clip.path] = outcome
+            advance("downloading", len(written) + len(refused), len(clips))
+    return written, refused

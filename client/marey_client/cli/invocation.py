@@ -1,0 +1,37 @@
+"""What the options before the command say, and the session they open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from marey_client.marey import Marey
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
+
+
+@dataclass(frozen=True)
+class Invocation:
+    """The options of `marey` itself."""
+
+    server: str | None
+    token_file: Path | None
+    verbose: bool
+
+
+def connect(context: typer.Context, *, anonymous: bool = False) -> Marey:
+    """A session with the server that the options, the environment or `marey login` name."""
+    from marey_client.credentials import resolve
+    from marey_client.marey import Marey
+
+    given: Invocation = context.find_object(Invocation) or Invocation(None, None, False)
+    if given.verbose:
+        import logging
+
+        logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    found = resolve(given.server, given.token_file)
+    return Marey(found.url, None if anonymous else found.token)

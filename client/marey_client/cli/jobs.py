@@ -1,0 +1,207 @@
+"""`retarget`, `job` and `why`."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marey_client.cli.addresses import Address, find_item, require_item
+from marey_client.cli.failures import Refused, WrongUsage
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.output import Advance, print_json, print_pairs, print_table, progress, tell
+
+if TYPE_CHECKING:
+    from marey_client.marey import Marey
+    from marey_schemas.jobs import CollectionInput, ItemInput, Job
+
+job = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Jobs.")
+
+FOLLOW_EVERY_S = 0.5
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    app.command()(retarget)
+    app.add_typer(job, name="job")
+    app.command()(why)
+
+
+def retarget(
+    context: typer.Context,
+    sources: Annotated[list[str], typer.Argument(help="Clips or folders of clips: project/folder[/name].")],
+    to: Annotated[str, typer.Option(help="The skeleton: project/folder/name, or project/id.")],
+    into: Annotated[str, typer.Option(help="The folder in the project that the results go to.")],
+    scale: Annotated[float | None, typer.Option(help="Root scale; default: ratio of the hip heights.")] = None,
+    suffix: Annotated[str, typer.Option(help="Appended to the names of the results.")] = "",
+    tag: Annotated[list[str] | None, typer.Option(help="Tag of the results; may be repeated.")] = None,
+    priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
+    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Move clips to another skeleton, as a job."""
+    from marey_schemas.jobs import ItemInput, JobCreate, RetargetParams
+    from marey_schemas.kinds import Kind
+
+    addresses = [Address.parse(source) for source in sources]
+    target_address = Address.parse(to)
+    if len({address.project for address in [*addresses, target_address]}) > 1:
+        raise WrongUsage("the clips and the skeleton must be in one project")
+    params = RetargetParams(scale=scale, suffix=suffix, tags=tuple(tag or ()))
+    with connect(context) as marey:
+        clips = tuple(_clips_at(marey, address) for address in addresses)
+        target = require_item(marey, target_address, [Kind.SKELETON])
+        wanted = JobCreate(
+            kind="retarget",
+            inputs={"clips": clips, "skeleton": ItemInput(item=target.id)},
+            params=params.model_dump(exclude_defaults=True),
+            into=into.strip("/"),
+            priority=priority,
+        )
+        submitted = marey.project(target_address.project).submit(wanted)
+        if not wait:
+            return print_json(submitted) if as_json else typer.echo(submitted.id)
+        ended = _follow(marey, submitted)
+    return _print_ended(ended, as_json)
+
+
+def _clips_at(marey: Marey, address: Address) -> ItemInput | CollectionInput:
+    from marey_schemas.jobs import CollectionInput, ItemInput
+    from marey_schemas.kinds import Kind
+
+    clip = find_item(marey, address, [Kind.CLIP])
+    return CollectionInput(collection=address.path) if clip is None else ItemInput(item=clip.id)
+
+
+def _follow(marey: Marey, submitted: Job) -> Job:
+    with progress() as advance:
+        return marey.jobs.wait(submitted.id, on_progress=lambda now: _show_progress(now, advance))
+
+
+def _show_progress(now: Job, advance: Advance) -> None:
+    if now.size:
+        advance(f"{now.kind} {now.state}", now.children.get("succeeded", 0), now.size)
+    elif now.progress is not None:
+        advance(now.progress.note or f"{now.kind} {now.state}", now.progress.done, now.progress.total)
+    else:
+        advance(f"{now.kind} {now.state}", 0, None)
+
+
+def _print_ended(ended: Job, as_json: bool) -> None:
+    result = ended.result or {}
+    refused: list[dict[str, Any]] = list(result.get("refused", ()))
+    if as_json:
+        print_json(ended)
+    else:
+        for one in refused:
+            tell(f"{one.get('name')}: {one.get('detail')} ({one.get('code')})")
+        told = ", ".join(f"{value} {name}" for name, value in result.items() if isinstance(value, int))
+        typer.echo(f"{ended.id} {ended.state}" + (f": {told}" if told else "") + f"; {len(refused)} refused")
+    if refused:
+        raise Refused
+
+
+# -- jobs --
+
+
+@job.command("ls")
+def list_jobs(
+    context: typer.Context,
+    project: str,
+    state: Annotated[str | None, typer.Option(help="waiting, queued, running, succeeded, failed or cancelled.")] = None,
+    limit: Annotated[int, typer.Option(min=1, help="How many, newest first.")] = 50,
+    as_json: AsJson = False,
+) -> None:
+    """Show the jobs of a project, newest first."""
+    from itertools import islice
+
+    with connect(context) as marey:
+        jobs = list(islice(marey.project(project).jobs(filters={"state": state}), limit))
+    if as_json:
+        return print_json(jobs)
+    rows = [(one.id, one.kind, one.state, _done(one), one.author, one.created_at) for one in jobs]
+    return print_table(("id", "kind", "state", "done", "author", "submitted"), rows)
+
+
+@job.command("show")
+def show_job(context: typer.Context, job_id: str, as_json: AsJson = False) -> None:
+    """Show how a job stands, and every try at it."""
+    with connect(context) as marey:
+        found = marey.jobs.get(job_id)
+        attempts = list(marey.jobs.attempts(job_id))
+    if as_json:
+        return print_json({**found.model_dump(mode="json"), "attempts": attempts})
+    print_pairs(found.model_dump(mode="json", exclude={"rev", "inputs"}, exclude_none=True).items())
+    rows = [(one.fence, one.worker, one.started_at, one.ended_at, one.outcome, one.detail) for one in attempts]
+    return print_table(("fence", "worker", "started", "ended", "outcome", "detail"), rows)
+
+
+@job.command("log")
+def show_log(
+    context: typer.Context,
+    job_id: str,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until the job has ended.")] = False,
+) -> None:
+    """Print what a job wrote."""
+    with connect(context) as marey:
+        offset = 0
+        while True:
+            ended = marey.jobs.get(job_id).state.terminal
+            text = marey.jobs.log(job_id, offset=offset)
+            typer.echo(text, nl=False)
+            offset += len(text.encode())
+            if ended or not follow:
+                return
+            time.sleep(FOLLOW_EVERY_S)
+
+
+@job.command("cancel")
+def cancel_job(context: typer.Context, job_id: str, as_json: AsJson = False) -> None:
+    """Ask a job to stop; a queued one is cancelled at once."""
+    with connect(context) as marey:
+        found = marey.jobs.cancel(job_id)
+    if as_json:
+        return print_json(found)
+    return tell(f"{found.id} is {found.state}" + (", and will stop" if found.cancel_requested else ""))
+
+
+@job.command("retry")
+def retry_job(
+    context: typer.Context,
+    job_id: str,
+    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Submit a job that failed or was cancelled again, as a new job."""
+    with connect(context) as marey:
+        again = marey.jobs.retry(job_id)
+        if not wait:
+            return print_json(again) if as_json else typer.echo(again.id)
+        ended = _follow(marey, again)
+    return _print_ended(ended, as_json)
+
+
+def why(
+    context: typer.Context,
+    job_id: Annotated[str, typer.Argument(help="A job that waits, runs for long, or failed.")],
+    as_json: AsJson = False,
+) -> None:
+    """Explain why a job is where it is."""
+    from marey_client.explanations import explain_job
+
+    with connect(context) as marey:
+        reasons = explain_job(marey, job_id)
+    if as_json:
+        return print_json(reasons)
+    for reason in reasons:
+        typer.echo(reason)
+    return None
+
+
+def _done(one: Job) -> str:
+    if one.size:
+        return f"{one.children.get('succeeded', 0)}/{one.size}"
+    if one.progress is None:
+        return ""
+    return f"{one.progress.done:g}" + (f"/{one.progress.total:g}" if one.progress.total else "")

@@ -1,0 +1,109 @@
+"""`serve`, `worker`, `demo` and `db`: commands that run here instead of asking a server."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from marey_client.cli.invocation import AsJson
+
+db = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="The database of a server on this machine.")
+
+DataFolder = Annotated[Path | None, typer.Option(help="Data folder; default: MAREY_DATA, marey.toml, ./marey-data.")]
+DatabaseUrl = Annotated[str | None, typer.Option(help="postgresql://...; default: marey.db in the data folder.")]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    app.command()(serve)
+    app.command()(worker)
+    app.command()(demo)
+    app.add_typer(db, name="db")
+
+
+def serve(
+    data: DataFolder = None,
+    host: Annotated[str | None, typer.Option(help="Address to listen on; default 127.0.0.1.")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="0 for any free one; default 8460.")] = None,
+    workers: Annotated[int, typer.Option(min=0, help="Worker processes beside the server.")] = 1,
+    database_url: DatabaseUrl = None,
+    log_form: Annotated[str, typer.Option(help="text for people, json for programs.")] = "text",
+) -> None:
+    """Run a server, its database file and a local worker until stopped."""
+    from marey_client import embedded
+
+    embedded.serve(data=data, host=host, port=port, local_workers=workers, database_url=database_url, log_form=log_form)
+
+
+def worker(
+    context: typer.Context,
+    slots: Annotated[int, typer.Option(min=1, help="Jobs at the same time, each in a process of its own.")] = 1,
+    kind: Annotated[list[str] | None, typer.Option(help="Only jobs of this kind; may be repeated.")] = None,
+    label: Annotated[list[str] | None, typer.Option(help="name=value that jobs may ask for; may be repeated.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name shown to people; default: host and process id.")] = None,
+    cache: Annotated[Path | None, typer.Option(help="Folder that keeps downloaded inputs.")] = None,
+    cache_mb: Annotated[int, typer.Option(min=16, help="How much it may keep.")] = 2048,
+) -> None:
+    """Run jobs of a server until stopped. The token must have the scope `work`."""
+    from marey_client import embedded
+    from marey_client.cli.invocation import Invocation
+    from marey_client.credentials import resolve
+
+    given: Invocation = context.find_object(Invocation) or Invocation(None, None, False)
+    found = resolve(given.server, given.token_file)
+    embedded.work(
+        found,
+        slots=slots,
+        kinds=tuple(kind or ()),
+        labels=tuple(label or ()),
+        name=name,
+        cache=cache,
+        cache_mb=cache_mb,
+    )
+
+
+def demo(
+    motion: Annotated[Path | None, typer.Argument(help="A folder of motion files; left out: generated walks.")] = None,
+    data: Annotated[Path, typer.Option(help="Data folder of the demonstration's server.")] = Path("marey-demo"),
+    serve_on: Annotated[bool, typer.Option("--serve", help="Keep serving when everything is done.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """From takes to retargeted clips on this machine: import, retarget, table, picture."""
+    from marey_client import embedded
+
+    embedded.demo(motion, data=data, keep_serving=serve_on, as_json=as_json)
+
+
+# -- the database --
+
+
+@db.command("upgrade")
+def upgrade_database(data: DataFolder = None, database_url: DatabaseUrl = None) -> None:
+    """Bring the database's schema up to date."""
+    _database("upgrade", data, database_url)
+
+
+@db.command("backup")
+def backup_database(target: Path, data: DataFolder = None, database_url: DatabaseUrl = None) -> None:
+    """Copy the database, consistently, while the server may be running."""
+    _database("backup", data, database_url, target=target)
+
+
+@db.command("restore")
+def restore_database(source: Path, data: DataFolder = None, database_url: DatabaseUrl = None) -> None:
+    """Put a backup in the place of a database that is not there yet."""
+    _database("restore", data, database_url, source=source)
+
+
+@db.command("fsck")
+def check_database(data: DataFolder = None, database_url: DatabaseUrl = None, as_json: AsJson = False) -> None:
+    """Verify every digest and every reference."""
+    _database("fsck", data, database_url, as_json=as_json)
+
+
+def _database(action: str, data: Path | None, database_url: str | None, **options: Any) -> None:
+    from marey_client import embedded
+
+    embedded.database(action, data=data, database_url=database_url, **options)

@@ -1,0 +1,132 @@
+"""`project` and `member`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.output import print_json, print_pairs, print_table, tell
+
+project = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Projects.")
+member = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Who may do what in a project.")
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    app.add_typer(project, name="project")
+    app.add_typer(member, name="member")
+
+
+@project.command("create")
+def create_project(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="Lower-case letters, digits, - and _.")],
+    title: Annotated[str | None, typer.Option(help="Name shown to people.")] = None,
+    description: Annotated[str, typer.Option(help="What it is for.")] = "",
+    public: Annotated[bool, typer.Option("--public", help="Everybody with the address may read.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Make a project; you become its owner."""
+    from marey_schemas.access import ProjectCreate, Visibility
+
+    visibility = Visibility.PUBLIC if public else Visibility.PRIVATE
+    wanted = ProjectCreate(name=name, title=title, description=description, visibility=visibility)
+    with connect(context) as marey:
+        made = marey.create_project(wanted).read()
+    if as_json:
+        return print_json(made)
+    return tell(f"project {made.name} exists now")
+
+
+@project.command("ls")
+def list_projects(context: typer.Context, as_json: AsJson = False) -> None:
+    """Show every project you may see."""
+    with connect(context) as marey:
+        projects = list(marey.projects())
+    if as_json:
+        return print_json(projects)
+    rows = [(one.name, one.title, one.visibility, one.role, one.updated_at.date()) for one in projects]
+    return print_table(("name", "title", "visibility", "your role", "changed"), rows)
+
+
+@project.command("show")
+def show_project(context: typer.Context, name: str, as_json: AsJson = False) -> None:
+    """Show a project."""
+    with connect(context) as marey:
+        found = marey.project(name).read()
+    if as_json:
+        return print_json(found)
+    return print_pairs(found.model_dump(mode="json", exclude={"rev"}).items())
+
+
+@project.command("change")
+def change_project(
+    context: typer.Context,
+    name: str,
+    title: Annotated[str | None, typer.Option(help="Name shown to people.")] = None,
+    description: Annotated[str | None, typer.Option(help="What it is for.")] = None,
+    visibility: Annotated[str | None, typer.Option(help="private or public.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Change what a project is called and who may read it."""
+    from marey_schemas.access import ProjectChange
+
+    given = {"title": title, "description": description, "visibility": visibility}
+    change = ProjectChange.model_validate({key: value for key, value in given.items() if value is not None})
+    with connect(context) as marey:
+        changed = marey.project(name).change(change)
+    if as_json:
+        return print_json(changed)
+    return tell(f"project {changed.name} is changed")
+
+
+@project.command("delete")
+def delete_project(context: typer.Context, name: str) -> None:
+    """Hide a project; `marey project restore` brings it back."""
+    with connect(context) as marey:
+        marey.project(name).delete()
+    tell(f"project {name} is deleted; marey project restore {name} brings it back")
+
+
+@project.command("restore")
+def restore_project(context: typer.Context, name: str) -> None:
+    """Bring a deleted project back."""
+    with connect(context) as marey:
+        marey.project(name).restore()
+    tell(f"project {name} is back")
+
+
+@member.command("ls")
+def list_members(context: typer.Context, project_name: str, as_json: AsJson = False) -> None:
+    """Show the members of a project."""
+    with connect(context) as marey:
+        members = list(marey.project(project_name).members.list())
+    if as_json:
+        return print_json(members)
+    return print_table(("user", "role", "since"), [(one.user, one.role, one.since.date()) for one in members])
+
+
+@member.command("put")
+def put_member(
+    context: typer.Context,
+    project_name: str,
+    user: str,
+    role: Annotated[str, typer.Argument(help="reader, contributor, maintainer or owner.")],
+) -> None:
+    """Give a user a role in a project."""
+    from marey_schemas.access import MemberChange
+
+    wanted = MemberChange.model_validate({"role": role}).role
+    with connect(context) as marey:
+        marey.project(project_name).members.put(user, wanted)
+    tell(f"{user} is {wanted} of {project_name}")
+
+
+@member.command("remove")
+def remove_member(context: typer.Context, project_name: str, user: str) -> None:
+    """Take a user's role in a project away."""
+    with connect(context) as marey:
+        marey.project(project_name).members.remove(user)
+    tell(f"{user} is no member of {project_name} any more")

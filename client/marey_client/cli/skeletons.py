@@ -1,0 +1,108 @@
+"""`skeleton map` and `skeleton axes`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from marey_client.cli.addresses import Address, require_item
+from marey_client.cli.failures import WrongUsage
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.output import print_json, print_table, tell
+
+skeleton = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Which joint is which, and its axes.")
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    app.add_typer(skeleton, name="skeleton")
+
+
+@skeleton.command("map")
+def map_joints(
+    context: typer.Context,
+    place: Annotated[str, typer.Argument(help="project/folder/name, or project/id.")],
+    assignments: Annotated[
+        list[str] | None, typer.Argument(help="standard_joint=JointName to set one, standard_joint= to clear it.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show which joint plays which standard joint, or change it; a change is a new revision."""
+    from marey_schemas.kinds import Kind
+
+    with connect(context) as marey:
+        found = require_item(marey, Address.parse(place), [Kind.SKELETON])
+        mapping = found.mapping()
+        if assignments:
+            known = {joint.name for joint in found.hierarchy().joints}
+            joints = {**mapping.joints, **_assigned(assignments, known)}
+            chosen = {standard: joint for standard, joint in joints.items() if joint}
+            mapping = mapping.model_copy(update={"joints": chosen, "method": "manual", "confidence": 1.0})
+            item = found.put_mapping(mapping)
+            tell(f"{place}: revision {item.revision}")
+    if as_json:
+        return print_json(mapping)
+    rig = mapping.rig or "no known rig"
+    tell(f"{rig}; found by {mapping.method}, confidence {mapping.confidence:.2f}")
+    return print_table(("standard joint", "joint"), sorted(mapping.joints.items()))
+
+
+@skeleton.command("axes")
+def joint_axes(
+    context: typer.Context,
+    place: Annotated[str, typer.Argument(help="project/folder/name, or project/id.")],
+    joint: Annotated[str | None, typer.Argument(help="The joint to change; left out: show all.")] = None,
+    twist: Annotated[str | None, typer.Option(help="Axis along the bone, in the joint's frame: x,y,z.")] = None,
+    swing: Annotated[str | None, typer.Option(help="Axis orthogonal to it: x,y,z.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show the twist and swing axes of joints, or change those of one."""
+    from marey_schemas.documents import JointAxes
+    from marey_schemas.kinds import Kind
+
+    with connect(context) as marey:
+        found = require_item(marey, Address.parse(place), [Kind.SKELETON])
+        mapping = found.mapping()
+        if twist or swing:
+            if joint not in mapping.axes:
+                raise WrongUsage(f"{joint!r} has no axes; marey skeleton axes {place} shows the joints that have")
+            old = mapping.axes[joint]
+            new = JointAxes(twist=_vector(twist) or old.twist, swing=_vector(swing) or old.swing)
+            mapping = mapping.model_copy(update={"axes": {**mapping.axes, joint: new}, "method": "manual"})
+            item = found.put_mapping(mapping)
+            tell(f"{place}: revision {item.revision}")
+    shown = {name: axes for name, axes in mapping.axes.items() if joint in (None, name)}
+    if as_json:
+        return print_json(shown)
+    rows = [(name, _text(axes.twist), _text(axes.swing)) for name, axes in shown.items()]
+    return print_table(("joint", "twist", "swing"), rows)
+
+
+def _assigned(assignments: list[str], known: set[str]) -> dict[str, str]:
+    given: dict[str, str] = {}
+    for assignment in assignments:
+        standard, equals, joint = assignment.partition("=")
+        if not equals or not standard:
+            raise WrongUsage(f"{assignment!r}: write standard_joint=JointName")
+        if joint and joint not in known:
+            raise WrongUsage(f"{joint!r} is no joint of this skeleton; it has {', '.join(sorted(known)[:8])}, ...")
+        given[standard] = joint
+    return given
+
+
+def _vector(text: str | None) -> tuple[float, float, float] | None:
+    if text is None:
+        return None
+    try:
+        x, y, z = (float(number) for number in text.split(","))
+    except ValueError:
+        raise WrongUsage(f"{text!r}: an axis is three numbers, x,y,z") from None
+    length = (x * x + y * y + z * z) ** 0.5
+    if not 0 < length < float("inf"):
+        raise WrongUsage(f"{text!r}: an axis needs a direction")
+    return x / length, y / length, z / length
+
+
+def _text(vector: tuple[float, float, float]) -> str:
+    return " ".join(f"{number:+.3f}" for number in vector)

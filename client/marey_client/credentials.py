@@ -1,0 +1,118 @@
+"""Where the server is and which token to use.
+
+A token is looked for in this order: a file named on the command line, `MAREY_TOKEN`, the file `marey login` writes, and
+`admin.token` in the data folder of a server on this machine.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from marey_client.errors import BadCredentialFile
+
+DEFAULT_URL = "http://127.0.0.1:8460"
+DEFAULT_DATA = "marey-data"
+ADMIN_TOKEN = "admin.token"  # noqa: S105 - the name of a file
+LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
+
+
+@dataclass(frozen=True)
+class Credential:
+    """A server and the token for it."""
+
+    url: str
+    token: str | None = field(repr=False)
+
+
+def resolve(
+    url: str | None = None, token_file: Path | None = None, environment: Mapping[str, str] | None = None
+) -> Credential:
+    """The server and token that flags, environment and stored logins name."""
+    environment = os.environ if environment is None else environment
+    stored = read_logins(logins_path(environment))
+    chosen = (url or environment.get("MAREY_URL") or stored.default or DEFAULT_URL).rstrip("/")
+    if token_file is not None:
+        return Credential(chosen, read_secret(token_file))
+    token = environment.get("MAREY_TOKEN") or stored.tokens.get(chosen) or _local_token(chosen, environment)
+    return Credential(chosen, token)
+
+
+def read_secret(path: Path) -> str:
+    """The token in a file. Raises `BadCredentialFile` where it holds none, or other users may read it."""
+    try:
+        mode = path.stat().st_mode
+        text = path.read_text(encoding="ascii").strip()
+    except UnicodeDecodeError as error:
+        raise BadCredentialFile(f"{path} holds no token") from error
+    except OSError as error:
+        raise BadCredentialFile(f"{path} cannot be read: {error.strerror}") from error
+    if os.name == "posix" and mode & 0o077:
+        raise BadCredentialFile(f"{path} can be read by others; run: chmod 600 {path}")
+    if not text or any(character.isspace() for character in text):
+        raise BadCredentialFile(f"{path} must hold one token and nothing else")
+    return text
+
+
+# -- what `marey login` stores --
+
+
+@dataclass(frozen=True)
+class Logins:
+    """Tokens by server, and the server used when none is named."""
+
+    default: str | None = None
+    tokens: Mapping[str, str] = field(default_factory=dict, repr=False)
+
+
+def logins_path(environment: Mapping[str, str]) -> Path:
+    """The file of stored logins: below `XDG_CONFIG_HOME`, or `~/.config`."""
+    base = environment.get("XDG_CONFIG_HOME") or str(Path(environment.get("HOME") or Path.home()) / ".config")
+    return Path(base) / "marey" / "credentials.json"
+
+
+def read_logins(path: Path) -> Logins:
+    """The stored logins; none where nobody logged in. Raises `BadCredentialFile` where the file is damaged."""
+    if not path.exists():
+        return Logins()
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return Logins(content["default"], dict(content["tokens"]))
+    except (ValueError, KeyError, TypeError) as error:
+        raise BadCredentialFile(f"{path} is damaged; remove it and log in again") from error
+
+
+def store_login(path: Path, url: str, token: str) -> None:
+    """Remember a token for a server, and the server as the default. Only this user can read the file."""
+    tokens = {**read_logins(path).tokens, url: token}
+    _write_logins(path, Logins(url, tokens))
+
+
+def forget_login(path: Path, url: str) -> bool:
+    """Forget the token for a server; whether there was one."""
+    stored = read_logins(path)
+    if url not in stored.tokens:
+        return False
+    tokens = {known: token for known, token in stored.tokens.items() if known != url}
+    _write_logins(path, Logins(None if stored.default == url else stored.default, tokens))
+    return True
+
+
+def _write_logins(path: Path, logins: Logins) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False, encoding="utf-8") as file:  # mode 0600
+        json.dump({"default": logins.default, "tokens": dict(logins.tokens)}, file, indent=1)
+    Path(file.name).replace(path)
+
+
+def _local_token(url: str, environment: Mapping[str, str]) -> str | None:
+    """The administrator's token of a server on this machine, where its data folder is known and readable."""
+    if urlsplit(url).hostname not in LOOPBACK:
+        return None
+    path = Path(environment.get("MAREY_DATA") or DEFAULT_DATA) / ADMIN_TOKEN
+    return read_secret(path) if path.is_file() and os.access(path, os.R_OK) else None

@@ -1,0 +1,62 @@
+"""Why a job is where it is, in sentences."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from marey_schemas.jobs import Attempt, Job, JobState
+
+if TYPE_CHECKING:
+    from marey_client.marey import Marey
+
+
+def explain_job(marey: Marey, job_id: str, *, now: datetime | None = None) -> list[str]:
+    """What a job waits for, who works on it, or how it ended; the most telling reason first."""
+    job = marey.jobs.get(job_id)
+    attempts = list(marey.jobs.attempts(job_id))
+    running = list(marey.jobs.list(job.project, filters={"state": JobState.RUNNING.value}))
+    return explain(job, attempts, running, now or datetime.now(UTC))
+
+
+def explain(job: Job, attempts: list[Attempt], running: list[Job], now: datetime) -> list[str]:
+    """The same from what is known of the job, its attempts, and the project's running jobs."""
+    if job.size is not None and not job.state.terminal:
+        told = ", ".join(f"{count} {state}" for state, count in sorted(job.children.items()))
+        return [f"{job.state}: it gathers {job.size} tasks, of which {told or 'none has begun'}."]
+    reasons = {
+        JobState.WAITING: ["waiting: jobs it depends on have not all succeeded."],
+        JobState.QUEUED: _why_queued(job, running, now),
+        JobState.RUNNING: _why_running(job, attempts),
+        JobState.SUCCEEDED: ["succeeded" + (f": its result is that of {job.cached_from}." if job.cached_from else ".")],
+        JobState.FAILED: [_why_failed(job)],
+        JobState.CANCELLED: ["cancelled."],
+    }[job.state]
+    return reasons + [_told(attempt) for attempt in attempts if attempt.outcome not in (None, "succeeded")]
+
+
+def _why_queued(job: Job, running: list[Job], now: datetime) -> list[str]:
+    wait_s = (job.run_at - now).total_seconds()
+    if wait_s > 0:
+        return [f"queued: it is tried again in {wait_s:.0f} s, after attempt {job.attempt} of {job.max_attempts}."]
+    if running:
+        return [f"queued: the project's workers are busy with {len(running)} running jobs."]
+    return [f"queued: no worker has asked for a job of kind {job.kind} that may run here; is `marey worker` running?"]
+
+
+def _why_running(job: Job, attempts: list[Attempt]) -> list[str]:
+    current = next((attempt for attempt in attempts if attempt.fence == job.fence), None)
+    who = current.worker if current else "a worker"
+    stopping = " It has been asked to stop." if job.cancel_requested else ""
+    return [f"running: {who} works on it, attempt {job.attempt} of {job.max_attempts}.{stopping}"]
+
+
+def _why_failed(job: Job) -> str:
+    if job.failure is None:
+        return "failed."
+    return f"failed ({job.failure.reason}, {job.failure.code}): {job.failure.detail}"
+
+
+def _told(attempt: Attempt) -> str:
+    detail = f": {attempt.detail.strip().splitlines()[-1]}" if attempt.detail else ""
+    return f"attempt {attempt.fence} on {attempt.worker} was {attempt.outcome}{detail}"
