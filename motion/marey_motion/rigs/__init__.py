@@ -1,6 +1,17 @@
 """Rigs: standard joints, known rigs, and how a skeleton's joints and axes are recognised."""
 
+from marey_motion.rigs.axes import JointAxes, guess_axes, rest_pose_doubts
 from marey_motion.rigs.mapping import JointMapping, map_joints, symmetric_joints
 from marey_motion.rigs.standard import ESSENTIAL_JOINTS, STANDARD_JOINTS, mirrored
 
-__all__ = ["ESSENTIAL_JOINTS", "STANDARD_JOINTS", "JointMapping", "map_joints", "mirrored", "symmetric_joints"]
+__all__ = [
+    "ESSENTIAL_JOINTS",
+    "STANDARD_JOINTS",
+    "JointAxes",
+    "JointMapping",
+    "guess_axes",
+    "map_joints",
+    "mirrored",
+    "rest_pose_doubts",
+    "symmetric_joints",
+]

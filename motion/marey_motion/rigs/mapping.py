@@ -138,7 +138,7 @@ def _animal_signs(skeleton: Skeleton, joints: Mapping[str, int]) -> str:
     positions = skeleton.rest_global_positions
 
     def direction(start: str, end: str) -> NDArray[np.float64]:
-        way = positions[joints[end]] - positions[joints[start]]
+        way: NDArray[np.float64] = positions[joints[end]] - positions[joints[start]]
         length = float(np.linalg.norm(way))
         return way / length if length > 0.0 else way
 

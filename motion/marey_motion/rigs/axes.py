@@ -1,0 +1,291 @@
+"""Anatomical axes of joints, each in the joint's own frame, so that the same motion means the same on every rig.
+
+`twist` points along the bone: from the joint towards the next one. `swing` is perpendicular to it and points to the
+body's left when the limb hangs down or the trunk stands: the axis about which knees and elbows hinge. An arm that is
+raised sideways takes its swing axis along, so that in a T-pose with palms down it is up on the left, down on the right.
+
+The twist follows from offsets alone. The swing of a limb follows from the rest pose only where that is the pose of a
+standing body; many files put all bones on one line at rest, and there it is read off a motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import kinematics, quaternions
+from marey_motion.clip import Clip
+from marey_motion.errors import MappingError
+from marey_motion.rigs.mapping import JointMapping
+from marey_motion.rigs.standard import FINGERS, SIDES, STANDARD_JOINTS
+from marey_motion.skeleton import Skeleton
+
+Vectors = NDArray[np.float64]
+Triple = tuple[float, float, float]
+
+# Frames of a motion that are looked at, evenly spaced.
+FRAMES_READ = 300
+# Mean sine of the bend above which a hinge's axis is read off its bending.
+HINGE_BEND = 0.1
+# A tip nearer or farther than these shares of the bone before it is a marker of something else.
+TIP_LENGTHS = (0.05, 1.5)
+
+_TOWARDS: dict[str, tuple[str, ...]] = {
+    "pelvis": ("spine_2", "neck", "spine_1", "spine", "head"),
+    "spine": ("spine_1", "spine_2", "neck", "head"),
+    "spine_1": ("spine_2", "neck", "head"),
+    "spine_2": ("neck", "head"),
+    "neck": ("head",),
+    "clavicle": ("shoulder",),
+    "shoulder": ("elbow",),
+    "elbow": ("wrist",),
+    "wrist": ("middle_finger_base", "index_finger_base", "ring_finger_base", "pinky_finger_base", "finger"),
+    "hip": ("knee",),
+    "knee": ("ankle",),
+    "ankle": ("toe",),
+    **{
+        f"{finger}_{part}": (f"{finger}_{following}",)
+        for finger in ("thumb", *(f"{finger}_finger" for finger in FINGERS))
+        for part, following in (("root", "base"), ("base", "mid"), ("mid", "tip"), ("tip", "end"))
+    },
+}
+_BEFORE = {"wrist": "elbow", "toe": "ankle", "finger": "wrist", "ankle": "knee"}
+_LEG = ("hip", "knee", "ankle", "toe", "heel")
+
+
+@dataclass(frozen=True)
+class JointAxes:
+    """Unit directions in a joint's local frame: `twist` along the bone, `swing` perpendicular to it."""
+
+    twist: Triple
+    swing: Triple
+
+
+def guess_axes(skeleton: Skeleton, mapping: JointMapping, motion: Clip | None = None) -> dict[str, JointAxes]:
+    """Axes of every mapped joint, by joint name.
+
+    Parameters
+    ----------
+    mapping : standard names of the skeleton's joints; hips or shoulders of both sides are needed
+    motion : a clip of the skeleton in which the body moves. It is read only for the parts that `rest_pose_doubts`
+        names; without it their swing axes are a guess that retargeting should not rely on.
+
+    Raises
+    ------
+    MappingError    where the mapping lacks both hips and both shoulders, or names joints the skeleton does not have
+    """
+    joints = {standard: skeleton.index_of(name) for standard, name in mapping.joints.items()}
+    if not any({f"{side}_{joint}" for side in SIDES} <= joints.keys() for joint in ("hip", "shoulder")):
+        raise MappingError("axes need both hips or both shoulders in the mapping", where="left_hip")
+    rest = _Body(skeleton, joints, skeleton.rest_global_positions[None], skeleton.rest_global_rotations[None])
+    moving = rest if motion is None else _body_in_motion(motion, joints)
+    axes = {}
+    for standard in (name for name in STANDARD_JOINTS if name in joints):
+        body = rest if _part(standard) in rest.readable_parts else moving
+        twist = _twist(standard, rest, body)
+        swing = body.in_joint(standard, _swing(standard, body)) if (own := _knuckles(standard, rest)) is None else own
+        axes[skeleton.joint_names[joints[standard]]] = JointAxes(_triple(twist), _triple(_across(swing, twist)))
+    return axes
+
+
+def rest_pose_doubts(skeleton: Skeleton, mapping: JointMapping) -> tuple[str, ...]:
+    """Parts of the body ("trunk", "left arm", ...) whose swing axes cannot be read from the rest pose."""
+    joints = {standard: skeleton.index_of(name) for standard, name in mapping.joints.items()}
+    rest = _Body(skeleton, joints, skeleton.rest_global_positions[None], skeleton.rest_global_rotations[None])
+    parts = dict.fromkeys(_part(standard) for standard in STANDARD_JOINTS if standard in joints)
+    return tuple(part for part in parts if part not in rest.readable_parts)
+
+
+def _body_in_motion(motion: Clip, joints: Mapping[str, int]) -> _Body:
+    count = min(motion.frame_count, FRAMES_READ)
+    frames = np.linspace(0, motion.frame_count - 1, count).round().astype(np.intp)
+    positions = kinematics.global_positions(motion)[frames].astype(np.float64)
+    rotations = kinematics.global_rotations(motion)[frames].astype(np.float64)
+    return _Body(motion.skeleton, joints, positions, rotations)
+
+
+@dataclass(frozen=True, eq=False)
+class _Body:
+    """A body over K frames: global positions (K, J, 3) and rotations (K, J, 4)."""
+
+    skeleton: Skeleton
+    joints: Mapping[str, int]
+    positions: Vectors
+    rotations: Vectors
+
+    def way(self, start: str, end: str) -> Vectors | None:
+        """Unit directions (K, 3) between standard joints; zero where they coincide, None where one is not mapped."""
+        if start not in self.joints or end not in self.joints:
+            return None
+        return _unit(self.positions[:, self.joints[end]] - self.positions[:, self.joints[start]])
+
+    def in_joint(self, standard: str, vectors: Vectors) -> Vectors:
+        """Mean (3,) of global vectors (K, 3) seen from a joint."""
+        inverse = quaternions.conjugate(self.rotations[:, self.joints[standard]])
+        mean: Vectors = quaternions.rotate_vectors(inverse, vectors).astype(np.float64).mean(axis=0)
+        return mean
+
+    @cached_property
+    def hips_left(self) -> Vectors:
+        across = self.way("right_hip", "left_hip")
+        return self.shoulders_left if across is None else across
+
+    @cached_property
+    def shoulders_left(self) -> Vectors:
+        across = self.way("right_shoulder", "left_shoulder")
+        return self.hips_left if across is None else across
+
+    @cached_property
+    def up(self) -> Vectors:
+        """From the pelvis to the middle of the shoulders, perpendicular to the hips."""
+        low = self._middle("hip") if "pelvis" not in self.joints else self.positions[:, self.joints["pelvis"]]
+        high = self._middle("shoulder") if "left_shoulder" in self.joints else self.positions[:, self.joints["head"]]
+        trunk = high - low
+        return _unit(trunk - _dot(trunk, self.hips_left) * self.hips_left)
+
+    def _middle(self, joint: str) -> Vectors:
+        pair = [self.joints[f"{side}_{joint}"] for side in SIDES]
+        middle: Vectors = self.positions[:, pair].mean(axis=1)
+        return middle
+
+    @cached_property
+    def readable_parts(self) -> frozenset[str]:
+        """Parts that stand as a body's do, judged in the first frame."""
+        left, up = self.hips_left[0], self.up[0]
+        legs = [way[0] for side in SIDES if (way := self.way(f"{side}_hip", f"{side}_ankle")) is not None]
+        if left @ self.shoulders_left[0] < 0.7 or not np.any(up) or any(leg @ up > -0.7 for leg in legs):
+            return frozenset()
+        parts = {"trunk"}
+        for side, outwards in zip(SIDES, (left, -left), strict=True):
+            if self._leg_stands(side, up):
+                parts.add(f"{side} leg")
+            if self._arm_hangs_or_reaches_out(side, up, outwards):
+                parts.add(f"{side} arm")
+        return frozenset(parts)
+
+    def _leg_stands(self, side: str, up: Vectors) -> bool:
+        thigh, shank = self.way(f"{side}_hip", f"{side}_knee"), self.way(f"{side}_knee", f"{side}_ankle")
+        foot = self.way(f"{side}_ankle", f"{side}_toe")
+        straight = all(bone is None or bone[0] @ up < -0.7 for bone in (thigh, shank))
+        return straight and (foot is None or shank is None or abs(float(foot[0] @ shank[0])) < 0.95)
+
+    def _arm_hangs_or_reaches_out(self, side: str, up: Vectors, outwards: Vectors) -> bool:
+        bones = (self.way(f"{side}_shoulder", f"{side}_elbow"), self.way(f"{side}_elbow", f"{side}_wrist"))
+        return all(bone is None or (bone[0] @ up < 0.5 and bone[0] @ outwards > -0.3) for bone in bones)
+
+
+def _part(standard: str) -> str:
+    side, _, joint = standard.partition("_")
+    if side not in SIDES:
+        return "trunk"
+    return f"{side} leg" if joint in _LEG else f"{side} arm"
+
+
+def _twist(standard: str, rest: _Body, body: _Body) -> Vectors:
+    """Unit direction (3,) of a joint's bone in its frame."""
+    side, _, joint = standard.partition("_")
+    prefix, joint = (f"{side}_", joint) if side in SIDES else ("", standard)
+    for target in _TOWARDS.get(joint, ()):
+        way = rest.way(standard, prefix + target)
+        if way is not None and np.any(way):
+            return _unit(rest.in_joint(standard, way))
+    if prefix:
+        tip = _tip(rest.skeleton, rest.joints[standard])
+        if tip is not None:
+            return tip
+        before = f"{prefix}{_BEFORE.get(joint, 'elbow')}"
+        way = body.way(before, standard)
+        if way is not None and np.any(way):
+            return _unit(body.in_joint(standard, way))
+    return _unit(body.in_joint(standard, body.up))
+
+
+def _tip(skeleton: Skeleton, joint: int) -> Vectors | None:
+    """Unit direction (3,) to the farthest child or end site that can be the end of the joint's bone."""
+    ends = [skeleton.offsets[child] for child in skeleton.children[joint]]
+    ends += [site.offset for site in skeleton.end_sites if site.joint == joint]
+    bone = float(np.linalg.norm(skeleton.offsets[joint]))
+    shortest, longest = (share * bone for share in TIP_LENGTHS)
+    ends = [end for end in ends if shortest < np.linalg.norm(end) < longest]
+    return _unit(max(ends, key=lambda end: float(np.linalg.norm(end)))) if ends else None
+
+
+def _swing(standard: str, body: _Body) -> Vectors:
+    """Global directions (K, 3) whose mean in the joint's frame is its swing axis."""
+    side, _, joint = standard.partition("_")
+    if side not in SIDES:
+        if standard in ("spine_2", "neck", "head"):
+            return body.shoulders_left
+        return body.hips_left + body.shoulders_left if standard == "spine_1" else body.hips_left
+    if joint in ("hip", "knee"):
+        return _leg_hinge(side, body)
+    if joint in ("ankle", "toe", "heel"):
+        shank, foot = body.way(f"{side}_knee", f"{side}_ankle"), body.way(f"{side}_ankle", f"{side}_toe")
+        return body.hips_left if shank is None or foot is None else np.cross(foot, shank)
+    if joint == "clavicle":
+        return body.up if side == "left" else -body.up
+    return _arm_hinge(side, joint, body)
+
+
+def _leg_hinge(side: str, body: _Body) -> Vectors:
+    """The axis a knee bends about, which turns the shank backwards; the body's left where it does not bend."""
+    thigh, shank = body.way(f"{side}_hip", f"{side}_knee"), body.way(f"{side}_knee", f"{side}_ankle")
+    if len(body.positions) > 1 and thigh is not None and shank is not None:
+        bend = np.cross(thigh, shank)
+        if np.linalg.norm(body.in_joint(f"{side}_hip", bend)) > HINGE_BEND:
+            return bend
+    return body.hips_left
+
+
+def _arm_hinge(side: str, joint: str, body: _Body) -> Vectors:
+    """The axis an elbow stretches about; where it does not bend, left, carried along as the arm is raised."""
+    upper, fore = body.way(f"{side}_shoulder", f"{side}_elbow"), body.way(f"{side}_elbow", f"{side}_wrist")
+    if len(body.positions) > 1 and upper is not None and fore is not None:
+        bend = np.cross(fore, upper)
+        if np.linalg.norm(body.in_joint(f"{side}_shoulder", bend)) > HINGE_BEND:
+            return bend
+    bone = upper if joint == "shoulder" or fore is None else fore
+    if bone is None:
+        return body.shoulders_left
+    forward = np.cross(body.hips_left, body.up)
+    raised = quaternions.between_vectors(-body.up, bone, half_turn_axis=forward)
+    return quaternions.rotate_vectors(raised, body.hips_left).astype(np.float64)
+
+
+def _knuckles(standard: str, rest: _Body) -> Vectors | None:
+    """Swing axis (3,) of a hand that has fingers: across the palm, out of its back on the left side."""
+    side, _, joint = standard.partition("_")
+    if joint != "wrist":
+        return None
+    across = rest.way(f"{side}_pinky_finger_base", f"{side}_index_finger_base")
+    if across is None or not np.any(across):
+        return None
+    return np.cross(rest.in_joint(standard, across), _twist(standard, rest, rest))
+
+
+def _across(swing: Vectors, twist: Vectors) -> Vectors:
+    """The unit part of a swing axis perpendicular to the twist axis; any perpendicular where nothing is left of it."""
+    across = swing - (swing @ twist) * twist
+    if np.linalg.norm(across) < 1e-6:
+        across = np.cross(twist, np.eye(3)[int(np.argmin(np.abs(twist)))])
+    return _unit(across)
+
+
+def _unit(v: Vectors) -> Vectors:
+    length = np.linalg.norm(v, axis=-1, keepdims=True)
+    unit: Vectors = v / np.where(length > quaternions.TINY, length, 1.0)
+    return np.where(length > quaternions.TINY, unit, 0.0)
+
+
+def _dot(a: Vectors, b: Vectors) -> Vectors:
+    dot: Vectors = np.sum(a * b, axis=-1, keepdims=True)
+    return dot
+
+
+def _triple(v: Vectors) -> Triple:
+    x, y, z = (float(component) for component in v)
+    return x, y, z
