@@ -17,7 +17,8 @@ from marey_motion.formats.amc_frames import scan_frames
 from marey_motion.formats.asf import AsfSkeleton, read_asf
 from marey_motion.formats.euler import NO_COLUMN, rotations_from_euler
 from marey_motion.formats.numeric_text import excerpt
-from marey_motion.formats.source import CheckWarning, SourceMotion
+from marey_motion.checks import CheckWarning
+from marey_motion.source import SourceMotion
 from marey_motion.formats.text_lines import TextLines
 
 FORMAT = "asf-amc"

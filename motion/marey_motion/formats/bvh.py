@@ -16,10 +16,13 @@ from marey_motion.formats.euler import NO_COLUMN, rotations_from_euler
 from marey_motion.formats.frame_times import frame_rate_of
 from marey_motion.formats.joint_names import unique_names
 from marey_motion.formats.numeric_text import BadToken, scan_numbers
-from marey_motion.formats.source import CheckWarning, SourceMotion
+from marey_motion.checks import CheckWarning
+from marey_motion.source import SourceMotion
 from marey_motion.formats.text_lines import TextLines, number_problem
 
 FORMAT = "bvh"
+# Offsets and positions of the same joint agree to this part of the largest offset where exporters rounded both.
+_PRINTED_DIGITS = 1e-6
 
 
 @dataclass(frozen=True)
@@ -146,6 +149,8 @@ def _fill_motion(source: SourceMotion, values: NDArray[np.float64], columns: Cha
     if moved:
         source.translated_joints = tuple(moved)
         source.translations = np.stack([_positions_of(j, values, columns, source.offsets) for j in moved], axis=1)
+        _resolve_displacements(source, source.translations)
+        _drop_redundant_translations(source, source.translations)
 
 
 def _positions_of(
@@ -157,3 +162,35 @@ def _positions_of(
         if column != NO_COLUMN:
             positions[:, axis] = values[:, column]
     return positions
+
+
+def _resolve_displacements(source: SourceMotion, translations: NDArray[np.float64]) -> None:
+    """Add offsets where a file's position channels below the root are displacements from them, as some exporters write.
+
+    Taken as positions they would fold every bone to nothing, which no motion does: the channels of most joints stay
+    within a tenth of a bone's length of zero.
+    """
+    offsets = source.offsets[list(source.translated_joints)]
+    lengths = np.linalg.norm(offsets, axis=1)
+    reach = np.linalg.norm(translations, axis=2).max(axis=0)
+    folded = (lengths > 0) & (reach < 0.1 * lengths)
+    if 2 * np.count_nonzero(folded) <= np.count_nonzero(lengths):
+        return
+    translations += offsets
+    source.warnings.append(
+        CheckWarning(
+            "position-channels-relative",
+            f"position channels of {len(lengths)} joints stay near zero; they are read as displacements from OFFSET, "
+            "not as positions that replace it",
+            joints=tuple(source.joint_names[joint] for joint in source.translated_joints),
+        )
+    )
+
+
+def _drop_redundant_translations(source: SourceMotion, translations: NDArray[np.float64]) -> None:
+    """Keep only joints whose positions say more than their OFFSET, to the last digit that files print."""
+    offsets = source.offsets[list(source.translated_joints)]
+    size = np.abs(source.offsets).max()
+    moving = (np.abs(translations - offsets) > _PRINTED_DIGITS * size).any(axis=(0, 2))
+    source.translated_joints = tuple(np.array(source.translated_joints)[moving].tolist())
+    source.translations = np.ascontiguousarray(translations[:, moving]) if moving.any() else None

@@ -8,36 +8,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.checks import CheckWarning
 from marey_motion.clip import Clip
 from marey_motion.skeleton import Skeleton
 
 UpAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Handedness = Literal["right", "left"]
 UP_AXES: tuple[UpAxis, ...] = ("x", "y", "z", "-x", "-y", "-z")
-
-
-@dataclass(frozen=True)
-class CheckWarning:
-    """One finding about a motion; `checks.CODES` explains every code.
-
-    Parameters
-    ----------
-    code : stable slug
-    message : what was found, in a sentence with its numbers
-    joints : names of the joints concerned
-    frames : half-open range of the frames concerned, None for all of them
-    values : the numbers behind the sentence
-    """
-
-    code: str
-    message: str
-    joints: tuple[str, ...] = ()
-    frames: tuple[int, int] | None = None
-    values: dict[str, Any] = field(default_factory=dict)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain JSON types."""
-        return {**asdict(self), "joints": list(self.joints), "frames": list(self.frames) if self.frames else None}
 
 
 @dataclass(frozen=True)

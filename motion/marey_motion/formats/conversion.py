@@ -1,0 +1,124 @@
+"""The one place where a file's unit and axes become metres, right-handed, Y up."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import checks
+from marey_motion.clip import Clip
+from marey_motion.checks import CheckWarning
+from marey_motion.source import ImportedMotion, ImportOptions, SourceInfo, SourceMotion, UpAxis
+from marey_motion.skeleton import EndSite, Skeleton
+from marey_motion.units import infer_conversion
+
+Real = TypeVar("Real", np.float32, np.float64)
+
+# Rows are the file's axes that become x, y, z; each matrix is a rotation.
+_TO_Y_UP: dict[UpAxis, list[list[int]]] = {
+    "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    "-z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+    "-x": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+}
+
+
+def convert(source: SourceMotion, file: str, options: ImportOptions) -> ImportedMotion:
+    """Turn a motion as its file has it into a clip, with the record of what was inferred, changed and noticed.
+
+    Raises
+    ------
+    AmbiguousUnits    when neither the file, its body nor the options tell the unit or the upward axis
+    """
+    found = infer_conversion(source, file, options)
+    axes = np.array(_TO_Y_UP[found.up_axis], np.float64)
+    if found.handedness == "left":
+        axes[0] = -axes[0]
+    skeleton = _converted_skeleton(source, axes, found.unit_scale_m)
+    warnings = [*source.warnings, *found.warnings, *_notices(source, found.up_axis)]
+    clip = _converted_clip(source, skeleton, axes, found.unit_scale_m)
+    trimmed, floor_shift_m = (0, 0), 0.0
+    if clip is not None:
+        warnings += checks.check_clip(clip)
+        if options.trim_rest_pose:
+            clip, trimmed = checks.without_rest_pose(clip)
+        if options.align_floor:
+            clip, floor_shift_m = checks.on_the_floor(clip)
+    info = SourceInfo(
+        format=source.format,
+        file=file,
+        unit_scale_m=found.unit_scale_m,
+        up_axis=found.up_axis,
+        handedness=found.handedness,
+        frame_rate_hz=source.frame_rate_hz if clip is not None else None,
+        declared_frame_time_s=source.declared_frame_time_s,
+        channels=source.channels,
+        trimmed_frames=trimmed,
+        floor_shift_m=floor_shift_m,
+        evidence=found.evidence,
+    )
+    return ImportedMotion(clip, skeleton, info, tuple(warnings))
+
+
+def _converted_skeleton(source: SourceMotion, axes: NDArray[np.float64], scale: float) -> Skeleton:
+    return Skeleton(
+        joint_names=source.joint_names,
+        parents=source.parents,
+        offsets=source.offsets @ axes.T * scale,
+        rest_rotations=_turned(source.rest_rotations, axes),
+        end_sites=tuple(EndSite(joint, axes @ offset * scale) for joint, offset in source.end_sites),
+        display_names=source.display_names,
+    )
+
+
+def _converted_clip(source: SourceMotion, skeleton: Skeleton, axes: NDArray[np.float64], scale: float) -> Clip | None:
+    if source.rotations is None or source.root_positions is None or source.frame_rate_hz is None:
+        return None
+    frames = len(source.rotations)
+    poses = np.empty((frames, 3 + 4 * skeleton.joint_count), np.float32)
+    poses[:, :3] = source.root_positions @ axes.T * scale
+    poses[:, 3:] = _turned(source.rotations, axes).reshape(frames, -1)
+    # The source is not needed any more; a long file must not be held three times.
+    source.rotations = source.root_positions = None
+    translations = None
+    if source.translations is not None:
+        translations = (source.translations @ axes.T * scale).astype(np.float32)
+        source.translations = None
+    return Clip(skeleton, source.frame_rate_hz, poses, translations, source.translated_joints)
+
+
+def _turned(rotations: NDArray[Real], axes: NDArray[np.float64]) -> NDArray[Real]:
+    """The same rotations in other axes. A mirrored axis also turns the sense of rotation, so signs are exact."""
+    if np.array_equal(axes, np.eye(3)):
+        return rotations
+    sense = np.rint(np.linalg.det(axes))
+    result = np.empty_like(rotations)
+    result[..., 0] = rotations[..., 0]
+    for row, old in enumerate(np.abs(axes).argmax(axis=1)):
+        result[..., 1 + row] = rotations[..., 1 + old] * (sense * axes[row, old])
+    return result
+
+
+def _notices(source: SourceMotion, up_axis: UpAxis) -> list[CheckWarning]:
+    """What the reader and the conversion did that a user should know."""
+    notices = []
+    if up_axis != "y":
+        message = f"the file has {up_axis} up; it was turned to y up"
+        notices.append(CheckWarning("up-axis-converted", message, values={"up_axis": up_axis}))
+    orders = {"".join(name[0] for name in names if name.endswith("rotation")) for names in source.channels}
+    orders = {order for order in orders if len(order) > 1}
+    if len(orders) > 1:
+        listed = sorted(orders)
+        message = f"rotation orders differ between joints ({', '.join(listed)}); each joint is read in its own"
+        notices.append(CheckWarning("mixed-rotation-orders", message, values={"orders": listed}))
+    repeated = [
+        name for name, shown in zip(source.joint_names, source.display_names, strict=True) if name != shown
+    ]
+    if repeated:
+        message = f"{len(repeated)} joint names repeat in the file; they are told apart by their parent"
+        notices.append(CheckWarning("duplicate-joint-names", message, joints=tuple(repeated)))
+    return notices
