@@ -73,10 +73,7 @@ class ArraySpec:
     def require(self, max_bytes: int) -> None:
         """Raise `ArrayError` unless the array fits in `max_bytes`."""
         if self.nbytes > max_bytes:
-            detail = (
-                f"an array of dtype {self.dtype} and shape {list(self.shape)} exceeds the {max_bytes} bytes allowed"
-            )
-            raise ArrayError("too-large", detail)
+            raise ArrayError("too-large", f"{self} is larger than the {max_bytes} bytes allowed")
 
 
 def little_endian(array: NDArray[Any]) -> NDArray[Any]:

@@ -28,7 +28,8 @@ def canonical_json(tree: Any) -> bytes:
     """The one JSON text of a tree without arrays: sorted keys, no spaces, UTF-8, one spelling per number.
 
     JSON has one type of number, and databases and languages keep no other: a whole number below 2**63 is written
-    without a point whether it came as 1 or 1.0 (and -0.0 as 0), any other as the shortest text of its double.
+    without a point whether it came as 1 or 1.0 (and -0.0 as 0), any other as the shortest text of its double. Raises
+    `ValueError` for NaN and infinities, `TypeError` for a key that is no string.
     """
     return json.dumps(
         _canonical(tree), sort_keys=True, ensure_ascii=False, separators=(",", ":"), allow_nan=False
@@ -70,7 +71,7 @@ def attach_arrays(tree: Any, load: Callable[[str], NDArray[Any] | EncodedArray])
 
 def _canonical(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {key: _canonical(member) for key, member in value.items()}
+        return {_text_key(key): _canonical(member) for key, member in value.items()}
     if isinstance(value, list | tuple):
         return [_canonical(item) for item in value]
     if isinstance(value, float) and value.is_integer() and abs(value) < 1 << 63:
@@ -78,6 +79,12 @@ def _canonical(value: Any) -> Any:
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 1 << 63:
         return float(value)
     return value
+
+
+def _text_key(key: Any) -> str:
+    if not isinstance(key, str):
+        raise TypeError(f"the key {key!r} is not a string")
+    return key
 
 
 def _name(*parts: bytes | memoryview) -> str:

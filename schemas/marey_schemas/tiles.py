@@ -207,7 +207,9 @@ def _predict_quaternions(channels: Integers, lead: int) -> list[Bytes]:
 
 def _undo_prediction(body: _Sections, columns: int, frames: int) -> Integers:
     lead = int(body.take(1)[0])
-    count = max(columns - lead, 0) // 4
+    count = (columns - lead) // 4
+    if count < 1:
+        raise TileError(f"there is no quaternion behind {lead} of {columns} columns")
     choice = body.take(count)
     if (choice > 7).any():
         raise TileError("a quaternion has no such component")

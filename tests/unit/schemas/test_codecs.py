@@ -1,0 +1,186 @@
+import datetime
+import json
+import struct
+from typing import Any
+
+import bson
+import msgpack
+import numpy as np
+import pytest
+from bson import Binary, Code, Decimal128, Int64, ObjectId, Regex
+
+from marey_schemas import blocks, codecs
+from marey_schemas.codecs import BSON, JSON, MAX_LIST, MEDIA_TYPES, MSGPACK, CodecError, decode_tree, encode_tree
+
+
+def refusal(data: bytes, media_type: str, **limits: int) -> CodecError:
+    with pytest.raises(CodecError) as caught:
+        decode_tree(data, media_type, **limits)
+    return caught.value
+
+
+def write(tree: Any, media_type: str) -> bytes:
+    """A message as another program would write it."""
+    if media_type == JSON:
+        return json.dumps(tree).encode()
+    return bytes(msgpack.packb(tree)) if media_type == MSGPACK else bytes(bson.encode(tree))
+
+
+def test_json_has_arrays_as_nested_lists() -> None:
+    document = json.loads(encode_tree({"a": np.float32([[0.1, 2], [3, 4]])}, JSON))
+    assert document == {"a": {"dtype": "<f4", "shape": [2, 2], "data": [[0.1, 2.0], [3.0, 4.0]]}}
+
+
+@pytest.mark.parametrize("media_type", [MSGPACK, BSON])
+def test_binary_formats_have_arrays_as_little_endian_bytes(media_type: str) -> None:
+    data = encode_tree({"a": np.array([1, 2], ">i2")}, media_type)
+    document = msgpack.unpackb(data) if media_type == MSGPACK else bson.decode(data)
+    assert document == {"a": {"dtype": "<i2", "shape": [2], "data": b"\1\0\2\0"}}
+
+
+@pytest.mark.parametrize("media_type", [MSGPACK, BSON])
+def test_blocks_travel_as_the_bytes_of_the_block_codec(media_type: str) -> None:
+    array = np.arange(900, dtype=np.float32).reshape(300, 3)
+    data = encode_tree({"a": array}, media_type, arrays="blocks")
+    document = msgpack.unpackb(data) if media_type == MSGPACK else bson.decode(data)
+    assert document == {"a": {"dtype": "<f4", "shape": [300, 3], "encoding": "blocks", "data": blocks.encode(array)}}
+
+
+def test_json_cannot_carry_blocks() -> None:
+    with pytest.raises(CodecError, match="JSON cannot carry blocks"):
+        encode_tree({"a": np.zeros(3)}, JSON, arrays="blocks")
+    text = '{"a": {"dtype": "<f4", "shape": [1], "encoding": "blocks", "data": "TVJCMQ=="}}'
+    assert refusal(text.encode(), JSON).pointer == "/a"
+
+
+@pytest.mark.parametrize("media_type", ["text/json", "application/msgpack; arrays=blocks", ""])
+def test_an_unknown_media_type_is_refused(media_type: str) -> None:
+    with pytest.raises(CodecError, match="is not one of"):
+        encode_tree({}, media_type)
+    assert refusal(b"{}", media_type).code == "bad-media-type"
+
+
+@pytest.mark.parametrize("media_type", MEDIA_TYPES)
+def test_a_wrong_array_is_refused_where_it_stands(media_type: str) -> None:
+    wrong = {"dtype": "<f4", "shape": [2], "data": [1.0] if media_type == JSON else bytes(4)}
+    error = refusal(write({"clips": [{"poses": wrong}]}, media_type), media_type)
+    assert (error.code, error.pointer) == ("bad-array", "/clips/0/poses")
+
+
+@pytest.mark.parametrize("media_type", [MSGPACK, BSON])
+def test_arrays_together_may_not_exceed_the_limit_however_small_they_travel(media_type: str) -> None:
+    tree = {str(number): np.zeros(100_000, np.int8) for number in range(9)}
+    data = encode_tree(tree, media_type, arrays="blocks")
+    assert len(data) < 10_000
+    assert len(decode_tree(data, media_type, max_bytes=900_000)) == 9
+    error = refusal(data, media_type, max_bytes=899_999)
+    assert (error.code, error.pointer) == ("too-large", "/8")
+
+
+@pytest.mark.parametrize("media_type", MEDIA_TYPES)
+def test_a_claimed_shape_is_refused_before_it_is_allocated(media_type: str) -> None:
+    data: Any = [] if media_type == JSON else b""
+    error = refusal(write({"a": {"dtype": "<f8", "shape": [1 << 19, 1 << 19], "data": data}}, media_type), media_type)
+    assert (error.code, error.pointer) == ("too-large", "/a")
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "pointer"),
+    [
+        ("", "bad-syntax", ""),
+        ("{", "bad-syntax", ""),
+        ('{"a": NaN}', "bad-syntax", ""),
+        ('{"a": -Infinity}', "bad-syntax", ""),
+        ('{"a": [1e999]}', "not-finite", "/a/0"),
+        ('{"a": 1, "a": 1}', "bad-syntax", ""),
+        ('{"a": 9223372036854775808}', "out-of-range", "/a"),
+        ('{"a": ' + "9" * 5000 + "}", "bad-syntax", ""),
+        ('{"a": "\\udc00"}', "bad-text", "/a"),
+        ('{"a\\u0000b": 1}', "bad-key", ""),
+        ("[" * 65 + "]" * 65, "too-deep", "/0" * 64),
+        ("[" * 100_000, "too-deep", ""),
+        ('{"a": {"b": 1}} x', "bad-syntax", ""),
+    ],
+)
+def test_json_that_other_formats_could_not_carry_is_refused(text: str, code: str, pointer: str) -> None:
+    error = refusal(text.encode(), JSON)
+    assert (error.code, error.pointer) == (code, pointer)
+
+
+def test_json_must_be_utf_8() -> None:
+    assert refusal('{"a": "é"}'.encode("latin-1"), JSON).code == "bad-syntax"
+
+
+@pytest.mark.parametrize(
+    ("data", "code"),
+    [
+        (b"", "bad-syntax"),
+        (b"\x81\xa1a", "bad-syntax"),
+        (b"\x80\x80", "bad-syntax"),
+        (b"\xcf" + b"\xff" * 8, "out-of-range"),
+        (msgpack.packb({"a": msgpack.ExtType(5, b"x")}), "bad-type"),
+        (msgpack.packb({"a": msgpack.Timestamp(1)}), "bad-type"),
+        (msgpack.packb({"a": b"bytes"}), "bad-type"),
+        (msgpack.packb({b"a": 1}), "bad-key"),
+        (msgpack.packb({1: 1}), "bad-syntax"),
+        (b"\x82\xa1a\x01\xa1a\x02", "bad-syntax"),
+        (b"\x91" * 100_000, "too-deep"),
+        (b"\xcb" + struct.pack(">d", float("nan")), "not-finite"),
+        (b"\xa1\xff", "bad-syntax"),
+    ],
+)
+def test_messagepack_that_other_formats_could_not_carry_is_refused(data: bytes, code: str) -> None:
+    assert refusal(data, MSGPACK).code == code
+
+
+@pytest.mark.parametrize("header", [b"\xdd", b"\xdf"])
+def test_messagepack_cannot_claim_its_way_to_memory(header: bytes) -> None:
+    claim = header + struct.pack(">I", MAX_LIST) + (b"\xa1a" if header == b"\xdf" else b"")
+    assert refusal(claim * 500, MSGPACK).code == "bad-syntax"
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        ObjectId(),
+        datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC),
+        Decimal128("1.5"),
+        Regex("a"),
+        Code("x"),
+        Code("x", {"a": 1}),
+        Binary(b"x", 4),
+        b"bytes",
+        bson.Timestamp(1, 1),
+        bson.MinKey(),
+        bson.DBRef("collection", ObjectId()),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_bson_that_other_formats_could_not_carry_is_refused(value: Any) -> None:
+    error = refusal(bson.encode({"a": [1, value]}), BSON)
+    assert error.code == "bad-type"
+    assert error.pointer.startswith("/a/1")
+
+
+def test_bson_integers_of_both_widths_are_plain_integers() -> None:
+    tree = decode_tree(bson.encode({"a": Int64(5), "b": 5, "c": 1 << 40}), BSON)
+    assert [type(value) for value in tree.values()] == [int, int, int]
+
+
+@pytest.mark.parametrize("data", [b"", b"\5\0\0\0", b"\5\0\0\x80\0", b"\6\0\0\0\0", bson.encode({}) + b"\0"])
+def test_bson_of_another_size_than_it_says_is_refused(data: bytes) -> None:
+    assert refusal(data, BSON).code == "bad-syntax"
+
+
+def test_bson_nested_beyond_the_limit_is_refused() -> None:
+    data = bson.encode({})
+    for _ in range(3000):
+        data = struct.pack("<i", len(data) + 8) + b"\x03a\0" + data + b"\0"
+    assert refusal(data, BSON).code == "too-deep"
+
+
+def test_an_error_reads_as_a_place_and_a_reason() -> None:
+    with pytest.raises(CodecError) as caught:
+        encode_tree({"a": [1, float("nan")]}, JSON)
+    assert str(caught.value) == "/a/1: nan cannot travel; only finite numbers may"
+    assert codecs.CodecError("bad-syntax", "", "no").args == ("bad-syntax", "", "no")
