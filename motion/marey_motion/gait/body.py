@@ -1,0 +1,237 @@
+"""Poses of the studio skeleton from a root path and two feet: pelvis, legs, trunk and arms.
+
+Local +X is the body's left, +Y up, +Z forward; in the skeleton's rest pose all joints have the world's axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import convolve1d, minimum_filter1d
+
+from marey_motion import quaternions
+from marey_motion.errors import MotionError
+from marey_motion.gait import style as styles
+from marey_motion.gait.footfalls import FootMotion, smooth_positive_part
+from marey_motion.gait.path import Floats, RootState
+from marey_motion.gait.style import GaitStyle, eased
+from marey_motion.skeleton import Skeleton
+
+LEG_STRETCH = 0.99  # of the straight leg: a knee that locks would move with a jerk
+YIELDING_M = 0.10  # of a leg's length, over which a foot in mid-air begins to follow the stretched leg
+SETTLING_S = 0.12  # over which the pelvis gives way to a leg that would be out of reach
+BLENDING_S = 0.30  # over which trunk and arms follow a change of speed or turn
+SIDES = {"Left": 1, "Right": -1}
+
+
+@dataclass(frozen=True)
+class Moments:
+    """What drives the pose at n evenly spaced moments.
+
+    Parameters
+    ----------
+    times_s, phases : (n,) seconds and strides done
+    root : the exact path
+    """
+
+    times_s: Floats
+    phases: Floats
+    root: RootState
+
+    @property
+    def frame_rate_hz(self) -> float:
+        """Moments per second."""
+        return (len(self.times_s) - 1) / float(self.times_s[-1] - self.times_s[0])
+
+    def settled(self, values: Floats, window_s: float = BLENDING_S) -> Floats:
+        """Values (n,) averaged over `window_s` before and after, more over the near ones (Hann)."""
+        reach = _reach(window_s, self.frame_rate_hz)
+        weights = np.hanning(2 * reach + 3)[1:-1]
+        return np.asarray(convolve1d(values, weights / weights.sum(), mode="nearest"))
+
+    def settled_below(self, limits: Floats, window_s: float = SETTLING_S) -> Floats:
+        """A smooth curve (n,) nowhere above `limits` (n,): an average of minima, each of which includes the moment."""
+        lowest = minimum_filter1d(limits, 2 * _reach(window_s, self.frame_rate_hz) + 1, mode="nearest")
+        return self.settled(lowest, window_s)
+
+
+def _reach(window_s: float, frame_rate_hz: float) -> int:
+    return round(window_s * frame_rate_hz)
+
+
+def padding_frames(frame_rate_hz: float) -> int:
+    """Moments needed on either side of those wanted, so that no end disturbs the averages."""
+    return 2 * _reach(BLENDING_S, frame_rate_hz) + 1
+
+
+def pose_body(
+    skeleton: Skeleton, style: GaitStyle, moments: Moments, feet: Mapping[str, FootMotion]
+) -> tuple[Floats, Floats]:
+    """Root positions (n, 3) in metres and global rotations (n, J, 4) of the studio skeleton's joints.
+
+    Raises
+    ------
+    MotionError    where a step is longer than the leg
+    """
+    root = moments.root
+    rotations = {"Hips": _pelvis(style, moments)}
+    ankles = {side: _ankle(skeleton, side, feet[side], rotations) for side in SIDES}
+    loaded = {side: feet[side].heel_planted | feet[side].ball_planted for side in SIDES}
+    heights = _pelvis_heights(skeleton, style, moments, rotations["Hips"], ankles, loaded)
+    positions = np.stack((root.positions.imag, heights, root.positions.real), axis=-1)
+    for side in SIDES:
+        hip = positions + quaternions.rotate_vectors(rotations["Hips"], _offset(skeleton, side + "UpLeg"))
+        facing = 0.5 * (root.headings + feet[side].yaws)
+        _bend_leg(skeleton, side, hip, ankles[side], facing, feet[side].freedom, rotations)
+    _pose_trunk(style, moments, rotations)
+    for side, sign in SIDES.items():
+        _pose_arm(style, moments, side, sign, rotations)
+    return positions, np.stack([rotations[name] for name in skeleton.joint_names], axis=1)
+
+
+def _offset(skeleton: Skeleton, name: str) -> NDArray[np.float64]:
+    return np.asarray(skeleton.offsets[skeleton.index_of(name)])
+
+
+def _thigh_m(skeleton: Skeleton) -> float:
+    return -float(_offset(skeleton, "LeftLeg")[1])
+
+
+def _shank_m(skeleton: Skeleton) -> float:
+    return -float(_offset(skeleton, "LeftFoot")[1])
+
+
+def _pelvis(style: GaitStyle, moments: Moments) -> Floats:
+    """The heading, exactly, and a tilt that drops the side of the swinging leg; it leaves forward and left in place."""
+    speeds = moments.settled(moments.root.speeds)
+    tilts = style.bounce * 0.06 * eased(speeds / 1.4) * np.cos(2.0 * np.pi * moments.phases)
+    return quaternions.from_euler("yz", np.stack((moments.root.headings, tilts), axis=-1))
+
+
+def _ankle(skeleton: Skeleton, side: str, foot: FootMotion, rotations: dict[str, Floats]) -> Floats:
+    """Position (n, 3) of the ankle; notes the rotations of foot and toes."""
+    name, toes = side + "Foot", side + "ToeBase"
+    rotations[name] = quaternions.from_euler("yx", np.stack((foot.yaws, -foot.pitches), axis=-1))
+    rotations[toes] = quaternions.from_euler("yx", np.stack((foot.yaws, -foot.toe_pitches), axis=-1))
+    return foot.balls - quaternions.rotate_vectors(rotations[name], _offset(skeleton, toes))
+
+
+def _pelvis_heights(
+    skeleton: Skeleton,
+    style: GaitStyle,
+    moments: Moments,
+    pelvis: Floats,
+    ankles: Mapping[str, Floats],
+    loaded: Mapping[str, NDArray[np.bool_]],
+) -> Floats:
+    """Heights (n,) of the root: the gait's rise and fall, as far as the legs that stand reach the floor."""
+    speeds = moments.settled(moments.root.speeds)
+    leg = _thigh_m(skeleton) + _shank_m(skeleton)
+    moving = eased(speeds / 1.2)
+    crouch = 0.006 + moving * styles.blended(0.010, 0.045, speeds)
+    rise = style.bounce * moving * styles.blended(0.014, -0.035, speeds) * np.cos(4.0 * np.pi * moments.phases)
+    heights = skeleton.offsets[0, 1] + leg * (rise - crouch)
+    for side, ankle in ankles.items():
+        hip = quaternions.rotate_vectors(pelvis, _offset(skeleton, side + "UpLeg"))
+        across = moments.root.positions + hip[:, 2] + 1j * hip[:, 0] - (ankle[:, 2] + 1j * ankle[:, 0])
+        squared = np.where(loaded[side], (LEG_STRETCH * leg) ** 2 - np.abs(across) ** 2, np.inf)
+        if squared.min() <= 0.0:
+            moment = moments.times_s[np.argmin(squared)]
+            raise MotionError(
+                f"at {moment:.2f} s a step is longer than the leg of {leg:.2f} m; go slower or turn less",
+                code="gait_out_of_reach",
+                where="speed_m_s",
+            )
+        heights = np.minimum(heights, ankle[:, 1] + np.sqrt(squared) - hip[:, 1])
+    return moments.settled_below(heights)
+
+
+def _bend_leg(
+    skeleton: Skeleton,
+    side: str,
+    hip: Floats,
+    ankle: Floats,
+    facing: Floats,
+    freedom: Floats,
+    rotations: dict[str, Floats],
+) -> None:
+    """Two-bone inverse kinematics: knees bend to where pelvis and foot face, `facing` (n,) radians.
+
+    A swinging foot that trails out of reach is drawn along by the leg, the more softly the higher `freedom` (n,).
+    """
+    thigh, shank = _thigh_m(skeleton), _shank_m(skeleton)
+    reach = ankle - hip
+    distance = np.linalg.norm(reach, axis=-1, keepdims=True)
+    along = reach / distance
+    slack = LEG_STRETCH * (thigh + shank) - distance
+    distance = distance + slack - smooth_positive_part(slack, YIELDING_M * freedom[:, None])
+    ankle = hip + distance * along
+    ahead = np.stack((np.sin(facing), np.zeros_like(facing), np.cos(facing)), axis=-1)
+    bend = quaternions.perpendicular(ahead, along)
+    cosine = np.clip((thigh**2 + distance**2 - shank**2) / (2.0 * thigh * distance), -1.0, 1.0)
+    knee = hip + thigh * (cosine * along + np.sqrt(1.0 - cosine**2) * bend)
+    hinge = np.cross(bend, along)
+    for joint, start, end in ((side + "UpLeg", hip, knee), (side + "Leg", knee, ankle)):
+        y = (start - end) / np.linalg.norm(start - end, axis=-1, keepdims=True)
+        rotations[joint] = quaternions.from_matrix(np.stack((hinge, y, np.cross(hinge, y)), axis=-1))
+
+
+def _pose_trunk(style: GaitStyle, moments: Moments, rotations: dict[str, Floats]) -> None:
+    """Lean into speed and turns, shoulders against the legs, a head that looks ahead."""
+    root = moments.root
+    forward = moments.settled(root.speeds * np.cos(root.travel_angles))
+    bank = style.lean * moments.settled(styles.bank_rad(root.speeds, root.turn_rates))
+    lean = (
+        style.lean
+        * np.sign(forward)
+        * styles.blended(
+            0.03 * eased(np.abs(forward)), np.minimum(0.10 + 0.025 * np.abs(forward), 0.30), np.abs(forward)
+        )
+    )
+    twist = _shoulder_twist(style, moments)
+    slow = style.wander * np.array([_drift(style, moments, which) for which in range(3)])
+    for name, share in (("Spine", 0.33), ("Spine1", 0.67), ("Spine2", 1.0)):
+        rotations[name] = _turned("yzx", root.headings + share * twist, -share * bank, share * (lean + 0.02 * slow[1]))
+    rotations["Neck"] = _turned("yzx", root.headings + 0.3 * twist + 0.05 * slow[0], -0.6 * bank, 0.5 * lean)
+    rotations["Head"] = _turned("yzx", root.headings + 0.15 * slow[0], -0.3 * bank, 0.2 * lean + 0.06 * slow[2])
+
+
+def _pose_arm(style: GaitStyle, moments: Moments, side: str, sign: int, rotations: dict[str, Floats]) -> None:
+    """Arms that swing against the legs from hanging shoulders; elbows bend with speed."""
+    speeds = moments.settled(moments.root.speeds)
+    swing = style.arm_swing * sign * np.sin(2.0 * np.pi * moments.phases)
+    angle = swing * styles.blended(0.38 * eased(speeds / 1.4), 0.55, speeds) - styles.blended(0.04, 0.10, speeds)
+    drift = style.wander * _drift(style, moments, 1 + (sign > 0))
+    aside = 0.16 + styles.blended(0.0, 0.10, speeds) + 0.04 * drift
+    inward = styles.blended(0.15, 0.35, speeds)
+    bend = styles.blended(0.25 + 0.15 * swing * eased(speeds / 1.4), 1.45 + 0.25 * swing, speeds) + 0.05 * drift
+    rotations[side + "Shoulder"] = rotations["Spine2"]
+    yaw = moments.root.headings + _shoulder_twist(style, moments)
+    rotations[side + "Arm"] = _turned("yxyz", yaw, -angle, -sign * inward, -sign * (0.5 * np.pi - aside))
+    rotations[side + "ForeArm"] = quaternions.multiply(rotations[side + "Arm"], _turned("y", -sign * bend))
+    rotations[side + "Hand"] = rotations[side + "HandThumb1"] = rotations[side + "ForeArm"]
+    curl = np.full_like(bend, -sign * 0.35)
+    rotations[side + "HandMiddle1"] = quaternions.multiply(rotations[side + "Hand"], _turned("z", curl))
+
+
+def _shoulder_twist(style: GaitStyle, moments: Moments) -> Floats:
+    speeds = moments.settled(moments.root.speeds)
+    size = styles.blended(0.10 * eased(speeds / 1.4), 0.14, speeds)
+    return np.asarray(-style.sway * size * np.sin(2.0 * np.pi * moments.phases))
+
+
+def _drift(style: GaitStyle, moments: Moments, which: int) -> Floats:
+    """A slow wave (n,) between -1 and 1, each with its own period and phase."""
+    period_s = (9.1, 6.7, 4.9)[which]
+    return np.asarray(np.sin(2.0 * np.pi * moments.times_s / period_s + style.wander_phases_rad[which]))
+
+
+def _turned(axes: str, *angles: Floats) -> Floats:
+    """Rotations (n, 4) about the axes of the moving frame, in the order written; angles (n,) in radians."""
+    result = quaternions.identity()
+    for axis, angle in zip(axes, angles, strict=True):
+        result = quaternions.multiply(result, quaternions.from_axis_angle(np.eye(3)["xyz".index(axis)], angle))
+    return result

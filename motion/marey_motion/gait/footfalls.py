@@ -1,0 +1,291 @@
+"""Where and when each foot stands, and its way from one foothold to the next.
+
+A foot is its ball, the joint that the toes turn about. While the foot is loaded, the heel or the ball is a fixed point
+of the floor: the foot rolls about the heel when it lands with the toes up, stands flat, then rolls about the ball.
+Between, the ball follows a cubic in the frame of the root, whose ends move with the floor, so that nothing jumps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.gait import style as styles
+from marey_motion.gait.path import Complexes, Floats, RootPath, RootState
+from marey_motion.gait.style import GaitStyle, eased
+
+LANDING_SHARE = 0.18  # of the stance, in which a foot that lands tilted comes down flat
+PUSH_OFF_START = 0.50  # share of the stance after which the foot rolls off
+EARLY_PEAK = 729.0 / 16.0  # makes s²(1 - s)⁴ reach 1, at a third of the swing, where the heel is highest
+ROUNDING_M = 0.05  # greatest height over which a swinging foot changes what it keeps clear of the floor
+STILL_M = 1e-9  # lift below which a foot has not left the floor
+SHORT_STEP_M = 0.12  # shorter steps are lifted less; no step, no lift
+
+
+@dataclass(frozen=True)
+class FootShape:
+    """Lengths of the leg and foot that stepping depends on, metres.
+
+    Parameters
+    ----------
+    ball_height_m : of the ball joint above the floor in the rest pose
+    heel_length_m : from the heel to the ball along the sole
+    toe_length_m : from the ball to the tip of the toes
+    ball_ahead_m : of the ball in front of the hip in the rest pose
+    half_width_m : from the middle of the body to the foot in the rest pose
+    hip_height_m : of the hip above the floor in the rest pose
+    """
+
+    ball_height_m: float
+    heel_length_m: float
+    toe_length_m: float
+    ball_ahead_m: float
+    half_width_m: float
+    hip_height_m: float
+
+
+@dataclass(frozen=True)
+class Cadence:
+    """Strides over time: the phase grows by one with each stride, continuously, at a rate that suits the speed."""
+
+    path: RootPath
+    style: GaitStyle
+
+    @cached_property
+    def _pieces(self) -> Floats:
+        """(4, pieces): start time, phase there, stride rate there and its slope."""
+        pieces = self.path.pieces
+        turn_rates = np.array([piece.turn_rate_rad_s for piece in pieces])
+        travels = np.array([piece.travel_angle_rad for piece in pieces])
+        durations = np.array([piece.duration_s for piece in pieces])
+        first, last = (
+            styles.stride_rate_hz(np.array(speeds), turn_rates, travels) / self.style.stride
+            for speeds in ([piece.speed_m_s for piece in pieces], [piece.final_speed_m_s for piece in pieces])
+        )
+        done = np.cumsum(0.5 * (first + last) * durations)[1:-1] - 0.5 * (first[0] + last[0]) * durations[0]
+        return np.array([self.path.starts_s, np.concatenate(([0.0, 0.0], done)), first, (last - first) / durations])
+
+    def phase_at(self, times_s: Floats) -> Floats:
+        """Strides done since time 0, shape (n,)."""
+        start, phase, rate, slope = self._pieces[:, self.path.piece_at(times_s)]
+        elapsed = times_s - start
+        return np.asarray(phase + rate * elapsed + 0.5 * slope * elapsed**2)
+
+    def time_at(self, phases: Floats) -> Floats:
+        """Seconds at which so many strides are done, shape (n,)."""
+        piece = np.searchsorted(self._pieces[1, 1:], phases, side="right")
+        start, phase, rate, slope = self._pieces[:, piece]
+        missing = phases - phase
+        # This form of the quadratic's root stays exact where the rate hardly changes.
+        return np.asarray(start + 2.0 * missing / (rate + np.sqrt(rate**2 + 2.0 * slope * missing)))
+
+
+@dataclass(frozen=True)
+class FootMotion:
+    """One foot at n moments.
+
+    Parameters
+    ----------
+    balls : (n, 3) position of the ball joint, metres
+    yaws, pitches, toe_pitches : (n,) radians; toes up is positive
+    freedom : (n,) 0 while the foot is loaded, rising to 1 in the middle of its swing
+    heel_planted, ball_planted : (n,) bool    that point of the sole is fixed on the floor
+    """
+
+    balls: Floats
+    yaws: Floats
+    pitches: Floats
+    toe_pitches: Floats
+    freedom: Floats
+    heel_planted: NDArray[np.bool_]
+    ball_planted: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Footfalls:
+    """The stances of one foot over a stretch of time.
+
+    Parameters
+    ----------
+    cadence : when strides happen, and along which path
+    shape : lengths of the foot
+    side : 1 for the left foot, -1 for the right
+    span_s : first and last moment that is asked for, seconds
+    """
+
+    cadence: Cadence
+    shape: FootShape
+    side: int
+    span_s: tuple[float, float]
+
+    @cached_property
+    def centre_phases(self) -> Floats:
+        """Phase in the middle of each stance: whole for the left foot, half a stride later for the right."""
+        first, last = self.cadence.phase_at(np.array(self.span_s))
+        return np.arange(np.floor(first) - 2.0, np.ceil(last) + 3.0) + (0.0 if self.side > 0 else 0.5)
+
+    @cached_property
+    def middles(self) -> RootState:
+        """The root in the middle of each stance."""
+        return self.cadence.path.at(self.cadence.time_at(self.centre_phases))
+
+    @cached_property
+    def strikes_s(self) -> Floats:
+        """When each stance begins."""
+        return self.cadence.time_at(self.centre_phases - 0.5 * styles.stance_share(self.middles.speeds))
+
+    @cached_property
+    def leaves_s(self) -> Floats:
+        """When each stance ends."""
+        return self.cadence.time_at(self.centre_phases + 0.5 * styles.stance_share(self.middles.speeds))
+
+    @cached_property
+    def footholds(self) -> Complexes:
+        """Where the ball of each flat foot stands, z + i·x, metres."""
+        root, shape, style = self.middles, self.shape, self.cadence.style
+        forward = np.cos(root.travel_angles)
+        sideways = np.abs(np.sin(root.travel_angles))
+        # A rolling foot reaches further back than forward, so its stance is centred a little behind the hip.
+        ahead = shape.ball_ahead_m - styles.blended(0.09, 0.05, root.speeds) * eased(root.speeds / 1.4) * forward
+        narrowing = styles.blended(1.0 - 0.25 * eased(root.speeds), 0.45, root.speeds)
+        rate = styles.stride_rate_hz(root.speeds, root.turn_rates, root.travel_angles) / style.stride
+        # Side steps must not cross: half of the way between the feet is a quarter of a stride.
+        spread = 0.25 * root.speeds * sideways / rate
+        bank = styles.bank_rad(root.speeds, root.turn_rates) * style.lean
+        lateral = self.side * (shape.half_width_m * narrowing * style.step_width + spread)
+        lateral = lateral - 0.6 * shape.hip_height_m * np.tan(bank)
+        return np.asarray(root.positions + np.exp(1j * root.headings) * (ahead + 1j * lateral))
+
+    @cached_property
+    def lifts_m(self) -> Floats:
+        """Greatest clearance of the step that follows each stance but the last."""
+        way = np.abs(np.diff(self.footholds)) + 0.3 * np.abs(np.diff(self.middles.headings))
+        highest = styles.clearance_m(0.5 * (self.middles.speeds[1:] + self.middles.speeds[:-1]))
+        return np.asarray(self.cadence.style.lift * highest * -np.expm1(-way / SHORT_STEP_M))
+
+    def at(self, times_s: Floats) -> FootMotion:
+        """The foot at times within the span, shape (n,), seconds."""
+        stance = np.searchsorted(self.strikes_s, times_s, side="right") - 1
+        loaded = times_s < self.leaves_s[stance]
+        planted = loaded | (self._lift(stance) < STILL_M)
+        standing, swinging = self._standing(times_s, stance), self._swinging(times_s, stance)
+
+        def chosen(field: str) -> Floats:
+            return np.where(loaded, standing[field], swinging[field])
+
+        ground, pitches = chosen("ground"), chosen("pitches").real
+        return FootMotion(
+            balls=np.stack((ground.imag, self.shape.ball_height_m + chosen("heights"), ground.real), axis=-1),
+            yaws=chosen("yaws"),
+            pitches=pitches,
+            toe_pitches=chosen("toe_pitches"),
+            freedom=chosen("freedom"),
+            heel_planted=planted & (pitches >= 0.0),
+            ball_planted=planted & (pitches <= 0.0),
+        )
+
+    @cached_property
+    def _landing_pitches(self) -> Floats:
+        return styles.landing_pitch_rad(self.middles.speeds, self.middles.travel_angles)
+
+    @cached_property
+    def _leaving_pitches(self) -> Floats:
+        return styles.leaving_pitch_rad(self.middles.speeds, self.middles.travel_angles)
+
+    @cached_property
+    def _leaving_pitch_rates(self) -> Floats:
+        """Slope of `_push_off` at its end, in radians per second."""
+        return np.asarray(self._leaving_pitches / ((1.0 - PUSH_OFF_START) * (self.leaves_s - self.strikes_s)))
+
+    def _standing(self, times_s: Floats, stance: NDArray[np.intp]) -> dict[str, Floats | Complexes]:
+        """The loaded foot: rolls about the heel, stands, rolls about the ball."""
+        share = (times_s - self.strikes_s[stance]) / (self.leaves_s - self.strikes_s)[stance]
+        landing = 1.0 - eased(share / LANDING_SHARE)
+        pushing = np.clip((share - PUSH_OFF_START) / (1.0 - PUSH_OFF_START), 0.0, 1.0)
+        pitches = self._landing_pitches[stance] * landing + self._leaving_pitches[stance] * pushing**2 * (2.0 - pushing)
+        return {
+            "ground": self._rolled(pitches, stance),
+            "heights": self.shape.heel_length_m * np.sin(np.maximum(pitches, 0.0)),
+            "pitches": pitches,
+            "toe_pitches": np.maximum(pitches, 0.0),
+            "freedom": np.zeros_like(pitches),
+            "yaws": self.middles.headings[stance],
+        }
+
+    def _rolled(self, pitches: Floats, stance: NDArray[np.intp]) -> Complexes:
+        """Where the ball is over the floor when the foot has rolled about its heel by positive `pitches`."""
+        back = self.shape.heel_length_m * (1.0 - np.cos(np.maximum(pitches, 0.0)))
+        return np.asarray(self.footholds[stance] - back * np.exp(1j * self.middles.headings[stance]))
+
+    def _lift(self, stance: NDArray[np.intp]) -> Floats:
+        return self.lifts_m[np.minimum(stance, len(self.lifts_m) - 1)]
+
+    def _swinging(self, times_s: Floats, stance: NDArray[np.intp]) -> dict[str, Floats | Complexes]:
+        """The free foot, from the end of `stance` to the beginning of the next."""
+        following = np.minimum(stance + 1, len(self.strikes_s) - 1)
+        duration = self.strikes_s[following] - self.leaves_s[stance]
+        share = np.clip((times_s - self.leaves_s[stance]) / np.where(duration > 0.0, duration, 1.0), 0.0, 1.0)
+        bump = 16.0 * (share * (1.0 - share)) ** 2
+        early = EARLY_PEAK * share**2 * (1.0 - share) ** 4
+        pitches = _cubic(
+            share,
+            self._leaving_pitches[stance],
+            self._leaving_pitch_rates[stance] * duration,
+            self._landing_pitches[following],
+            np.zeros_like(duration),
+        )
+        turn = self.middles.headings[following] - self.middles.headings[stance]
+        lifts = self._lift(stance)
+        rounding = np.minimum(lifts, ROUNDING_M) * bump
+        # The lowest of heel, ball and toes keeps the clearance; the maximum is smooth wherever the foot is in the air.
+        heel_drop = smooth_positive_part(self.shape.heel_length_m * np.sin(pitches), rounding)
+        toe_pitches = np.where(pitches > 0.0, pitches, pitches * bump)
+        toe_drop = smooth_positive_part(-self.shape.toe_length_m * np.sin(toe_pitches), 0.4 * rounding)
+        return {
+            "ground": self._swing_ground(times_s, stance, following, share),
+            "heights": lifts * early + heel_drop + toe_drop,
+            "pitches": pitches,
+            "toe_pitches": toe_pitches,
+            "freedom": rounding / ROUNDING_M,
+            "yaws": self.middles.headings[stance] + turn * eased(share),
+        }
+
+    def _swing_ground(
+        self, times_s: Floats, stance: NDArray[np.intp], following: NDArray[np.intp], share: Floats
+    ) -> Complexes:
+        """Way of the ball over the floor: a cubic in the root's frame that starts and ends at rest on the floor."""
+        path = self.cadence.path
+        leaving, landing = path.at(self.leaves_s[stance]), path.at(self.strikes_s[following])
+        pitches, rates = self._leaving_pitches[stance], self._leaving_pitch_rates[stance]
+        rolling = -self.shape.heel_length_m * np.sin(np.maximum(pitches, 0.0)) * rates
+        moving = rolling * np.exp(1j * self.middles.headings[stance])
+        start, start_rate = _seen_from(leaving, self._rolled(pitches, stance), moving)
+        end, end_rate = _seen_from(landing, self._rolled(self._landing_pitches[following], following), 0.0 * moving)
+        duration = self.strikes_s[following] - self.leaves_s[stance]
+        now = path.at(times_s)
+        local = _cubic(share, start, start_rate * duration, end, end_rate * duration)
+        return np.asarray(now.positions + local * np.exp(1j * now.headings))
+
+
+def _seen_from(root: RootState, points: Complexes, velocities: Complexes) -> tuple[Complexes, Complexes]:
+    """Position and velocity of points of the ground in the turning, travelling frame of the root."""
+    to_root = np.exp(-1j * root.headings)
+    local = (points - root.positions) * to_root
+    return local, (velocities - root.velocities) * to_root - 1j * root.turn_rates * local
+
+
+def _cubic(share: Floats, start: Any, start_rate: Any, end: Any, end_rate: Any) -> Any:
+    """Hermite's cubic over `share` in 0 to 1; rates are per unit of `share`."""
+    s, r = share, 1.0 - share
+    return (
+        r * r * (1.0 + 2.0 * s) * start + r * r * s * start_rate + s * s * (3.0 - 2.0 * s) * end - s * s * r * end_rate
+    )
+
+
+def smooth_positive_part(values: Floats, width: Floats) -> Floats:
+    """max(values, 0), never below it, rounded over about `width` around zero."""
+    return np.asarray(0.5 * (values + np.sqrt(values**2 + width**2)))

@@ -1,0 +1,124 @@
+"""How a gait looks at each speed, and what makes one walker differ from the next.
+
+The curves are fits by eye to typical adult values (Winter, Biomechanics and Motor Control of Human Movement, 2009);
+they shape steps and swings and never touch the root's path.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating[Any]]
+GRAVITY_M_S2 = 9.81
+STEERING_RADIUS_M = 0.3  # turning on the spot needs steps like walking at this radius
+BANK_LIMIT_RAD = 0.35
+
+
+@dataclass(frozen=True)
+class GaitStyle:
+    """Factors on the neutral gait, 1 for neutral and 0 for none.
+
+    With `bounce`, `lean`, `sway` and `arm_swing` at 0 the upper body rides rigidly on the root.
+
+    Parameters
+    ----------
+    stride : length of strides at a given speed
+    step_width : distance between the lines the feet walk on
+    lift : height of the swinging feet
+    bounce : rise and fall of the pelvis and its sideways tilt
+    lean : forward lean of the trunk and banking into turns
+    sway : counter-rotation of the shoulders against the legs
+    arm_swing : amplitude of the arms
+    wander : slow irregular drift of head and arms; each clip's own
+    wander_phases_rad : phases of that drift
+    """
+
+    stride: float = 1.0
+    step_width: float = 1.0
+    lift: float = 1.0
+    bounce: float = 1.0
+    lean: float = 1.0
+    sway: float = 1.0
+    arm_swing: float = 1.0
+    wander: float = 0.0
+    wander_phases_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def varied(cls, seed: int) -> GaitStyle:
+        """The style of one walker out of a crowd; the same for the same seed."""
+        generator = np.random.default_rng(seed)
+        stride, width, lift, bounce, lean, sway, arms = 1.0 + generator.uniform(-1.0, 1.0, 7) * (
+            (0.06, 0.25, 0.3, 0.25, 0.5, 0.3, 0.35)
+        )
+        phases = generator.uniform(0.0, 2.0 * np.pi, 3)
+        return cls(
+            stride=float(stride),
+            step_width=float(width),
+            lift=float(lift),
+            bounce=float(bounce),
+            lean=float(lean),
+            sway=float(sway),
+            arm_swing=float(arms),
+            wander=1.0,
+            wander_phases_rad=(float(phases[0]), float(phases[1]), float(phases[2])),
+        )
+
+
+def eased(x: Floats | float) -> Floats:
+    """From 0 at x <= 0 to 1 at x >= 1 with level ends."""
+    x = np.clip(x, 0.0, 1.0)
+    result: Floats = np.asarray(x * x * (3.0 - 2.0 * x))
+    return result
+
+
+def running_share(speed_m_s: Floats | float) -> Floats:
+    """0 for a walk, 1 for a run, between them where people change over."""
+    return eased((np.asarray(speed_m_s) - 1.9) / 0.5)
+
+
+def blended(walk: Floats | float, run: Floats | float, speed_m_s: Floats | float) -> Floats:
+    """The walk's value, the run's, or between, as the speed asks."""
+    share = running_share(speed_m_s)
+    result: Floats = np.asarray((1.0 - share) * walk + share * run)
+    return result
+
+
+def stride_rate_hz(speed_m_s: Floats, turn_rate_rad_s: Floats, travel_angle_rad: Floats) -> Floats:
+    """Strides (two steps) per second."""
+    stepping = np.hypot(speed_m_s, STEERING_RADIUS_M * turn_rate_rad_s)
+    forward = blended(0.45 + 0.36 * stepping, 1.15 + 0.075 * stepping, stepping)
+    shorter = 1.0 + 0.35 * np.abs(np.sin(travel_angle_rad)) + 0.15 * np.maximum(-np.cos(travel_angle_rad), 0.0)
+    return np.asarray(forward * shorter)
+
+
+def stance_share(speed_m_s: Floats) -> Floats:
+    """Part of a stride in which a foot is on the floor."""
+    return blended(0.68 - 0.05 * speed_m_s, np.maximum(0.46 - 0.035 * speed_m_s, 0.20), speed_m_s)
+
+
+def landing_pitch_rad(speed_m_s: Floats, travel_angle_rad: Floats) -> Floats:
+    """Pitch of the foot when it lands, toes up positive: heel first going forward, ball first going backward."""
+    along = np.cos(travel_angle_rad)
+    size = np.where(along > 0.0, blended(0.33, 0.12, speed_m_s), 0.30)
+    return np.asarray(along * size * eased(speed_m_s / 1.2))
+
+
+def leaving_pitch_rad(speed_m_s: Floats, travel_angle_rad: Floats) -> Floats:
+    """Pitch of the foot when it leaves the floor: off the ball going forward, off the heel going backward."""
+    along = np.cos(travel_angle_rad)
+    size = np.where(along > 0.0, blended(1.05, 1.15, speed_m_s), 0.15)
+    return np.asarray(-along * size * eased(speed_m_s / 1.2))
+
+
+def clearance_m(speed_m_s: Floats) -> Floats:
+    """Height of the sole above the floor in the middle of a long step."""
+    return blended(0.035, 0.04 + 0.045 * speed_m_s, speed_m_s)
+
+
+def bank_rad(speeds: Floats, turn_rates: Floats) -> Floats:
+    """Lean into a turn that balances the centrifugal force, to a limit; positive leans left."""
+    return BANK_LIMIT_RAD * np.tanh(np.arctan(speeds * turn_rates / GRAVITY_M_S2) / BANK_LIMIT_RAD)
