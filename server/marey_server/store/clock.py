@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from datetime import UTC, datetime
 from typing import Protocol
 
 from sqlalchemy import Connection, insert, select, text, update
@@ -57,3 +58,8 @@ def save_high_water(connection: Connection, now_us: int) -> None:
         connection.execute(insert(server_state).values(key=_HIGH_WATER, value=now_us))
     elif now_us - stored >= _SAVE_EVERY_US:
         connection.execute(update(server_state).where(server_state.c.key == _HIGH_WATER).values(value=now_us))
+
+
+def datetime_of(us: int) -> datetime:
+    """A stored time as documents show it."""
+    return datetime.fromtimestamp(us // 1_000_000, UTC).replace(microsecond=us % 1_000_000)

@@ -16,11 +16,13 @@ from contextlib import contextmanager
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import sqlalchemy
-from sqlalchemy import Connection, CursorResult, Engine, Executable, event, exc, make_url
+from sqlalchemy import Connection, CursorResult, Engine, Executable, Table, event, exc, make_url
+from sqlalchemy.dialects import postgresql, sqlite
 
 from marey_server.access.principal import Principal
 from marey_server.errors import StorageFull, Unavailable
 from marey_server.store import tables
+from marey_server.store.blob_backings import BlobBacking, DatabaseBlobs
 from marey_server.store.clock import Clock, DatabaseClock
 
 P = ParamSpec("P")
@@ -37,9 +39,10 @@ WRITE_TRIES = 5
 class Transaction:
     """One transaction and the principal on whose behalf it runs."""
 
-    def __init__(self, connection: Connection, principal: Principal, clock: Clock) -> None:
+    def __init__(self, connection: Connection, principal: Principal, clock: Clock, blobs: BlobBacking) -> None:
         self.connection = connection
         self.principal = principal
+        self.blobs = blobs
         self._clock = clock
         self._now_us: int | None = None
         self._after_commit: list[Callable[[], None]] = []
@@ -59,6 +62,22 @@ class Transaction:
     def execute(self, statement: Executable, parameters: Any = None) -> CursorResult[Any]:
         """Run one statement."""
         return self.connection.execute(statement, parameters)  # type: ignore[return-value]
+
+    def insert_or_ignore(self, table: Table, row: Mapping[str, Any]) -> postgresql.Insert | sqlite.Insert:
+        """An INSERT that does nothing where a unique index refuses the row; for one row, add `returning` to learn which."""
+        if self.is_postgres:
+            return postgresql.insert(table).values(**row).on_conflict_do_nothing()
+        return sqlite.insert(table).values(**row).on_conflict_do_nothing()
+
+    def lock(self, name: str) -> None:
+        """Wait until nobody else holds the lock `name`, and hold it to the end of a write.
+
+        SQLite has one writer at a time anyway.
+        """
+        if self.is_postgres:
+            self.execute(
+                sqlalchemy.select(sqlalchemy.func.pg_advisory_xact_lock(sqlalchemy.func.hashtextextended(name, 0)))
+            )
 
     def emit(self, kind: str, subject: str, *, project_id: str | None = None, **body: Any) -> None:
         """Record an event, visible when the transaction commits."""
@@ -89,13 +108,22 @@ class Transaction:
 class Database:
     """The connections of one server process."""
 
-    def __init__(self, url: str, *, readers: int = 8, clock: Clock | None = None, echo: bool = False) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        readers: int = 8,
+        clock: Clock | None = None,
+        blobs: BlobBacking | None = None,
+        echo: bool = False,
+    ) -> None:
         self.url = make_url(url)
         if self.url.drivername in ("postgresql", "postgres"):
             self.url = self.url.set(drivername="postgresql+psycopg")
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         self.engine = self._create_engine(readers, echo)
         self.clock: Clock = clock or DatabaseClock()
+        self.blobs: BlobBacking = blobs or DatabaseBlobs()
         self._readers = ThreadPoolExecutor(readers, thread_name_prefix="marey-read")
         self._writers = ThreadPoolExecutor(1, thread_name_prefix="marey-write") if self.is_sqlite else self._readers
 
@@ -127,7 +155,7 @@ class Database:
     ) -> T:
         """Run `function(tx, ...)` in a read-only transaction of the calling thread."""
         with self._connect(readonly=True) as connection:
-            return function(Transaction(connection, principal, self.clock), *args, **kwargs)
+            return function(Transaction(connection, principal, self.clock, self.blobs), *args, **kwargs)
 
     def write(
         self,
@@ -144,7 +172,7 @@ class Database:
         for attempt in range(WRITE_TRIES):
             try:
                 with self._connect(readonly=False) as connection:
-                    tx = Transaction(connection, principal, self.clock)
+                    tx = Transaction(connection, principal, self.clock, self.blobs)
                     answer = function(tx, *args, **kwargs)
             except exc.DBAPIError as error:
                 if attempt == WRITE_TRIES - 1 or not _worth_retrying(error):

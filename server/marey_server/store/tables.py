@@ -338,6 +338,13 @@ job_log = Table(
     ForeignKeyConstraint(["job_id", "fence"], ["attempt.job_id", "attempt.fence"]),
 )
 
+job_blob = Table(  # blobs that a job's parameters or result name
+    "job_blob",
+    metadata,
+    Column("job_id", ID, ForeignKey("job.id"), primary_key=True),
+    Column("blob_digest", DIGEST, ForeignKey("blob.digest"), primary_key=True, index=True),
+)
+
 staged_output = Table(
     "staged_output",
     metadata,

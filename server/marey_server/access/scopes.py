@@ -1,0 +1,17 @@
+"""How far a credential reaches. A scope is `read`, `write`, `jobs`, `work` or `admin`, alone or as `write!project=walk`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+def allows(scopes: Iterable[str], need: str, project: str | None = None) -> bool:
+    """Whether `scopes` reach `need` in `project`; without a project, only unbound scopes do."""
+    wanted = {need} if project is None else {need, f"{need}!project={project}"}
+    return not wanted.isdisjoint(scopes)
+
+
+def exceeding(wanted: Iterable[str], held: Iterable[str]) -> list[str]:
+    """Those of `wanted` that reach further than `held` does."""
+    held = set(held)
+    return [scope for scope in wanted if scope not in held and scope.partition("!")[0] not in held]

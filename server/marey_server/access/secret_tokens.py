@@ -1,0 +1,58 @@
+"""The texts that callers show as bearer tokens.
+
+`marey_<prefix>_<secret>` belongs to a user; the prefix finds the row. `mareyjob_<secret>` belongs to an attempt of a job.
+Rows hold SHA-256 of the secret: it has 256 random bits, so that no slow hash is needed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import secrets
+from typing import NamedTuple
+
+_USER = "marey_"
+_ATTEMPT = "mareyjob_"
+
+
+class IssuedToken(NamedTuple):
+    """A new token: the text shown once, and what the database keeps of it."""
+
+    text: str
+    prefix: str
+    secret_hash: str
+
+
+def issue_user_token() -> IssuedToken:
+    """A new token of a user."""
+    prefix, secret = secrets.token_hex(6), secrets.token_hex(32)
+    return IssuedToken(f"{_USER}{prefix}_{secret}", prefix, hash_secret(secret))
+
+
+def issue_attempt_token() -> IssuedToken:
+    """A new token of an attempt; its row is found by the hash."""
+    secret = secrets.token_hex(32)
+    return IssuedToken(f"{_ATTEMPT}{secret}", "", hash_secret(secret))
+
+
+def hash_secret(secret: str) -> str:
+    """What the database keeps of a secret: 64 hexadecimal digits."""
+    return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def secret_matches(secret: str, secret_hash: str) -> bool:
+    """Whether `secret` is the one that was hashed, in constant time."""
+    return hmac.compare_digest(hash_secret(secret), secret_hash)
+
+
+def split_user_token(text: str) -> tuple[str, str] | None:
+    """Prefix and secret of a user's token, None if `text` is none."""
+    if not text.startswith(_USER):
+        return None
+    prefix, _, secret = text[len(_USER) :].partition("_")
+    return (prefix, secret) if prefix and secret else None
+
+
+def attempt_secret(text: str) -> str | None:
+    """The secret of an attempt's token, None if `text` is none."""
+    return text[len(_ATTEMPT) :] or None if text.startswith(_ATTEMPT) else None

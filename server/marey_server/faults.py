@@ -1,0 +1,46 @@
+"""Places where a test can make the process die, stop or fail, to see what it leaves behind.
+
+`MAREY_FAULT=name:kill` kills the process (SIGKILL) when it passes the point `name`; `name:stop` stops it (SIGSTOP);
+`name:error` raises ENOSPC; `name@3:kill` acts on the third pass only. Several are separated by commas.
+"""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import os
+import signal
+from collections.abc import Iterator
+
+VARIABLE = "MAREY_FAULT"
+
+
+class _Fault:
+    def __init__(self, text: str) -> None:
+        place, _, self.action = text.partition(":")
+        self.name, _, nth = place.partition("@")
+        self._nth = int(nth) if nth else None
+        self._passes: Iterator[int] = itertools.count(1)
+        if self.action not in ("kill", "stop", "error"):
+            raise ValueError(f"{VARIABLE}={text}: the action must be kill, stop or error")
+
+    def act(self) -> None:
+        count = next(self._passes)
+        if self._nth is not None and count != self._nth:
+            return
+        if self.action == "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        elif self.action == "stop":
+            os.kill(os.getpid(), signal.SIGSTOP)
+        else:
+            raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)} (fault point {self.name})")
+
+
+_faults = [_Fault(text) for text in os.environ.get(VARIABLE, "").split(",") if text]
+
+
+def point(name: str) -> None:
+    """Do what the environment asks for here: ordinarily nothing."""
+    for fault in _faults:
+        if fault.name == name:
+            fault.act()

@@ -1,0 +1,148 @@
+"""Where the bytes of blobs lie. Rows of `blob` say which blobs exist; a backing only keeps their bytes.
+
+A backing is called inside the transaction that inserts or deletes the blob's row. That row is the lock: nobody else can
+write or remove the same bytes before the transaction ends.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Protocol
+
+from sqlalchemy import Connection, delete, insert, select
+
+from marey_server.store.tables import blob_chunk
+
+CHUNK_BYTES = 2**20
+
+
+class BlobBacking(Protocol):
+    """Keeps the bytes of blobs."""
+
+    def write(self, connection: Connection, digest: str, chunks: Iterable[bytes]) -> None:
+        """Keep bytes, given in pieces of `CHUNK_BYTES` and a last one that may be shorter."""
+        ...
+
+    def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
+        """Bytes `start` to `stop` in pieces of at most `CHUNK_BYTES`; fewer where the backing lost some."""
+        ...
+
+    def remove(self, connection: Connection, digest: str) -> None:
+        """Forget the bytes; nothing happens where there are none."""
+        ...
+
+    def stray_digests(self, connection: Connection, *, older_than_s: float) -> Iterator[str]:
+        """Digests of bytes kept for at least so long; some may have no row in `blob`."""
+        ...
+
+    def check_writable(self) -> None:
+        """Raise `OSError` where nothing can be written."""
+        ...
+
+
+class DatabaseBlobs:
+    """In the database, in rows of 1 MiB."""
+
+    def write(self, connection: Connection, digest: str, chunks: Iterable[bytes]) -> None:
+        """Keep bytes."""
+        for position, chunk in enumerate(chunks):
+            connection.execute(insert(blob_chunk), {"digest": digest, "position": position, "data": chunk})
+
+    def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
+        """Bytes `start` to `stop`."""
+        statement = select(blob_chunk.c.data).where(blob_chunk.c.digest == digest)
+        for position in range(start // CHUNK_BYTES, -(-stop // CHUNK_BYTES)):
+            data = connection.execute(statement.where(blob_chunk.c.position == position)).scalar()
+            if data is None:
+                return
+            base = position * CHUNK_BYTES
+            yield data if start <= base and base + len(data) <= stop else data[max(start - base, 0) : stop - base]
+
+    def remove(self, connection: Connection, digest: str) -> None:
+        """Forget the bytes."""
+        connection.execute(delete(blob_chunk).where(blob_chunk.c.digest == digest))
+
+    def stray_digests(self, connection: Connection, *, older_than_s: float) -> Iterator[str]:  # noqa: ARG002
+        """None: a foreign key holds bytes and rows together."""
+        return iter(())
+
+    def check_writable(self) -> None:
+        """The database is checked by itself."""
+
+
+class DirectoryBlobs:
+    """In files of a directory: `<root>/ab/cdef...`, written aside, synced and renamed."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._incoming = root / "incoming"
+        self._incoming.mkdir(parents=True, exist_ok=True)
+
+    def _path(self, digest: str) -> Path:
+        digits = digest.removeprefix("sha256:")
+        return self.root / digits[:2] / digits[2:]
+
+    def write(self, connection: Connection, digest: str, chunks: Iterable[bytes]) -> None:  # noqa: ARG002
+        """Keep bytes; what a transaction that rolled back left under the same name is replaced."""
+        path = self._path(digest)
+        path.parent.mkdir(exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=self._incoming)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                for chunk in chunks:
+                    file.write(chunk)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(name, path)
+        except BaseException:
+            with suppress(FileNotFoundError):
+                os.unlink(name)
+            raise
+        _sync_directory(path.parent)
+        _sync_directory(self.root)
+
+    def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:  # noqa: ARG002
+        """Bytes `start` to `stop`."""
+        try:
+            file = self._path(digest).open("rb")
+        except FileNotFoundError:
+            return
+        with file:
+            file.seek(start)
+            while start < stop and (chunk := file.read(min(CHUNK_BYTES, stop - start))):
+                start += len(chunk)
+                yield chunk
+
+    def remove(self, connection: Connection, digest: str) -> None:  # noqa: ARG002
+        """Forget the bytes."""
+        self._path(digest).unlink(missing_ok=True)
+
+    def stray_digests(self, connection: Connection, *, older_than_s: float) -> Iterator[str]:  # noqa: ARG002
+        """Digests of files; half-written ones of a process that died are removed on the way."""
+        newest = time.time() - older_than_s
+        for folder in sorted(self.root.iterdir()):
+            for path in folder.iterdir():
+                with suppress(FileNotFoundError):
+                    if path.stat().st_mtime <= newest:
+                        if folder == self._incoming:
+                            path.unlink()
+                        else:
+                            yield f"sha256:{folder.name}{path.name}"
+
+    def check_writable(self) -> None:
+        """Raise `OSError` where nothing can be written."""
+        with tempfile.TemporaryFile(dir=self._incoming) as file:
+            file.write(b"writable")
+
+
+def _sync_directory(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,258 @@
+"""Documents: JSON of a known schema, named by content; array leaves and named files are blobs.
+
+In the database an array leaf stands as `{"dtype", "shape", "content"}`; `document_blob` says which blob holds it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from numpy.typing import NDArray
+from pydantic import ValidationError
+from sqlalchemy import insert, select
+
+from marey_schemas import blocks
+from marey_schemas.arrays import EncodedArray
+from marey_schemas.canonical import attach_arrays, canonical_json, detach_arrays
+from marey_schemas.documents import SCHEMAS
+from marey_schemas.problems import FieldError
+from marey_server.errors import Conflict, Invalid, NotFound
+from marey_server.store import blobs
+from marey_server.store.database import Transaction
+from marey_server.store.tables import blob, document, document_blob
+
+OPEN_SCHEMA = "marey/document@1"
+
+_DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
+_NUL = re.compile(rb"(?<!\\)(?:\\\\)*\\u0000")
+_REFERENCE_KEYS = {"dtype", "shape", "content"}
+_FILE_POINTERS = {"marey/clip-info@1": ("/source/file", "/source/companion")}
+_POINTER_LENGTH = 512
+
+Tree = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedDocument:
+    """A document that was checked and encoded, ready to be stored. Making one needs no database and much of the time."""
+
+    digest: str
+    schema: str
+    body: Tree
+    size_bytes: int
+    arrays: dict[str, tuple[str, bytes]]
+    """By JSON Pointer: digest and bytes of the blob that holds the array."""
+    files: dict[str, str]
+    """By JSON Pointer: digests of blobs that the document names."""
+
+
+def prepare_document(tree: Any, *, schema: str | None = None) -> PreparedDocument:
+    """Check a document against its schema (`schema` if given, else the one it names) and encode its arrays.
+
+    Raises `Invalid` with one entry per thing that is wrong.
+    """
+    name = _check(tree, schema)
+    tree = {**tree, "schema": name}
+    encoded: dict[str, bytes] = {}
+
+    def keep(content: str, array: NDArray[Any] | EncodedArray) -> None:
+        if content not in encoded:
+            encoded[content] = array.data if isinstance(array, EncodedArray) else blocks.encode(array)
+
+    try:
+        canonical = canonical_json(detach_arrays(tree, keep))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise Invalid(f"This cannot be stored as a document: {error}", code="bad-document") from error
+    if _NUL.search(canonical):
+        raise Invalid("Text in documents must not hold the character U+0000.", code="bad-text")
+    body = json.loads(canonical)
+    arrays = {
+        pointer: (blobs.digest_of(encoded[leaf["content"]]), encoded[leaf["content"]])
+        for pointer, leaf in _members(body)
+        if _is_reference(leaf)
+    }
+    files = _named_files(name, body)
+    _check_pointers([*arrays, *files])
+    size_bytes = len(canonical) + sum(len(data) for data in encoded.values())
+    return PreparedDocument(blobs.digest_of(canonical), name, body, size_bytes, arrays, files)
+
+
+def prepared(content: Any, *, schema: str | None = None) -> PreparedDocument:
+    """`content` itself if it is prepared already for `schema`."""
+    if not isinstance(content, PreparedDocument):
+        return prepare_document(content, schema=schema)
+    if schema not in (None, OPEN_SCHEMA, content.schema):
+        raise Invalid(f"This part holds {schema}, not {content.schema}.", code="bad-schema")
+    return content
+
+
+def with_body(content: PreparedDocument, body: Tree) -> PreparedDocument:
+    """The document with other text and the same arrays and files."""
+    canonical = canonical_json(body)
+    return replace(content, digest=blobs.digest_of(canonical), body=body)
+
+
+def _check(tree: Any, schema: str | None) -> str:
+    if not isinstance(tree, Mapping):
+        raise Invalid("A document is an object.", code="bad-document")
+    named = tree.get("schema", schema)
+    if schema is not None and schema != OPEN_SCHEMA and named != schema:
+        raise Invalid(f"This part holds {schema}, not {named!r}.", code="bad-schema")
+    for pointer, leaf in _members(tree):
+        if _is_reference(leaf):
+            detail = "Send the array itself (dtype, shape, data); a reference to content is no document's own."
+            raise Invalid(detail, errors=[FieldError(pointer=pointer, code="array-reference", detail=detail)])
+    model = SCHEMAS.get(str(named)) or SCHEMAS[OPEN_SCHEMA]
+    try:
+        model.model_validate(tree)
+    except ValidationError as error:
+        errors = [
+            FieldError(pointer="/" + "/".join(map(str, found["loc"])), code=found["type"], detail=found["msg"])
+            for found in error.errors(include_url=False, include_context=False, include_input=False)[:100]
+        ]
+        raise Invalid(f"This is no valid {named}: {errors[0].pointer}: {errors[0].detail}", errors=errors) from error
+    return str(named or OPEN_SCHEMA)
+
+
+def _is_reference(value: Any) -> bool:
+    return isinstance(value, Mapping) and value.keys() == _REFERENCE_KEYS
+
+
+def _members(value: Any, pointer: str = "") -> Iterator[tuple[str, Any]]:
+    """Every member of a tree with its JSON Pointer, containers before what they hold."""
+    yield pointer, value
+    if isinstance(value, Mapping):
+        for key, member in value.items():
+            yield from _members(member, f"{pointer}/{str(key).replace('~', '~0').replace('/', '~1')}")
+    elif isinstance(value, list | tuple):
+        for index, member in enumerate(value):
+            yield from _members(member, f"{pointer}/{index}")
+
+
+def _named_files(schema: str, body: Tree) -> dict[str, str]:
+    """Blobs that a document names: in the fields its schema has for them, and in members called `blob`."""
+    fixed = _FILE_POINTERS.get(schema, ())
+    return {
+        pointer: value
+        for pointer, value in _members(body)
+        if isinstance(value, str) and (pointer in fixed or pointer.endswith("/blob")) and _DIGEST.fullmatch(value)
+    }
+
+
+def _check_pointers(pointers: list[str]) -> None:
+    for pointer in pointers:
+        if len(pointer) > _POINTER_LENGTH:
+            detail = f"Arrays and files must lie at a JSON Pointer of at most {_POINTER_LENGTH} characters."
+            raise Invalid(
+                detail, errors=[FieldError(pointer=pointer[:_POINTER_LENGTH], code="too-deep", detail=detail)]
+            )
+
+
+# -- storing ----------------------------------------------------------------------------------------------------------
+
+
+def store_document(tx: Transaction, content: Any, *, schema: str | None = None) -> str:
+    """Store a document, given as a tree or prepared, and return its digest. The same document again adds no rows.
+
+    Raises `Conflict` (`missing-blobs`) where it names blobs that the caller has not sent and may not read.
+    """
+    ready = prepared(content, schema=schema)
+    if ready.files:
+        _require_files(tx, ready.files)
+    row = {
+        "digest": ready.digest,
+        "schema": ready.schema,
+        "body": ready.body,
+        "size_bytes": ready.size_bytes,
+        "created_us": tx.now_us,
+    }
+    if blobs.insert_new(tx, document, row):
+        held = {pointer: digest for pointer, (digest, _data) in ready.arrays.items()}
+        for digest, data in sorted(dict(ready.arrays.values()).items()):
+            blobs.store_blob(tx, digest, data)
+        _refer(tx, ready.digest, held | ready.files)
+    return ready.digest
+
+
+def store_variant(tx: Transaction, digest: str, body: Tree) -> str:
+    """Store a document with the arrays and files of another and the text of `body`; return its digest."""
+    original = tx.execute(select(document.c.schema, document.c.size_bytes).where(document.c.digest == digest)).one()
+    row = {
+        "digest": blobs.digest_of(canonical_json(body)),
+        "schema": original.schema,
+        "body": body,
+        "size_bytes": original.size_bytes,
+        "created_us": tx.now_us,
+    }
+    if blobs.insert_new(tx, document, row):
+        statement = select(document_blob.c.pointer, document_blob.c.blob_digest)
+        held = tx.execute(statement.where(document_blob.c.document_digest == digest)).all()
+        _refer(tx, row["digest"], {found.pointer: found.blob_digest for found in held})
+    return str(row["digest"])
+
+
+def _require_files(tx: Transaction, files: Mapping[str, str]) -> None:
+    allowed = blobs.readable(tx, files.values())
+    lacking = {pointer: digest for pointer, digest in files.items() if digest not in allowed}
+    if lacking:
+        raise Conflict(
+            "The document names blobs that are not here; send them first.",
+            code="missing-blobs",
+            context={"missing": sorted(set(lacking.values()))},
+            errors=[
+                FieldError(pointer=pointer, code="missing-blob", detail=digest) for pointer, digest in lacking.items()
+            ],
+        )
+
+
+def _refer(tx: Transaction, digest: str, held: Mapping[str, str]) -> None:
+    if held:
+        rows = [
+            {"document_digest": digest, "pointer": pointer, "blob_digest": blob_digest}
+            for pointer, blob_digest in held.items()
+        ]
+        tx.execute(insert(document_blob), rows)
+
+
+# -- reading ----------------------------------------------------------------------------------------------------------
+
+
+def load_document(tx: Transaction, digest: str, *, arrays: Literal["encoded", "decoded", "none"] = "encoded") -> Tree:
+    """A stored document; its arrays as stored, as numpy arrays, or as references."""
+    body = load_body(tx, digest)
+    if arrays == "none":
+        return body
+    return attach_stored(tx, digest, body, (lambda stored: stored.decode()) if arrays == "decoded" else None)
+
+
+def load_body(tx: Transaction, digest: str) -> Tree:
+    """The document with references in place of its arrays."""
+    body = tx.execute(select(document.c.body).where(document.c.digest == digest)).scalar()
+    if body is None:
+        raise NotFound(f"There is no document {digest}.")
+    return dict(body)
+
+
+def attach_stored(
+    tx: Transaction, digest: str, body: Tree, convert: Callable[[EncodedArray], Any] | None = None
+) -> Tree:
+    """`body` with its arrays in place of the references, each passed through `convert`."""
+    statement = select(document_blob.c.pointer, document_blob.c.blob_digest, blob.c.size_bytes).join(
+        blob, blob.c.digest == document_blob.c.blob_digest
+    )
+    rows = tx.execute(statement.where(document_blob.c.document_digest == digest)).all()
+    places = {row.pointer: row for row in rows}
+    leaves = {pointer: leaf for pointer, leaf in _members(body) if _is_reference(leaf)}
+    loaded: dict[str, Any] = {}
+    for pointer, leaf in leaves.items():
+        if leaf["content"] not in loaded:
+            row = places[pointer]
+            data = blobs.read_blob(tx, row.blob_digest, 0, row.size_bytes)
+            stored = EncodedArray(leaf["dtype"], tuple(leaf["shape"]), data)
+            loaded[leaf["content"]] = convert(stored) if convert else stored
+    attached: Tree = attach_arrays(body, loaded.__getitem__)
+    return attached

@@ -1,0 +1,124 @@
+"""Lists of items: filters, order, pages, choice of fields."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from sqlalchemy import ColumnElement, func, or_, select
+
+from marey_schemas.access import Role
+from marey_schemas.items import Item, Page
+from marey_schemas.kinds import Kind
+from marey_server.errors import BadRequest
+from marey_server.store import listing, projects
+from marey_server.store.database import Transaction
+from marey_server.store.items.reading import item_rows, shown_items
+from marey_server.store.tables import collection, item, item_tag
+
+SORT_KEYS: dict[str, ColumnElement[Any]] = {
+    "id": item.c.id,
+    "name": item.c.name,
+    "created_at": item.c.created_us,
+    "updated_at": item.c.updated_us,
+    "frames": item.c.frames,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ItemFilters:
+    """Which items a list holds; what is None does not matter."""
+
+    collection: str | None = None
+    """A folder, with those below it."""
+    path: str | None = None
+    """Folder and name."""
+    name: str | None = None
+    """Exact, or the start of the name before a final `*`."""
+    tags: tuple[str, ...] = ()
+    """Any of these."""
+    skeleton: str | None = None
+    frames_gte: int | None = None
+    frames_lte: int | None = None
+    q: str | None = None
+    """Part of the name, whatever its case."""
+    deleted: bool = False
+
+
+def list_items(
+    tx: Transaction,
+    project: str,
+    kind: Kind,
+    filters: ItemFilters = ItemFilters(),
+    *,
+    sort: str = "-created_at",
+    cursor: str | None = None,
+    limit: int = listing.DEFAULT_LIMIT,
+    fields: Collection[str] | None = None,
+    count: bool = False,
+) -> Page:
+    """One page of a project's items of a kind. With `fields`, each is an object of these members only."""
+    project_row = projects.require(tx, project, Role.CONTRIBUTOR if filters.deleted else Role.READER)
+    order = listing.parse_order(sort, SORT_KEYS)
+    identity = [project_row.id, kind.value, asdict(filters)]
+    conditions = _conditions(project_row.id, kind, filters)
+    total = None
+    if count:
+        total = tx.execute(select(func.count()).select_from(item).where(*conditions)).scalar_one()
+    if cursor is not None:
+        conditions.append(order.after(listing.read_cursor(tx, cursor, order, identity)))
+    statement = item_rows().where(*conditions).order_by(*order.clauses()).limit(limit + 1)
+    rows, next_cursor = listing.page_of(tx, tx.execute(statement).all(), limit, order, identity)
+    return Page(items=tuple(_shown(tx, rows, fields)), next_cursor=next_cursor, count=total)
+
+
+def _shown(tx: Transaction, rows: Any, fields: Collection[str] | None) -> list[Any]:
+    if fields is None:
+        return shown_items(tx, rows)
+    if unknown := sorted(set(fields) - set(Item.model_fields)):
+        raise BadRequest(f"An item has no field {unknown[0]!r}.", code="bad-fields")
+    shown = shown_items(tx, rows, tags="tags" in fields, parts="parts" in fields)
+    return [found.model_dump(mode="json", include=set(fields)) for found in shown]
+
+
+def _conditions(project_id: str, kind: Kind, filters: ItemFilters) -> list[ColumnElement[bool]]:
+    conditions = [
+        item.c.project_id == project_id,
+        item.c.kind == kind.value,
+        item.c.deleted_us.is_not(None) if filters.deleted else item.c.deleted_us.is_(None),
+    ]
+    if filters.collection:
+        conditions.append(item.c.collection_id.in_(_below(project_id, filters.collection)))
+    if filters.path is not None:
+        folder, _, name = filters.path.rpartition("/")
+        at = select(collection.c.id).where(collection.c.project_id == project_id, collection.c.path == folder)
+        conditions += [item.c.collection_id.in_(at), item.c.name == name]
+    if filters.name is not None:
+        conditions += _named(filters.name)
+    if filters.tags:
+        tagged = select(item_tag.c.item_id).where(item_tag.c.tag.in_(filters.tags))
+        conditions.append(item.c.id.in_(tagged))
+    if filters.skeleton is not None:
+        conditions.append(item.c.skeleton_id == filters.skeleton)
+    if filters.frames_gte is not None:
+        conditions.append(item.c.frames >= filters.frames_gte)
+    if filters.frames_lte is not None:
+        conditions.append(item.c.frames <= filters.frames_lte)
+    if filters.q:
+        conditions.append(func.lower(item.c.name).contains(filters.q.lower(), autoescape=True))
+    return conditions
+
+
+def _below(project_id: str, path: str) -> Any:
+    return select(collection.c.id).where(
+        collection.c.project_id == project_id,
+        or_(collection.c.path == path, func.substr(collection.c.path, 1, len(path) + 1) == f"{path}/"),
+    )
+
+
+def _named(name: str) -> list[ColumnElement[bool]]:
+    if not name.endswith("*"):
+        return [item.c.name == name]
+    start = name[:-1]
+    return [item.c.name >= start, func.substr(item.c.name, 1, len(start)) == start]

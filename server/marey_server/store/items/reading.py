@@ -1,0 +1,145 @@
+"""Items and their parts as they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from sqlalchemy import Row, Select, select, tuple_
+
+from marey_schemas.access import Role
+from marey_schemas.arrays import EncodedArray
+from marey_schemas.items import Item, PartSummary
+from marey_schemas.kinds import Kind
+from marey_server.errors import Invalid, NotFound
+from marey_server.store import documents, projects
+from marey_server.store.clock import datetime_of
+from marey_server.store.database import Transaction
+from marey_server.store.items.slices import slice_motion
+from marey_server.store.projects import ProjectRow
+from marey_server.store.tables import collection, document, item, item_tag, revision_part
+
+
+def read_item(tx: Transaction, project: str, kind: Kind, item_id: str) -> Item:
+    """An item at its newest revision. Raises `NotFound`."""
+    project_row = projects.require(tx, project)
+    return shown_items(tx, [find_item(tx, project_row, kind, item_id)])[0]
+
+
+def item_rows() -> Select[Any]:
+    """Rows of items with the path of their collection."""
+    return select(item, collection.c.path).join(collection, collection.c.id == item.c.collection_id)
+
+
+def find_item(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, *, deleted: bool = False) -> Row[Any]:
+    """Row of an item. Raises `NotFound`."""
+    state = item.c.deleted_us.is_not(None) if deleted else item.c.deleted_us.is_(None)
+    row = tx.execute(
+        item_rows().where(item.c.id == item_id, item.c.project_id == project_row.id, item.c.kind == kind.value, state)
+    ).first()
+    if row is None:
+        raise no_item(kind, item_id)
+    return row
+
+
+def no_item(kind: Kind, item_id: str) -> NotFound:
+    """There is no such item."""
+    return NotFound(f"There is no {kind} {item_id!r} here.", code="no-item")
+
+
+def shown_items(tx: Transaction, rows: Sequence[Row[Any]], *, tags: bool = True, parts: bool = True) -> list[Item]:
+    """Items as they travel: tags and parts of all of them in one query each."""
+    tags_of = read_tags(tx, [row.id for row in rows]) if tags and rows else {}
+    parts_of = read_parts(tx, [(row.id, row.head) for row in rows]) if parts and rows else {}
+    return [
+        Item(
+            id=row.id, kind=Kind(row.kind), name=row.name, collection=row.path, tags=tags_of.get(row.id, ()),
+            revision=row.head, parts=parts_of.get((row.id, row.head), {}), summary=row.summary,
+            created_at=datetime_of(row.created_us), updated_at=datetime_of(row.updated_us),
+            deleted_at=None if row.deleted_us is None else datetime_of(row.deleted_us), rev=row.rev,
+        )
+        for row in rows
+    ]  # fmt: skip
+
+
+def read_tags(tx: Transaction, item_ids: Collection[str]) -> dict[str, tuple[str, ...]]:
+    """Tags by item, sorted."""
+    found: dict[str, list[str]] = {}
+    for row in tx.execute(select(item_tag.c.item_id, item_tag.c.tag).where(item_tag.c.item_id.in_(item_ids))):
+        found.setdefault(row.item_id, []).append(row.tag)
+    return {item_id: tuple(sorted(tags)) for item_id, tags in found.items()}
+
+
+def read_parts(
+    tx: Transaction, revisions: Collection[tuple[str, int]]
+) -> dict[tuple[str, int], dict[str, PartSummary]]:
+    """Parts by item and revision number."""
+    statement = (
+        select(
+            revision_part.c.item_id, revision_part.c.number, revision_part.c.part,
+            document.c.digest, document.c.schema, document.c.size_bytes,
+        )
+        .join(document, document.c.digest == revision_part.c.document_digest)
+        .where(tuple_(revision_part.c.item_id, revision_part.c.number).in_(revisions))
+    )  # fmt: skip
+    found: dict[tuple[str, int], dict[str, PartSummary]] = {}
+    for row in tx.execute(statement):
+        summary = PartSummary(document=row.digest, schema_=row.schema, size_bytes=row.size_bytes)
+        found.setdefault((row.item_id, row.number), {})[row.part] = summary
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A part of a revision. Arrays of `tree` are as stored, or decoded where a slice was asked for."""
+
+    tree: dict[str, Any]
+    digest: str
+    revision: int
+    rev: int
+    """The item's `rev`: what a change of its newest revision expects."""
+
+
+def read_part(
+    tx: Transaction,
+    project: str,
+    kind: Kind,
+    item_id: str,
+    part: str,
+    *,
+    revision: int | None = None,
+    frames: slice | None = None,
+    joints: Sequence[str] | None = None,
+    arrays: Literal["encoded", "decoded", "none"] = "encoded",
+) -> Part:
+    """The document of a part: of the newest revision, or of `revision`.
+
+    `frames` (half-open, clipped to what is there) and `joints` (names, in the order wanted) cut a motion.
+    Raises `NotFound` where there is no such item, revision or part, `Invalid` where a cut makes no sense.
+    """
+    project_row = projects.require(tx, project, Role.READER)
+    number = item.c.head if revision is None else revision
+    statement = (
+        select(item.c.rev, revision_part.c.number, document.c.digest, document.c.schema, document.c.body)
+        .join(revision_part, revision_part.c.item_id == item.c.id)
+        .join(document, document.c.digest == revision_part.c.document_digest)
+        .where(
+            item.c.id == item_id, item.c.project_id == project_row.id, item.c.kind == kind.value,
+            item.c.deleted_us.is_(None), revision_part.c.number == number, revision_part.c.part == part,
+        )
+    )  # fmt: skip
+    row = tx.execute(statement).first()
+    if row is None:
+        raise NotFound(f"There is no part {part!r} of {kind} {item_id!r} at that revision.", code="no-part")
+    body = dict(row.body)
+    if frames is not None or joints is not None:
+        if row.schema != "marey/motion@1":
+            raise Invalid("Only motions are cut by frames and joints.", code="not-a-motion")
+        tree = slice_motion(documents.attach_stored(tx, row.digest, body), frames, joints)
+    elif arrays == "none":
+        tree = body
+    else:
+        decode = EncodedArray.decode if arrays == "decoded" else None
+        tree = documents.attach_stored(tx, row.digest, body, decode)
+    return Part(tree, row.digest, row.number, row.rev)

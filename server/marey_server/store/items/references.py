@@ -1,0 +1,107 @@
+"""References from documents to items: to other drafts of the same write, and to revisions that must exist."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import select
+
+from marey_schemas.kinds import Kind
+from marey_schemas.problems import FieldError
+from marey_server.errors import Invalid
+from marey_server.store.database import Transaction
+from marey_server.store.documents import load_body
+from marey_server.store.items.drafts import Published
+from marey_server.store.projects import ProjectRow
+from marey_server.store.tables import item, revision_part
+
+Tree = dict[str, Any]
+
+
+def outputs_in(tree: Any) -> Iterator[str]:
+    """Names of the drafts that a document refers to as `{"output": name}`."""
+    if isinstance(tree, Mapping):
+        if tree.keys() == {"output"} and isinstance(tree["output"], str):
+            yield tree["output"]
+        else:
+            for member in tree.values():
+                yield from outputs_in(member)
+    elif isinstance(tree, list | tuple):
+        for member in tree:
+            yield from outputs_in(member)
+
+
+def in_order(names: Mapping[str, Sequence[str]]) -> list[str]:
+    """Names, each after those it refers to; names that stand for nothing here are left out.
+
+    Raises `Invalid` where some refer to each other.
+    """
+    ordered: dict[str, None] = {}
+    for start in names:
+        path = [start]
+        while path:
+            waiting = [name for name in names[path[-1]] if name in names and name not in ordered]
+            if not waiting:
+                ordered[path.pop()] = None
+            elif waiting[0] in path:
+                raise Invalid(f"Results refer to each other: {' -> '.join([*path, waiting[0]])}.", code="output-cycle")
+            else:
+                path.append(waiting[0])
+    return list(ordered)
+
+
+def resolved(tree: Any, done: Mapping[str, Published]) -> Any:
+    """The tree with each reference to a draft replaced by the revision it became."""
+    if isinstance(tree, Mapping):
+        if tree.keys() == {"output"} and tree["output"] in done:
+            published = done[tree["output"]]
+            return {"item": published.item, "revision": published.revision}
+        return {key: resolved(member, done) for key, member in tree.items()}
+    if isinstance(tree, list | tuple):
+        return [resolved(member, done) for member in tree]
+    return tree
+
+
+def require_references(tx: Transaction, project_row: ProjectRow, kind: Kind, bodies: Mapping[str, Tree]) -> None:
+    """Check what the new parts of an item refer to. Raises `Invalid` where it is not there or does not fit."""
+    if kind is Kind.CLIP and "motion" in bodies:
+        motion = bodies["motion"]
+        hierarchy = _referred(tx, project_row, motion["skeleton"], Kind.SKELETON, "hierarchy", "/motion/skeleton")
+        known = [joint["name"] for joint in hierarchy["joints"]]
+        if sorted(known) != sorted(motion["joints"]):
+            odd = sorted(set(known) ^ set(motion["joints"]))[:5]
+            detail = f"The joints of the motion and of its skeleton differ: {', '.join(odd) or 'a name stands twice'}."
+            raise _invalid("/motion/joints", "wrong-joints", detail)
+    elif kind is Kind.ANNOTATION:
+        body = bodies["annotation"]
+        motion = _referred(tx, project_row, body["clip"], Kind.CLIP, "motion", "/annotation/clip")
+        frames = motion["poses"]["shape"][0]
+        ends = [segment["end"] for segment in body.get("segments", ())]
+        ends += [keyframe["frame"] + 1 for keyframe in body.get("keyframes", ())]
+        if max(ends, default=0) > frames:
+            raise _invalid("/annotation", "beyond-end", f"The clip has {frames} frames; the annotation {max(ends)}.")
+
+
+def _referred(tx: Transaction, project_row: ProjectRow, ref: Tree, kind: Kind, part: str, pointer: str) -> Tree:
+    statement = (
+        select(revision_part.c.document_digest)
+        .join(item, item.c.id == revision_part.c.item_id)
+        .where(
+            item.c.id == ref.get("item"),
+            item.c.project_id == project_row.id,
+            item.c.kind == kind.value,
+            item.c.deleted_us.is_(None),
+            revision_part.c.number == ref.get("revision"),
+            revision_part.c.part == part,
+        )
+    )
+    digest = tx.execute(statement).scalar()
+    if digest is None:
+        what = ref.get("output") or f"{ref.get('item')} at revision {ref.get('revision')}"
+        raise _invalid(pointer, f"no-{kind.value}", f"There is no {kind.value} {what} in this project.")
+    return load_body(tx, digest)
+
+
+def _invalid(pointer: str, code: str, detail: str) -> Invalid:
+    return Invalid(detail, code=code, errors=[FieldError(pointer=pointer, code=code, detail=detail)])

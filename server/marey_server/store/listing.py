@@ -1,0 +1,113 @@
+"""Pages of lists: sort keys, and signed cursors that stay right while rows are inserted."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import hmac
+import json
+import secrets
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import ColumnElement, Row, UnaryExpression, and_, or_, select
+
+from marey_schemas.canonical import canonical_json
+from marey_server.errors import BadRequest
+from marey_server.store.database import Transaction
+from marey_server.store.tables import server_state
+
+_KEY_NAME = "cursor_key"
+_MAC_BYTES = 16
+DEFAULT_LIMIT = 50
+MAX_LIMIT = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """How a list is sorted: columns with their direction, the last one unique."""
+
+    text: str
+    columns: tuple[tuple[ColumnElement[Any], bool], ...]
+    """Each with whether it falls."""
+
+    def clauses(self) -> list[UnaryExpression[Any]]:
+        """For ORDER BY."""
+        return [column.desc() if falls else column.asc() for column, falls in self.columns]
+
+    def after(self, values: Sequence[Any]) -> ColumnElement[bool]:
+        """Condition: behind a row with these values. Its first term alone is a range of an index."""
+        (first, falls), *rest = self.columns
+        beyond = first < values[0] if falls else first > values[0]
+        if not rest:
+            return beyond
+        bound = first <= values[0] if falls else first >= values[0]
+        return and_(bound, or_(beyond, Order("", tuple(rest)).after(values[1:])))
+
+
+def parse_order(text: str, keys: Mapping[str, ColumnElement[Any]], unique: str = "id") -> Order:
+    """Order from `sort=-created_at,name`. Raises `BadRequest` where a key is unknown or stands twice."""
+    names = [part.strip() for part in text.split(",") if part.strip()]
+    bare = [name.removeprefix("-") for name in names]
+    if unknown := [name for name in bare if name not in keys]:
+        raise BadRequest(f"This cannot be sorted by {unknown[0]!r}; by {', '.join(keys)}.", code="bad-sort")
+    if len(set(bare)) != len(bare):
+        raise BadRequest("A sort key stands twice.", code="bad-sort")
+    if unique in bare:
+        names = names[: bare.index(unique) + 1]
+    else:
+        names.append(f"-{unique}" if names and names[-1].startswith("-") else unique)
+    return Order(",".join(names), tuple((keys[name.removeprefix("-")], name.startswith("-")) for name in names))
+
+
+def make_cursor(tx: Transaction, order: Order, filters: Any, values: Sequence[Any]) -> str:
+    """Opaque text for the page behind the row with these values."""
+    payload = json.dumps([order.text, _fingerprint(filters), list(values)], separators=(",", ":")).encode()
+    return base64.urlsafe_b64encode(_mac(tx, payload) + payload).decode().rstrip("=")
+
+
+def read_cursor(tx: Transaction, cursor: str, order: Order, filters: Any) -> list[Any]:
+    """Values of the row a page ended with. Raises `BadRequest` where the cursor is not ours or of another list."""
+    try:
+        data = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
+    except (ValueError, binascii.Error) as error:
+        raise _bad_cursor() from error
+    mac, payload = data[:_MAC_BYTES], data[_MAC_BYTES:]
+    if not hmac.compare_digest(mac, _mac(tx, payload)):
+        raise _bad_cursor()
+    text, fingerprint, values = json.loads(payload)
+    if text != order.text or fingerprint != _fingerprint(filters):
+        raise BadRequest("The cursor belongs to a list with other filters or another order.", code="bad-cursor")
+    return list(values)
+
+
+def _bad_cursor() -> BadRequest:
+    return BadRequest("This is no cursor of this server; start again without one.", code="bad-cursor")
+
+
+def _fingerprint(filters: Any) -> str:
+    return hashlib.sha256(canonical_json(filters)).hexdigest()[:16]
+
+
+def _mac(tx: Transaction, payload: bytes) -> bytes:
+    key = tx.execute(select(server_state.c.value).where(server_state.c.key == _KEY_NAME)).scalar_one()
+    return hmac.digest(bytes.fromhex(key), payload, "sha256")[:_MAC_BYTES]
+
+
+def make_cursor_key(tx: Transaction) -> None:
+    """Make the key that signs cursors, unless there is one."""
+    row = {"key": _KEY_NAME, "value": secrets.token_hex(32)}
+    tx.execute(tx.insert_or_ignore(server_state, row))
+
+
+def page_of(
+    tx: Transaction, rows: Sequence[Row[Any]], limit: int, order: Order, filters: Any
+) -> tuple[Sequence[Row[Any]], str | None]:
+    """At most `limit` of rows that were asked for with one more, and the cursor of the next page."""
+    if len(rows) <= limit:
+        return rows, None
+    rows = rows[:limit]
+    last = rows[-1]._mapping
+    return rows, make_cursor(tx, order, filters, [last[column] for column, _ in order.columns])
