@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
+import json
 import logging
 import signal
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from functools import cache, partial
+from importlib.metadata import version
 from typing import Any
 
 from tornado.httpserver import HTTPServer
@@ -17,11 +21,13 @@ from tornado.routing import AnyMatches, Rule
 from tornado.web import Application as TornadoApplication
 from tornado.web import RequestHandler
 
+from marey_server.docs_page import render_page
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.handlers.resource import Resource
 from marey_server.handlers.routes import RouteTable
 from marey_server.observe import access_log, configure_logging
-from marey_server.services import Services
+from marey_server.openapi import build_document
+from marey_server.services import Description, Services
 from marey_server.settings import Settings
 from marey_server.store.database import Database
 
@@ -34,9 +40,9 @@ READ_BUFFER_BYTES = 1024 * 1024
 class Application(TornadoApplication):
     """Every route, and what their handlers share."""
 
-    def __init__(self, services: Services) -> None:
-        self.services = services
+    def __init__(self, settings: Settings, database: Database) -> None:
         self.routes = RouteTable(self, RESOURCES)
+        self.services = Services(settings, database, cache(partial(describe, self.routes)))
         super().__init__([Rule(AnyMatches(), self.routes)], log_function=self.record_request)
 
     def record_request(self, handler: RequestHandler) -> None:
@@ -68,7 +74,14 @@ def _fields(handler: Resource, route: str, status: int, duration_s: float) -> di
 
 def create_app(settings: Settings, database: Database) -> Application:
     """An application over a database whose schema is current."""
-    return Application(Services(settings, database))
+    return Application(settings, database)
+
+
+def describe(routes: RouteTable) -> Description:
+    """The API described for programs and for people."""
+    document = build_document(routes, version("marey"))
+    text = json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode()
+    return Description(text, render_page(document), hashlib.sha256(text).hexdigest()[:16])
 
 
 @dataclass(frozen=True)

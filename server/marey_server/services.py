@@ -17,12 +17,22 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
+@dataclass(frozen=True)
+class Description:
+    """The API described, as bytes: the OpenAPI document, the page, and a name of this state of both."""
+
+    document: bytes
+    page: bytes
+    tag: str
+
+
 @dataclass
 class Services:
     """Database, threads, metrics and the state of a server that is starting, serving or draining."""
 
     settings: Settings
     database: Database
+    description: Callable[[], Description]
     metrics: Metrics = field(default_factory=Metrics)
     draining: asyncio.Event = field(default_factory=asyncio.Event)
     in_flight: set[Any] = field(default_factory=set)

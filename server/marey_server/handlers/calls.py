@@ -92,6 +92,10 @@ def run_call(tx: Transaction, call: Call) -> Rendered:
     return rendered
 
 
+def only_identify(tx: Transaction) -> None:
+    """Do nothing more than `run_plain` does by itself: look the credential up."""
+
+
 def run_plain(tx: Transaction, caller: Caller, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     """Do something on behalf of the caller and hand its result back."""
     tx.principal = caller.identify(tx)

@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import Literal
 
 from marey_schemas import codecs
-from marey_server.errors import BadRequest, NotAcceptable, UnsupportedMediaType
+from marey_server.errors import NotAcceptable, Unauthenticated, UnsupportedMediaType
 
 MAX_RANGES = 64
 
@@ -124,10 +124,10 @@ def require_plain_encoding(content_encoding: str | None) -> None:
 
 
 def bearer_token(authorization: str | None) -> str | None:
-    """The token of an Authorization header, None without one. Raises `BadRequest` where it is malformed."""
+    """The token of an Authorization header, None without one. Raises `Unauthenticated` where it is malformed."""
     if authorization is None:
         return None
     scheme, _, token = authorization.strip().partition(" ")
     if scheme.lower() != "bearer" or not token.strip() or len(token) > 1024:
-        raise BadRequest("The Authorization header must read: Bearer <token>.", code="bad-authorization")
+        raise Unauthenticated("The Authorization header must read: Bearer <token>.", code="bad-authorization")
     return token.strip()

@@ -29,9 +29,9 @@ from pydantic import BaseModel
 from tornado.web import HTTPError, RequestHandler, stream_request_body
 
 from marey_server.access.principal import ANONYMOUS
-from marey_server.errors import BadRequest, MareyError, MethodNotAllowed, TooLarge, Unauthenticated
+from marey_server.errors import BadRequest, MareyError, MethodNotAllowed, TooLarge
 from marey_server.handlers import negotiation, problem
-from marey_server.handlers.calls import CHALLENGE, Call, Caller, run_call, run_plain
+from marey_server.handlers.calls import Call, Caller, only_identify, run_call, run_plain
 from marey_server.handlers.declarations import Bytes, Declared, Document, Operation
 from marey_server.handlers.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.handlers.reply import API, Form, Rendered, Reply, render
@@ -178,8 +178,8 @@ class Resource(RequestHandler):
             body = self.operation.body
             if body is not None and body.streamed:
                 await self.begin(**self.path_variables)
-            elif self._declared_length() > EARLY_CHECK_BYTES:
-                await self.look_up(_nothing)
+            elif self.declared_length() > EARLY_CHECK_BYTES:
+                await self.look_up(only_identify)
         except MareyError as error:
             await self._refuse(error)
 
@@ -192,7 +192,7 @@ class Resource(RequestHandler):
         self.operation = operation
         headers = self.request.headers
         self.media = negotiation.choose(headers.get("Accept"), self._offers(operation))
-        self.caller = Caller(_token(headers.get("Authorization")), operation)
+        self.caller = Caller(negotiation.bearer_token(headers.get("Authorization")), operation)
         self.query = parse_query(operation.query, self.request.query_arguments)
         if operation.precondition == "required" or (
             operation.precondition != "none" and ("If-Match" in headers or "If-None-Match" in headers)
@@ -214,17 +214,18 @@ class Resource(RequestHandler):
         negotiation.require_plain_encoding(self.request.headers.get("Content-Encoding"))
         if body is None or not self._expects_body():
             return
-        if self._declared_length() > body.max_bytes:
-            raise TooLarge(f"The body has {self._declared_length()} bytes; at most {body.max_bytes} are taken here.")
+        if self.declared_length() > body.max_bytes:
+            raise TooLarge(f"The body has {self.declared_length()} bytes; at most {body.max_bytes} are taken here.")
         if body.content is not Bytes and not body.streamed:
             self.body_type = negotiation.body_type(self.request.headers.get("Content-Type"))
 
-    def _declared_length(self) -> int:
+    def declared_length(self) -> int:
+        """The length of the body as its sender says; 0 where it does not."""
         text = self.request.headers.get("Content-Length", "0")
         return int(text) if text.isdigit() else 0
 
     def _expects_body(self) -> bool:
-        return self._declared_length() > 0 or "Transfer-Encoding" in self.request.headers
+        return self.declared_length() > 0 or "Transfer-Encoding" in self.request.headers
 
     @property
     def path_variables(self) -> dict[str, Any]:
@@ -338,6 +339,9 @@ class Resource(RequestHandler):
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
         """Any error as a problem document; details of our own faults stay in the log."""
+        if self._headers_written:  # part of an answer is out: only a cut connection says that it is not whole
+            self.request.connection.close()  # type: ignore[union-attr]
+            return
         exc_info = kwargs.get("exc_info")
         error = exc_info[1] if exc_info else HTTPError(status_code)
         self.set_header("X-Request-Id", self.request_id)
@@ -362,17 +366,6 @@ class Resource(RequestHandler):
         self.services.in_flight.discard(self)
 
 
-def _token(authorization: str | None) -> str | None:
-    try:
-        return negotiation.bearer_token(authorization)
-    except BadRequest as error:
-        raise Unauthenticated(error.detail, headers=CHALLENGE) from None
-
-
 def _decode(data: bytes, media_type: str, content: Any) -> Any:
     tree = decode_body(data, media_type)
     return tree if content is Document else validate_body(content, tree)
-
-
-def _nothing(tx: Transaction) -> None:
-    """Only look the credential up."""

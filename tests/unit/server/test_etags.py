@@ -1,0 +1,52 @@
+"""Entity tags, and what a writer must say about the state he changes."""
+
+import pytest
+
+from marey_server.errors import BadRequest, PreconditionFailed, PreconditionRequired
+from marey_server.handlers.etags import ABSENT, ANY_STATE, entity_tag, matches, parse_tags, write_precondition
+
+
+def test_a_tag_names_state_and_form():
+    assert entity_tag(7, "msgpack") == '"7.msgpack"'
+
+
+@pytest.mark.parametrize("header", ['"7.json"', 'W/"7.json"', '"6.json", "7.json"', "*"])
+def test_a_caller_who_holds_the_state_in_this_form_needs_no_bytes(header):
+    assert matches(header, '"7.json"')
+
+
+@pytest.mark.parametrize("header", [None, '"7.msgpack"', '"17.json"'])
+def test_another_state_or_form_is_sent(header):
+    assert not matches(header, '"7.json"')
+
+
+def test_what_was_read_in_one_form_can_be_changed_in_another():
+    assert write_precondition('"7.msgpack"', None).expected_rev == 7
+
+
+def test_a_change_without_a_precondition_is_refused():
+    with pytest.raises(PreconditionRequired):
+        write_precondition(None, None)
+
+
+def test_the_star_accepts_any_state():
+    assert write_precondition("*", None) is ANY_STATE
+
+
+def test_creating_only_is_a_precondition_where_things_can_be_created():
+    assert write_precondition(None, "*", may_create=True) is ABSENT
+    with pytest.raises(PreconditionRequired):
+        write_precondition(None, "*")
+    with pytest.raises(BadRequest):
+        write_precondition(None, '"7.json"', may_create=True)
+
+
+def test_a_foreign_tag_can_never_match():
+    with pytest.raises(PreconditionFailed):
+        write_precondition('"33a64df5"', None)
+
+
+@pytest.mark.parametrize("header", ["7.json", '"7.json', '"7.json" "8.json"', '"\n"'])
+def test_malformed_tags_are_refused(header):
+    with pytest.raises(BadRequest):
+        parse_tags(header)

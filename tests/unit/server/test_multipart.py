@@ -1,0 +1,104 @@
+"""Multipart bodies, cut as they stream."""
+
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from marey_server.errors import BadRequest, TooLarge, UnsupportedMediaType
+from marey_server.handlers.multipart import MultipartReader, PartEnd, PartHead, boundary_of
+
+BOUNDARY = b"frontier"
+
+
+def body_of(parts):
+    lines = []
+    for head, data in parts:
+        lines += [b"--" + BOUNDARY, head, b"", data]
+    return b"\r\n".join([*lines, b"--" + BOUNDARY + b"--", b""])
+
+
+def head(field, file_name=None):
+    text = f'Content-Disposition: form-data; name="{field}"'
+    return (text + (f'; filename="{file_name}"' if file_name is not None else "")).encode()
+
+
+def read(body, cuts=(), max_parts=100):
+    """(head, bytes) of every part, fed in pieces."""
+    reader = MultipartReader(BOUNDARY, max_parts=max_parts)
+    places = [0, *sorted(cuts), len(body)]
+    found = []
+    for start, stop in itertools.pairwise(places):
+        for piece in reader.feed(body[start:stop]):
+            if isinstance(piece, PartHead):
+                found.append((piece, bytearray()))
+            elif isinstance(piece, bytes):
+                found[-1][1].extend(piece)
+            else:
+                assert isinstance(piece, PartEnd)
+    reader.finish()
+    return [(part, bytes(data)) for part, data in found]
+
+
+near_boundary = st.lists(
+    st.sampled_from([b"\r", b"\n", b"-", b"--", BOUNDARY, b"\r\n--", b"\r\n--fron", b"\x00", b"data"]), max_size=12
+).map(b"".join)
+
+
+@given(
+    data=st.lists(near_boundary.filter(lambda data: b"--" + BOUNDARY not in data), max_size=4),
+    cuts=st.lists(st.integers(0, 400), max_size=20),
+)
+def test_parts_come_out_as_they_went_in_wherever_the_stream_is_cut(data, cuts):
+    body = body_of([(head("files", f"take{index}.bvh"), one) for index, one in enumerate(data)])
+    if not data:
+        body = b"--" + BOUNDARY + b"--\r\n"
+    found = read(body, [cut for cut in cuts if cut < len(body)])
+    assert found == [(PartHead("files", f"take{index}.bvh"), one) for index, one in enumerate(data)]
+
+
+def test_fields_and_files_are_told_apart():
+    found = read(body_of([(head("collection"), b"raw"), (head("files", "a b.bvh"), b"HIERARCHY")]))
+    assert found == [(PartHead("collection", None), b"raw"), (PartHead("files", "a b.bvh"), b"HIERARCHY")]
+
+
+def test_escaped_quotes_in_file_names_are_read_in_both_spellings():
+    found = read(body_of([(head("files", 'a\\"b.bvh'), b""), (head("files", "a%22b.bvh"), b"")]))
+    assert [part.file_name for part, _ in found] == ['a"b.bvh', 'a"b.bvh']
+
+
+def test_what_comes_before_the_first_part_is_ignored():
+    assert read(b"preamble\r\n" + body_of([(head("x"), b"1")])) == [(PartHead("x", None), b"1")]
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"--frontier\r\n",
+        body_of([(head("x"), b"1")])[:-10],
+        body_of([(b"Content-Type: text/plain", b"1")]),
+        body_of([(b"Content-Disposition: attachment", b"1")]),
+        b"--frontierland\r\n\r\n--frontier--",
+    ],
+)
+def test_broken_bodies_are_refused(body):
+    with pytest.raises(BadRequest):
+        read(body)
+
+
+def test_endless_heads_and_too_many_parts_are_refused():
+    with pytest.raises(TooLarge):
+        read(b"--frontier\r\nX: " + b"y" * 20_000)
+    with pytest.raises(TooLarge):
+        read(body_of([(head("x"), b"1")] * 3), max_parts=2)
+
+
+def test_the_boundary_is_read_with_and_without_quotation_marks():
+    assert boundary_of("multipart/form-data; boundary=abc") == b"abc"
+    assert boundary_of('multipart/form-data; charset=utf-8; boundary="a b"') == b"a b"
+    with pytest.raises(BadRequest):
+        boundary_of("multipart/form-data")
+    with pytest.raises(UnsupportedMediaType):
+        boundary_of("text/plain")

@@ -1,0 +1,63 @@
+"""What form of an answer a caller gets."""
+
+import pytest
+
+from marey_server.errors import NotAcceptable, Unauthenticated, UnsupportedMediaType
+from marey_server.handlers import negotiation
+from marey_server.handlers.negotiation import BSON, DOCUMENT_FORMS, JSON, MODEL_FORMS, MSGPACK, MSGPACK_BLOCKS, choose
+
+
+@pytest.mark.parametrize("accept", [None, "", "*/*", "application/*", "text/html, */*;q=0.1"])
+def test_a_caller_without_a_preference_gets_json(accept):
+    assert choose(accept, DOCUMENT_FORMS) is JSON
+
+
+def test_the_highest_quality_wins_over_the_order_of_the_header():
+    assert choose("application/json;q=0.2, application/bson;q=0.9, application/msgpack;q=0.5", MODEL_FORMS) is BSON
+
+
+def test_a_specific_range_overrides_a_general_one():
+    assert choose("*/*, application/json;q=0", MODEL_FORMS) is MSGPACK
+
+
+def test_blocks_are_sent_only_to_those_who_ask_for_them():
+    assert choose("application/msgpack", DOCUMENT_FORMS) is MSGPACK
+    assert choose("application/msgpack; arrays=blocks", DOCUMENT_FORMS) is MSGPACK_BLOCKS
+    assert (
+        choose("application/msgpack;arrays=blocks;q=0.9, application/msgpack;q=0.8", DOCUMENT_FORMS) is MSGPACK_BLOCKS
+    )
+
+
+def test_a_caller_who_accepts_nothing_on_offer_is_told_what_is():
+    with pytest.raises(NotAcceptable) as refusal:
+        choose("image/png, application/json;q=0, application/msgpack;q=0, application/bson;q=0", MODEL_FORMS)
+    assert refusal.value.context["offered"] == ["application/json", "application/msgpack", "application/bson"]
+
+
+@pytest.mark.parametrize("accept", ["application/json;q=high", "json", ";;;", "application/json;q=-1"])
+def test_malformed_ranges_match_nothing(accept):
+    with pytest.raises(NotAcceptable):
+        choose(accept, MODEL_FORMS)
+
+
+def test_a_body_without_a_type_is_json():
+    assert negotiation.body_type(None) == "application/json"
+
+
+@pytest.mark.parametrize("content_type", ["text/plain", "application/xml", "application/json; charset=latin-1"])
+def test_other_bodies_are_refused(content_type):
+    with pytest.raises(UnsupportedMediaType):
+        negotiation.body_type(content_type)
+
+
+def test_compressed_bodies_are_refused():
+    with pytest.raises(UnsupportedMediaType):
+        negotiation.require_plain_encoding("gzip")
+
+
+def test_only_bearer_tokens_are_credentials():
+    assert negotiation.bearer_token("bearer abc") == "abc"
+    assert negotiation.bearer_token(None) is None
+    for header in ("Basic dXNlcjpwdw==", "Bearer", "Bearer  ", "token"):
+        with pytest.raises(Unauthenticated):
+            negotiation.bearer_token(header)
