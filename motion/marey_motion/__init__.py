@@ -1,1 +1,73 @@
-"""The mathematics of motion: arrays in, arrays out."""
+"""The mathematics of motion: arrays in, arrays out.
+
+The names below load the module they live in when they are first used, so that importing the package costs next to
+nothing and compiled kernels load only where something is computed.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from marey_motion.clip import Clip as Clip
+    from marey_motion.errors import AmbiguousUnits as AmbiguousUnits
+    from marey_motion.errors import ClipError as ClipError
+    from marey_motion.errors import FormatError as FormatError
+    from marey_motion.errors import FormatLimit as FormatLimit
+    from marey_motion.errors import MappingError as MappingError
+    from marey_motion.errors import MotionError as MotionError
+    from marey_motion.errors import RotationError as RotationError
+    from marey_motion.errors import SkeletonError as SkeletonError
+    from marey_motion.errors import UnknownFormat as UnknownFormat
+    from marey_motion.errors import UnknownJoint as UnknownJoint
+    from marey_motion.kinematics import foot_contacts as foot_contacts
+    from marey_motion.kinematics import forward_directions as forward_directions
+    from marey_motion.kinematics import forward_kinematics as forward_kinematics
+    from marey_motion.kinematics import global_positions as global_positions
+    from marey_motion.kinematics import global_rotations as global_rotations
+    from marey_motion.kinematics import headings as headings
+    from marey_motion.kinematics import turn_rates as turn_rates
+    from marey_motion.kinematics import velocities as velocities
+    from marey_motion.rigs import JointAxes as JointAxes
+    from marey_motion.rigs import JointMapping as JointMapping
+    from marey_motion.rigs import guess_axes as guess_axes
+    from marey_motion.rigs import map_joints as map_joints
+    from marey_motion.skeleton import EndSite as EndSite
+    from marey_motion.skeleton import Skeleton as Skeleton
+    from marey_motion.skeleton import same_hierarchy as same_hierarchy
+
+_HOMES = {
+    "clip": ("Clip",),
+    "errors": (
+        "AmbiguousUnits",
+        "ClipError",
+        "FormatError",
+        "FormatLimit",
+        "MappingError",
+        "MotionError",
+        "RotationError",
+        "SkeletonError",
+        "UnknownFormat",
+        "UnknownJoint",
+    ),
+    "kinematics": (
+        "foot_contacts",
+        "forward_directions",
+        "forward_kinematics",
+        "global_positions",
+        "global_rotations",
+        "headings",
+        "turn_rates",
+        "velocities",
+    ),
+    "rigs": ("JointAxes", "JointMapping", "guess_axes", "map_joints"),
+    "skeleton": ("EndSite", "Skeleton", "same_hierarchy"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)

@@ -1,0 +1,142 @@
+"""Skeletons, mappings and clips to and from the documents that travel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.clip import Clip
+from marey_motion.errors import ClipError, MappingError
+from marey_motion.rigs import STANDARD_JOINTS, JointAxes, JointMapping
+from marey_motion.skeleton import EndSite, Skeleton
+from marey_schemas import documents as schemas
+
+
+def skeleton_to_document(skeleton: Skeleton) -> schemas.SkeletonHierarchy:
+    """Part `hierarchy` of a skeleton."""
+    joints = tuple(
+        schemas.Joint(
+            name=name,
+            parent=int(parent),
+            offset=tuple(offset.tolist()),
+            rest_rotation=tuple(rotation.tolist()),
+            display_name=None if display == name else display,
+        )
+        for name, display, parent, offset, rotation in zip(
+            skeleton.joint_names,
+            skeleton.display_names,
+            skeleton.parents,
+            skeleton.offsets,
+            skeleton.rest_rotations,
+            strict=True,
+        )
+    )
+    sites = tuple(schemas.EndSite(joint=site.joint, offset=tuple(site.offset.tolist())) for site in skeleton.end_sites)
+    return schemas.SkeletonHierarchy(schema="marey/skeleton@1", joints=joints, end_sites=sites)
+
+
+def skeleton_from_document(document: schemas.SkeletonHierarchy) -> Skeleton:
+    """The skeleton of a `hierarchy` part; `SkeletonError` where its numbers describe none."""
+    return Skeleton(
+        joint_names=tuple(joint.name for joint in document.joints),
+        parents=np.array([joint.parent for joint in document.joints], dtype=np.int32),
+        offsets=np.array([joint.offset for joint in document.joints], dtype=np.float64),
+        rest_rotations=np.array([joint.rest_rotation for joint in document.joints], dtype=np.float64),
+        end_sites=tuple(EndSite(site.joint, np.array(site.offset)) for site in document.end_sites),
+        display_names=tuple(joint.display_name or joint.name for joint in document.joints),
+    )
+
+
+def clip_to_document(clip: Clip, skeleton: schemas.RevisionRef | schemas.OutputRef) -> schemas.Motion:
+    """Part `motion` of a clip whose skeleton is stored as `skeleton`."""
+    names = clip.skeleton.joint_names
+    return schemas.Motion(
+        schema="marey/motion@1",
+        skeleton=skeleton,
+        frame_rate_hz=clip.frame_rate_hz,
+        joints=names,
+        poses=np.ascontiguousarray(clip.poses),
+        translations=None if clip.translations is None else np.ascontiguousarray(clip.translations),
+        translated_joints=tuple(names[joint] for joint in clip.translated_joints),
+    )
+
+
+def clip_from_document(document: schemas.Motion, skeleton: Skeleton) -> Clip:
+    """The clip of a `motion` part, with its rotations in the skeleton's order.
+
+    `ClipError` where the document is not of this skeleton or its numbers are no motion.
+    """
+    if set(document.joints) != set(skeleton.joint_names) or len(document.joints) != skeleton.joint_count:
+        odd = sorted(set(document.joints) ^ set(skeleton.joint_names)) or ["a repeated name"]
+        raise ClipError(f"the motion's joints are not the skeleton's: {', '.join(odd[:5])}", where="joints")
+    if document.joints[0] != skeleton.joint_names[0]:
+        raise ClipError(f"the first joint must be the root, {skeleton.joint_names[0]}", where="joints")
+    poses, translations = document.poses, document.translations
+    if document.joints != skeleton.joint_names:
+        place = {name: index for index, name in enumerate(document.joints)}
+        order = [place[name] for name in skeleton.joint_names]
+        rotations = poses[:, 3:].reshape(len(poses), -1, 4)[:, order]
+        poses = np.concatenate((poses[:, :3], rotations.reshape(len(poses), -1)), axis=1)
+    translated = [skeleton.index_of(name) for name in document.translated_joints]
+    if translations is not None and translated != sorted(translated):
+        order = np.argsort(translated).tolist()
+        translated = [translated[index] for index in order]
+        translations = translations[:, order]
+    return Clip(skeleton, document.frame_rate_hz, poses, translations, tuple(translated))
+
+
+def mapping_to_document(mapping: JointMapping, axes: Mapping[str, JointAxes]) -> schemas.SkeletonMapping:
+    """Part `mapping` of a skeleton."""
+    return schemas.SkeletonMapping(
+        schema="marey/skeleton-mapping@1",
+        rig=mapping.rig,
+        method=mapping.method,
+        confidence=mapping.confidence,
+        joints=dict(mapping.joints),
+        axes={joint: schemas.JointAxes(twist=one.twist, swing=one.swing) for joint, one in axes.items()},
+        notes=mapping.notes,
+    )
+
+
+def mapping_from_document(
+    document: schemas.SkeletonMapping, skeleton: Skeleton
+) -> tuple[JointMapping, dict[str, JointAxes]]:
+    """Mapping and axes of a `mapping` part that people may have edited.
+
+    Axes are brought to unit length and the swing made perpendicular to the twist. `MappingError` where a standard name
+    is unknown, a joint is not of the skeleton, or an axis has no direction.
+    """
+    for standard, name in document.joints.items():
+        if standard not in STANDARD_JOINTS:
+            raise MappingError(f"{standard!r} is no standard joint", where=f"joints.{standard}")
+        if name not in skeleton:
+            raise MappingError(f"the skeleton has no joint {name!r}", where=f"joints.{standard}")
+    for name in document.axes:
+        if name not in skeleton:
+            raise MappingError(f"the skeleton has no joint {name!r}", where=f"axes.{name}")
+    axes = {name: _orthonormal(name, one) for name, one in document.axes.items()}
+    mapping = JointMapping(
+        document.rig, dict(document.joints), document.confidence, document.method, tuple(document.notes)
+    )
+    return mapping, axes
+
+
+def _orthonormal(joint: str, axes: schemas.JointAxes) -> JointAxes:
+    twist, swing = np.array(axes.twist), np.array(axes.swing)
+    length = float(np.linalg.norm(twist))
+    if not 0.0 < length < np.inf:
+        raise MappingError("the twist axis has no direction", where=f"axes.{joint}")
+    twist = twist / length
+    across = swing - (swing @ twist) * twist
+    reach = float(np.linalg.norm(across))
+    if not 1e-6 * float(np.linalg.norm(swing)) < reach < np.inf:
+        raise MappingError("the swing axis must point across the twist axis", where=f"axes.{joint}")
+    across /= reach
+    return JointAxes(_triple(twist), _triple(across))
+
+
+def _triple(v: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = (float(component) for component in v)
+    return x, y, z
