@@ -69,6 +69,15 @@ def require(
     )  # fmt: skip
 
 
+def find_by_id(tx: Transaction, project_id: str) -> ProjectRow:
+    """The project of a job, for what the queue does for the job's author, who was authorised at submission."""
+    row = tx.execute(select(project).where(project.c.id == project_id)).one()
+    return ProjectRow(
+        row.id, row.name, row.title, row.description, Visibility(row.visibility),
+        row.created_us, row.updated_us, row.deleted_us, row.rev, Role.CONTRIBUTOR, False,
+    )  # fmt: skip
+
+
 def _refuse(principal: Principal, name: str, need: Role) -> None:
     if principal.kind == "anonymous":
         raise Unauthenticated(f"Sign in to do this in {name!r}.")
