@@ -27,18 +27,16 @@ class TileError(ValueError):
 def pack(tile: NDArray[Any], lead: int | None) -> bytes:
     """Compress a (frames, columns) little-endian array.
 
-    `lead` is the number of columns before the first quaternion, None where the columns hold none. A form that does
-    not decode to the same bits, or does not make the tile smaller, gives way to the next simpler one.
+    `lead` is the number of columns before the first quaternion, None where the columns hold none. Of the forms that
+    predict, the first that decodes to the same bits is taken, unless the plain bytes compress better.
     """
-    raw = np.ascontiguousarray(tile).view(np.uint8).reshape(-1)
+    plain = np.ascontiguousarray(tile).view(np.uint8).reshape(-1)
+    packed = _compress([np.array([RAW], np.uint8), plain])
     for sections in _candidates(tile, lead):
-        content = np.concatenate(sections)
-        restored = np.ascontiguousarray(_restore(content, tile.dtype, *tile.shape)).view(np.uint8).reshape(-1)
-        if np.array_equal(restored, raw):
-            packed = _compress(content, [section.size for section in sections])
-            if len(packed) < raw.size:
-                return packed
-    return _compress(np.concatenate([np.array([RAW], np.uint8), raw]), [1 + raw.size])
+        restored = np.ascontiguousarray(_restore(np.concatenate(sections), tile.dtype, *tile.shape))
+        if np.array_equal(restored.view(np.uint8).reshape(-1), plain):
+            return min(_compress(sections), packed, key=len)
+    return packed
 
 
 def unpack(data: bytes | memoryview, dtype: np.dtype[Any], frames: int, columns: int) -> NDArray[Any]:
@@ -53,13 +51,13 @@ def unpack(data: bytes | memoryview, dtype: np.dtype[Any], frames: int, columns:
     return _restore(np.frombuffer(content, np.uint8), dtype, frames, columns)
 
 
-def _compress(content: Bytes, section_sizes: list[int]) -> bytes:
+def _compress(sections: list[Bytes]) -> bytes:
     """One zstd frame in which every section ends a block, so that each has entropy tables of its own."""
-    stream = zstandard.ZstdCompressor(level=1, write_checksum=True).compressobj(size=content.size)
-    parts, start = [], 0
-    for size in section_sizes:
-        parts += [stream.compress(content[start : start + size].data), stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
-        start += size
+    size = sum(section.size for section in sections)
+    stream = zstandard.ZstdCompressor(level=1, write_checksum=True).compressobj(size=size)
+    parts = []
+    for section in sections:
+        parts += [stream.compress(section.data), stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
     return b"".join([*parts, stream.flush()])
 
 
@@ -164,7 +162,8 @@ def _undo_difference(body: _Sections, itemsize: int, channels: int, frames: int)
     integers = _unfold_sign(_join_planes(body, itemsize, channels, frames))
     for order in range(MAX_ORDER, 0, -1):
         rows = np.flatnonzero(orders >= order)
-        integers[rows, order - 1 :] = np.add.accumulate(integers[rows, order - 1 :], axis=1)
+        part = integers[rows, order - 1 :]
+        integers[rows, order - 1 :] = np.add.accumulate(part, axis=1, out=part)
     return integers
 
 
