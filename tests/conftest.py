@@ -1,9 +1,13 @@
 """Fixtures that every test may use."""
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+pytest_plugins = ("database_fixtures",)
 
 MOCAP_VARIABLE = "MAREY_TEST_MOCAP"
 

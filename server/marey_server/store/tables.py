@@ -31,6 +31,8 @@ Document = JSON().with_variant(JSONB(), "postgresql")
 Micros = BigInteger
 Sequence64 = BigInteger().with_variant(Integer(), "sqlite")  # SQLite numbers rows by itself only for INTEGER keys
 ID = String(40)
+Name = String(255).with_variant(String(255, collation="C"), "postgresql")  # by code point, as SQLite sorts
+Path = String(1024).with_variant(String(1024, collation="C"), "postgresql")
 DIGEST = String(71)
 
 
@@ -97,7 +99,7 @@ collection = Table(
     metadata,
     Column("id", ID, primary_key=True),
     Column("project_id", ID, ForeignKey("project.id"), nullable=False),
-    Column("path", String(1024), nullable=False),
+    Column("path", Path, nullable=False),
     Column("created_us", Micros, nullable=False),
     Column("updated_us", Micros, nullable=False),
     Column("deleted_us", Micros),
@@ -112,10 +114,10 @@ item = Table(
     Column("project_id", ID, ForeignKey("project.id"), nullable=False),
     Column("collection_id", ID, ForeignKey("collection.id"), nullable=False, index=True),
     Column("kind", String(16), nullable=False),
-    Column("name", String(255), nullable=False),
+    Column("name", Name, nullable=False),
     Column("head", Integer, nullable=False),
     Column("summary", Document, nullable=False),
-    Column("frames", Integer),
+    Column("frames", Integer, nullable=False, default=0),
     Column("skeleton_id", ID, index=True),
     Column("created_us", Micros, nullable=False),
     Column("updated_us", Micros, nullable=False),
@@ -123,6 +125,10 @@ item = Table(
     Column("rev", Integer, nullable=False, default=1),
     _alive("item", "collection_id", "kind", "name"),
     Index("ix_item_listing", "project_id", "kind", "id"),
+    Index("ix_item_by_name", "project_id", "kind", "name", "id"),
+    Index("ix_item_by_creation", "project_id", "kind", "created_us", "id"),
+    Index("ix_item_by_update", "project_id", "kind", "updated_us", "id"),
+    Index("ix_item_by_frames", "project_id", "kind", "frames", "id"),
 )
 
 item_tag = Table(
@@ -364,11 +370,12 @@ event = Table(
     Column("seq", Sequence64, primary_key=True, autoincrement=True),
     Column("xid", BigInteger, nullable=False, default=0),  # Postgres transaction: readers order by (xid, seq)
     Column("at_us", Micros, nullable=False),
-    Column("project_id", ID, index=True),
+    Column("project_id", ID),
     Column("kind", String(64), nullable=False),
     Column("subject", String(64), nullable=False, index=True),
     Column("actor", String(255)),
     Column("body", Document, nullable=False),
+    Index("ix_event_feed", "project_id", "xid", "seq"),
     sqlite_autoincrement=True,
 )
 

@@ -1,0 +1,25 @@
+"""Runs migrations in the transaction that `store.schema` opens, or in one of its own for the commands of Alembic."""
+
+import os
+
+from alembic import context
+from sqlalchemy import Connection
+
+from marey_server.store.database import Database
+from marey_server.store.tables import metadata
+
+
+def migrate(connection: Connection) -> None:
+    """Bring the database at `connection` to the revision asked for."""
+    context.configure(connection=connection, target_metadata=metadata, render_as_batch=True, transactional_ddl=True)
+    with context.begin_transaction():
+        context.run_migrations()
+
+
+if "connection" in context.config.attributes:
+    migrate(context.config.attributes["connection"])
+else:
+    database = Database(os.environ.get("MAREY_DATABASE_URL", "sqlite://"))
+    with database.engine.begin() as own:
+        migrate(own)
+    database.close()

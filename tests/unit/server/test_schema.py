@@ -1,0 +1,78 @@
+"""The tables in the code and the tables that migrations make are the same, on both databases."""
+
+import pytest
+import sqlalchemy
+from alembic.autogenerate import compare_metadata
+from alembic.runtime.migration import MigrationContext
+
+from marey_server.store import schema
+from marey_server.store.database import Database
+from marey_server.store.tables import metadata
+
+
+def test_migrations_make_exactly_the_tables_of_the_code(database):
+    over_expressions = {
+        index.name
+        for table in metadata.tables.values()
+        for index in table.indexes
+        if len(index.columns) < len(index.expressions)
+    }  # Alembic cannot compare these; the next test does
+
+    def comparable(_thing, name, kind, _reflected, _other):
+        return kind != "index" or name not in over_expressions
+
+    with database.engine.connect() as connection:
+        context = MigrationContext.configure(
+            connection, opts={"compare_server_default": True, "include_object": comparable}
+        )
+        assert compare_metadata(context, metadata) == []
+
+
+def test_indexes_over_expressions_are_migrated_too(database):
+    def indexes(connection):
+        catalogue = (
+            "SELECT name, sql FROM sqlite_master WHERE type = 'index' AND sql IS NOT NULL"
+            if connection.dialect.name == "sqlite"
+            else "SELECT indexname, indexdef FROM pg_indexes WHERE schemaname = 'public'"
+        )
+        return {
+            name: " ".join(sql.split()) for name, sql in connection.exec_driver_sql(catalogue) if "alembic" not in name
+        }
+
+    with database.engine.begin() as connection:
+        migrated = indexes(connection)
+        connection.exec_driver_sql("DROP TABLE alembic_version")
+        metadata.drop_all(connection)
+        metadata.create_all(connection)
+        assert indexes(connection) == migrated
+
+
+def test_a_database_is_at_head_only_after_the_upgrade(database, tmp_path):
+    with database.engine.connect() as connection:
+        assert schema.schema_at_head(connection)
+    empty = Database(f"sqlite:///{tmp_path}/empty.db")
+    with empty.engine.connect() as connection:
+        assert not schema.schema_at_head(connection)
+    empty.close()
+
+
+def test_upgrading_again_keeps_everything(database, database_url):
+    with database.engine.begin() as connection:
+        connection.exec_driver_sql("INSERT INTO server_state (key, value) VALUES ('mine', '1')")
+        before = connection.execute(sqlalchemy.select(metadata.tables["server_state"])).all()
+    schema.upgrade_schema(database_url)
+    with database.engine.connect() as connection:
+        assert connection.execute(sqlalchemy.select(metadata.tables["server_state"])).all() == before
+
+
+def test_an_upgrade_that_fails_leaves_the_database_as_it_was(tmp_path, monkeypatch):
+    def fail(_tx):
+        raise RuntimeError("power cut")
+
+    monkeypatch.setattr(schema, "make_cursor_key", fail)
+    with pytest.raises(RuntimeError):
+        schema.upgrade_schema(f"sqlite:///{tmp_path}/half.db")
+    database = Database(f"sqlite:///{tmp_path}/half.db")
+    with database.engine.connect() as connection:
+        assert sqlalchemy.inspect(connection).get_table_names() == []
+    database.close()
