@@ -24,6 +24,7 @@ import re
 from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any, ClassVar, Concatenate, ParamSpec, TypeVar
+from urllib.parse import urlencode
 
 from pydantic import BaseModel
 from tornado.web import HTTPError, RequestHandler, stream_request_body
@@ -166,7 +167,17 @@ class Resource(RequestHandler):
         """Called with each piece of a streamed body."""
 
     def _declared_reply(self, outcome: Any) -> Reply:
+        if self.operation.answer is None:
+            return Reply()
+        if self.operation.paged:
+            return Reply(outcome, headers=self._link_to_next(outcome.next_cursor))
         return Reply(outcome, rev=outcome.rev if self.operation.etag else None)
+
+    def _link_to_next(self, cursor: str | None) -> dict[str, str]:
+        if cursor is None:
+            return {}
+        query = [(name, values[0]) for name, values in self.request.query_arguments.items() if name != "cursor"]
+        return {"Link": f'<{self.request.path}?{urlencode([*query, ("cursor", cursor)])}>; rel="next"'}
 
     # -- one request, from its headers to its answer ------------------------------------------------------------------
 
