@@ -357,7 +357,8 @@ def _unit(v: Wide, what: str) -> Wide:
 
 def _check_orthonormal(m: Wide) -> None:
     error = np.abs(np.einsum("...ik,...jk->...ij", m, m) - np.eye(3)).max(axis=(-2, -1), initial=0.0)
-    wrong = ~(error <= 1e-3) | ~(np.linalg.det(m) > 0.0)
+    determinant = np.sum(_cross(m[..., 0, :], m[..., 1, :]) * m[..., 2, :], axis=-1)
+    wrong = ~(error <= 1e-3) | ~(determinant > 0.0)
     if np.any(wrong):
         index = tuple(int(i) for i in np.argwhere(wrong)[0])
         kind = "mirrors" if error[index] <= 1e-3 else "scales or shears"
