@@ -105,7 +105,7 @@ EXPORT = KindDeclaration(
 BUILT_IN = (IMPORT, RETARGET, EXPORT)
 
 
-class UnknownKind(LookupError):
+class UnknownKindError(LookupError):
     """No kind of job has this name."""
 
 
@@ -127,8 +127,8 @@ def job_kinds() -> Mapping[str, KindDeclaration]:
 
 
 def find_kind(name: str) -> KindDeclaration:
-    """The kind called `name`; `UnknownKind` if there is none."""
+    """The kind called `name`; `UnknownKindError` if there is none."""
     try:
         return job_kinds()[name]
     except KeyError:
-        raise UnknownKind(f"there is no kind of job called {name!r}; known: {', '.join(job_kinds())}") from None
+        raise UnknownKindError(f"there is no kind of job called {name!r}; known: {', '.join(job_kinds())}") from None

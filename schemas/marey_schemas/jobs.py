@@ -328,3 +328,54 @@ class BatchCompleteRequest(Request):
     """Complete many jobs that stage no outputs beyond those staged already."""
 
     completions: tuple[BatchCompletion, ...] = Field(min_length=1, max_length=256)
+
+
+class CompleteAnswer(Answer):
+    """The job has succeeded, and this is what it published."""
+
+    job: str
+    state: JobState
+    outputs: tuple[JobOutput, ...] = ()
+
+
+class FailAnswer(Answer):
+    """What becomes of the job after the failed attempt."""
+
+    job: str
+    state: JobState
+    retry_in_s: float | None = Field(None, description="Set when the job is queued again.")
+
+
+class BatchCompletionResult(Answer):
+    """What became of one completion of a batch: an answer, or the reason why there is none."""
+
+    job: str
+    fence: int
+    answer: CompleteAnswer | None = None
+    code: str | None = None
+    detail: str | None = None
+
+
+class BatchCompleteAnswer(Answer):
+    """One result per completion, in the order sent."""
+
+    results: tuple[BatchCompletionResult, ...]
+
+
+class LogAnswer(Answer):
+    """How long the attempt's log is now."""
+
+    offset: int = Field(description="Where the next piece goes.")
+    capped: bool = Field(default=False, description="The log is full; nothing more is kept.")
+
+
+class JobBatch(Request):
+    """Submit many jobs, all or none."""
+
+    jobs: tuple[JobCreate, ...] = Field(min_length=1, max_length=1000)
+
+
+class JobList(Answer):
+    """Jobs in the order submitted."""
+
+    jobs: tuple[Job, ...]

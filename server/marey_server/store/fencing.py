@@ -1,0 +1,79 @@
+"""The fence: what an attempt must still hold for anything it writes to count.
+
+A claim raises the job's fence; whoever worked under an older one has lost the job without knowing it. Every write of an
+attempt repeats this predicate in the transaction of the write, since a check of its own would be outrun.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import ColumnElement, Row, and_, case, literal_column, select, tuple_
+
+from marey_server.access.principal import Principal
+from marey_server.errors import LeaseLost, NotFound
+from marey_server.store.database import Transaction
+from marey_server.store.tables import attempt, job
+
+# Literals, not parameters: SQLite uses a partial index only where it can see that the condition is met.
+RUNNING: ColumnElement[str] = literal_column("'running'")
+QUEUED: ColumnElement[str] = literal_column("'queued'")
+WAITING: ColumnElement[str] = literal_column("'waiting'")
+
+
+def same_fence(*attempts: tuple[str, int]) -> ColumnElement[bool]:
+    """Nobody has claimed the job since this attempt did; of several attempts, each for its own job."""
+    if len(attempts) == 1:
+        return job.c.fence == attempts[0][1]
+    return tuple_(job.c.id, job.c.fence).in_(attempts)
+
+
+def held(*attempts: tuple[str, int]) -> ColumnElement[bool]:
+    """These attempts, each a job's id and a fence, still hold their jobs: the predicate of every write of a worker."""
+    ids = [job_id for job_id, _ in attempts]
+    of_these = job.c.id == ids[0] if len(ids) == 1 else job.c.id.in_(ids)
+    return and_(of_these, job.c.state == RUNNING, same_fence(*attempts))
+
+
+def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
+    """The credential must be that of this very attempt.
+
+    Raises `NotFound` for a credential that is no attempt's of this job, `LeaseLost` for another attempt of it.
+    """
+    if principal.kind == "system":
+        return
+    if principal.kind != "attempt" or principal.job_id != job_id:
+        raise NotFound(f"There is no attempt {fence} of {job_id} that this credential may write to.")
+    if principal.fence != fence:
+        raise lease_lost(job_id, fence)
+
+
+def hold(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any]) -> Row[Any]:
+    """Keep the job from changing hands until the transaction ends, and read `columns` of it.
+
+    Raises `LeaseLost` if the attempt does not hold it any more.
+    """
+    statement = select(job.c.project_id, *columns).where(held((job_id, fence))).with_for_update()
+    row = tx.execute(statement).one_or_none()
+    if row is None:
+        raise lease_lost(job_id, fence)
+    return row
+
+
+def lease_lost(job_id: str, fence: int) -> LeaseLost:
+    """The error that tells a worker to stop."""
+    return LeaseLost(f"Attempt {fence} does not hold {job_id} any more. Stop working on it.")
+
+
+def earlier_answer(tx: Transaction, job_id: str, fence: int, write_id: str) -> dict[str, Any] | None:
+    """What the attempt's last word with this `write_id` was answered; `None` if it has not been said."""
+    statement = select(attempt.c.answer).where(
+        attempt.c.job_id == job_id, attempt.c.fence == fence, attempt.c.write_id == write_id
+    )
+    answer: dict[str, Any] | None = tx.execute(statement).scalar_one_or_none()
+    return answer
+
+
+def earlier(first: Any, second: Any) -> ColumnElement[int]:
+    """The smaller of two times in SQL; both databases have a function for it, under different names."""
+    return case((first < second, first), else_=second)

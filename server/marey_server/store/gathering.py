@@ -1,0 +1,63 @@
+"""The end of a fan-out: one result from the results of its tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from sqlalchemy import and_, select
+
+from marey_schemas.jobs import FailureReason
+from marey_server.store.database import Transaction
+from marey_server.store.fencing import RUNNING
+from marey_server.store.job_ends import Ended, end_jobs, failure_document
+from marey_server.store.tables import job
+
+MOST_GATHERED = 1000
+"""Entries of a list, such as refusals with their reasons, that the gathering job repeats."""
+
+
+def gather(tx: Transaction, parent_id: str) -> list[Ended]:
+    """End the gathering job, all of whose tasks have ended: failed if one failed, else cancelled if one was."""
+    rows = tx.execute(
+        select(job.c.id, job.c.state, job.c.result, job.c.failure)
+        .where(job.c.parent_id == parent_id)
+        .order_by(job.c.position)
+    ).all()
+    result = {"tasks": len(rows), **combine_results(row.result for row in rows if row.result is not None)}
+    running = and_(job.c.id == parent_id, job.c.state == RUNNING)
+    failed = [row for row in rows if row.state == "failed"]
+    if failed:
+        first = failed[0]
+        failure = failure_document(
+            FailureReason(first.failure["reason"]),
+            first.failure["code"],
+            f"{len(failed)} of {len(rows)} tasks failed; the first, {first.id}: {first.failure['detail']}",
+        )
+        return end_jobs(tx, running, "failed", failure=failure, result=result)
+    state = "cancelled" if any(row.state == "cancelled" for row in rows) else "succeeded"
+    return end_jobs(tx, running, state, result=result)
+
+
+def combine_results(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """Numbers are added up, lists put together (the first thousand entries), tables combined; other facts stay with the
+    tasks.
+    """
+    combined: dict[str, Any] = {}
+    for result in results:
+        for name, value in result.items():
+            if isinstance(value, bool):
+                continue
+            if isinstance(value, int | float):
+                combined[name] = _as_kind(combined.get(name), 0) + value
+            elif isinstance(value, list | tuple):
+                combined[name] = [*_as_kind(combined.get(name), []), *value][:MOST_GATHERED]
+            elif isinstance(value, dict):
+                combined[name] = combine_results([_as_kind(combined.get(name), {}), value])
+    return combined
+
+
+def _as_kind(value: Any, empty: Any) -> Any:
+    """What was combined so far, unless an earlier task gave something of another type under the name."""
+    same = isinstance(value, int | float) if empty == 0 else isinstance(value, type(empty))
+    return value if same else empty

@@ -1,0 +1,87 @@
+"""Rows of jobs as they travel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy import Row, Select, func, select
+
+from marey_schemas.jobs import Job
+from marey_server.store.clock import datetime_of
+from marey_server.store.database import Transaction
+from marey_server.store.tables import job, project, user
+
+IN_LIST = 1000
+
+
+def select_jobs() -> Select[Any]:
+    """Jobs with the names of their project and author."""
+    return (
+        select(job, project.c.name.label("project_name"), user.c.name.label("author_name"))
+        .join(project, project.c.id == job.c.project_id)
+        .outerjoin(user, user.c.id == job.c.author_id)
+    )
+
+
+def job_documents(tx: Transaction, ids: Sequence[str]) -> list[Job]:
+    """The documents of these jobs, in this order."""
+    found: dict[str, Job] = {}
+    for start in range(0, len(ids), IN_LIST):
+        rows = tx.execute(select_jobs().where(job.c.id.in_(ids[start : start + IN_LIST]))).all()
+        found |= {document.id: document for document in as_documents(tx, rows)}
+    return [found[one] for one in ids]
+
+
+def as_documents(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Job]:
+    """Rows of `select_jobs` as they travel; gathering jobs with the states of their tasks."""
+    children = _children(tx, [row.id for row in rows if row.size is not None])
+    return [_document(row, children.get(row.id, {})) for row in rows]
+
+
+def _children(tx: Transaction, parents: Sequence[str]) -> dict[str, dict[str, int]]:
+    if not parents:
+        return {}
+    statement = (
+        select(job.c.parent_id, job.c.state, func.count().label("count"))
+        .where(job.c.parent_id.in_(parents))
+        .group_by(job.c.parent_id, job.c.state)
+    )
+    counts: dict[str, dict[str, int]] = {}
+    for row in tx.execute(statement):
+        counts.setdefault(row.parent_id, {})[row.state] = row._mapping["count"]
+    return counts
+
+
+def _document(row: Row[Any], children: dict[str, int]) -> Job:
+    return Job(
+        id=row.id,
+        project=row.project_name,
+        kind=row.kind,
+        state=row.state,
+        params=row.params,
+        inputs=row.inputs,
+        into=row.into_path,
+        priority=row.priority,
+        seed=row.seed,
+        attempt=row.attempt,
+        fence=row.fence,
+        max_attempts=row.max_attempts,
+        interruptions=row.interruptions,
+        parent=row.parent_id,
+        size=row.size,
+        children=children,
+        retry_of=row.retry_of,
+        cached_from=row.cached_from,
+        progress=row.progress,
+        failure=row.failure,
+        result=row.result,
+        cancel_requested=row.cancel_requested_us is not None,
+        publish_conflict=row.publish_conflict,
+        author=row.author_name,
+        created_at=datetime_of(row.created_us),
+        run_at=datetime_of(row.run_at_us),
+        started_at=None if row.started_us is None else datetime_of(row.started_us),
+        finished_at=None if row.finished_us is None else datetime_of(row.finished_us),
+        rev=row.rev,
+    )

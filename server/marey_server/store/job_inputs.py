@@ -1,0 +1,178 @@
+"""From what a job's submission names to the exact revisions it will read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+from sqlalchemy import ColumnElement, Select, func, or_, select
+
+from marey_schemas.job_kinds import KindDeclaration
+from marey_schemas.jobs import CollectionInput, InputSpec, ItemInput, JobCreate
+from marey_schemas.problems import FieldError
+from marey_server.errors import Invalid
+from marey_server.store.database import Transaction
+from marey_server.store.projects import ProjectRow
+from marey_server.store.tables import collection, item
+
+MOST_INPUTS = 100_000
+IN_LIST = 1000
+
+Pin = dict[str, Any]
+"""An input as the job keeps it: the fields of `PinnedInput`."""
+
+PinnedInputs = dict[str, list[Pin]]
+
+
+class _Found(NamedTuple):
+    id: str
+    kind: str
+    name: str
+    head: int
+    path: str
+
+
+def pin_inputs(
+    tx: Transaction, project: ProjectRow, kind: KindDeclaration, request: JobCreate, at: str = ""
+) -> PinnedInputs:
+    """Every input with the revision it has now, or had when it was named; collections become their items.
+
+    Raises `Invalid`, with a pointer below `at` for each thing that is wrong: an input the kind does not have or lacks,
+    an item or revision that is not in the project, an item of another kind, a collection that holds none.
+    """
+    errors = _misnamed(kind, request, at)
+    named = [choice for choices in request.inputs.values() for choice in _as_many(choices)]
+    known = _find_items(tx, project, [choice.item for choice in named if isinstance(choice, ItemInput)])
+    pins: PinnedInputs = {}
+    for name, choices in request.inputs.items():
+        spec = kind.inputs.get(name)
+        if spec is not None:
+            pins[name] = _pin_input(tx, project, spec, choices, f"{at}/inputs/{_escaped(name)}", known, errors)
+    if not errors:
+        errors += _missing_revisions(request, known, at)
+    total = sum(map(len, pins.values()))
+    if total > MOST_INPUTS:
+        errors.append(
+            _error(f"{at}/inputs", "too-many", f"{total} inputs are named; at most {MOST_INPUTS} are possible.")
+        )
+    if errors:
+        raise Invalid(f"{errors[0].pointer}: {errors[0].detail}", errors=errors[:100])
+    return pins
+
+
+def _misnamed(kind: KindDeclaration, request: JobCreate, at: str) -> list[FieldError]:
+    unknown = [
+        _error(
+            f"{at}/inputs/{_escaped(name)}",
+            "unknown-input",
+            f"{kind.name} has no input {name!r}; it has {', '.join(map(repr, kind.inputs)) or 'none'}.",
+        )
+        for name in request.inputs
+        if name not in kind.inputs
+    ]
+    lacking = [
+        _error(f"{at}/inputs", "missing-input", f"{kind.name} needs the input {name!r}: {spec.description}")
+        for name, spec in kind.inputs.items()
+        if spec.required and name not in request.inputs
+    ]
+    return unknown + lacking
+
+
+def _pin_input(
+    tx: Transaction,
+    project: ProjectRow,
+    spec: InputSpec,
+    choices: Any,
+    pointer: str,
+    known: dict[str, _Found],
+    errors: list[FieldError],
+) -> list[Pin]:
+    single = not isinstance(choices, tuple)
+    pins: dict[tuple[str, int], Pin] = {}
+    for index, choice in enumerate(_as_many(choices)):
+        place = pointer if single else f"{pointer}/{index}"
+        if isinstance(choice, CollectionInput):
+            found = _items_below(tx, project, spec, choice.collection)
+            if not found:
+                detail = f"The collection {choice.collection!r} holds no {spec.kind.value}."
+                errors.append(_error(f"{place}/collection", "empty-collection", detail))
+            chosen = [(one, one.head) for one in found]
+        else:
+            one = known.get(choice.item)
+            if one is None or one.kind != spec.kind:
+                detail = f"There is no {spec.kind.value} {choice.item!r} in the project."
+                errors.append(_error(f"{place}/item", "unknown-item", detail))
+                continue
+            chosen = [(one, choice.revision or one.head)]
+        for one, number in chosen:
+            pins.setdefault((one.id, number), _pin(one, number))
+    if not errors and not spec.many and len(pins) != 1:
+        errors.append(_error(pointer, "one-item", f"This input takes one {spec.kind.value}, not {len(pins)}."))
+    return list(pins.values())
+
+
+def _pin(found: _Found, number: int) -> Pin:
+    return {"item": found.id, "revision": number, "kind": found.kind, "name": found.name, "collection": found.path}
+
+
+# -- looking up -------------------------------------------------------------------------------------------------------
+
+
+def _find_items(tx: Transaction, project: ProjectRow, ids: Iterable[str]) -> dict[str, _Found]:
+    wanted = sorted(set(ids))
+    rows = [
+        _Found(row.id, row.kind, row.name, row.head, row.path)
+        for start in range(0, len(wanted), IN_LIST)
+        for row in tx.execute(_items(project).where(item.c.id.in_(wanted[start : start + IN_LIST])))
+    ]
+    return {row.id: row for row in rows}
+
+
+def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: str) -> list[_Found]:
+    """The items of the input's kind in a collection and below it, by place and name."""
+    statement = _items(project).where(item.c.kind == spec.kind.value).limit(MOST_INPUTS + 1)
+    if path:
+        statement = statement.where(_within(path))
+    rows = tx.execute(statement.order_by(collection.c.path, item.c.name, item.c.id))
+    return [_Found(row.id, row.kind, row.name, row.head, row.path) for row in rows]
+
+
+def _within(path: str) -> ColumnElement[bool]:
+    """Compared as text, not with LIKE, which on SQLite takes `A` for `a`."""
+    below = f"{path}/"
+    return or_(collection.c.path == path, func.substr(collection.c.path, 1, len(below)) == below)
+
+
+def _items(project: ProjectRow) -> Select[Any]:
+    return (
+        select(item.c.id, item.c.kind, item.c.name, item.c.head, collection.c.path)
+        .join(collection, collection.c.id == item.c.collection_id)
+        .where(item.c.project_id == project.id, item.c.deleted_us.is_(None))
+    )
+
+
+def _missing_revisions(request: JobCreate, known: dict[str, _Found], at: str) -> list[FieldError]:
+    """Revisions that were named by number and do not exist."""
+    asked: list[tuple[str, ItemInput]] = []
+    for name, choices in request.inputs.items():
+        for index, choice in enumerate(_as_many(choices)):
+            if isinstance(choice, ItemInput) and choice.revision is not None:
+                place = f"{at}/inputs/{_escaped(name)}" + (f"/{index}" if isinstance(choices, tuple) else "")
+                asked.append((place, choice))
+    beyond = [(place, choice) for place, choice in asked if (choice.revision or 0) > known[choice.item].head]
+    return [
+        _error(f"{place}/revision", "unknown-revision", f"{choice.item} has no revision {choice.revision}.")
+        for place, choice in beyond
+    ]
+
+
+def _as_many(choices: Any) -> Sequence[ItemInput | CollectionInput]:
+    return choices if isinstance(choices, tuple) else (choices,)
+
+
+def _escaped(name: str) -> str:
+    return name.replace("~", "~0").replace("/", "~1")
+
+
+def _error(pointer: str, code: str, detail: str) -> FieldError:
+    return FieldError(pointer=pointer, code=code, detail=detail)

@@ -1,0 +1,277 @@
+"""Jobs as their users see them: read, listed, cancelled, tried again."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from sqlalchemy import ColumnElement, Row, and_, case, func, select, update
+
+from marey_schemas.access import Role
+from marey_schemas.items import Event, Page
+from marey_schemas.job_kinds import UnknownKindError, find_kind
+from marey_schemas.jobs import Attempt, Job, JobCreate, JobOutput, JobState, Resources
+from marey_server.access import roles
+from marey_server.errors import Conflict, Forbidden, NotFound
+from marey_server.store import listing, projects
+from marey_server.store.clock import datetime_of
+from marey_server.store.database import Transaction
+from marey_server.store.fencing import RUNNING, earlier
+from marey_server.store.job_documents import as_documents, job_documents, select_jobs
+from marey_server.store.job_ends import ENDED_COLUMNS, Ended, as_ended
+from marey_server.store.job_events import emit_job_events
+from marey_server.store.job_logs import MOST_READ_BYTES, LogPage, read_log
+from marey_server.store.projects import ProjectRow
+from marey_server.store.queue_policy import DEFAULT_POLICY, QueuePolicy
+from marey_server.store.settling import settle
+from marey_server.store.submission import Submission, submit_checked
+from marey_server.store.tables import attempt, event, job, user
+
+SORT_KEYS: dict[str, ColumnElement[Any]] = {
+    "id": job.c.id,
+    "created_at": job.c.created_us,
+    "priority": job.c.priority,
+}
+
+UNFINISHED = ("waiting", "queued", "running")
+
+
+@dataclass(frozen=True, slots=True)
+class JobFilters:
+    """Which jobs a list holds; what is empty does not matter."""
+
+    states: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ()
+    parent: str | None = None
+    """Tasks of this gathering job; without it, tasks are left out."""
+    author: str | None = None
+
+
+# -- reading -----------------------------------------------------------------------------------------------------------
+
+
+def read_job(tx: Transaction, job_id: str) -> Job:
+    """A job and how it stands. Raises `NotFound`."""
+    row, _ = _find(tx, job_id)
+    return as_documents(tx, [row])[0]
+
+
+def list_jobs(
+    tx: Transaction,
+    project: str,
+    filters: JobFilters = JobFilters(),
+    *,
+    sort: str = "-created_at",
+    cursor: str | None = None,
+    limit: int = listing.DEFAULT_LIMIT,
+    count: bool = False,
+) -> Page:
+    """One page of a project's jobs, without the tasks of fan-outs unless they are asked for."""
+    project_row = projects.require(tx, project)
+    order = listing.parse_order(sort, SORT_KEYS)
+    identity = [project_row.id, asdict(filters)]
+    conditions = _conditions(project_row.id, filters)
+    total = None
+    if count:
+        counted = select_jobs().where(*conditions).with_only_columns(func.count(), maintain_column_froms=True)
+        total = tx.execute(counted).scalar_one()
+    if cursor is not None:
+        conditions.append(order.after(listing.read_cursor(tx, cursor, order, identity)))
+    statement = select_jobs().where(*conditions).order_by(*order.clauses()).limit(limit + 1)
+    rows, next_cursor = listing.page_of(tx, tx.execute(statement).all(), limit, order, identity)
+    return Page(items=tuple(as_documents(tx, rows)), next_cursor=next_cursor, count=total)
+
+
+def list_attempts(tx: Transaction, job_id: str) -> list[Attempt]:
+    """Every try at a job, the first one first."""
+    _find(tx, job_id)
+    rows = tx.execute(select(attempt).where(attempt.c.job_id == job_id).order_by(attempt.c.fence))
+    return [
+        Attempt(
+            job=row.job_id,
+            fence=row.fence,
+            worker=row.worker,
+            started_at=datetime_of(row.started_us),
+            ended_at=None if row.ended_us is None else datetime_of(row.ended_us),
+            outcome=row.outcome,
+            detail=row.detail,
+        )
+        for row in rows
+    ]
+
+
+def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
+    """What a job published, or the tasks of a gathering job, job by job."""
+    row, _ = _find(tx, job_id)
+    if row.size is None:
+        return Page(items=tuple(JobOutput(**output) for output in row.outputs or ()))
+    order = listing.parse_order("position", {"position": job.c.position, "id": job.c.id})
+    statement = select(job.c.id, job.c.position, job.c.outputs).where(job.c.parent_id == job_id)
+    if cursor is not None:
+        statement = statement.where(order.after(listing.read_cursor(tx, cursor, order, job_id)))
+    tasks = tx.execute(statement.order_by(*order.clauses()).limit(limit + 1)).all()
+    page, next_cursor = listing.page_of(tx, tasks, limit, order, job_id)
+    outputs = tuple(JobOutput(**output) for task in page for output in task.outputs or ())
+    return Page(items=outputs, next_cursor=next_cursor)
+
+
+def list_events(tx: Transaction, job_id: str, after: int = 0, limit: int = listing.DEFAULT_LIMIT) -> list[Event]:
+    """What happened to a job, for members of its project."""
+    _, project = _find(tx, job_id, public=False)
+    statement = select(event).where(event.c.subject == job_id, event.c.seq > after).order_by(event.c.seq).limit(limit)
+    return [
+        Event(
+            seq=row.seq,
+            at=datetime_of(row.at_us),
+            project=project.name,
+            kind=row.kind,
+            subject=row.subject,
+            actor=row.actor,
+            body=row.body,
+        )
+        for row in tx.execute(statement)
+    ]
+
+
+def read_job_log(tx: Transaction, job_id: str, offset: int = 0, limit: int = MOST_READ_BYTES) -> LogPage:
+    """A piece of what a job's attempts printed, for members of its project."""
+    row, _ = _find(tx, job_id, public=False)
+    return read_log(tx, row, offset, limit)
+
+
+def _conditions(project_id: str, filters: JobFilters) -> list[ColumnElement[bool]]:
+    conditions = [job.c.project_id == project_id]
+    if filters.parent is None:
+        conditions.append(job.c.parent_id.is_(None))
+    else:
+        conditions.append(job.c.parent_id == filters.parent)
+    if filters.states:
+        conditions.append(job.c.state.in_(filters.states))
+    if filters.kinds:
+        conditions.append(job.c.kind.in_(filters.kinds))
+    if filters.author is not None:
+        conditions.append(user.c.name == filters.author)
+    return conditions
+
+
+# -- cancelling --------------------------------------------------------------------------------------------------------
+
+
+def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLICY) -> Job:
+    """Cancel a job, at once where nobody works on it, else as soon as the worker stops or its grace is over.
+
+    A gathering job is cancelled with its tasks. Cancelling twice is cancelling once.
+    Raises `Conflict` for a job that has succeeded or failed, `Forbidden` for somebody else's job.
+    """
+    row, project = _find(tx, job_id, "jobs")
+    _require_own(tx, row, project, "cancel")
+    if row.size is not None:
+        settle(tx, _cancel(tx, and_(job.c.parent_id == job_id, job.c.state.in_(UNFINISHED)), policy))
+    settle(tx, _cancel(tx, and_(job.c.id == job_id, job.c.state.in_(UNFINISHED)), policy))
+    document = job_documents(tx, [job_id])[0]
+    if document.state in (JobState.SUCCEEDED, JobState.FAILED):
+        raise Conflict(f"The job has {document.state} already; nothing can be cancelled.", code="job-ended")
+    return document
+
+
+def _cancel(tx: Transaction, condition: ColumnElement[bool], policy: QueuePolicy) -> list[Ended]:
+    """Cancel the jobs that meet the condition, in one statement whatever their state; those that ended by it.
+
+    A running job's time is over with the cancellation, so that its lease cannot outlive the grace.
+    """
+    running = job.c.state == RUNNING
+    rows = tx.execute(
+        update(job)
+        .where(condition)
+        .values(
+            state=case((running, "running"), else_="cancelled"),
+            cancel_requested_us=func.coalesce(job.c.cancel_requested_us, tx.now_us),
+            deadline_us=case((running, earlier(job.c.deadline_us, tx.now_us)), else_=None),
+            lease_expires_us=case(
+                (running, earlier(job.c.lease_expires_us, tx.now_us + policy.end_grace_us)), else_=None
+            ),
+            finished_us=case((running, None), else_=tx.now_us),
+            rev=job.c.rev + 1,
+        )
+        .returning(*ENDED_COLUMNS)
+    ).all()
+    told = [row for row in rows if row.state == "running"]
+    emit_job_events(tx, "job.cancel_requested", [(row.project_id, row.id, {}) for row in told])
+    return [as_ended(row) for row in rows if row.state != "running"]
+
+
+# -- trying again ------------------------------------------------------------------------------------------------------
+
+
+def retry_job(tx: Transaction, job_id: str) -> Job:
+    """Submit a failed or cancelled job again, with the inputs it had; what its tasks brought is not computed twice.
+
+    Raises `Conflict` for a job that has not ended or has succeeded, and for a task.
+    """
+    row, project = _find(tx, job_id, "jobs")
+    _require_own(tx, row, project, "retry")
+    if row.state not in ("failed", "cancelled"):
+        raise Conflict(
+            f"Only a failed or cancelled job can be tried again; this one is {row.state}.", code="not-failed"
+        )
+    if row.parent_id is not None:
+        raise Conflict(f"This is a task; try {row.parent_id} again, which it belongs to.", code="is-task")
+    try:
+        kind = find_kind(row.kind)
+    except UnknownKindError as error:
+        raise Conflict(f"This server does not know the kind any more: {error}.", code="unknown-kind") from error
+    request = JobCreate(
+        kind=row.kind,
+        params=row.params,
+        into=row.into_path,
+        priority=row.priority,
+        after=(),
+        on_failure=row.on_failure,
+        concurrency_key=_concurrency_key(tx, row),
+        cache=row.cache_mode,
+        seed=row.seed,
+        max_attempts=row.max_attempts,
+        resources=Resources(time_limit_s=row.time_limit_s, memory_limit_mb=row.memory_limit_mb),
+        message=row.message,
+    )
+    again = Submission(kind, request, row.params, _pins_of(tx, row, kind.fan_out), row.labels_key, retry_of=row.id)
+    return submit_checked(tx, project, [again])[0]
+
+
+def _pins_of(tx: Transaction, row: Row[Any], fanned: str | None) -> dict[str, Any]:
+    """The inputs of a job; those of a gathering job are with its tasks."""
+    if row.size is None or fanned is None:
+        return dict(row.inputs)
+    statement = select(job.c.inputs).where(job.c.parent_id == row.id).order_by(job.c.position)
+    pins = [pin for inputs in tx.execute(statement).scalars() for pin in inputs[fanned]]
+    return {**row.inputs, fanned: pins}
+
+
+def _concurrency_key(tx: Transaction, row: Row[Any]) -> str | None:
+    """The key of a job, or of a gathering job's tasks."""
+    key: str | None = row.concurrency_key
+    if row.size is not None:
+        key = tx.execute(select(job.c.concurrency_key).where(job.c.parent_id == row.id).limit(1)).scalar()
+    return key
+
+
+# -- who may -----------------------------------------------------------------------------------------------------------
+
+
+def _find(tx: Transaction, job_id: str, scope: str = "read", *, public: bool = True) -> tuple[Row[Any], ProjectRow]:
+    """The job and its project, if the caller may read it; a job of a hidden project is as unknown as none."""
+    row = tx.execute(select_jobs().where(job.c.id == job_id)).one_or_none()
+    if row is not None:
+        try:
+            return row, projects.require(tx, row.project_name, Role.READER, scope, public=public)
+        except NotFound:
+            pass
+    raise NotFound(f"There is no job {job_id!r} that you may see.", code="no-job")
+
+
+def _require_own(tx: Transaction, row: Row[Any], project: ProjectRow, what: str) -> None:
+    """Contributors act on their own jobs, maintainers on all."""
+    if roles.includes(project.role, Role.MAINTAINER):
+        return
+    if not roles.includes(project.role, Role.CONTRIBUTOR) or row.author_id != tx.principal.user_id:
+        raise Forbidden(f"To {what} somebody else's job needs the role maintainer.", code="insufficient-role")

@@ -1,0 +1,40 @@
+"""Labels of jobs and workers as one indexed text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations
+from urllib.parse import quote
+
+from marey_schemas.problems import FieldError
+from marey_server.errors import Invalid
+
+MOST_LABELS = 6
+"""A worker matches 2 to the power of its labels many sets of labels, so there is a limit."""
+
+LONGEST_KEY = 512
+
+
+def labels_key(labels: Mapping[str, str]) -> str:
+    """The labels in a fixed order, such as `gpu=a100,site=lyon`; raises `Invalid` if there are too many."""
+    pairs = _checked_pairs(labels)
+    key = ",".join(pairs)
+    if len(key) > LONGEST_KEY:
+        raise _refusal(f"The labels take {len(key)} characters; at most {LONGEST_KEY} fit.")
+    return key
+
+
+def keys_within(labels: Mapping[str, str]) -> list[str]:
+    """The key of every set of labels that a worker carrying `labels` satisfies, the empty one first."""
+    pairs = _checked_pairs(labels)
+    return [",".join(subset) for size in range(len(pairs) + 1) for subset in combinations(pairs, size)]
+
+
+def _checked_pairs(labels: Mapping[str, str]) -> list[str]:
+    if len(labels) > MOST_LABELS:
+        raise _refusal(f"There are {len(labels)} labels; at most {MOST_LABELS} are possible.")
+    return [f"{quote(name, safe='')}={quote(value, safe='')}" for name, value in sorted(labels.items())]
+
+
+def _refusal(detail: str) -> Invalid:
+    return Invalid(detail, errors=[FieldError(pointer="/labels", code="too-long", detail=detail)])

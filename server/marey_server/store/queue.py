@@ -1,0 +1,211 @@
+"""Claims and heartbeats: how a job gets a worker and keeps it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import CTE, BigInteger, ColumnElement, FromClause, Row, and_, cast, exists, func, insert, or_, select, update
+
+from marey_schemas.access import Role
+from marey_schemas.jobs import (
+    PROTOCOL_VERSION,
+    ClaimRequest,
+    Heartbeat,
+    HeartbeatAnswer,
+    Lease,
+    PinnedInput,
+    Resources,
+)
+from marey_schemas.problems import FieldError
+from marey_server import faults
+from marey_server.access.secret_tokens import IssuedToken, issue_attempt_token
+from marey_server.errors import Forbidden, Invalid
+from marey_server.store.clock import save_high_water
+from marey_server.store.database import Transaction
+from marey_server.store.fencing import QUEUED, RUNNING, earlier, held, lease_lost, require_attempt
+from marey_server.store.job_events import emit_job_events
+from marey_server.store.labels import keys_within
+from marey_server.store.queue_policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
+from marey_server.store.tables import attempt, job, member, project
+
+
+def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_POLICY) -> list[Lease]:
+    """Give the caller up to `request.max` queued jobs, best first, each under a new fence.
+
+    Raises `Forbidden` for a caller that may not work, `Invalid` for another version of the protocol.
+    """
+    if request.protocol != PROTOCOL_VERSION:
+        detail = f"The worker speaks version {request.protocol} of the protocol, the server {PROTOCOL_VERSION}."
+        raise Invalid(detail, errors=[FieldError(pointer="/protocol", code="protocol", detail=detail)])
+    workable = _workable_projects(tx)
+    rows = sorted(tx.execute(_claim_statement(tx, request, policy, workable)), key=_pick_order)
+    if not rows:
+        return []
+    if not tx.is_postgres:
+        save_high_water(tx.connection, tx.now_us)
+    tokens = [issue_attempt_token() for _ in rows]
+    tx.execute(
+        insert(attempt),
+        [
+            {
+                "job_id": row.id,
+                "fence": row.fence,
+                "worker": request.worker,
+                "claimed_by": tx.principal.token_id,
+                "token_hash": token.secret_hash,
+                "started_us": tx.now_us,
+            }
+            for row, token in zip(rows, tokens, strict=True)
+        ],
+    )
+    emit_job_events(tx, "job.started", [(row.project_id, row.id, {"fence": row.fence}) for row in rows])
+    names = _project_names(tx, {row.project_id for row in rows})
+    tx.after_commit(lambda: faults.point("claim.after_commit"))
+    return [_lease(row, names[row.project_id], token, policy) for row, token in zip(rows, tokens, strict=True)]
+
+
+def heartbeat(
+    tx: Transaction, job_id: str, fence: int, request: Heartbeat, policy: QueuePolicy = DEFAULT_POLICY
+) -> HeartbeatAnswer:
+    """Extend the lease, even a late one that nobody has taken; never past the grace of a cancel or of the time limit.
+
+    Raises `LeaseLost` if the attempt does not hold the job any more.
+    """
+    require_attempt(tx.principal, job_id, fence)
+    values: dict[str, Any] = {
+        "lease_expires_us": earlier(job.c.deadline_us + policy.end_grace_us, tx.now_us + policy.lease_ttl_us)
+    }
+    if request.progress is not None:
+        values["progress"] = request.progress.model_dump(mode="json")
+    columns = (job.c.lease_expires_us, job.c.cancel_requested_us, job.c.deadline_us)
+    row = tx.execute(update(job).where(held((job_id, fence))).values(**values).returning(*columns)).one_or_none()
+    if row is None:
+        raise lease_lost(job_id, fence)
+    if not tx.is_postgres:
+        save_high_water(tx.connection, tx.now_us)
+    return HeartbeatAnswer(
+        lease_ttl_s=max(0, row.lease_expires_us - tx.now_us) / SECOND_US,
+        cancel_requested=row.cancel_requested_us is not None,
+        deadline_s=max(0, row.deadline_us - tx.now_us) / SECOND_US,
+    )
+
+
+# -- the claim in one statement ---------------------------------------------------------------------------------------
+
+
+def _claim_statement(tx: Transaction, request: ClaimRequest, policy: QueuePolicy, workable: ColumnElement[bool]) -> Any:
+    pick = _pick(tx, request, workable)
+    return (
+        update(job)
+        .where(job.c.id == pick.c.id)
+        .values(
+            state="running",
+            fence=job.c.fence + 1,
+            attempt=job.c.attempt + 1,
+            lease_expires_us=tx.now_us + policy.lease_ttl_us,
+            deadline_us=tx.now_us + cast(job.c.time_limit_s, BigInteger) * SECOND_US,
+            started_us=func.coalesce(job.c.started_us, tx.now_us),
+            progress=None,
+            rev=job.c.rev + 1,
+        )
+        .returning(
+            job.c.id,
+            job.c.project_id,
+            job.c.kind,
+            job.c.params,
+            job.c.inputs,
+            job.c.into_path,
+            job.c.seed,
+            job.c.time_limit_s,
+            job.c.memory_limit_mb,
+            job.c.fence,
+            job.c.attempt,
+            job.c.priority,
+            job.c.run_at_us,
+        )
+    )
+
+
+def _pick(tx: Transaction, request: ClaimRequest, workable: ColumnElement[bool]) -> CTE:
+    """The ids to claim: of jobs that share a concurrency key only the first, and none while one runs."""
+    label_keys = keys_within(request.labels)
+
+    def claimable(candidate: FromClause) -> ColumnElement[bool]:
+        conditions = [
+            candidate.c.state == QUEUED,
+            candidate.c.run_at_us <= tx.now_us,
+            candidate.c.kind.in_(request.kinds),
+            candidate.c.labels_key.in_(label_keys),
+        ]
+        if request.job is not None:
+            conditions.append(candidate.c.id == request.job)
+        return and_(*conditions)
+
+    rival = job.alias("rival")
+    same_key = and_(rival.c.project_id == job.c.project_id, rival.c.concurrency_key == job.c.concurrency_key)
+    rival_runs = exists().where(same_key, rival.c.state == RUNNING)
+    first_of_key = (
+        select(rival.c.id).where(same_key, claimable(rival)).order_by(*_order(rival)).limit(1).scalar_subquery()
+    )
+    return (
+        select(job.c.id)
+        .where(
+            claimable(job),
+            workable,
+            or_(job.c.concurrency_key.is_(None), and_(~rival_runs, job.c.id == first_of_key)),
+        )
+        .order_by(*_order(job))
+        .limit(request.max)
+        .with_for_update(skip_locked=True)
+        .cte("pick")
+    )
+
+
+def _order(candidate: FromClause) -> tuple[ColumnElement[Any], ...]:
+    return candidate.c.priority.desc(), candidate.c.run_at_us, candidate.c.id
+
+
+def _pick_order(row: Row[Any]) -> tuple[Any, ...]:
+    return -row.priority, row.run_at_us, row.id
+
+
+def _workable_projects(tx: Transaction) -> ColumnElement[bool]:
+    """Jobs of projects whose work the caller may do: a worker reads what the project holds and writes in its name."""
+    caller = tx.principal
+    scopes = [scope for scope in caller.scopes if scope.partition("!")[0] == "work"]
+    if not scopes or caller.kind not in ("user", "system"):
+        raise Forbidden("Claiming jobs needs a user's token with the scope `work`.")
+    projects = select(project.c.id).where(project.c.deleted_us.is_(None))
+    if "work" not in scopes:
+        projects = projects.where(project.c.name.in_([scope.partition("=")[2] for scope in scopes]))
+    if not caller.administrator:
+        roles = (Role.MAINTAINER.value, Role.OWNER.value)
+        mine = select(member.c.project_id).where(member.c.user_id == caller.user_id, member.c.role.in_(roles))
+        projects = projects.where(project.c.id.in_(mine))
+    return job.c.project_id.in_(projects)
+
+
+# -- answers ----------------------------------------------------------------------------------------------------------
+
+
+def _project_names(tx: Transaction, ids: set[str]) -> dict[str, str]:
+    rows = tx.execute(select(project.c.id, project.c.name).where(project.c.id.in_(ids)))
+    return {row.id: row.name for row in rows}
+
+
+def _lease(row: Row[Any], project_name: str, token: IssuedToken, policy: QueuePolicy) -> Lease:
+    return Lease(
+        job=row.id,
+        project=project_name,
+        kind=row.kind,
+        params=row.params,
+        inputs={name: tuple(PinnedInput(**pin) for pin in pins) for name, pins in row.inputs.items()},
+        into=row.into_path,
+        seed=row.seed,
+        resources=Resources(time_limit_s=row.time_limit_s, memory_limit_mb=row.memory_limit_mb),
+        fence=row.fence,
+        attempt=row.attempt,
+        attempt_token=token.text,
+        lease_ttl_s=policy.lease_ttl_s,
+        heartbeat_s=policy.heartbeat_s,
+    )

@@ -1,0 +1,45 @@
+"""The figures of the queue, in one place, so that a server's settings and a test can say others."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+
+SECOND_US = 1_000_000
+
+
+@dataclass(frozen=True)
+class QueuePolicy:
+    """How long things last and how often they are tried.
+
+    `random_unit` draws from [0, 1); a test that gives its own makes backoff predictable.
+    """
+
+    lease_ttl_s: float = 60.0
+    heartbeat_s: float = 15.0
+    end_grace_s: float = 30.0  # how long a worker may take to stop after a cancel or the end of its time
+    first_backoff_s: float = 10.0
+    longest_backoff_s: float = 15 * 60.0
+    max_interruptions: int = 20
+    log_limit_bytes: int = 10 * 2**20
+    random_unit: Callable[[], float] = random.random
+
+    @property
+    def lease_ttl_us(self) -> int:
+        """Length of a lease in microseconds."""
+        return round(self.lease_ttl_s * SECOND_US)
+
+    @property
+    def end_grace_us(self) -> int:
+        """Grace of a worker that was told to stop, in microseconds."""
+        return round(self.end_grace_s * SECOND_US)
+
+    def backoff_us(self, failures: int) -> int:
+        """How long a job rests after its `failures`-th failure: four times as long each time, less up to a quarter."""
+        steps = min(failures - 1, 16)
+        rest_s = min(self.longest_backoff_s, self.first_backoff_s * 4.0**steps)
+        return round(rest_s * (1 - 0.25 * self.random_unit()) * SECOND_US)
+
+
+DEFAULT_POLICY = QueuePolicy()

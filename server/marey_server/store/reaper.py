@@ -1,0 +1,86 @@
+"""Takes back jobs whose lease has run out: from dead workers, and from those that do not stop when told to."""
+
+from __future__ import annotations
+
+import threading
+from typing import NamedTuple
+
+from sqlalchemy import and_, select, tuple_
+
+from marey_server.store import job_cache
+from marey_server.store.database import Transaction
+from marey_server.store.fencing import RUNNING, held
+from marey_server.store.job_ends import AttemptEnd
+from marey_server.store.queue_policy import DEFAULT_POLICY, QueuePolicy
+from marey_server.store.settling import settle
+from marey_server.store.tables import job
+from marey_server.store.verdicts import ENDING_COLUMNS, carry_out, judge_expired
+
+PAGE = 256
+
+
+class StartGrace:
+    """Holds the reaper back for a whole lease after this process has started or the database has been away.
+
+    Leases run out while nobody can renew them; those who live renew them in this time. A jump of the clock counts as an
+    absence too.
+    """
+
+    def __init__(self, policy: QueuePolicy = DEFAULT_POLICY) -> None:
+        self._ttl_us = policy.lease_ttl_us
+        self._lock = threading.Lock()
+        self._since_us: int | None = None
+        self._seen_us = 0
+
+    def over(self, now_us: int) -> bool:
+        """Whether leases may be taken back; `now_us` is the database's time."""
+        with self._lock:
+            if self._since_us is None or not 0 <= now_us - self._seen_us <= self._ttl_us:
+                self._since_us = now_us
+            self._seen_us = now_us
+            return now_us - self._since_us >= self._ttl_us
+
+    def restart(self) -> None:
+        """The database could not be reached."""
+        with self._lock:
+            self._since_us = None
+
+
+class ReapedPage(NamedTuple):
+    """How many jobs were taken back, and where to go on; `after` is None behind the last page."""
+
+    taken: int
+    after: tuple[int, str] | None
+
+
+def reap_page(tx: Transaction, after: tuple[int, str] | None = None, limit: int = PAGE) -> ReapedPage:
+    """Take back up to `limit` jobs, longest overdue first, from `after` on.
+
+    Each is moved by an update of its own that repeats fence and overdue lease, so that a heartbeat or a result which
+    comes at the same moment either wins or finds the lease gone.
+    """
+    overdue = and_(job.c.state == RUNNING, job.c.lease_expires_us <= tx.now_us)
+    statement = (
+        select(*ENDING_COLUMNS, job.c.lease_expires_us)
+        .where(overdue)
+        .order_by(job.c.lease_expires_us, job.c.id)
+        .limit(limit)
+        .with_for_update(skip_locked=True)
+    )
+    if after is not None:
+        statement = statement.where(tuple_(job.c.lease_expires_us, job.c.id) > after)
+    rows = tx.execute(statement).all()
+    for row in rows:
+        verdict = judge_expired(row, tx.now_us)
+        condition = and_(held((row.id, row.fence)), job.c.lease_expires_us <= tx.now_us)
+        end = AttemptEnd(row.id, row.fence, verdict.outcome, "The lease ran out.")
+        carry_out(tx, row, condition, verdict, end, fence=job.c.fence + 1)
+    last = rows[-1] if len(rows) == limit else None
+    return ReapedPage(len(rows), None if last is None else (last.lease_expires_us, last.id))
+
+
+def share_waiting(tx: Transaction) -> int:
+    """Serve jobs that wait for a result that is there; how many."""
+    ended = job_cache.share_waiting(tx)
+    settle(tx, ended)
+    return len(ended)

@@ -1,0 +1,193 @@
+"""What follows from the end of a job, in the same transaction: its dependants move, its gathering job counts, those
+that wait to share its result get it.
+
+Rows are locked downstream: a job before its gathering job and before its dependants.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from itertools import islice
+from typing import Any
+
+from sqlalchemy import Row, and_, bindparam, false, select, update
+
+from marey_server.store import job_cache
+from marey_server.store.database import Transaction
+from marey_server.store.fencing import RUNNING, WAITING
+from marey_server.store.gathering import gather
+from marey_server.store.job_ends import Ended, dependency_failure, end_jobs
+from marey_server.store.job_events import emit_job_events, wake_watchers, wake_workers
+from marey_server.store.tables import job, job_dependency
+
+PAGE = 1000
+"""Ended jobs looked at in one statement."""
+
+
+def settle(tx: Transaction, ended: Iterable[Ended]) -> None:
+    """Let everything follow that follows from these ends, until nothing more does."""
+    queue = list(ended)
+    while queue:
+        page, queue = queue[:PAGE], queue[PAGE:]
+        _announce(tx, page)
+        queue += _count_tasks(tx, page)
+        queue += _move_dependants(tx, page)
+
+
+def make_ready(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
+    """Let waiting jobs whose dependencies are met go on: into the queue, to their tasks, or to a result that is there.
+
+    The rows hold `READY_COLUMNS`. Returns the jobs that ended by it.
+    """
+    ended: list[Ended] = []
+    for row in rows:
+        if row.size is not None:
+            ended += _open_fan_out(tx, row)
+    single = [row for row in rows if row.size is None]
+    for page in _pages(single):
+        ended += _admit(tx, page)
+    return ended
+
+
+READY_COLUMNS = (job.c.id, job.c.project_id, job.c.kind, job.c.size, job.c.cache_key, job.c.cache_mode)
+
+
+def _announce(tx: Transaction, ended: Sequence[Ended]) -> None:
+    for state in sorted({end.state for end in ended}):
+        emit_job_events(
+            tx,
+            f"job.{state}",
+            [(end.project_id, end.id, {"failure": end.failure}) for end in ended if end.state == state],
+        )
+    wake_watchers(tx, [end.id for end in ended])
+
+
+# -- dependants -------------------------------------------------------------------------------------------------------
+
+
+def _move_dependants(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
+    ends = {end.id: end for end in ended}
+    statement = (
+        update(job_dependency)
+        .where(job_dependency.c.on_job_id.in_(ends), job_dependency.c.satisfied == false())
+        .values(satisfied=True)
+        .returning(job_dependency.c.job_id, job_dependency.c.on_job_id)
+    )
+    upstream: dict[str, list[Ended]] = {}
+    for row in tx.execute(statement):
+        upstream.setdefault(row.job_id, []).append(ends[row.on_job_id])
+    following: list[Ended] = []
+    ids = iter(sorted(upstream))
+    while page := list(islice(ids, PAGE)):
+        following += _move(tx, _waiting(tx, page), upstream)
+    return following
+
+
+def _waiting(tx: Transaction, ids: Sequence[str]) -> Sequence[Row[Any]]:
+    columns = (*READY_COLUMNS, job.c.dependencies_left, job.c.on_failure, job.c.cached_from)
+    statement = select(*columns).where(job.c.id.in_(ids), job.c.state == WAITING).order_by(job.c.id).with_for_update()
+    return tx.execute(statement).all()
+
+
+def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[Ended]]) -> list[Ended]:
+    sharing = [row for row in rows if row.cached_from is not None]
+    others = [row for row in rows if row.cached_from is None]
+    following = _doom(tx, [(row, upstream[row.id]) for row in others if not all(e.succeeded for e in upstream[row.id])])
+    met = [(row, row.dependencies_left - len(upstream[row.id])) for row in others if _all_succeeded(upstream[row.id])]
+    _store_counts(tx, {row.id: left for row, left in met})
+    following += make_ready(tx, [row for row, left in met if left == 0])
+    following += job_cache.share(tx, [row for row in sharing if _all_succeeded(upstream[row.id])])
+    orphans = [row for row in sharing if not _all_succeeded(upstream[row.id])]
+    _stop_sharing(tx, orphans)
+    return following + make_ready(tx, orphans)
+
+
+def _all_succeeded(ends: Iterable[Ended]) -> bool:
+    return all(end.succeeded for end in ends)
+
+
+def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
+    if left:
+        statement = update(job).where(job.c.id == bindparam("of_job")).values(dependencies_left=bindparam("left"))
+        tx.execute(statement, [{"of_job": job_id, "left": count} for job_id, count in left.items()])
+
+
+def _doom(tx: Transaction, doomed: Sequence[tuple[Row[Any], list[Ended]]]) -> list[Ended]:
+    """End the jobs that depend on one that did not succeed: failed, or cancelled where they are to be skipped."""
+    following: list[Ended] = []
+    for row, ends in doomed:
+        cause = next(end for end in ends if not end.succeeded)
+        following += doom(tx, row.id, cause.id, cause.state, row.on_failure)
+    return following
+
+
+def doom(tx: Transaction, job_id: str, cause: str, cause_state: str, on_failure: str) -> list[Ended]:
+    """End a waiting job, and its tasks, because `cause` did not succeed."""
+    waits = and_(job.c.id == job_id, job.c.state == WAITING)
+    tasks = end_jobs(tx, and_(job.c.parent_id == job_id, job.c.state == WAITING), "cancelled")
+    if on_failure == "skip":
+        return [*tasks, *end_jobs(tx, waits, "cancelled")]
+    return [*tasks, *end_jobs(tx, waits, "failed", failure=dependency_failure(cause, cause_state))]
+
+
+# -- fan-out ----------------------------------------------------------------------------------------------------------
+
+
+def _open_fan_out(tx: Transaction, row: Row[Any]) -> list[Ended]:
+    """The gathering job runs from now on, and its tasks may."""
+    tasks = tx.execute(
+        select(*READY_COLUMNS).where(job.c.parent_id == row.id, job.c.state == WAITING).order_by(job.c.position)
+    ).all()
+    tx.execute(
+        update(job)
+        .where(job.c.id == row.id, job.c.state == WAITING)
+        .values(state="running", started_us=tx.now_us, dependencies_left=len(tasks), rev=job.c.rev + 1)
+    )
+    if not tasks:  # every task was cancelled before it could start
+        return gather(tx, row.id)
+    return make_ready(tx, tasks)
+
+
+def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
+    """Count the tasks that ended at their gathering jobs; where it was the last one, the gathering job ends too."""
+    following: list[Ended] = []
+    for parent_id, count in sorted(Counter(end.parent_id for end in ended if end.parent_id is not None).items()):
+        left = tx.execute(
+            update(job)
+            .where(job.c.id == parent_id, job.c.state == RUNNING)
+            .values(dependencies_left=job.c.dependencies_left - count, rev=job.c.rev + 1)
+            .returning(job.c.dependencies_left)
+        ).scalar_one_or_none()
+        if left == 0:
+            following += gather(tx, parent_id)
+    return following
+
+
+# -- into the queue ---------------------------------------------------------------------------------------------------
+
+
+def _admit(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
+    decisions = job_cache.decide(tx, rows)
+    queued = [row for row in rows if row.id not in decisions]
+    if queued:
+        tx.execute(
+            update(job)
+            .where(job.c.id.in_([row.id for row in queued]), job.c.state == WAITING)
+            .values(state="queued", dependencies_left=0, rev=job.c.rev + 1)
+        )
+        wake_workers(tx, {row.kind for row in queued})
+    joining = [(row, decisions[row.id]) for row in rows if row.id in decisions]
+    return job_cache.join(tx, joining)
+
+
+def _stop_sharing(tx: Transaction, rows: Sequence[Row[Any]]) -> None:
+    """The job they waited for brought no result: they go on by themselves, the first of them for all."""
+    if rows:
+        ids = [row.id for row in rows]
+        tx.execute(update(job).where(job.c.id.in_(ids)).values(cached_from=None, dependencies_left=0))
+
+
+def _pages(rows: Sequence[Row[Any]]) -> Iterable[Sequence[Row[Any]]]:
+    for start in range(0, len(rows), PAGE):
+        yield rows[start : start + PAGE]
