@@ -50,9 +50,11 @@ class ItemHandle:
         tree, _ = self.transport.get_tree(f"{self.url}/parts/{part}", {"revision": revision, **query})
         return dict(tree)
 
-    def put_part(self, part: str, document: Mapping[str, Any]) -> Item:
+    def put_part(self, part: str, document: Mapping[str, Any], *, message: str | None = None) -> Item:
         """Make a new revision in which `part` is `document`; `PreconditionFailed` if the item was changed since."""
-        response = self.transport.send_tree("PUT", f"{self.url}/parts/{part}", document, headers=self._if_match())
+        response = self.transport.send_tree(
+            "PUT", f"{self.url}/parts/{part}", document, params={"message": message}, headers=self._if_match()
+        )
         return self._renewed(read_model(Item, response))
 
     def change(self, change: ItemChange) -> Item:
@@ -125,10 +127,10 @@ class Items(Generic[Handle]):
     ) -> Iterator[Handle]:
         """Items in order, fetched page by page.
 
-        `collection` names one folder, `path` a folder and everything below it; `filters` are the server's, such as
+        `collection` names a folder, with everything below it; `path` one item; `filters` are the server's, such as
         `{"frames.gte": 120, "tag.in": "walk,run"}`.
         """
-        params = {"collection": collection, "path": path, "sort": sort, "limit": page_size, **(filters or {})}
+        params = {"collection": collection or None, "path": path, "sort": sort, "limit": page_size, **(filters or {})}
         return (self._handle(item) for item in pages(self.transport, Item, self.url, params))
 
     def get(self, item_id: str) -> Handle:

@@ -7,6 +7,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from copy import copy
 from typing import Any, TypeVar
 
 import httpx
@@ -59,15 +60,27 @@ class Transport:
     ) -> None:
         self.url = url.rstrip("/")
         self.retries = retries or Retries()
+        self._auth = BearerToken(token) if token else None
         self._client = httpx.Client(
             base_url=self.url + API,
-            auth=BearerToken(token) if token else None,
             timeout=httpx.Timeout(timeout_s, connect=10.0),
             limits=httpx.Limits(max_connections=32, max_keepalive_connections=16),
             headers={"User-Agent": "marey-client"},
             transport=http,
             trust_env=False,
         )
+
+    def with_token(self, token: str, *, retries: Retries | None = None) -> Transport:
+        """The same connections with another token; closing either closes both."""
+        other = self.with_retries(retries or self.retries)
+        other._auth = BearerToken(token)
+        return other
+
+    def with_retries(self, retries: Retries) -> Transport:
+        """The same connections and token with other patience."""
+        other = copy(self)
+        other.retries = retries
+        return other
 
     def close(self) -> None:
         """Close every connection."""
@@ -123,6 +136,7 @@ class Transport:
                 params=_present(params),
                 content=content() if callable(content) else content,
                 headers=sent_headers,
+                auth=self._auth,
                 timeout=httpx.Timeout(timeout_s, connect=10.0) if timeout_s else httpx.USE_CLIENT_DEFAULT,
             )
             raise_for_problem(response)
@@ -171,7 +185,9 @@ class Transport:
     ) -> Iterator[httpx.Response]:
         """GET an answer whose bytes are read while they arrive. Not repeated: the caller knows how far it came."""
         sent_headers = {"Accept": "*/*", **(headers or {})}
-        with self._client.stream("GET", path, params=_present(params), headers=sent_headers) as response:
+        with self._client.stream(
+            "GET", path, params=_present(params), headers=sent_headers, auth=self._auth
+        ) as response:
             if response.status_code >= 400:
                 response.read()
             raise_for_problem(response)

@@ -1,1 +1,1 @@
-"""The Marey worker: claims jobs, runs them in child processes, writes results back."""
+"""Claims jobs, runs them in child processes, and writes the results back through the client."""

@@ -1,0 +1,5 @@
+"""`python -m marey_worker`."""
+
+from marey_worker.commands import main
+
+main()

@@ -1,0 +1,231 @@
+"""One attempt at a job: a child computes, this watches over it and does what it asks."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import tempfile
+import threading
+import time
+import uuid
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from marey_client.errors import LeaseLost, MareyError, NotFound
+from marey_schemas.job_kinds import find_kind
+from marey_schemas.jobs import CompleteRequest, FailRequest, Lease
+from marey_worker import faults, signatures
+from marey_worker.attempt_api import AttemptApi
+from marey_worker.cache import InputCache
+from marey_worker.child_process import ChildProcess
+from marey_worker.environment import environment
+from marey_worker.keeper import LeaseKeeper
+from marey_worker.messages import Done, Failed, Made, PutFile, ReadBlob, ReadPart, Reply, Request, Run, Stage
+
+log = logging.getLogger(__name__)
+
+MIB = 1 << 20
+WATCH_EVERY_S = 0.1
+WEIGH_EVERY_S = 0.5
+LOG_EVERY_S = 2.0
+LOG_LIMIT_BYTES = 64 * MIB
+TRANSFERS_AT_ONCE = 4
+
+
+class Stop(Enum):
+    """Why an attempt is given up."""
+
+    LEASE_LOST = "lease-lost"
+    CANCELLED = "cancelled"
+    INTERRUPTED = "interrupted"
+    TIME = "time-limit"
+    MEMORY = "memory-limit"
+    LOG = "log-limit"
+
+
+@dataclass
+class Watch:
+    """Looks after the limits of one attempt."""
+
+    lease: Lease
+    keeper: LeaseKeeper
+    stopping: threading.Event
+    log_path: Path
+    started: float
+    weighed: float = 0.0
+
+    def verdict(self, child: ChildProcess) -> Stop | None:
+        """Why the attempt must stop now, if it must."""
+        if self.keeper.lost.is_set():
+            return Stop.LEASE_LOST
+        if self.keeper.cancelled.is_set():
+            return Stop.CANCELLED
+        if self.stopping.is_set():
+            return Stop.INTERRUPTED
+        if time.monotonic() - self.started > self.lease.resources.time_limit_s:
+            return Stop.TIME
+        if time.monotonic() - self.weighed > WEIGH_EVERY_S:
+            self.weighed = time.monotonic()
+            if child.resident_bytes > self.lease.resources.memory_limit_mb * MIB:
+                return Stop.MEMORY
+        if self.log_path.stat().st_size > LOG_LIMIT_BYTES:
+            return Stop.LOG
+        return None
+
+    def explain(self, stop: Stop) -> str:
+        """The reason in a sentence, with its figures."""
+        resources = self.lease.resources
+        return {
+            Stop.LEASE_LOST: "the lease was lost",
+            Stop.CANCELLED: "the job was cancelled",
+            Stop.INTERRUPTED: "the worker is being stopped",
+            Stop.TIME: f"the job ran longer than its {resources.time_limit_s} s",
+            Stop.MEMORY: f"the job needs more than its {resources.memory_limit_mb} MB of memory",
+            Stop.LOG: f"the job's log grew beyond {LOG_LIMIT_BYTES // MIB} MB",
+        }[stop]
+
+
+class Attempt:
+    """Runs one lease to its end."""
+
+    def __init__(
+        self, api: AttemptApi, lease: Lease, cache: InputCache, server: str, stopping: threading.Event
+    ) -> None:
+        self._api = api
+        self._lease = lease
+        self._cache = cache
+        self._server = server
+        self._scratch = Path(tempfile.mkdtemp(prefix="marey-job-"))
+        self._log_path = self._scratch / "log"
+        self._log_path.touch(mode=0o600)
+        self._log_sent = 0
+        self._keeper = LeaseKeeper(api, lease)
+        self._watch = Watch(lease, self._keeper, stopping, self._log_path, time.monotonic())
+        self._transfers = ThreadPoolExecutor(TRANSFERS_AT_ONCE, thread_name_prefix="marey-transfer")
+
+    def run(self, child: ChildProcess) -> None:
+        """Have `child` do the job and tell the server how it went. Afterwards the child is idle, or dead."""
+        try:
+            child.send(self._order())
+            end = self._attend(child)
+            if isinstance(end, Stop):
+                child.kill()
+            self._transfers.shutdown(wait=True, cancel_futures=True)
+            self._report(end)
+        except LeaseLost as error:
+            log.warning("%s: given up: %s", self._lease.job, error)
+        except MareyError as error:
+            log.error("%s: its end could not be told: %s", self._lease.job, error)
+        finally:
+            self._keeper.stop()
+            self._transfers.shutdown(wait=False, cancel_futures=True)
+            shutil.rmtree(self._scratch, ignore_errors=True)
+
+    def _order(self) -> Run:
+        lease = self._lease
+        return Run(
+            lease.job, lease.kind, lease.params, lease.inputs, lease.seed,
+            lease.resources.memory_limit_mb * MIB, self._log_path, self._scratch,
+        )  # fmt: skip
+
+    # -- while the child computes --
+
+    def _attend(self, child: ChildProcess) -> Done | Failed | Stop:
+        """Do what the child asks until the job ends, one way or another."""
+        log_due = time.monotonic() + LOG_EVERY_S
+        while True:
+            try:
+                message = child.receive(WATCH_EVERY_S)
+            except EOFError:
+                return self._death(child)
+            if isinstance(message, Done | Failed):
+                return message
+            if isinstance(message, Made):
+                self._keeper.tell(message.progress)
+            elif message is not None:
+                self._transfers.submit(self._serve, message, child)
+            if (stop := self._watch.verdict(child)) is not None:
+                return stop
+            if time.monotonic() > log_due:
+                self._transfers.submit(self._send_log)
+                log_due = time.monotonic() + LOG_EVERY_S
+
+    def _serve(self, request: Request, child: ChildProcess) -> None:
+        """Do one thing the child asked for, and answer."""
+        try:
+            child.send(Reply(request.request, self._carried_out(request)))
+        except LeaseLost:
+            self._keeper.lost.set()
+        except (MareyError, OSError) as error:
+            child.send(Reply(request.request, refusal=str(error), missing=isinstance(error, NotFound)))
+
+    def _carried_out(self, request: Request) -> Any:
+        match request:
+            case ReadPart(_, kind, item, revision, part):
+                return self._kept(f"{item}@{revision}/{part}", lambda: self._api.read_part(kind, item, revision, part))
+            case ReadBlob(_, digest):
+                return self._kept(digest, lambda: self._api.read_blob(digest))
+            case PutFile(_, path):
+                digest = self._api.put_file(path)
+                faults.point("worker.after_blob")
+                return digest
+            case Stage(_, body):
+                self._api.stage(body)
+                faults.point("worker.after_blob")
+                return None
+
+    def _kept(self, name: str, fetch: Callable[[], bytes]) -> bytes:
+        """Bytes from the cache. Names of things are names within a server and a project's rights; digests are too."""
+        return self._cache.get(f"{self._server} {self._lease.project} {name}", fetch)
+
+    def _death(self, child: ChildProcess) -> Failed:
+        status = child.wait()
+        return Failed("worker-process-died", signatures.told_exit(status), signatures.of_exit(status), retryable=True)
+
+    # -- at the end --
+
+    def _report(self, end: Done | Failed | Stop) -> None:
+        self._keeper.stop()
+        if end is Stop.LEASE_LOST:
+            log.warning("%s: %s", self._lease.job, self._watch.explain(end))
+            return
+        self._keeper.confirm()
+        self._send_log()
+        if isinstance(end, Done):
+            self._complete(end)
+        else:
+            self._api.fail(self._failure(end))
+
+    def _complete(self, done: Done) -> None:
+        request = CompleteRequest(
+            write_id=uuid.uuid4().hex,
+            result=done.result,
+            code_version=find_kind(self._lease.kind).code_version,
+            environment=environment(),
+        )
+        faults.point("worker.before_complete")
+        self._api.complete(request)
+        faults.point("worker.after_complete")
+
+    def _failure(self, end: Failed | Stop) -> FailRequest:
+        if isinstance(end, Failed):
+            code, detail, signature, retryable = end.code, end.detail, end.signature, end.retryable
+        else:
+            code, detail, retryable = end.value, self._watch.explain(end), end is not Stop.LOG
+            signature = end.value if end in (Stop.MEMORY, Stop.LOG) else None
+        return FailRequest(
+            write_id=uuid.uuid4().hex, code=code[:128], detail=detail[-20_000:], signature=signature,
+            retryable=retryable, interrupted=end is Stop.INTERRUPTED,
+        )  # fmt: skip
+
+    def _send_log(self) -> None:
+        with self._log_path.open("rb") as file:
+            file.seek(self._log_sent)
+            data = file.read(LOG_LIMIT_BYTES)
+        if data:
+            self._api.append_log(data)
+            self._log_sent += len(data)

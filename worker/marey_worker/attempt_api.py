@@ -1,0 +1,111 @@
+"""What a worker says to the server about jobs, as HTTP."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from marey_client.blobs import Blobs
+from marey_client.errors import Conflict, LeaseLost, Unauthenticated
+from marey_client.retries import Retries
+from marey_client.transport import BLOCKS, Transport, as_json, read_model
+from marey_schemas.jobs import (
+    ClaimRequest,
+    CompleteRequest,
+    FailRequest,
+    Heartbeat,
+    HeartbeatAnswer,
+    Lease,
+    LeaseList,
+    Progress,
+)
+from marey_schemas.kinds import Kind
+
+PATIENT = Retries(tries=100, longest_s=10.0, total_s=600.0)
+"""For the last word of an attempt: computed results are worth waiting for."""
+
+LOG_PIECE_BYTES = 256 << 10
+
+
+def claim(transport: Transport, request: ClaimRequest) -> tuple[Lease, ...]:
+    """Ask for work. Not repeated: an answer that was lost is a lease that runs out."""
+    response = transport.send(
+        "POST", "/leases", content=as_json(request), repeatable=False, timeout_s=request.wait_s + 30.0
+    )
+    return read_model(LeaseList, response).leases
+
+
+class AttemptApi:
+    """The endpoints of one attempt, with its own token. Every method may raise `LeaseLost`."""
+
+    def __init__(self, transport: Transport, lease: Lease) -> None:
+        self._transport = transport.with_token(lease.attempt_token)
+        self._patient = transport.with_token(lease.attempt_token, retries=PATIENT)
+        self._project = lease.project
+        self._url = f"/jobs/{lease.job}/attempts/{lease.fence}"
+        self._log_offset = 0
+
+    def heartbeat(self, progress: Progress | None) -> HeartbeatAnswer:
+        """Say that the worker is alive."""
+        return read_model(HeartbeatAnswer, self._post("heartbeat", as_json(Heartbeat(progress=progress))))
+
+    def append_log(self, data: bytes) -> None:
+        """Append to the attempt's log; where an earlier try arrived after all, go on behind it."""
+        for start in range(0, len(data), LOG_PIECE_BYTES):
+            piece = data[start : start + LOG_PIECE_BYTES]
+            try:
+                offset = {"Upload-Offset": str(self._log_offset)}
+                self._post("log", piece, media_type="text/plain; charset=utf-8", headers=offset)
+                self._log_offset += len(piece)
+            except LeaseLost:
+                raise
+            except Conflict as error:
+                self._log_offset = int(error.context["offset"])
+
+    def stage(self, body: bytes) -> None:
+        """Stage outputs: an encoded `StageRequest`."""
+        self._post("outputs", body, self._patient, media_type=BLOCKS)
+
+    def complete(self, request: CompleteRequest) -> None:
+        """Publish what is staged; the same request again is answered the same."""
+        self._post("complete", as_json(request), self._patient)
+
+    def fail(self, request: FailRequest) -> None:
+        """End the attempt without success; the same request again is answered the same."""
+        self._post("fail", as_json(request))
+
+    def read_part(self, kind: Kind, item: str, revision: int, part: str) -> bytes:
+        """A part's document as MessagePack with arrays in blocks, undecoded."""
+        path = f"/projects/{self._project}/{kind.plural}/{item}/parts/{part}"
+        with _dead_token_is_lost_lease():
+            return self._transport.send("GET", path, params={"revision": revision}, headers={"Accept": BLOCKS}).content
+
+    def read_blob(self, digest: str) -> bytes:
+        """Bytes by digest."""
+        with _dead_token_is_lost_lease():
+            return Blobs(self._transport).fetch(digest)
+
+    def put_file(self, path: Path) -> str:
+        """Send a file; its digest."""
+        with _dead_token_is_lost_lease():
+            return Blobs(self._patient).put_file(path)
+
+    def _post(
+        self, name: str, content: bytes | None, transport: Transport | None = None, **options: Any
+    ) -> httpx.Response:
+        with _dead_token_is_lost_lease():
+            sender = transport or self._transport
+            return sender.send("POST", f"{self._url}/{name}", content=content, repeatable=True, **options)
+
+
+@contextmanager
+def _dead_token_is_lost_lease() -> Iterator[None]:
+    """An attempt's token dies with its fence: the server may notice that first."""
+    try:
+        yield
+    except Unauthenticated as error:
+        raise LeaseLost(error.problem) from error

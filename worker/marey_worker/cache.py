@@ -1,0 +1,94 @@
+"""Inputs that were downloaded before: files with a seal, the least recently used go first."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+log = logging.getLogger(__name__)
+
+SEAL_BYTES = 32
+KEEP_AFTER_CLEANING = 0.8
+TEMPORARY = ".new-"
+
+
+class InputCache:
+    """Bytes by key, in a folder that workers of one machine may share.
+
+    What a key names never changes: a digest, or a part of a revision. Every file begins with the SHA-256 of the rest,
+    so that a damaged or half-written file is noticed and fetched again.
+    """
+
+    def __init__(self, folder: Path, max_bytes: int) -> None:
+        self.folder = folder
+        self.max_bytes = max_bytes
+        self._lock = threading.Lock()
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        self._bytes = sum(size for _, size, _ in self._files())
+
+    def get(self, key: str, fetch: Callable[[], bytes]) -> bytes:
+        """The bytes of `key`: from the folder, or from `fetch`, and then kept."""
+        path = self.folder / hashlib.sha256(key.encode()).hexdigest()
+        held = self._read(path)
+        if held is not None:
+            return held
+        data = fetch()
+        self._keep(path, data)
+        return data
+
+    def _read(self, path: Path) -> bytes | None:
+        try:
+            sealed = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        seal, data = sealed[:SEAL_BYTES], sealed[SEAL_BYTES:]
+        if hashlib.sha256(data).digest() != seal:
+            log.warning("%s is damaged; fetching it again", path)
+            path.unlink(missing_ok=True)
+            return None
+        os.utime(path)
+        return data
+
+    def _keep(self, path: Path, data: bytes) -> None:
+        size = SEAL_BYTES + len(data)
+        if size > self.max_bytes:
+            return
+        with tempfile.NamedTemporaryFile(dir=self.folder, prefix=TEMPORARY, delete=False) as file:
+            try:
+                file.write(hashlib.sha256(data).digest())
+                file.write(data)
+            except OSError as error:
+                Path(file.name).unlink()
+                log.warning("cannot keep an input in %s: %s", self.folder, error)
+                return
+        Path(file.name).replace(path)
+        with self._lock:
+            self._bytes += size
+            if self._bytes > self.max_bytes:
+                self._clean()
+
+    def _clean(self) -> None:
+        """Remove what was not used for longest, until a fifth of the room is free."""
+        files = sorted(self._files())
+        self._bytes = sum(size for _, size, _ in files)
+        for _, size, path in files:
+            if self._bytes <= KEEP_AFTER_CLEANING * self.max_bytes:
+                return
+            path.unlink(missing_ok=True)
+            self._bytes -= size
+
+    def _files(self) -> list[tuple[float, int, Path]]:
+        """(time of last use, size, path) of every file; another worker may be removing some."""
+        found: list[tuple[float, int, Path]] = []
+        for entry in os.scandir(self.folder):
+            try:
+                status = entry.stat()
+            except FileNotFoundError:
+                continue
+            found.append((status.st_mtime, status.st_size, Path(entry.path)))
+        return found

@@ -1,0 +1,91 @@
+"""The process that computes. It stays warm: modules load once, compiled kernels are kept, jobs follow one another."""
+
+from __future__ import annotations
+
+import faulthandler
+import gc
+import importlib
+import os
+import signal
+import sys
+import traceback
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from marey_schemas.job_kinds import KindDeclaration, find_kind
+from marey_worker import signatures
+from marey_worker.context import Context, JobRefused
+from marey_worker.limits import allow_memory, die_with_parent
+from marey_worker.messages import Done, End, Failed, Ready, Run
+
+DETAIL_BYTES = 16_000
+
+
+def main() -> None:
+    """Serve the pipe whose number is the first argument, until it closes."""
+    die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at a terminal reaches the supervisor, which decides
+    faulthandler.enable()
+    pipe = Connection(int(sys.argv[1]))
+    load(sys.argv[2:])
+    pipe.send(Ready())
+    while True:
+        try:
+            run: Run = pipe.recv()
+        except EOFError:
+            return
+        write_output_to(run.log_path)
+        end = run_job(run, pipe)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        pipe.send(end)
+        gc.collect()
+
+
+def load(kinds: list[str]) -> None:
+    """Import what the kinds need, so that the first job does not wait for it."""
+    for name in kinds:
+        importlib.import_module(find_kind(name).implementation.partition(":")[0])
+
+
+def run_job(run: Run, pipe: Connection) -> End:
+    """Do one job; every way it can end, as a message."""
+    context = Context(run, pipe)
+    allow_memory(run.memory_limit_bytes)
+    try:
+        result = _function_of(find_kind(run.kind))(context, find_kind(run.kind).params.model_validate(run.params))
+        context.finish_staging()
+    except JobRefused as error:
+        return Failed(error.code, error.detail, None, retryable=False)
+    except ValidationError as error:
+        return Failed("bad-params", str(error), None, retryable=False)
+    except MemoryError:
+        limit_mb = run.memory_limit_bytes >> 20
+        return Failed("memory-limit", f"the job needs more than its {limit_mb} MB of memory", "memory-limit", True)
+    except Exception as error:  # noqa: BLE001 - whatever a kind raises ends this job, not the process
+        text = "".join(traceback.format_exception(error))[-DETAIL_BYTES:]
+        sys.stderr.write(text)
+        code = getattr(error, "code", "exception")
+        return Failed(code if isinstance(code, str) else "exception", text, signatures.of_exception(error), True)
+    finally:
+        allow_memory(None)
+    return Done(result)
+
+
+def write_output_to(path: Path) -> None:
+    """Send what this process prints, and what native code and the interpreter print when they crash, to a file."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    os.dup2(descriptor, 1)
+    os.dup2(descriptor, 2)
+    os.close(descriptor)
+
+
+def _function_of(kind: KindDeclaration):  # type: ignore[no-untyped-def]
+    module, _, function = kind.implementation.partition(":")
+    return getattr(importlib.import_module(module), function)
+
+
+if __name__ == "__main__":
+    main()

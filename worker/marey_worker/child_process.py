@@ -1,0 +1,87 @@
+"""A child as its supervisor sees it: started, spoken to, killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from multiprocessing.connection import Connection
+from typing import Any
+
+from marey_worker.limits import resident_bytes
+
+TERMINATE_S = 10.0
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+class ChildProcess:
+    """A warm process of its own session. Started, used and killed by one thread; replies may come from others."""
+
+    def __init__(self, kinds: Sequence[str], *, threads: int) -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+                [sys.executable, "-m", "marey_worker.child", str(theirs.fileno()), *kinds],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+                env={**os.environ, **{name: os.environ.get(name, str(threads)) for name in THREAD_VARIABLES}},
+            )
+        self._pipe = Connection(ours.detach())
+        self._sending = threading.Lock()
+
+    @property
+    def pid(self) -> int:
+        """The process id."""
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process.poll() is None
+
+    @property
+    def resident_bytes(self) -> int:
+        """Memory the process and all it started hold."""
+        return resident_bytes(self.pid)
+
+    def send(self, message: Any) -> None:
+        """Send a message; a child that has died is noticed when it is listened to."""
+        with self._sending:
+            try:
+                self._pipe.send(message)
+            except (BrokenPipeError, ConnectionResetError):
+                return
+
+    def receive(self, timeout_s: float) -> Any | None:
+        """The next message, or None if none came in time. Raises `EOFError` once the child has died."""
+        try:
+            return self._pipe.recv() if self._pipe.poll(timeout_s) else None
+        except ConnectionResetError as error:
+            raise EOFError from error
+
+    def wait(self) -> int:
+        """How the process ended; negative: by which signal."""
+        return self._process.wait()
+
+    def kill(self, *, grace_s: float = TERMINATE_S) -> None:
+        """End the process and all it started: politely, and after `grace_s` in any case."""
+        if self.alive:
+            self._signal(signal.SIGTERM)
+            deadline = time.monotonic() + grace_s
+            while self.alive and time.monotonic() < deadline:
+                time.sleep(0.02)
+        self._signal(signal.SIGKILL)
+        self._process.wait()
+        self._pipe.close()
+
+    def _signal(self, number: signal.Signals) -> None:
+        try:
+            os.killpg(self.pid, number)
+        except ProcessLookupError:
+            return

@@ -1,0 +1,97 @@
+"""A worker as a program."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+
+from marey_client.credentials import Credential, resolve
+from marey_client.errors import MareyError, NoCredential
+from marey_client.transport import Transport
+from marey_schemas.job_kinds import UnknownKind, find_kind, job_kinds
+from marey_worker.supervisor import Supervisor, WorkerOptions, default_cache
+
+MIB = 1 << 20
+
+
+def work(
+    credential: Credential,
+    *,
+    slots: int = 1,
+    kinds: tuple[str, ...] = (),
+    labels: tuple[str, ...] = (),
+    name: str | None = None,
+    cache: Path | None = None,
+    cache_mb: int = 2048,
+    attached: bool = False,
+) -> None:
+    """Run a worker until SIGTERM or SIGINT, then exit; not with 0 if a job was running.
+
+    `attached`: stop, too, when standard input closes, because whoever started this worker has gone.
+    """
+    if credential.token is None:
+        raise NoCredential(f"a worker needs a token with the scope `work` for {credential.url}; see --token-file")
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
+    logging.getLogger("httpx").setLevel(logging.WARNING)
+    given = {} if name is None else {"name": name}
+    options = WorkerOptions(
+        slots=slots, kinds=_known_kinds(kinds), labels=_parsed_labels(labels),
+        cache=cache or default_cache(os.environ), cache_bytes=cache_mb * MIB, **given,  # type: ignore[arg-type]
+    )  # fmt: skip
+    supervisor = Supervisor(Transport(credential.url, credential.token), options)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: supervisor.stop())
+    if attached:
+        threading.Thread(target=_stop_at_end_of_input, args=(supervisor,), name="attached", daemon=True).start()
+    status = supervisor.run()
+    logging.shutdown()
+    os._exit(status)  # threads that wait for work hold nothing
+
+
+def main() -> None:
+    """`python -m marey_worker`: what `marey serve` starts."""
+    parser = argparse.ArgumentParser(prog="python -m marey_worker", description="Run jobs of a Marey server.")
+    parser.add_argument("--server", help="address of the server")
+    parser.add_argument("--slots", type=int, default=1, help="jobs at the same time")
+    parser.add_argument("--name", help="name shown to people")
+    parser.add_argument("--cache", type=Path, help="folder that keeps downloaded inputs")
+    parser.add_argument("--token-file", type=Path, help="file that holds a token with the scope `work`")
+    parser.add_argument(
+        "--attached", action="store_true", help="read the token from standard input; stop when that closes"
+    )
+    given = parser.parse_args()
+    try:
+        credential = resolve(given.server, given.token_file, {} if given.attached else None)
+        if given.attached:
+            credential = Credential(credential.url, sys.stdin.readline().strip())
+        work(credential, slots=given.slots, name=given.name, cache=given.cache, attached=given.attached)
+    except MareyError as error:
+        parser.exit(1, f"marey worker: {error}\n")
+
+
+def _known_kinds(names: tuple[str, ...]) -> tuple[str, ...]:
+    try:
+        return tuple(find_kind(name).name for name in names) or tuple(job_kinds())
+    except UnknownKind as error:
+        raise MareyError(str(error)) from error
+
+
+def _parsed_labels(texts: tuple[str, ...]) -> dict[str, str]:
+    labels = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals or not name:
+            raise MareyError(f"label {text!r}: write name=value")
+        labels[name] = value
+    return labels
+
+
+def _stop_at_end_of_input(supervisor: Supervisor) -> None:
+    while os.read(sys.stdin.fileno(), 4096):
+        pass
+    supervisor.stop()

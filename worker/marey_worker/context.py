@@ -1,0 +1,134 @@
+"""What the function behind a kind of job may use."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, TypeVar
+
+from marey_schemas.codecs import MSGPACK, decode_tree, encode_tree
+from marey_schemas.jobs import PinnedInput, Progress, StagedOutput, StageRequest
+from marey_schemas.kinds import Kind
+from marey_worker.messages import Made, PutFile, ReadBlob, ReadPart, Reply, Request, Run, Stage
+
+T = TypeVar("T")
+
+READ_AHEAD = 4
+STAGED_AT_ONCE = 2
+
+
+class JobRefused(Exception):
+    """The job cannot succeed, however often it is tried. `code` is a stable slug."""
+
+    def __init__(self, code: str, detail: str) -> None:
+        super().__init__(detail)
+        self.code = code
+        self.detail = detail
+
+
+class RequestRefused(Exception):
+    """The supervisor could not do what the job asked of it."""
+
+
+class NoSuchThing(RequestRefused):
+    """What the job asked for does not exist, or the job may not see it."""
+
+
+class Context:
+    """One job: its inputs, and the ways to read documents, tell progress and stage results.
+
+    Everything goes through the supervisor; reading ahead and staging overlap with computing.
+    """
+
+    def __init__(self, run: Run, pipe: Connection) -> None:
+        self.inputs: Mapping[str, tuple[PinnedInput, ...]] = run.inputs
+        self.seed = run.seed
+        self.scratch: Path = run.scratch
+        self._pipe = pipe
+        self._requests = 0
+        self._replies: dict[int, Reply] = {}
+        self._staging: deque[int] = deque()
+
+    # -- reading --
+
+    def document(self, kind: Kind, item: str, revision: int, part: str) -> Any:
+        """A part of a revision; arrays are numpy arrays. Raises `NoSuchThing` where there is none."""
+        return _decoded(self._ask(lambda request: ReadPart(request, kind, item, revision, part)))
+
+    def documents(self, pins: Iterable[PinnedInput], part: str) -> Iterator[tuple[PinnedInput, Any]]:
+        """Each input with a part of it, read ahead while the caller works."""
+        return (
+            (pin, _decoded(data))
+            for pin, data in self._read_ahead(
+                pins, lambda pin, request: ReadPart(request, pin.kind, pin.item, pin.revision, part)
+            )
+        )
+
+    def blob(self, digest: str) -> bytes:
+        """Bytes by digest."""
+        data: bytes = self._ask(lambda request: ReadBlob(request, digest))
+        return data
+
+    # -- writing --
+
+    def stage(self, outputs: Sequence[StagedOutput]) -> None:
+        """Hand over results. They become visible when the whole job is done, all at once."""
+        tree = StageRequest(outputs=tuple(outputs)).model_dump(by_alias=True)
+        body = encode_tree(tree, MSGPACK, arrays="blocks")
+        while len(self._staging) >= STAGED_AT_ONCE:
+            self._value(self._staging.popleft())
+        self._staging.append(self._send(lambda request: Stage(request, body)))
+
+    def put_file(self, path: Path) -> str:
+        """Send a file; its digest, to be named in the result."""
+        digest: str = self._ask(lambda request: PutFile(request, path))
+        return digest
+
+    def finish_staging(self) -> None:
+        """Wait until everything that was staged has arrived."""
+        while self._staging:
+            self._value(self._staging.popleft())
+
+    def progress(self, done: float, total: float | None = None, note: str = "") -> None:
+        """Tell how far the job is; as often as is convenient."""
+        self._pipe.send(Made(Progress(done=done, total=total, note=note)))
+
+    def log(self, text: str) -> None:
+        """Write a line to the job's log, as `print` does too."""
+        print(text, flush=True)  # noqa: T201 - the log is this process's output
+
+    # -- the pipe --
+
+    def _read_ahead(self, things: Iterable[T], request_for: Callable[[T, int], Request]) -> Iterator[tuple[T, bytes]]:
+        waiting: deque[tuple[T, int]] = deque()
+        for thing in things:
+            waiting.append((thing, self._send(lambda request, thing=thing: request_for(thing, request))))  # type: ignore[misc]
+            if len(waiting) > READ_AHEAD:
+                first, request = waiting.popleft()
+                yield first, self._value(request)
+        while waiting:
+            first, request = waiting.popleft()
+            yield first, self._value(request)
+
+    def _ask(self, make: Callable[[int], Request]) -> Any:
+        return self._value(self._send(make))
+
+    def _send(self, make: Callable[[int], Request]) -> int:
+        self._requests += 1
+        self._pipe.send(make(self._requests))
+        return self._requests
+
+    def _value(self, request: int) -> Any:
+        while request not in self._replies:
+            reply: Reply = self._pipe.recv()
+            self._replies[reply.request] = reply
+        reply = self._replies.pop(request)
+        if reply.refusal is not None:
+            raise NoSuchThing(reply.refusal) if reply.missing else RequestRefused(reply.refusal)
+        return reply.value
+
+
+def _decoded(data: bytes) -> Any:
+    return decode_tree(data, MSGPACK)

@@ -1,0 +1,91 @@
+"""Keeps a lease while its job runs: heartbeats from a thread of their own, on the monotonic clock."""
+
+from __future__ import annotations
+
+import logging
+import random
+import threading
+import time
+
+from marey_client.errors import LeaseLost, MareyError
+from marey_schemas.jobs import HeartbeatAnswer, Lease, Progress
+from marey_worker.attempt_api import AttemptApi
+
+log = logging.getLogger(__name__)
+
+CONFIRM_AFTER = 2 / 3
+"""After this share of a lease without a heartbeat, nothing is published before one has succeeded."""
+
+PROGRESS_EVERY_S = 2.0
+RETRY_S = 1.0
+TICK_S = 0.25
+
+
+class LeaseKeeper:
+    """Heartbeats of one attempt.
+
+    `lost` and `cancelled` are set when the server says so. A server that does not answer is asked again; work goes on,
+    and `confirm` decides before anything is published.
+    """
+
+    def __init__(self, api: AttemptApi, lease: Lease) -> None:
+        self.lost = threading.Event()
+        self.cancelled = threading.Event()
+        self._api = api
+        self._job = lease.job
+        self._interval_s = lease.heartbeat_s
+        self._ttl_s = lease.lease_ttl_s
+        self._heard = self._tried = time.monotonic()
+        self._progress: Progress | None = None
+        self._told: Progress | None = None
+        self._stopped = threading.Event()
+        self._beating = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name=f"heartbeat-{lease.job}", daemon=True)
+        self._thread.start()
+
+    def tell(self, progress: Progress) -> None:
+        """Remember how far the job is, for the next heartbeat."""
+        self._progress = progress
+
+    def stop(self) -> None:
+        """Send no more heartbeats."""
+        self._stopped.set()
+
+    def confirm(self) -> None:
+        """Make sure that the lease is held before publishing. Raises `LeaseLost`, or why the server does not answer."""
+        if self.lost.is_set() or time.monotonic() - self._heard > CONFIRM_AFTER * self._ttl_s:
+            self._beat()
+
+    def _run(self) -> None:
+        wait_s = self._jittered(self._interval_s)
+        while not self._stopped.wait(TICK_S):
+            silent_s = time.monotonic() - self._tried
+            news = self._progress is not self._told and silent_s >= PROGRESS_EVERY_S
+            if news or silent_s >= wait_s:
+                wait_s = self._jittered(self._interval_s if self._try_beat() else RETRY_S)
+
+    def _try_beat(self) -> bool:
+        try:
+            self._beat()
+        except LeaseLost as error:
+            log.warning("%s: %s", self._job, error)
+            self.lost.set()
+            self._stopped.set()
+        except MareyError as error:
+            log.warning("%s: no heartbeat: %s", self._job, error)
+            return False
+        return True
+
+    def _beat(self) -> None:
+        with self._beating:
+            progress = self._progress
+            self._tried = time.monotonic()
+            answer: HeartbeatAnswer = self._api.heartbeat(progress)
+            self._heard = time.monotonic()
+            self._told = progress
+            self._ttl_s = answer.lease_ttl_s
+            if answer.cancel_requested:
+                self.cancelled.set()
+
+    def _jittered(self, seconds: float) -> float:
+        return seconds * random.uniform(0.8, 1.0)  # noqa: S311 - spreads heartbeats, no secret

@@ -1,0 +1,55 @@
+"""What a child may use, and that it does not outlive its supervisor."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+import signal
+import sys
+
+import psutil
+
+MIB = 1 << 20
+PR_SET_PDEATHSIG = 1
+
+
+def die_with_parent() -> None:
+    """Have the kernel kill this process when the thread that started it ends.
+
+    Where the kernel cannot (other systems than Linux), the child ends at its next message, which nobody reads.
+    """
+    if sys.platform != "linux":
+        return
+    parent = os.getppid()
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def allow_memory(limit_bytes: int | None) -> None:
+    """Let this process map `limit_bytes` more than now, or as much as it likes.
+
+    An allocation beyond that raises `MemoryError` at once, before the machine runs short.
+    """
+    _, hard = resource.getrlimit(resource.RLIMIT_AS)
+    soft = resource.RLIM_INFINITY if limit_bytes is None else psutil.Process().memory_info().vms + limit_bytes
+    if hard != resource.RLIM_INFINITY:
+        soft = hard if soft == resource.RLIM_INFINITY else min(soft, hard)
+    resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def resident_bytes(pid: int) -> int:
+    """Memory that a process and all it started hold; 0 once it has ended."""
+    try:
+        process = psutil.Process(pid)
+        family = [process, *process.children(recursive=True)]
+    except psutil.NoSuchProcess:
+        return 0
+    total = 0
+    for member in family:
+        try:
+            total += member.memory_info().rss
+        except psutil.NoSuchProcess:
+            continue
+    return total

@@ -1,0 +1,108 @@
+"""What the supervisor and a child say to each other over their pipe. The child never sees a token or an address."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from marey_schemas.jobs import PinnedInput, Progress
+from marey_schemas.kinds import Kind
+
+# From the supervisor
+
+
+@dataclass(frozen=True)
+class Run:
+    """Do this job."""
+
+    job: str
+    kind: str
+    params: Mapping[str, Any]
+    inputs: Mapping[str, tuple[PinnedInput, ...]]
+    seed: int
+    memory_limit_bytes: int
+    log_path: Path
+    scratch: Path
+
+
+@dataclass(frozen=True)
+class Reply:
+    """The answer to a request: bytes, a digest or nothing; or why it was not carried out."""
+
+    request: int
+    value: Any = None
+    refusal: str | None = None
+    missing: bool = False
+
+
+# From the child
+
+
+@dataclass(frozen=True)
+class Ready:
+    """The child has loaded what it needs to work."""
+
+
+@dataclass(frozen=True)
+class ReadPart:
+    """Read a part of a revision: the document as it travels."""
+
+    request: int
+    kind: Kind
+    item: str
+    revision: int
+    part: str
+
+
+@dataclass(frozen=True)
+class ReadBlob:
+    """Read bytes by digest."""
+
+    request: int
+    digest: str
+
+
+@dataclass(frozen=True)
+class PutFile:
+    """Send a file; the answer is its digest."""
+
+    request: int
+    path: Path
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Stage outputs: an encoded `StageRequest`."""
+
+    request: int
+    body: bytes
+
+
+@dataclass(frozen=True)
+class Made:
+    """How far the job is."""
+
+    progress: Progress
+
+
+@dataclass(frozen=True)
+class Done:
+    """The job is done; everything it staged has been acknowledged."""
+
+    result: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Failed:
+    """The job cannot be done."""
+
+    code: str
+    detail: str
+    signature: str | None
+    retryable: bool
+
+
+Request = ReadPart | ReadBlob | PutFile | Stage
+End = Done | Failed

@@ -1,0 +1,36 @@
+"""Names for ways to fail: two attempts that end with the same one are not tried a third time."""
+
+from __future__ import annotations
+
+import hashlib
+import signal
+import traceback
+
+
+def of_exception(error: BaseException) -> str:
+    """Where an exception was raised and of which type, whatever its text says."""
+    frames = traceback.extract_tb(error.__traceback__)
+    places = [f"{frame.filename.rpartition('/')[2]}:{frame.name}:{frame.lineno}" for frame in frames]
+    digest = hashlib.sha256("\n".join([type(error).__qualname__, *places]).encode()).hexdigest()
+    return f"exception:{type(error).__name__}:{digest[:16]}"
+
+
+def of_exit(status: int) -> str:
+    """How a process ended that should not have."""
+    return f"exit:{_signal_name(-status) if status < 0 else status}"
+
+
+def told_exit(status: int) -> str:
+    """The same in words."""
+    if status == -signal.SIGKILL:
+        return "the process that ran the job was killed (SIGKILL); most likely the machine ran out of memory"
+    if status < 0:
+        return f"the process that ran the job died of {_signal_name(-status)}"
+    return f"the process that ran the job exited with status {status}"
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

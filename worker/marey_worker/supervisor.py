@@ -1,0 +1,159 @@
+"""One worker: slots that claim and run jobs, until it is told to stop."""
+
+from __future__ import annotations
+
+import logging
+import os
+import random
+import socket
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
+
+from marey_client.errors import Forbidden, Invalid, MareyError, Unauthenticated
+from marey_client.retries import ONCE
+from marey_client.transport import Transport
+from marey_schemas.job_kinds import job_kinds
+from marey_schemas.jobs import ClaimRequest, Lease
+from marey_worker import faults
+from marey_worker.attempt import Attempt
+from marey_worker.attempt_api import AttemptApi, claim
+from marey_worker.cache import InputCache
+from marey_worker.child_process import ChildProcess
+
+log = logging.getLogger(__name__)
+
+CLAIM_WAIT_S = 20.0
+LONGEST_PAUSE_S = 15.0
+INTERRUPTED_STATUS = 143
+REFUSED_STATUS = 1
+JOBS_PER_CHILD = 1000
+
+
+@dataclass(frozen=True)
+class WorkerOptions:
+    """How a worker works.
+
+    `kinds` and `labels` say what it takes; `slots` how many jobs at a time; `threads` how many a job may use.
+    """
+
+    name: str = field(default_factory=lambda: f"{socket.gethostname()}:{os.getpid()}")
+    slots: int = 1
+    kinds: tuple[str, ...] = field(default_factory=lambda: tuple(job_kinds()))
+    labels: Mapping[str, str] = field(default_factory=dict)
+    cache: Path = field(default_factory=lambda: default_cache(os.environ))
+    cache_bytes: int = 2 << 30
+    threads: int = field(default_factory=lambda: os.cpu_count() or 1)
+
+
+def default_cache(environment: Mapping[str, str]) -> Path:
+    """Where inputs are kept: below `XDG_CACHE_HOME`, or `~/.cache`."""
+    return Path(environment.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "marey" / "inputs"
+
+
+class Supervisor:
+    """Speaks with the server for its children, and outlives whatever happens to them."""
+
+    def __init__(self, transport: Transport, options: WorkerOptions) -> None:
+        self._transport = transport
+        self._claims = transport.with_retries(ONCE)
+        self._options = options
+        self._cache = InputCache(options.cache, options.cache_bytes)
+        self._stopping = threading.Event()
+        self._running: set[str] = set()
+        self._refusal: MareyError | None = None
+
+    def stop(self) -> None:
+        """Claim nothing more, give back what runs, and let `run` return."""
+        self._stopping.set()
+
+    def run(self) -> int:
+        """Work until stopped; the exit status: not 0 if a job was running then, or if the server refused the worker."""
+        slots = [threading.Thread(target=self._work, name=f"slot-{n}", daemon=True) for n in range(self._options.slots)]
+        for slot in slots:
+            slot.start()
+        log.info("%s works for %s: %s", self._options.name, self._transport.url, ", ".join(self._options.kinds))
+        self._stopping.wait()
+        interrupted = bool(self._running)
+        while self._running:  # slots that only wait for work hold nothing and may be left
+            time.sleep(0.02)
+        if self._refusal is not None:
+            log.error("the server refuses this worker: %s", self._refusal)
+            return REFUSED_STATUS
+        return INTERRUPTED_STATUS if interrupted else 0
+
+    # -- one slot --
+
+    def _work(self) -> None:
+        failures = 0
+        with _Bench(self._options) as bench:
+            while not self._stopping.is_set():
+                child = bench.child()
+                try:
+                    leases = self._claim()
+                except (Unauthenticated, Forbidden, Invalid) as error:
+                    self._refusal = error
+                    self.stop()
+                    break
+                except MareyError as error:
+                    failures += 1
+                    log.warning("no work: %s", error)
+                    self._stopping.wait(_pause_s(failures))
+                    continue
+                failures = 0
+                for lease in leases:
+                    self._attempt(lease, child)
+
+    def _claim(self) -> tuple[Lease, ...]:
+        wanted = ClaimRequest(
+            worker=self._options.name,
+            kinds=self._options.kinds,
+            labels=dict(self._options.labels),
+            max=1,
+            wait_s=CLAIM_WAIT_S,
+        )
+        return claim(self._claims, wanted)
+
+    def _attempt(self, lease: Lease, child: ChildProcess) -> None:
+        self._running.add(lease.job)
+        try:
+            faults.point("worker.after_claim")
+            log.info("%s: %s, attempt %d", lease.job, lease.kind, lease.attempt)
+            api = AttemptApi(self._transport, lease)
+            Attempt(api, lease, self._cache, self._transport.url, self._stopping).run(child)
+        finally:
+            self._running.discard(lease.job)
+
+
+class _Bench:
+    """The warm child of a slot: replaced when it has died, or has done enough jobs for its memory to be a mess."""
+
+    def __init__(self, options: WorkerOptions) -> None:
+        self._options = options
+        self._child: ChildProcess | None = None
+        self._jobs = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._child is not None:
+            self._child.kill(grace_s=0.0)
+
+    def child(self) -> ChildProcess:
+        """A child that is ready for a job."""
+        if self._child is not None and (not self._child.alive or self._jobs >= JOBS_PER_CHILD):
+            self._child.kill(grace_s=0.0)
+            self._child = None
+        if self._child is None:
+            threads = max(1, self._options.threads // self._options.slots)
+            self._child, self._jobs = ChildProcess(self._options.kinds, threads=threads), 0
+        self._jobs += 1
+        return self._child
+
+
+def _pause_s(failures: int) -> float:
+    return random.uniform(0.5, 1.0) * min(LONGEST_PAUSE_S, 0.25 * 2.0**failures)  # noqa: S311 - spreads retries
