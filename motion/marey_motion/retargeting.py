@@ -1,0 +1,291 @@
+"""Motion of one skeleton on another, joint by joint, whatever their rest poses, proportions and local axes.
+
+Both skeletons give each joint two axes in its own frame: twist along the bone and swing across it (`rigs.guess_axes`).
+A target joint takes the global orientation in which its two axes coincide with those of the source joint that plays the
+same standard joint (Herrmann et al. 2019, Algorithm 1, after Monzani et al. 2000).
+
+The paper rotates twist onto twist, then swing onto swing, for every pose. As both axes are fixed in their joints, that
+comes to one constant rotation per joint: with the axes of source and target as the columns of orthonormal matrices S
+and T, the target's global orientation is G·S·Tᵀ for the source's G. Two things differ from the print: the swing turns
+purely about the twist axis, so that the first alignment survives the second, and it acts after it (line 12 prints the
+product the other way round).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import quaternions
+from marey_motion.clip import Clip
+from marey_motion.errors import ClipError, MappingError
+from marey_motion.rigs import ESSENTIAL_JOINTS, STANDARD_JOINTS, JointAxes, JointMapping
+from marey_motion.rigs.standard import SIDES
+from marey_motion.skeleton import Skeleton, same_hierarchy
+
+Floats = NDArray[np.floating[Any]]
+
+FEWEST_ESSENTIAL = 8  # of the essential joints: a pelvis, and more than the legs or the arms alone
+SAME_SKELETON_M = 1e-5  # by which offsets may differ that went through a file
+SAME_DIRECTION = 0.94  # cosine of about 20 degrees: bones of one rig on two people differ by less
+FOOT_DROP = 0.45  # of the ankle-to-toe length: the height of the ankle above the toe of a foot that stands
+
+
+@dataclass(frozen=True)
+class JointPair:
+    """A standard joint that both skeletons have, and the names it goes by."""
+
+    standard: str
+    source: str
+    target: str
+
+
+@dataclass(frozen=True, eq=False)
+class RetargetPlan:
+    """All that retargeting clips of one skeleton to another needs to know; made by `plan_retarget`.
+
+    Parameters
+    ----------
+    source, target : the skeletons
+    scale : target metres per source metre of pelvis translation
+    pairs : joints that follow the source
+    carried : names of joints outside the mapping that keep their source rotation, because both rigs are the same
+    at_rest : names of the target's other joints, which keep their rest rotation
+    missing : standard joints that only one of the skeletons has
+    sources : (K,) int32    source joint that each target joint follows, -1 for none
+    corrections : (K, 4) float64    S·Tᵀ of each mapped joint, identity for the others
+    """
+
+    source: Skeleton
+    target: Skeleton
+    scale: float
+    pairs: tuple[JointPair, ...]
+    carried: tuple[str, ...]
+    at_rest: tuple[str, ...]
+    missing: tuple[str, ...]
+    sources: NDArray[np.int32]
+    corrections: NDArray[np.float64]
+
+
+def plan_retarget(
+    source: Skeleton,
+    source_mapping: JointMapping,
+    source_axes: Mapping[str, JointAxes],
+    target: Skeleton,
+    target_mapping: JointMapping,
+    target_axes: Mapping[str, JointAxes],
+    *,
+    scale: float | None = None,
+) -> RetargetPlan:
+    """Work out which joint follows which, by what correction, and how far the body travels.
+
+    Parameters
+    ----------
+    source_mapping, target_mapping : standard joints of the skeletons
+    source_axes, target_axes : twist and swing axes by joint name, at least of the mapped joints
+    scale : target metres per source metre of travel; the ratio of the hip heights when None
+
+    Raises
+    ------
+    MappingError    naming the standard joints or axes that are missing
+    """
+    pairs = _paired(source, source_mapping, target, target_mapping)
+    _check_enough(pairs, source_mapping, target_mapping)
+    if scale is None:
+        scale = _hip_height_ratio(pairs, source, source_axes, target, target_axes)
+    elif not (np.isfinite(scale) and scale > 0):
+        raise MappingError(f"a scale of {scale} must be a positive number", code="scale_invalid", where="scale")
+    sources = np.full(target.joint_count, -1, dtype=np.int32)
+    corrections = quaternions.identity(target.joint_count).astype(np.float64)
+    for pair in pairs:
+        joint = target.index_of(pair.target)
+        sources[joint] = source.index_of(pair.source)
+        axes = _axes_of(source_axes, pair.source, "source"), _axes_of(target_axes, pair.target, "target")
+        corrections[joint] = quaternions.from_matrix(axes[0] @ axes[1].T)
+    followed = {pair.target for pair in pairs}
+    others = tuple(name for name in target.joint_names if name not in followed)
+    same_rig = _are_same_rig(source, target)
+    both = source_mapping.joints.keys() & target_mapping.joints.keys()
+    either = source_mapping.joints.keys() | target_mapping.joints.keys()
+    return RetargetPlan(
+        source,
+        target,
+        float(scale),
+        pairs,
+        carried=others if same_rig else (),
+        at_rest=() if same_rig else others,
+        missing=tuple(name for name in STANDARD_JOINTS if name in either - both),
+        sources=sources,
+        corrections=corrections,
+    )
+
+
+def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
+    """The clip's motion on the plan's target skeleton.
+
+    Mapped joints take the source's orientation, all others rest (or keep theirs between copies of one rig). Bones keep
+    the target's lengths, whatever the source's `translations` did to its own. The pelvis travels as in the source,
+    times the plan's scale.
+
+    Raises
+    ------
+    ClipError    where the clip is of another skeleton than the plan's source
+    """
+    from marey_motion import retargeting_kernels as kernels
+
+    if not same_hierarchy(clip.skeleton, plan.source, tolerance_m=SAME_SKELETON_M):
+        raise ClipError("the clip is of another skeleton than the plan was made for", where="skeleton")
+    target = plan.target
+    ways = np.where(plan.sources >= 0, kernels.MAPPED, kernels.AT_REST).astype(np.int8)
+    sources = plan.sources.copy()
+    for name in plan.carried:
+        joint = target.index_of(name)
+        ways[joint], sources[joint] = kernels.CARRIED, joint
+    poses = np.empty((clip.frame_count, 3 + 4 * target.joint_count), dtype=np.float32)
+    kernels.rotations(
+        clip.poses[:, 3:],
+        plan.source.parents,
+        ways,
+        sources,
+        plan.corrections,
+        target.rest_rotations,
+        target.parents,
+        poses[:, 3:],
+    )
+    rotations = poses[:, 3:].reshape(clip.frame_count, -1, 4)
+    pelvis = next(pair for pair in plan.pairs if pair.standard == "pelvis")
+    travel = plan.scale * _position_in_world(clip, clip.skeleton.index_of(pelvis.source))
+    poses[:, :3] = travel - _position_from_root(target, rotations, target.index_of(pelvis.target))
+    return Clip(target, clip.frame_rate_hz, poses)
+
+
+def _paired(
+    source: Skeleton, source_mapping: JointMapping, target: Skeleton, target_mapping: JointMapping
+) -> tuple[JointPair, ...]:
+    """Joints of both skeletons that play the same standard joint, each target joint once.
+
+    A root is a joint of its own only where it is not another standard joint as well, such as the pelvis.
+    """
+    joints = [dict(mapping.joints) for mapping in (source_mapping, target_mapping)]
+    for skeleton, names in zip((source, target), joints, strict=True):
+        root = names.pop("root", None)
+        if root is not None and root not in names.values():
+            names["root"] = root
+        for name in names.values():
+            skeleton.index_of(name)
+    pairs: dict[str, JointPair] = {}
+    for standard in STANDARD_JOINTS:
+        if standard in joints[0] and standard in joints[1]:
+            pair = JointPair(standard, joints[0][standard], joints[1][standard])
+            pairs.setdefault(pair.target, pair)
+    return tuple(pairs.values())
+
+
+def _check_enough(pairs: tuple[JointPair, ...], source_mapping: JointMapping, target_mapping: JointMapping) -> None:
+    found = {pair.standard for pair in pairs} & set(ESSENTIAL_JOINTS)
+    if "pelvis" in found and len(found) >= FEWEST_ESSENTIAL:
+        return
+    lacks = []
+    for which, mapping in (("source", source_mapping), ("target", target_mapping)):
+        missing = [name for name in ESSENTIAL_JOINTS if name not in mapping.joints]
+        if missing:
+            lacks.append(f"the {which} skeleton's mapping has no {', '.join(missing)}")
+    raise MappingError(
+        f"too few joints to retarget: {'; '.join(lacks)}. Set them in the mapping as standard name: joint name; "
+        f"the pelvis and at least {FEWEST_ESSENTIAL - 1} others of the essential joints are needed on both sides",
+        code="mapping_too_small",
+        where="mapping",
+    )
+
+
+def _axes_of(axes: Mapping[str, JointAxes], joint: str, which: str) -> NDArray[np.float64]:
+    """(3, 3) orthonormal: twist, swing and their cross product as columns, in the joint's frame."""
+    if joint not in axes:
+        raise MappingError(f"the {which} skeleton has no twist and swing axes for this joint", where=joint)
+    twist, swing = np.array(axes[joint].twist), np.array(axes[joint].swing)
+    cross = np.cross(twist, swing)
+    if not np.linalg.norm(cross) > 1e-6 * np.linalg.norm(twist) * np.linalg.norm(swing):
+        raise MappingError(
+            f"the twist axis {axes[joint].twist} and the swing axis {axes[joint].swing} of the {which} skeleton's "
+            "joint must have a length and point in different directions",
+            where=joint,
+        )
+    columns = (twist, np.cross(cross, twist), cross)
+    return np.stack([column / np.linalg.norm(column) for column in columns], axis=-1)
+
+
+def _hip_height_ratio(
+    pairs: tuple[JointPair, ...],
+    source: Skeleton,
+    source_axes: Mapping[str, JointAxes],
+    target: Skeleton,
+    target_axes: Mapping[str, JointAxes],
+) -> float:
+    heights = []
+    for skeleton, axes, which in ((source, source_axes, "source"), (target, target_axes, "target")):
+        joints = {pair.standard: skeleton.index_of(getattr(pair, which)) for pair in pairs}
+        heights.append(_hip_height(skeleton, joints, axes))
+    return heights[1] / heights[0]
+
+
+def _hip_height(skeleton: Skeleton, joints: Mapping[str, int], axes: Mapping[str, JointAxes]) -> float:
+    """Height of the pelvis above the toes of a body that stands straight, metres.
+
+    Added up along the bones, because the rest pose of many files is not one that stands.
+    """
+    missing = [
+        f"{side}_{joint}" for side in SIDES for joint in ("hip", "knee", "ankle") if f"{side}_{joint}" not in joints
+    ]
+    if missing:
+        raise MappingError(
+            f"the hip height needs both legs, but {', '.join(missing)} is not mapped on both sides; "
+            "map it or give the scale yourself",
+            where=missing[0],
+        )
+    positions, pelvis = skeleton.rest_global_positions, joints["pelvis"]
+    up = quaternions.rotate_vectors(
+        skeleton.rest_global_rotations[pelvis], np.array(axes[skeleton.joint_names[pelvis]].twist)
+    )
+    height = 0.0
+    for side in SIDES:
+        hip, knee, ankle = (positions[joints[f"{side}_{joint}"]] for joint in ("hip", "knee", "ankle"))
+        height += 0.5 * float((positions[pelvis] - hip) @ up / np.linalg.norm(up))
+        height += 0.5 * float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
+        if {"left_toe", "right_toe"} <= joints.keys():
+            height += 0.5 * FOOT_DROP * float(np.linalg.norm(positions[joints[f"{side}_toe"]] - ankle))
+    return height
+
+
+def _are_same_rig(source: Skeleton, target: Skeleton) -> bool:
+    """Whether both have the same joints, connected and at rest alike, of whatever lengths."""
+    if source.joint_names != target.joint_names or not np.array_equal(source.parents, target.parents):
+        return False
+    turned = quaternions.angle_between(source.rest_rotations, target.rest_rotations)
+    along = np.sum(source.offsets * target.offsets, axis=1)
+    lengths = np.linalg.norm(source.offsets, axis=1) * np.linalg.norm(target.offsets, axis=1)
+    return bool(np.all(turned < 1e-4) and np.all(along[1:] >= SAME_DIRECTION * lengths[1:]))
+
+
+def _position_in_world(clip: Clip, joint: int) -> Floats:
+    """Positions (F, 3) of one joint of a clip, metres."""
+    moved: dict[int, Floats] = {}
+    if clip.translations is not None:
+        moved = {other: clip.translations[:, slot] for slot, other in enumerate(clip.translated_joints)}
+    return clip.root_translations + _position_from_root(clip.skeleton, clip.rotations, joint, moved)
+
+
+def _position_from_root(
+    skeleton: Skeleton, rotations: Floats, joint: int, moved: Mapping[int, Floats] = MappingProxyType({})
+) -> Floats:
+    """Vectors (F, 3) from the root to one joint in the world; `moved` has the offsets (F, 3) that are not constant."""
+    position: Floats = np.zeros((len(rotations), 3))
+    for step in skeleton.path_to_root(joint)[:-1]:
+        offset = moved.get(step, skeleton.offsets[step])
+        rotation = rotations[:, skeleton.parents[step]].astype(np.float64)
+        position = quaternions.rotate_vectors(rotation, position + offset)
+    return position

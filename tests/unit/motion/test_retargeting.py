@@ -1,0 +1,407 @@
+"""One body's motion on another body."""
+
+from dataclasses import replace
+from itertools import permutations
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from marey_motion import kinematics, quaternions
+from marey_motion.clip import Clip
+from marey_motion.errors import ClipError, MappingError, UnknownJoint
+from marey_motion.formats import read_motion
+from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
+from marey_motion.retargeting import plan_retarget, retarget
+from marey_motion.rigs import JointAxes, guess_axes, map_joints
+from marey_motion.skeleton import Skeleton
+
+SIDES = ("left", "right")
+# Bones that every rig has without joints between, so that joint and child show the twist axis to the eye.
+LIMBS = [
+    (f"{side}_{start}", f"{side}_{end}")
+    for side in SIDES
+    for start, end in (("hip", "knee"), ("knee", "ankle"), ("ankle", "toe"), ("shoulder", "elbow"), ("elbow", "wrist"))
+]
+FOLDERS = ("cmu-amc/16", "bandai-namco-2", "snu-mss", "game-engine")
+
+
+class Actor:
+    """A skeleton with all that retargeting needs to know of it, and a motion."""
+
+    def __init__(self, clip):
+        self.clip, self.skeleton = clip, clip.skeleton
+        self.mapping = map_joints(self.skeleton)
+        self.axes = guess_axes(self.skeleton, self.mapping, clip)
+
+    def joint(self, standard):
+        return self.skeleton.index_of(self.mapping.joints[standard])
+
+
+def plan_between(source, target, **options):
+    return plan_retarget(
+        source.skeleton, source.mapping, source.axes, target.skeleton, target.mapping, target.axes, **options
+    )
+
+
+def resting(skeleton):
+    """A clip of one frame at rest."""
+    return Clip(skeleton, 60.0, np.concatenate((skeleton.offsets[0], skeleton.rest_rotations.ravel()))[None])
+
+
+def tumbling(skeleton, frames=200, seed=4):
+    """Rotations of any kind, half turns among them, that no body makes."""
+    generator = np.random.default_rng(seed)
+    rotations = quaternions.normalise(generator.normal(size=(frames, skeleton.joint_count, 4)))
+    rotations[0] = quaternions.identity()
+    rotations[1:4, :] = np.eye(4)[1:, None]
+    poses = np.concatenate((generator.normal(size=(frames, 3)), rotations.reshape(frames, -1)), axis=1)
+    return Clip(skeleton, 60.0, poses)
+
+
+@pytest.fixture(scope="module")
+def studio():
+    return Actor(generate_gait(1.3, 0.6, 3.0))
+
+
+@pytest.fixture(scope="module")
+def game():
+    return Actor(resting(game_skeleton()))
+
+
+@pytest.fixture(scope="module")
+def real(mocap):
+    """A take of each of four capture systems, by folder."""
+
+    def take(path, companion=None):
+        asf = (mocap / companion).read_bytes() if companion else None
+        return Actor(read_motion((mocap / path).read_bytes(), path.rsplit("/")[-1], companion=asf).clip)
+
+    return {
+        "cmu-amc/16": take("cmu-amc/16/16_15.amc", "cmu-amc/16/16.asf"),
+        "bandai-namco-2": take("bandai-namco-2/dataset-2_walk-turn-left_normal_003.bvh"),
+        "snu-mss": take("rigs/snu-mss/walk_fullbody.bvh"),
+        "game-engine": take("rigs/game-engine/custom_skeleton_walk_example.bvh"),
+    }
+
+
+def degrees_between(a, b):
+    """Angles between directions, exact for small ones."""
+    a, b = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (a.astype(float), b.astype(float)))
+    return np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
+
+
+def bone_directions(clip, start, end):
+    positions = kinematics.global_positions(clip).astype(np.float64)
+    return positions[:, end] - positions[:, start]
+
+
+def axis_directions(clip, joint, axis):
+    rotations = kinematics.global_rotations(clip).astype(np.float64)
+    return quaternions.rotate_vectors(rotations[:, joint], axis)
+
+
+def assert_bones_point_alike(source, target, result, plan, tolerance_deg=0.1):
+    for start, end in LIMBS:
+        expected = bone_directions(source.clip, source.joint(start), source.joint(end))
+        found = bone_directions(result, target.joint(start), target.joint(end))
+        assert degrees_between(expected, found).max() < tolerance_deg, (start, end)
+    for pair in plan.pairs:
+        for axis in ("twist", "swing"):
+            expected = axis_directions(
+                source.clip, source.skeleton.index_of(pair.source), getattr(source.axes[pair.source], axis)
+            )
+            found = axis_directions(
+                result, target.skeleton.index_of(pair.target), getattr(target.axes[pair.target], axis)
+            )
+            assert degrees_between(expected, found).max() < tolerance_deg, (pair, axis)
+
+
+def assert_no_flips_of_its_own(source, result, plan):
+    """Every mapped joint turns between frames as the source's does, and no quaternion changes its sign."""
+    before = kinematics.global_rotations(source.clip).astype(np.float64)
+    after = kinematics.global_rotations(result).astype(np.float64)
+    for pair in plan.pairs:
+        turned, turns = (
+            np.degrees(quaternions.angle_between(rotations[1:, joint], rotations[:-1, joint]))
+            for rotations, joint in (
+                (before, source.skeleton.index_of(pair.source)),
+                (after, result.skeleton.index_of(pair.target)),
+            )
+        )
+        assert np.abs(turns - turned).max() < 0.1, pair
+    assert np.sum(result.rotations[1:] * result.rotations[:-1], axis=-1).min() >= 0.0
+
+
+def algorithm_1(source, target, plan, frame):
+    """Local rotations (K, 4) of one pose as the paper's Algorithm 1 finds them, joint by joint."""
+    source_global = kinematics.global_rotations(source.clip).astype(np.float64)[frame]
+    target_global = quaternions.identity(target.skeleton.joint_count)
+    local = target.skeleton.rest_rotations.copy()
+    followed = {pair.target: pair.source for pair in plan.pairs}
+    for joint, name in enumerate(target.skeleton.joint_names):
+        parent = target.skeleton.parents[joint]
+        inherited = target_global[parent] if parent >= 0 else quaternions.identity()
+        if name in followed:
+            turn = source_global[source.skeleton.index_of(followed[name])]
+            twist, swing = (
+                quaternions.rotate_vectors(turn, axis)
+                for axis in (source.axes[followed[name]].twist, source.axes[followed[name]].swing)
+            )
+            own = target.axes[name]
+            q_y = quaternions.between_vectors(own.twist, twist, half_turn_axis=own.swing)
+            carried = quaternions.rotate_vectors(q_y, own.swing)
+            sine = np.dot(np.cross(carried, swing), twist)
+            q_x = quaternions.from_axis_angle(twist, np.arctan2(sine, np.dot(carried, swing)))
+            local[joint] = quaternions.multiply(quaternions.conjugate(inherited), quaternions.multiply(q_x, q_y))
+        target_global[joint] = quaternions.multiply(inherited, local[joint])
+    return local
+
+
+def test_the_precomputed_corrections_equal_algorithm_1_done_pose_by_pose(studio, game):
+    for source, target in ((studio, game), (game, studio)):
+        moving = SimpleNamespace(clip=tumbling(source.skeleton), skeleton=source.skeleton, axes=source.axes)
+        plan = plan_between(source, target)
+        result = retarget(moving.clip, plan)
+
+        for frame in range(moving.clip.frame_count):
+            expected = algorithm_1(moving, target, plan, frame)
+            assert quaternions.angle_between(result.rotations[frame].astype(float), expected).max() < 1e-5
+
+
+def test_the_same_skeleton_gives_the_same_motion(studio, game):
+    for actor, clip in ((studio, studio.clip), (game, tumbling(game.skeleton))):
+        result = retarget(clip, plan_between(actor, actor))
+
+        angles = quaternions.angle_between(result.rotations.astype(float), clip.rotations.astype(float))
+        assert angles.max() < 1e-6
+        assert np.sum(result.rotations[0] * clip.rotations[0], axis=-1).min() > 0.0
+        pelvis = actor.joint("pelvis")
+        moved = kinematics.global_positions(result)[:, pelvis] - kinematics.global_positions(clip)[:, pelvis]
+        assert np.abs(moved).max() < 1e-5
+
+
+def test_every_joint_of_a_copy_is_carried_along_mapped_or_not(game):
+    smaller = Actor(resting(replace(game.skeleton, offsets=0.8 * game.skeleton.offsets)))
+    plan = plan_between(game, smaller)
+
+    assert plan.at_rest == ()
+    assert "weapon_r" in plan.carried
+    clip = tumbling(game.skeleton)
+    result = retarget(clip, plan)
+    assert quaternions.angle_between(result.rotations.astype(float), clip.rotations.astype(float)).max() < 1e-6
+
+
+def test_bones_point_where_the_source_points_them_on_another_rig(studio, game):
+    plan = plan_between(studio, game)
+    result = retarget(studio.clip, plan)
+
+    assert_bones_point_alike(studio, game, result, plan, tolerance_deg=0.01)
+    assert_no_flips_of_its_own(studio, result, plan)
+    assert result.skeleton is game.skeleton
+    assert result.frame_rate_hz == studio.clip.frame_rate_hz
+
+
+def test_there_and_back_returns_the_mapped_joints(studio, game):
+    there = retarget(studio.clip, plan_between(studio, game))
+    back = retarget(there, plan_between(game, studio))
+
+    angles = quaternions.angle_between(back.rotations.astype(float), studio.clip.rotations.astype(float))
+    assert np.degrees(angles.max()) < 0.001
+    assert np.abs(back.root_translations - studio.clip.root_translations).max() < 1e-5
+
+
+@pytest.mark.parametrize("stature_m", [1.1, 1.5, 2.1])
+def test_scaled_copies_keep_the_height_of_their_feet_in_proportion(studio, stature_m):
+    copy = Actor(resting(studio_skeleton(stature_m)))
+    plan = plan_between(studio, copy)
+    result = retarget(studio.clip, plan)
+
+    assert plan.scale == pytest.approx(stature_m / 1.78, rel=1e-12)
+    expected = kinematics.global_positions(studio.clip, end_sites=True) * plan.scale
+    assert np.abs(kinematics.global_positions(result, end_sites=True) - expected).max() < 1e-5
+
+
+def test_the_feet_of_another_body_stay_on_the_floor(studio, game):
+    result = retarget(studio.clip, plan_between(studio, game))
+
+    toes = [game.joint(f"{side}_toe") for side in SIDES]
+    heights = kinematics.global_positions(result)[:, toes, 1]
+    assert 0.01 < heights.min() < 0.03
+
+
+def test_an_explicit_scale_is_used_for_the_travel(studio, game):
+    plan = plan_between(studio, game, scale=2.0)
+    result = retarget(studio.clip, plan)
+
+    pelvis = kinematics.global_positions(result)[:, game.joint("pelvis")]
+    assert np.abs(pelvis - 2.0 * studio.clip.root_translations).max() < 1e-5
+
+
+def test_unmapped_joints_rest_and_the_plan_names_them(studio, game):
+    plan = plan_between(studio, game)
+    result = retarget(studio.clip, plan)
+
+    assert {"weapon_r", "upperarm_twist_01_l", "root"} <= set(plan.at_rest)
+    assert "left_hip" in {pair.standard for pair in plan.pairs}
+    for name in plan.at_rest:
+        joint = game.skeleton.index_of(name)
+        angles = quaternions.angle_between(
+            result.rotations[:, joint].astype(float), game.skeleton.rest_rotations[joint]
+        )
+        assert angles.max() < 1e-6
+
+
+def test_each_frame_depends_on_itself_alone_and_no_frame_is_a_reference_pose(studio, game):
+    plan = plan_between(studio, game)
+    whole = retarget(studio.clip, plan)
+    part = retarget(studio.clip.sliced(70, 120), plan)
+
+    angles = quaternions.angle_between(whole.rotations[70:120].astype(float), part.rotations.astype(float))
+    assert angles.max() < 1e-6
+    assert np.abs(whole.root_translations[70:120] - part.root_translations).max() < 1e-6
+
+
+def test_signs_stay_continuous_when_the_source_flips_its_own(studio, game):
+    poses = studio.clip.poses.copy()
+    poses[1::2, 3:] *= -1.0
+    result = retarget(replace(studio.clip, poses=poses), plan_between(studio, game))
+
+    assert np.sum(result.rotations[1:] * result.rotations[:-1], axis=-1).min() > 0.0
+
+
+def test_translations_of_the_source_move_its_pelvis_but_stretch_no_bone(game, studio):
+    clip = tumbling(game.skeleton, 5)
+    pelvis, knee = game.joint("pelvis"), game.joint("left_knee")
+    shift = np.zeros((5, 2, 3))
+    shift[:, 0], shift[:, 1] = (0.3, -0.2, 0.5), (9.0, 9.0, 9.0)
+    stretched = replace(clip, translations=shift, translated_joints=(pelvis, knee))
+    plan = plan_between(game, studio)
+    result, plain = retarget(stretched, plan), retarget(clip, plan)
+
+    assert np.array_equal(result.rotations, plain.rotations)
+    expected = plan.scale * kinematics.global_positions(stretched)[:, pelvis]
+    assert np.abs(result.root_translations - expected).max() < 1e-5
+
+
+def test_the_same_clip_gives_the_same_bytes(studio, game):
+    first, second = (retarget(studio.clip, plan_between(studio, game)) for _ in range(2))
+
+    assert first.poses.tobytes() == second.poses.tobytes()
+
+
+def test_too_small_a_mapping_is_refused_with_what_is_missing(studio, game):
+    few = {name: game.mapping.joints[name] for name in ("root", "pelvis", "left_hip", "right_hip", "head")}
+
+    with pytest.raises(MappingError) as error:
+        plan_retarget(
+            studio.skeleton,
+            studio.mapping,
+            studio.axes,
+            game.skeleton,
+            replace(game.mapping, joints=few),
+            game.axes,
+        )
+    assert "target skeleton's mapping has no left_knee" in str(error.value)
+    assert "source" not in str(error.value)
+    assert "standard name: joint name" in str(error.value)
+
+
+def test_a_mapping_without_a_pelvis_is_refused(studio, game):
+    joints = {name: joint for name, joint in studio.mapping.joints.items() if name != "pelvis"}
+
+    with pytest.raises(MappingError, match="source skeleton's mapping has no pelvis"):
+        plan_between(
+            SimpleNamespace(skeleton=studio.skeleton, mapping=replace(studio.mapping, joints=joints), axes=studio.axes),
+            game,
+        )
+
+
+def test_a_mapping_to_a_joint_that_is_not_there_is_refused_by_name(studio, game):
+    joints = {**studio.mapping.joints, "head": "Haed"}
+
+    with pytest.raises(UnknownJoint, match="did you mean Head"):
+        plan_between(
+            SimpleNamespace(skeleton=studio.skeleton, mapping=replace(studio.mapping, joints=joints), axes=studio.axes),
+            game,
+        )
+
+
+def test_bodies_without_legs_need_an_explicit_scale(studio, game):
+    joints = {name: joint for name, joint in studio.mapping.joints.items() if "knee" not in name}
+    crippled = SimpleNamespace(
+        skeleton=studio.skeleton, mapping=replace(studio.mapping, joints=joints), axes=studio.axes
+    )
+
+    with pytest.raises(MappingError, match="give the scale"):
+        plan_between(crippled, game)
+    assert plan_between(crippled, game, scale=1.5).scale == 1.5
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_scale_must_be_positive(studio, game, scale):
+    with pytest.raises(MappingError, match="positive"):
+        plan_between(studio, game, scale=scale)
+
+
+def test_missing_or_parallel_axes_are_refused_by_the_joint_they_are_missing_for(studio, game):
+    without = {name: axes for name, axes in game.axes.items() if name != "calf_l"}
+    parallel = {**game.axes, "calf_l": JointAxes((1.0, 0.0, 0.0), (2.0, 0.0, 0.0))}
+
+    for axes in (without, parallel):
+        with pytest.raises(MappingError, match="calf_l"):
+            plan_between(studio, SimpleNamespace(skeleton=game.skeleton, mapping=game.mapping, axes=axes))
+
+
+def test_a_clip_of_another_skeleton_than_planned_is_refused(studio, game):
+    with pytest.raises(ClipError, match="another skeleton"):
+        retarget(studio.clip, plan_between(game, studio))
+
+
+def test_skeletons_of_one_joint_are_refused(studio):
+    stick = Skeleton(("stick",), np.array([-1]), np.zeros((1, 3)), np.array([(1.0, 0.0, 0.0, 0.0)]))
+
+    with pytest.raises(MappingError, match="no pelvis"):
+        plan_between(studio, SimpleNamespace(skeleton=stick, mapping=map_joints(stick), axes={}))
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_real_motion_on_its_own_skeleton_stays_as_it_is(real, folder):
+    actor = real[folder]
+    result = retarget(actor.clip, plan_between(actor, actor))
+
+    angles = quaternions.angle_between(result.rotations.astype(float), actor.clip.rotations.astype(float))
+    assert angles.max() < 1e-6
+
+
+@pytest.mark.parametrize(("from_folder", "to_folder"), list(permutations(FOLDERS, 2)))
+def test_real_motion_points_all_bones_alike_on_another_rig(real, from_folder, to_folder):
+    source, target = real[from_folder], real[to_folder]
+    plan = plan_between(source, target)
+    result = retarget(source.clip, plan)
+
+    assert len(plan.pairs) >= 20
+    assert np.isfinite(result.poses).all()
+    assert_bones_point_alike(source, target, result, plan)
+    assert_no_flips_of_its_own(source, result, plan)
+
+
+@pytest.mark.parametrize(("from_folder", "to_folder"), list(permutations(FOLDERS, 2)))
+def test_real_motion_there_and_back_returns_the_mapped_joints(real, from_folder, to_folder):
+    source, target = real[from_folder], real[to_folder]
+    plan = plan_between(source, target)
+    back = retarget(retarget(source.clip, plan), plan_between(target, source))
+
+    before, after = (kinematics.global_rotations(clip).astype(np.float64) for clip in (source.clip, back))
+    followed = {pair.source for pair in plan.pairs}
+    for name in followed:
+        joint = source.skeleton.index_of(name)
+        assert np.degrees(quaternions.angle_between(before[:, joint], after[:, joint]).max()) < 0.1, name
+        if source.skeleton.joint_names[source.skeleton.parents[joint]] in followed:
+            local = quaternions.angle_between(
+                source.clip.rotations[:, joint].astype(float), back.rotations[:, joint].astype(float)
+            )
+            assert np.degrees(local.max()) < 0.1, name
+    pelvis = source.joint("pelvis")
+    moved = kinematics.global_positions(back)[:, pelvis] - kinematics.global_positions(source.clip)[:, pelvis]
+    assert np.abs(moved).max() < 1e-4
