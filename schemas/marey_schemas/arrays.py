@@ -62,7 +62,6 @@ def array_from_leaf(leaf: Mapping[str, Any], *, max_bytes: int = MAX_ARRAY_BYTES
 
     Raises `ArrayError` where data does not match dtype and shape, and before allocating more than `max_bytes`.
     """
-    encoding = leaf.get("encoding")
     unknown = sorted(leaf.keys() - LEAF_KEYS - {"encoding"})
     if unknown:
         raise ArrayError("bad-array", f"an array has no member {unknown[0]!r}")
@@ -70,7 +69,7 @@ def array_from_leaf(leaf: Mapping[str, Any], *, max_bytes: int = MAX_ARRAY_BYTES
     spec.require(max_bytes)
     data = leaf["data"]
     if "encoding" in leaf:
-        if encoding != "blocks" or not isinstance(data, bytes):
+        if leaf["encoding"] != "blocks" or not isinstance(data, bytes):
             raise ArrayError("bad-array", 'the only encoding of an array is "blocks", with bytes as its data')
         array = EncodedArray(spec.dtype, spec.shape, data).decode(max_bytes=max_bytes)
     elif isinstance(data, bytes):
@@ -100,8 +99,7 @@ def _from_lists(data: object, spec: ArraySpec) -> NDArray[Any]:
                 found = f"a list of {len(item)}" if type(item) is list else type(item).__name__
                 raise ArrayError("bad-array", f"axis {axis} must be a list of {size}, not {found}")
         level = list(chain.from_iterable(level))
-    kind = np.dtype(spec.dtype).kind
-    wrong = set(map(type, level)) - _ELEMENT_TYPES[kind]
+    wrong = set(map(type, level)) - _ELEMENT_TYPES[np.dtype(spec.dtype).kind]
     if wrong:
         names = ", ".join(sorted(found.__name__ for found in wrong))
         raise ArrayError("bad-array", f"elements of type {names} in an array of dtype {spec.dtype}")

@@ -17,14 +17,8 @@ import numpy as np
 from bson.raw_bson import RawBSONDocument
 from numpy.typing import NDArray
 
-from marey_schemas.arrays import (
-    LEAF_KEYS,
-    ArrayError,
-    EncodedArray,
-    array_from_leaf,
-    nested_lists,
-)
-from marey_schemas.arrayspec import little_endian, require_finite
+from marey_schemas.arrays import LEAF_KEYS, EncodedArray, array_from_leaf, nested_lists
+from marey_schemas.arrayspec import DTYPES, ArrayError, little_endian, require_finite
 
 JSON, MSGPACK, BSON = MEDIA_TYPES = ("application/json", "application/msgpack", "application/bson")
 MAX_BYTES = 1 << 28
@@ -195,7 +189,7 @@ class _Walk:
             return self._list(value)
         if isinstance(value, np.ndarray | EncodedArray) and self._on_array is not None:
             return self._array(self._on_array, value)
-        if isinstance(value, np.generic) and self._on_array is not None:
+        if isinstance(value, np.generic) and value.dtype.newbyteorder("<").str in DTYPES and self._on_array is not None:
             return self.visit(value.item())
         raise self._error("bad-type", f"a value of type {type(value).__name__} cannot travel")
 

@@ -183,7 +183,21 @@ class TestEveryCodec:
         assert codec.refusal({text: "t"}).code == "bad-text"
 
     @pytest.mark.parametrize(
-        "value", [b"bytes", datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC), Decimal(1), {1, 2}, object(), 1j]
+        "value",
+        [
+            b"bytes",
+            datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC),
+            Decimal(1),
+            {1, 2},
+            object(),
+            1j,
+            np.longdouble(1),
+            np.complex64(1),
+            np.datetime64(1, "ns"),
+            np.timedelta64(1, "ns"),
+            np.bytes_(b"bytes"),
+        ],
+        ids=lambda value: type(value).__name__,
     )
     def test_a_value_that_some_format_could_not_carry_is_refused(self, codec: Codec, value: Any) -> None:
         error = codec.refusal({"a": [value]})
