@@ -79,12 +79,12 @@ def _complete(
         .values(state="succeeded", finished_us=tx.now_us, lease_expires_us=None, rev=job.c.rev + 1)
         .returning(*ENDED_COLUMNS, job.c.fence, job.c.into_path, job.c.author_id, job.c.message)
     ).all()
+    staged = staging.staged_drafts(tx, [(row.id, row.fence) for row in won]) if won else {}
     done: dict[_Place, tuple[Ended, CompleteAnswer]] = {}
     records = []
     for row in sorted(won, key=lambda row: row.id):
         request = requests[row.id, row.fence]
-        drafts = staging.staged_drafts(tx, row.id, row.fence)
-        outputs = staging.publish_drafts(tx, row, drafts)
+        outputs = staging.publish_drafts(tx, row, staged.get((row.id, row.fence), {}))
         staging.keep_named_blobs(tx, row.id, set(staging.named_blobs(request.result)))
         records.append(
             {

@@ -15,7 +15,7 @@ from sqlalchemy import Row, and_, insert, or_, select, update
 
 from marey_schemas.canonical import canonical_json
 from marey_schemas.job_kinds import KindDeclaration
-from marey_server.store import staging
+from marey_server.store import blobs, staging
 from marey_server.store.database import Transaction
 from marey_server.store.fencing import QUEUED, RUNNING, WAITING
 from marey_server.store.job_ends import Ended, end_jobs
@@ -167,16 +167,19 @@ def share_waiting(tx: Transaction) -> list[Ended]:
 def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")
-    columns = (job.c.id, job.c.project_id, job.c.kind, job.c.into_path, job.c.author_id, job.c.message, job.c.inputs)
+    own = (job.c.id, job.c.project_id, job.c.kind, job.c.into_path, job.c.author_id, job.c.message, job.c.inputs)
+    shared = (source.c.fence, source.c.result, source.c.code_version, source.c.environment)
     row = tx.execute(
-        select(*columns, source.c.id.label("source_id"), source.c.result, source.c.code_version, source.c.environment)
+        select(*own, source.c.id.label("source_id"), *shared)
         .join(source, source.c.id == job.c.cached_from)
         .where(waits)
     ).one()
-    drafts = staging.staged_drafts(tx, row.source_id)
+    place = (row.source_id, row.fence)
+    drafts = staging.staged_drafts(tx, [place]).get(place, {})
     if not staging.all_stored(tx, drafts):
         return _compute_again(tx, row)
     outputs = staging.publish_drafts(tx, row, staging.with_inputs(drafts, row.inputs))
+    blobs.keep_for_job(tx, row.id, staging.named_blobs(row.result))
     return end_jobs(
         tx,
         waits,

@@ -75,10 +75,7 @@ def list_jobs(
     if count:
         counted = select_jobs().where(*conditions).with_only_columns(func.count(), maintain_column_froms=True)
         total = tx.execute(counted).scalar_one()
-    if cursor is not None:
-        conditions.append(order.after(listing.read_cursor(tx, cursor, order, identity)))
-    statement = select_jobs().where(*conditions).order_by(*order.clauses()).limit(limit + 1)
-    rows, next_cursor = listing.page_of(tx, tx.execute(statement).all(), limit, order, identity)
+    rows, next_cursor = listing.read_page(tx, select_jobs().where(*conditions), order, identity, cursor, limit)
     return Page(items=tuple(as_documents(tx, rows)), next_cursor=next_cursor, count=total)
 
 
@@ -107,11 +104,8 @@ def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit:
         return Page(items=tuple(JobOutput(**output) for output in row.outputs or ()))
     order = listing.parse_order("position", {"position": job.c.position, "id": job.c.id})
     statement = select(job.c.id, job.c.position, job.c.outputs).where(job.c.parent_id == job_id)
-    if cursor is not None:
-        statement = statement.where(order.after(listing.read_cursor(tx, cursor, order, job_id)))
-    tasks = tx.execute(statement.order_by(*order.clauses()).limit(limit + 1)).all()
-    page, next_cursor = listing.page_of(tx, tasks, limit, order, job_id)
-    outputs = tuple(JobOutput(**output) for task in page for output in task.outputs or ())
+    tasks, next_cursor = listing.read_page(tx, statement, order, job_id, cursor, limit)
+    outputs = tuple(JobOutput(**output) for task in tasks for output in task.outputs or ())
     return Page(items=outputs, next_cursor=next_cursor)
 
 

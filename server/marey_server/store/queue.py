@@ -2,9 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Any
+from itertools import product
+from typing import Any, NamedTuple
 
-from sqlalchemy import CTE, BigInteger, ColumnElement, FromClause, Row, and_, cast, exists, func, insert, or_, select, update
+from sqlalchemy import (
+    CTE,
+    BigInteger,
+    ColumnElement,
+    FromClause,
+    Row,
+    Select,
+    and_,
+    bindparam,
+    cast,
+    exists,
+    func,
+    insert,
+    or_,
+    select,
+    update,
+)
+from sqlalchemy.sql.dml import ReturningUpdate
 
 from marey_schemas.access import Role
 from marey_schemas.jobs import (
@@ -37,8 +55,7 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
     if request.protocol != PROTOCOL_VERSION:
         detail = f"The worker speaks version {request.protocol} of the protocol, the server {PROTOCOL_VERSION}."
         raise Invalid(detail, errors=[FieldError(pointer="/protocol", code="protocol", detail=detail)])
-    workable = _workable_projects(tx)
-    rows = sorted(tx.execute(_claim_statement(tx, request, policy, workable)), key=_pick_order)
+    rows = _claim_rows(tx, request, policy)
     if not rows:
         return []
     if not tx.is_postgres:
@@ -90,11 +107,13 @@ def heartbeat(
     )
 
 
-# -- the claim in one statement ---------------------------------------------------------------------------------------
+# -- the claim in one statement ----------------------------------------------------------------------------------------
 
 
-def _claim_statement(tx: Transaction, request: ClaimRequest, policy: QueuePolicy, workable: ColumnElement[bool]) -> Any:
-    pick = _pick(tx, request, workable)
+def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
+    """Pick and claim. Building it takes longer than running it, so each variant is built once."""
+    pick = _pick(restriction)
+    now_us = bindparam("now_us", type_=BigInteger)
     return (
         update(job)
         .where(job.c.id == pick.c.id)
@@ -102,9 +121,9 @@ def _claim_statement(tx: Transaction, request: ClaimRequest, policy: QueuePolicy
             state="running",
             fence=job.c.fence + 1,
             attempt=job.c.attempt + 1,
-            lease_expires_us=tx.now_us + policy.lease_ttl_us,
-            deadline_us=tx.now_us + cast(job.c.time_limit_s, BigInteger) * SECOND_US,
-            started_us=func.coalesce(job.c.started_us, tx.now_us),
+            lease_expires_us=bindparam("lease_expires"),
+            deadline_us=now_us + cast(job.c.time_limit_s, BigInteger) * SECOND_US,
+            started_us=func.coalesce(job.c.started_us, now_us),
             progress=None,
             rev=job.c.rev + 1,
         )
@@ -126,19 +145,19 @@ def _claim_statement(tx: Transaction, request: ClaimRequest, policy: QueuePolicy
     )
 
 
-def _pick(tx: Transaction, request: ClaimRequest, workable: ColumnElement[bool]) -> CTE:
+def _pick(restriction: _Restriction) -> CTE:
     """The ids to claim: of jobs that share a concurrency key only the first, and none while one runs."""
-    label_keys = keys_within(request.labels)
 
     def claimable(candidate: FromClause) -> ColumnElement[bool]:
         conditions = [
             candidate.c.state == QUEUED,
-            candidate.c.run_at_us <= tx.now_us,
-            candidate.c.kind.in_(request.kinds),
-            candidate.c.labels_key.in_(label_keys),
+            candidate.c.run_at_us <= bindparam("now_us", type_=BigInteger),
+            candidate.c.kind.in_(bindparam("kinds", expanding=True)),
+            candidate.c.labels_key.in_(bindparam("label_keys", expanding=True)),
+            candidate.c.project_id.in_(_workable_projects(restriction)),
         ]
-        if request.job is not None:
-            conditions.append(candidate.c.id == request.job)
+        if restriction.one_job:
+            conditions.append(candidate.c.id == bindparam("one_job"))
         return and_(*conditions)
 
     rival = job.alias("rival")
@@ -149,13 +168,9 @@ def _pick(tx: Transaction, request: ClaimRequest, workable: ColumnElement[bool])
     )
     return (
         select(job.c.id)
-        .where(
-            claimable(job),
-            workable,
-            or_(job.c.concurrency_key.is_(None), and_(~rival_runs, job.c.id == first_of_key)),
-        )
+        .where(claimable(job), or_(job.c.concurrency_key.is_(None), and_(~rival_runs, job.c.id == first_of_key)))
         .order_by(*_order(job))
-        .limit(request.max)
+        .limit(bindparam("most"))
         .with_for_update(skip_locked=True)
         .cte("pick")
     )
@@ -169,20 +184,52 @@ def _pick_order(row: Row[Any]) -> tuple[Any, ...]:
     return -row.priority, row.run_at_us, row.id
 
 
-def _workable_projects(tx: Transaction) -> ColumnElement[bool]:
-    """Jobs of projects whose work the caller may do: a worker reads what the project holds and writes in its name."""
+def _workable_projects(restriction: _Restriction) -> Select[Any]:
+    """Projects whose work the caller may do: a worker reads what a project holds and writes in its name."""
+    projects = select(project.c.id).where(project.c.deleted_us.is_(None))
+    if restriction.named_projects:
+        projects = projects.where(project.c.name.in_(bindparam("project_names", expanding=True)))
+    if restriction.own_projects:
+        roles = (Role.MAINTAINER.value, Role.OWNER.value)
+        mine = select(member.c.project_id).where(member.c.user_id == bindparam("user"), member.c.role.in_(roles))
+        projects = projects.where(project.c.id.in_(mine))
+    return projects
+
+
+class _Restriction(NamedTuple):
+    """What a claim is limited to, besides kinds and labels."""
+
+    one_job: bool
+    named_projects: bool
+    own_projects: bool
+
+
+_CLAIM_STATEMENTS = {
+    restriction: _claim_statement(restriction)
+    for restriction in (_Restriction(*flags) for flags in product((False, True), repeat=3))
+}
+
+
+def _claim_rows(tx: Transaction, request: ClaimRequest, policy: QueuePolicy) -> list[Row[Any]]:
     caller = tx.principal
     scopes = [scope for scope in caller.scopes if scope.partition("!")[0] == "work"]
     if not scopes or caller.kind not in ("user", "system"):
-        raise Forbidden("Claiming jobs needs a user's token with the scope `work`.")
-    projects = select(project.c.id).where(project.c.deleted_us.is_(None))
-    if "work" not in scopes:
-        projects = projects.where(project.c.name.in_([scope.partition("=")[2] for scope in scopes]))
-    if not caller.administrator:
-        roles = (Role.MAINTAINER.value, Role.OWNER.value)
-        mine = select(member.c.project_id).where(member.c.user_id == caller.user_id, member.c.role.in_(roles))
-        projects = projects.where(project.c.id.in_(mine))
-    return job.c.project_id.in_(projects)
+        raise Forbidden("Claiming jobs needs a user's token with the scope `work`.", code="insufficient-scope")
+    restriction = _Restriction(request.job is not None, "work" not in scopes, not caller.administrator)
+    parameters: dict[str, Any] = {
+        "now_us": tx.now_us,
+        "lease_expires": tx.now_us + policy.lease_ttl_us,
+        "kinds": list(request.kinds),
+        "label_keys": keys_within(request.labels),
+        "most": request.max,
+    }
+    if restriction.one_job:
+        parameters["one_job"] = request.job
+    if restriction.named_projects:
+        parameters["project_names"] = [scope.partition("=")[2] for scope in scopes]
+    if restriction.own_projects:
+        parameters["user"] = caller.user_id
+    return sorted(tx.execute(_CLAIM_STATEMENTS[restriction], parameters), key=_pick_order)
 
 
 # -- answers ----------------------------------------------------------------------------------------------------------

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import delete, func, insert, select
+from sqlalchemy import delete, func, insert, select, tuple_
 
 from marey_schemas.jobs import StagedOutput
 from marey_schemas.kinds import PARTS, Kind
@@ -124,15 +124,19 @@ def _pinned_sources(output: StagedOutput, pins: PinnedInputs) -> dict[str, list[
 # -- publishing -------------------------------------------------------------------------------------------------------
 
 
-def staged_drafts(tx: Transaction, job_id: str, fence: int | None = None) -> dict[str, StagedDraft]:
-    """The drafts by name, in the order staged, of an attempt; without a fence, of the one that completed."""
-    attempt_fence = select(job.c.fence).where(job.c.id == job_id).scalar_subquery() if fence is None else fence
+def staged_drafts(
+    tx: Transaction, attempts: Collection[tuple[str, int]]
+) -> dict[tuple[str, int], dict[str, StagedDraft]]:
+    """What attempts (job id and fence) staged: drafts by name, in the order staged."""
     statement = (
-        select(staged_output.c.name, staged_output.c.draft)
-        .where(staged_output.c.job_id == job_id, staged_output.c.fence == attempt_fence)
-        .order_by(staged_output.c.position)
+        select(staged_output)
+        .where(tuple_(staged_output.c.job_id, staged_output.c.fence).in_(list(attempts)))
+        .order_by(staged_output.c.job_id, staged_output.c.position)
     )
-    return {row.name: row.draft for row in tx.execute(statement)}
+    drafts: dict[tuple[str, int], dict[str, StagedDraft]] = {}
+    for row in tx.execute(statement):
+        drafts.setdefault((row.job_id, row.fence), {})[row.name] = row.draft
+    return drafts
 
 
 def all_stored(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> bool:
