@@ -17,6 +17,7 @@ from marey_schemas.jobs import Job
 
 MOTION_SUFFIXES = frozenset({".bvh", ".asf", ".amc", ".c3d", ".npz", ".json"})
 COMPANION_SUFFIX = ".asf"
+NEEDS_COMPANION_SUFFIX = ".amc"
 FILES_PER_IMPORT = 50
 BYTES_PER_IMPORT = 64 << 20
 UPLOADS_AT_ONCE = 8
@@ -69,20 +70,29 @@ def find_files(places: Iterable[Path]) -> FoundFiles:
 
 
 def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
-    """Files in portions that one request can import; each AMC comes with the ASF files of its folder."""
+    """Files in portions that one request can import.
+
+    Each AMC comes with the ASF files of its folder, and files that differ in their suffix alone stay together, because
+    the server names clips with an eye on the other files of a request.
+    """
+    groups: defaultdict[tuple[str, str], list[LocalFile]] = defaultdict(list)
     companions: defaultdict[str, list[LocalFile]] = defaultdict(list)
     for file in files:
-        if _suffix(file) == COMPANION_SUFFIX:
-            companions[_folder(file)].append(file)
+        path = PurePosixPath(file.name)
+        groups[path.parent.as_posix(), path.stem].append(file)
+        if path.suffix.lower() == COMPANION_SUFFIX:
+            companions[path.parent.as_posix()].append(file)
     portion: dict[str, LocalFile] = {}
-    for file in files:
-        together = [*(companions[_folder(file)] if _suffix(file) == ".amc" else []), file]
-        new = [one for one in together if one.name not in portion]
-        size = sum(one.size_bytes for one in portion.values()) + sum(one.size_bytes for one in new)
-        if portion and (len(portion) + len(new) > FILES_PER_IMPORT or size > BYTES_PER_IMPORT):
+    size = 0
+    for (folder, _), group in groups.items():
+        needs_companion = any(file.name.lower().endswith(NEEDS_COMPANION_SUFFIX) for file in group)
+        together = {file.name: file for file in [*(companions[folder] if needs_companion else []), *group]}
+        together_bytes = sum(file.size_bytes for file in together.values())
+        if portion and (len(portion) + len(together) > FILES_PER_IMPORT or size + together_bytes > BYTES_PER_IMPORT):
             yield list(portion.values())
-            portion = {}
-        portion.update((one.name, one) for one in together)
+            portion, size = {}, 0
+        size += sum(file.size_bytes for name, file in together.items() if name not in portion)
+        portion |= together
     if portion:
         yield list(portion.values())
 
@@ -140,14 +150,6 @@ class Imports:
 
 def _say_nothing(_stage: str, _done: int, _total: int) -> None:
     pass
-
-
-def _folder(file: LocalFile) -> str:
-    return PurePosixPath(file.name).parent.as_posix()
-
-
-def _suffix(file: LocalFile) -> str:
-    return PurePosixPath(file.name).suffix.lower()
 
 
 def _listed(places: Iterable[Path]) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from marey_client.credentials import Credential, resolve
 from marey_client.errors import MareyError, NoCredential
 from marey_client.transport import Transport
-from marey_schemas.job_kinds import UnknownKind, find_kind, job_kinds
+from marey_schemas.job_kinds import UnknownKindError, find_kind, job_kinds
 from marey_worker.supervisor import Supervisor, WorkerOptions, default_cache
 
 MIB = 1 << 20
@@ -77,7 +77,7 @@ def main() -> None:
 def _known_kinds(names: tuple[str, ...]) -> tuple[str, ...]:
     try:
         return tuple(find_kind(name).name for name in names) or tuple(job_kinds())
-    except UnknownKind as error:
+    except UnknownKindError as error:
         raise MareyError(str(error)) from error
 
 

@@ -37,11 +37,6 @@ class Address:
         return f"{self.project}/{self.path}" if self.path else self.project
 
     @property
-    def folder(self) -> str:
-        """The path without its last name."""
-        return self.path.rpartition("/")[0]
-
-    @property
     def name(self) -> str:
         """The last name of the path, which may also be an item's id."""
         return self.path.rpartition("/")[2]
@@ -63,9 +58,7 @@ def find_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> ItemHand
             if address.name.startswith(f"{kind.value}_"):
                 return _existing(items, address.name)
             continue
-        named: ItemHandle | None = next(
-            items.list(collection=address.folder, filters={"name": address.name}, page_size=1), None
-        )
+        named: ItemHandle | None = next(items.list(path=address.path, page_size=1), None)
         if named is not None:
             return named
     return None

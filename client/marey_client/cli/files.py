@@ -137,11 +137,11 @@ def _items_in(
     from marey_schemas.kinds import Kind
 
     wanted = [_kind_named(name) for name in kinds] if kinds else list(Kind)
-    where = {"path": address.path or None} if recursive else {"collection": address.path}
     project = marey.project(address.project)
 
     def of_kind(kind: Kind) -> list[ItemHandle]:
-        return list(project.items(kind).list(sort="name", filters={**where, "tag.in": tag}))
+        found = project.items(kind).list(collection=address.path, sort="name", filters={"tag.in": tag})
+        return [item for item in found if recursive or item.item.collection == address.path]
 
     with ThreadPoolExecutor(4) as pool:
         return [item for items in pool.map(of_kind, wanted) for item in items]
@@ -215,7 +215,7 @@ def download(
         if single is not None:
             clips, base = [single], single.item.collection
         else:
-            clips, base = list(marey.project(address.project).clips.list(path=address.path or None)), address.path
+            clips, base = list(marey.project(address.project).clips.list(collection=address.path)), address.path
         if not clips:
             raise WrongUsage(f"there is no clip at {address}; marey ls {address.project} shows what there is")
         written, refused = _download_all(clips, base, output, format, unit)
