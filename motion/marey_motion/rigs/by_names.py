@@ -11,6 +11,9 @@ from marey_motion.rigs.names import JointName, parse_name
 from marey_motion.rigs.standard import CHAINS, ESSENTIAL_JOINTS
 from marey_motion.skeleton import Skeleton
 
+# Common prefixes that are tried; a file has one, and a few joints may look as if they had others.
+MOST_PREFIXES = 8
+
 
 @dataclass(frozen=True)
 class NameMatch:
@@ -74,7 +77,7 @@ def _prefixes(pelvis: tuple[JointName, ...], joints: dict[JointName, int]) -> li
         for joint in joints
         if joint.side == name.side and joint.base.endswith(name.base)
     }
-    return sorted(prefixes, key=lambda prefix: (len(prefix), prefix))
+    return sorted(prefixes, key=lambda prefix: (len(prefix), prefix))[:MOST_PREFIXES]
 
 
 def _first(alternatives: tuple[JointName, ...], prefix: str, joints: dict[JointName, int]) -> int | None:

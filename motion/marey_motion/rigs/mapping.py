@@ -129,10 +129,10 @@ def _spine(skeleton: Skeleton, joints: Mapping[str, int]) -> dict[str, int]:
 def _animal_signs(skeleton: Skeleton, joints: Mapping[str, int]) -> str:
     """What speaks for four legs, in words; nothing for a human."""
     for index, name in enumerate(skeleton.display_names):
-        # Hair in a pony tail grows on heads.
-        is_hair = joints.get("head") in skeleton.path_to_root(index)
-        if not is_hair and any(word in parse_name(name).base for word in _ANIMAL_WORDS):
-            return f"a joint such as {name} belongs to an animal"
+        if any(word in parse_name(name).base for word in _ANIMAL_WORDS):
+            # Hair in a pony tail grows on heads.
+            if joints.get("head") not in skeleton.path_to_root(index):
+                return f"a joint such as {name} belongs to an animal"
     if not set(ESSENTIAL_JOINTS) | {"spine_2"} <= joints.keys():
         return ""
     positions = skeleton.rest_global_positions
