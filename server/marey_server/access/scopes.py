@@ -1,4 +1,4 @@
-"""How far a credential reaches. A scope is `read`, `write`, `jobs`, `work` or `admin`, alone or as `write!project=walk`."""
+"""How far a credential reaches: `read`, `write`, `jobs`, `work`, `admin`, alone or bound as in `write!project=walk`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The texts that callers show as bearer tokens.
 
-`marey_<prefix>_<secret>` belongs to a user; the prefix finds the row. `mareyjob_<secret>` belongs to an attempt of a job.
-Rows hold SHA-256 of the secret: it has 256 random bits, so that no slow hash is needed.
+`marey_<prefix>_<secret>` belongs to a user; the prefix finds the row. `mareyjob_<secret>` belongs to an attempt of a
+job. Rows hold SHA-256 of the secret: it has 256 random bits, so that no slow hash is needed.
 """
 
 from __future__ import annotations

@@ -24,8 +24,8 @@ class Clock(Protocol):
 
 
 class DatabaseClock:
-    """Postgres: the server's own clock. SQLite: wall clock or stored high-water mark, whichever is later, sampled once and
-    then advanced by the monotonic clock, so that a jump of the wall clock neither revives nor kills a lease.
+    """Postgres: the server's own clock. SQLite: wall clock or stored high-water mark, whichever is later, sampled once
+    and then advanced by the monotonic clock, so that a jump of the wall clock neither revives nor kills a lease.
     """
 
     def __init__(self) -> None:

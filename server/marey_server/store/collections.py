@@ -1,23 +1,39 @@
-"""Collections: the folders of a project."""
+"""Collections: the folders of a project. The root is the collection with the empty path; it is made when needed."""
 
 from __future__ import annotations
 
-from sqlalchemy import select
+from typing import Any
 
+from sqlalchemy import ColumnElement, Row, func, literal, or_, select, update
+
+from marey_schemas.access import Role
+from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Page
+from marey_server.errors import Conflict, Invalid, NotFound
+from marey_server.store import listing, projects
+from marey_server.store.clock import datetime_of
 from marey_server.store.database import Transaction
 from marey_server.store.ids import new_id
 from marey_server.store.projects import ProjectRow
-from marey_server.store.tables import collection
+from marey_server.store.revs import change_row
+from marey_server.store.tables import collection, item
+from marey_server.store.violations import taken
+
+MAX_PATH_LENGTH = 1024
+MAX_PATH_BYTES = 2048
+"""What an index of Postgres holds, with room to spare."""
+
+_ALIVE = collection.c.deleted_us.is_(None)
 
 
 def ensure(tx: Transaction, project_row: ProjectRow, path: str) -> str:
     """Id of the collection at `path`, made with those above it where there is none; it cannot be deleted meanwhile."""
+    _check_length(path)
     found = _lock(tx, project_row.id, path)
     while found is None:
         if path:
             ensure(tx, project_row, path.rpartition("/")[0])
         row = {
-            "id": new_id("coll"), "project_id": project_row.id, "path": path,
+            "id": new_id("collection"), "project_id": project_row.id, "path": path,
             "created_us": tx.now_us, "updated_us": tx.now_us,
         }  # fmt: skip
         made = tx.execute(tx.insert_or_ignore(collection, row).returning(collection.c.id)).scalar()
@@ -28,8 +44,170 @@ def ensure(tx: Transaction, project_row: ProjectRow, path: str) -> str:
 
 
 def _lock(tx: Transaction, project_id: str, path: str) -> str | None:
-    statement = select(collection.c.id).where(
-        collection.c.project_id == project_id, collection.c.path == path, collection.c.deleted_us.is_(None)
-    )
+    statement = select(collection.c.id).where(collection.c.project_id == project_id, collection.c.path == path, _ALIVE)
     found: str | None = tx.execute(statement.with_for_update(read=True)).scalar()
     return found
+
+
+def _check_length(path: str) -> None:
+    if len(path) > MAX_PATH_LENGTH or len(path.encode()) > MAX_PATH_BYTES:
+        raise Invalid(f"A path has at most {MAX_PATH_LENGTH} characters and {MAX_PATH_BYTES} bytes.", code="long-path")
+
+
+def at_or_below(path: str) -> ColumnElement[bool]:
+    """Condition on rows of `collection`: the folder at `path`, or in it at any depth."""
+    if not path:
+        return literal(True)
+    return or_(collection.c.path == path, func.substr(collection.c.path, 1, len(path) + 1) == f"{path}/")
+
+
+# -- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read_collection(tx: Transaction, project: str, collection_id: str) -> Collection:
+    """A collection."""
+    return _shown(_find(tx, projects.require(tx, project), collection_id, _ALIVE))
+
+
+def list_collections(
+    tx: Transaction,
+    project: str,
+    *,
+    path: str = "",
+    deleted: bool = False,
+    cursor: str | None = None,
+    limit: int = listing.DEFAULT_LIMIT,
+) -> Page:
+    """Collections at and below `path`, by path, without the root; or those that were deleted."""
+    project_row = projects.require(tx, project, Role.CONTRIBUTOR if deleted else Role.READER)
+    order = listing.parse_order("path", {"path": collection.c.path, "id": collection.c.id})
+    statement = select(collection).where(
+        collection.c.project_id == project_row.id,
+        collection.c.path != "",
+        at_or_below(path),
+        collection.c.deleted_us.is_not(None) if deleted else _ALIVE,
+    )
+    identity = ["collections", project_row.id, path, deleted]
+    rows, next_cursor = listing.read_page(tx, statement, order, identity, cursor, limit)
+    return Page(items=tuple(_shown(row) for row in rows), next_cursor=next_cursor)
+
+
+def _find(tx: Transaction, project_row: ProjectRow, collection_id: str, state: ColumnElement[bool]) -> Row[Any]:
+    """Row of a collection, locked for a change. Raises `NotFound`."""
+    statement = select(collection).where(
+        collection.c.id == collection_id, collection.c.project_id == project_row.id, state
+    )
+    row = tx.execute(statement).first()
+    if row is None:
+        raise _no_collection(collection_id)
+    return row
+
+
+def _no_collection(collection_id: str) -> NotFound:
+    return NotFound(f"There is no collection {collection_id!r} here.", code="no-collection")
+
+
+def _shown(row: Row[Any]) -> Collection:
+    return Collection(
+        id=row.id, path=row.path, created_at=datetime_of(row.created_us), updated_at=datetime_of(row.updated_us),
+        deleted_at=None if row.deleted_us is None else datetime_of(row.deleted_us), rev=row.rev,
+    )  # fmt: skip
+
+
+# -- changing ---------------------------------------------------------------------------------------------------------
+
+
+def create_collection(tx: Transaction, project: str, request: CollectionCreate) -> Collection:
+    """A new folder, with those above it. Raises `Conflict` where there is one at this path."""
+    project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    if _lock(tx, project_row.id, request.path) is not None:
+        raise _path_taken(request.path)
+    return _shown(_find(tx, project_row, ensure(tx, project_row, request.path), _ALIVE))
+
+
+def _path_taken(path: str) -> Conflict:
+    return Conflict(f"There is a collection {path!r} already.", code="path-taken")
+
+
+def move_collection(
+    tx: Transaction, project: str, collection_id: str, request: CollectionChange, *, expected_rev: int | None
+) -> Collection:
+    """Rename or move a folder with all it holds. Raises `Conflict` where there is a folder at the new path."""
+    project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    old, new = _find(tx, project_row, collection_id, _ALIVE).path, request.path
+    _require_no_root(old)
+    if new.startswith(f"{old}/"):
+        raise Invalid(f"{old!r} cannot move into itself.", code="into-itself")
+    if new != old:
+        ensure(tx, project_row, new.rpartition("/")[0])
+    with taken(_path_taken(new)):
+        row = change_row(
+            tx, collection, (collection.c.id == collection_id, collection.c.path == old, _ALIVE),
+            {"path": new, "updated_us": tx.now_us}, expected_rev=expected_rev, absent=_no_collection(collection_id),
+        )  # fmt: skip
+        _move_contents(tx, project_row, old, new)
+    tx.emit("collection.moved", collection_id, project_id=project_row.id, path=new, was=old)
+    return _shown(row)
+
+
+def _move_contents(tx: Transaction, project_row: ProjectRow, old: str, new: str) -> None:
+    inside = (collection.c.project_id == project_row.id, _ALIVE, at_or_below(old), collection.c.path != old)
+    for path in tx.execute(select(collection.c.path).where(*inside)).scalars():
+        _check_length(new + path[len(old) :])
+    tx.execute(
+        update(collection)
+        .where(*inside)
+        .values(path=literal(new) + func.substr(collection.c.path, len(old) + 1), rev=collection.c.rev + 1)
+    )
+
+
+def delete_collection(tx: Transaction, project: str, collection_id: str, *, expected_rev: int | None) -> None:
+    """Hide a folder with all it holds; it can be restored."""
+    project_row = projects.require(tx, project, Role.MAINTAINER, "write")
+    path = _find(tx, project_row, collection_id, _ALIVE).path
+    _require_no_root(path)
+    change_row(
+        tx, collection, (collection.c.id == collection_id, collection.c.path == path, _ALIVE),
+        {"deleted_us": tx.now_us, "updated_us": tx.now_us}, expected_rev=expected_rev,
+        absent=_no_collection(collection_id),
+    )  # fmt: skip
+    below = (collection.c.project_id == project_row.id, at_or_below(path))
+    tx.execute(update(collection).where(*below, _ALIVE).values(deleted_us=tx.now_us, rev=collection.c.rev + 1))
+    hidden = select(collection.c.id).where(*below, collection.c.deleted_us == tx.now_us)
+    tx.execute(
+        update(item)
+        .where(item.c.collection_id.in_(hidden), item.c.deleted_us.is_(None))
+        .values(deleted_us=tx.now_us, rev=item.c.rev + 1)
+    )
+    tx.emit("collection.deleted", collection_id, project_id=project_row.id, path=path)
+
+
+def restore_collection(
+    tx: Transaction, project: str, collection_id: str, *, expected_rev: int | None = None
+) -> Collection:
+    """Bring back a folder with what was deleted along with it. Raises `Conflict` where its path is taken again."""
+    project_row = projects.require(tx, project, Role.MAINTAINER, "write")
+    gone = _find(tx, project_row, collection_id, collection.c.deleted_us.is_not(None))
+    ensure(tx, project_row, gone.path.rpartition("/")[0])
+    with taken(_path_taken(gone.path)):
+        row = change_row(
+            tx, collection, (collection.c.id == collection_id, collection.c.deleted_us == gone.deleted_us),
+            {"deleted_us": None, "updated_us": tx.now_us}, expected_rev=expected_rev,
+            absent=_no_collection(collection_id),
+        )  # fmt: skip
+        together = (collection.c.project_id == project_row.id, at_or_below(gone.path))
+        hidden = collection.c.deleted_us == gone.deleted_us
+        tx.execute(update(collection).where(*together, hidden).values(deleted_us=None, rev=collection.c.rev + 1))
+    tx.execute(
+        update(item)
+        .where(item.c.collection_id.in_(select(collection.c.id).where(*together, _ALIVE)))
+        .where(item.c.deleted_us == gone.deleted_us)
+        .values(deleted_us=None, rev=item.c.rev + 1)
+    )
+    tx.emit("collection.restored", collection_id, project_id=project_row.id, path=gone.path)
+    return _shown(row)
+
+
+def _require_no_root(path: str) -> None:
+    if not path:
+        raise Invalid("The root of a project cannot be moved or deleted.", code="is-root")

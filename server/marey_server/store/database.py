@@ -61,10 +61,10 @@ class Transaction:
 
     def execute(self, statement: Executable, parameters: Any = None) -> CursorResult[Any]:
         """Run one statement."""
-        return self.connection.execute(statement, parameters)  # type: ignore[return-value]
+        return self.connection.execute(statement, parameters)
 
     def insert_or_ignore(self, table: Table, row: Mapping[str, Any]) -> postgresql.Insert | sqlite.Insert:
-        """An INSERT that does nothing where a unique index refuses the row; for one row, add `returning` to learn which."""
+        """An INSERT that does nothing where a unique index refuses the row; `returning` then gives nothing."""
         if self.is_postgres:
             return postgresql.insert(table).values(**row).on_conflict_do_nothing()
         return sqlite.insert(table).values(**row).on_conflict_do_nothing()
@@ -166,8 +166,8 @@ class Database:
     ) -> T:
         """Run `function(tx, ...)` and commit, in the calling thread.
 
-        Runs again, from the start, when the database asks for it (deadlock, serialisation failure): `function` must have
-        no effect but through its transaction.
+        Runs again, from the start, when the database asks for it (deadlock, serialisation failure): `function` must
+        have no effect but through its transaction.
         """
         for attempt in range(WRITE_TRIES):
             try:

@@ -38,7 +38,7 @@ Tree = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class PreparedDocument:
-    """A document that was checked and encoded, ready to be stored. Making one needs no database and much of the time."""
+    """A document that was checked and encoded. Making one takes most of the time and needs no database."""
 
     digest: str
     schema: str

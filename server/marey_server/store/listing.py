@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, UnaryExpression, and_, or_, select
+from sqlalchemy import ColumnElement, Row, Select, UnaryExpression, and_, or_, select
 
 from marey_schemas.canonical import canonical_json
 from marey_server.errors import BadRequest
@@ -40,7 +40,7 @@ class Order:
     def after(self, values: Sequence[Any]) -> ColumnElement[bool]:
         """Condition: behind a row with these values. Its first term alone is a range of an index."""
         (first, falls), *rest = self.columns
-        beyond = first < values[0] if falls else first > values[0]
+        beyond: ColumnElement[bool] = first < values[0] if falls else first > values[0]
         if not rest:
             return beyond
         bound = first <= values[0] if falls else first >= values[0]
@@ -62,13 +62,13 @@ def parse_order(text: str, keys: Mapping[str, ColumnElement[Any]], unique: str =
     return Order(",".join(names), tuple((keys[name.removeprefix("-")], name.startswith("-")) for name in names))
 
 
-def make_cursor(tx: Transaction, order: Order, filters: Any, values: Sequence[Any]) -> str:
+def make_cursor(tx: Transaction, order: Order, identity: Any, values: Sequence[Any]) -> str:
     """Opaque text for the page behind the row with these values."""
-    payload = json.dumps([order.text, _fingerprint(filters), list(values)], separators=(",", ":")).encode()
+    payload = json.dumps([order.text, _fingerprint(identity), list(values)], separators=(",", ":")).encode()
     return base64.urlsafe_b64encode(_mac(tx, payload) + payload).decode().rstrip("=")
 
 
-def read_cursor(tx: Transaction, cursor: str, order: Order, filters: Any) -> list[Any]:
+def read_cursor(tx: Transaction, cursor: str, order: Order, identity: Any) -> list[Any]:
     """Values of the row a page ended with. Raises `BadRequest` where the cursor is not ours or of another list."""
     try:
         data = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
@@ -78,7 +78,7 @@ def read_cursor(tx: Transaction, cursor: str, order: Order, filters: Any) -> lis
     if not hmac.compare_digest(mac, _mac(tx, payload)):
         raise _bad_cursor()
     text, fingerprint, values = json.loads(payload)
-    if text != order.text or fingerprint != _fingerprint(filters):
+    if text != order.text or fingerprint != _fingerprint(identity):
         raise BadRequest("The cursor belongs to a list with other filters or another order.", code="bad-cursor")
     return list(values)
 
@@ -87,8 +87,8 @@ def _bad_cursor() -> BadRequest:
     return BadRequest("This is no cursor of this server; start again without one.", code="bad-cursor")
 
 
-def _fingerprint(filters: Any) -> str:
-    return hashlib.sha256(canonical_json(filters)).hexdigest()[:16]
+def _fingerprint(identity: Any) -> str:
+    return hashlib.sha256(canonical_json(identity)).hexdigest()[:16]
 
 
 def _mac(tx: Transaction, payload: bytes) -> bytes:
@@ -102,12 +102,20 @@ def make_cursor_key(tx: Transaction) -> None:
     tx.execute(tx.insert_or_ignore(server_state, row))
 
 
-def page_of(
-    tx: Transaction, rows: Sequence[Row[Any]], limit: int, order: Order, filters: Any
+def read_page(
+    tx: Transaction, statement: Select[Any], order: Order, identity: Any, cursor: str | None, limit: int
 ) -> tuple[Sequence[Row[Any]], str | None]:
-    """At most `limit` of rows that were asked for with one more, and the cursor of the next page."""
+    """At most `limit` rows of `statement` behind the cursor, and the cursor of the next page.
+
+    `identity` is JSON that tells this list from every other: what it lists, by which filters.
+    """
+    if not 1 <= limit <= MAX_LIMIT:
+        raise BadRequest(f"limit must lie between 1 and {MAX_LIMIT}.", code="bad-limit")
+    if cursor is not None:
+        statement = statement.where(order.after(read_cursor(tx, cursor, order, identity)))
+    rows = tx.execute(statement.order_by(*order.clauses()).limit(limit + 1)).all()
     if len(rows) <= limit:
         return rows, None
     rows = rows[:limit]
     last = rows[-1]._mapping
-    return rows, make_cursor(tx, order, filters, [last[column] for column, _ in order.columns])
+    return rows, make_cursor(tx, order, identity, [last[column] for column, _ in order.columns])

@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-from sqlalchemy import ColumnElement, and_, false, or_, select, true
+from sqlalchemy import ColumnElement, Row, Select, and_, false, insert, or_, select, true
 
-from marey_schemas.access import Role, Visibility
+from marey_schemas.access import Project, ProjectChange, ProjectCreate, Role, Visibility
+from marey_schemas.items import Page
 from marey_server.access import roles, scopes
 from marey_server.access.principal import Principal
-from marey_server.errors import Forbidden, NotFound, Unauthenticated
+from marey_server.errors import Conflict, Forbidden, NotFound, Unauthenticated
+from marey_server.store import listing
+from marey_server.store.clock import datetime_of
 from marey_server.store.database import Transaction
+from marey_server.store.ids import new_id
+from marey_server.store.revs import change_row
 from marey_server.store.tables import member, project
+from marey_server.store.violations import taken
+
+SORT_KEYS: dict[str, ColumnElement[Any]] = {
+    "name": project.c.name,
+    "created_at": project.c.created_us,
+    "updated_at": project.c.updated_us,
+    "id": project.c.id,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +45,18 @@ class ProjectRow:
     guest: bool
     """The caller is no member and reads because the project is public."""
 
+    def shown(self) -> Project:
+        """The project as it travels."""
+        return Project(
+            id=self.id, name=self.name, title=self.title, description=self.description, visibility=self.visibility,
+            role=None if self.guest else self.role, created_at=datetime_of(self.created_us),
+            updated_at=datetime_of(self.updated_us),
+            deleted_at=None if self.deleted_us is None else datetime_of(self.deleted_us), rev=self.rev,
+        )  # fmt: skip
+
+
+# -- who may do what --------------------------------------------------------------------------------------------------
+
 
 def require(
     tx: Transaction,
@@ -43,78 +69,152 @@ def require(
 ) -> ProjectRow:
     """The project `name`, if the caller has the role `need` there and a credential that reaches `scope`.
 
-    `public=False`: guests of a public project may not. `deleted=True`: look among deleted projects.
+    `public=False`: guests of a public project may not. `deleted=True`: the one of this name that was deleted last.
     Raises `NotFound` where the caller may not know the project, `Forbidden` where he may not do this in it,
     `Unauthenticated` where signing in could help.
     """
-    columns = [column for column in project.c if column is not project.c.visibility]
-    mine = and_(member.c.project_id == project.c.id, member.c.user_id == (tx.principal.user_id or ""))
-    statement = (
-        select(*columns, project.c.visibility, member.c.role)
-        .select_from(project.outerjoin(member, mine))
-        .where(project.c.name == name, project.c.deleted_us.is_not(None) if deleted else project.c.deleted_us.is_(None))
-        .order_by(project.c.deleted_us.desc())
-    )
-    row = tx.execute(statement).first()
-    role, guest = (None, False) if row is None else _role_in(tx.principal, row.id, row.name, row.visibility, row.role)
-    if row is None or role is None or (guest and deleted):
+    alive = project.c.deleted_us.is_not(None) if deleted else project.c.deleted_us.is_(None)
+    found = _with_my_role(tx.principal).where(project.c.name == name, alive).order_by(project.c.deleted_us.desc())
+    row = tx.execute(found.limit(1)).first()
+    seen = None if row is None else _as_seen(tx.principal, row)
+    if seen is None or (seen.guest and deleted):
         raise NotFound(f"There is no project {name!r} that you may see.", code="no-project")
-    if not roles.includes(role, need) or (guest and not public):
-        _refuse(tx.principal, name, need)
-    if not guest and not scopes.allows(tx.principal.scopes, scope, name):
+    if not roles.includes(seen.role, need) or (seen.guest and not public):
+        if tx.principal.kind == "anonymous":
+            raise Unauthenticated(f"Sign in to do this in {name!r}.")
+        raise Forbidden(f"This needs the role {need.value} in {name!r}.", code="insufficient-role")
+    if not seen.guest and not scopes.allows(tx.principal.scopes, scope, name):
         raise Forbidden(f"This token does not reach {scope!r} in {name!r}.", code="insufficient-scope")
+    return seen
+
+
+def find_by_id(tx: Transaction, project_id: str) -> ProjectRow:
+    """A project, deleted or not, for the server's own work: nobody is asked."""
+    row = tx.execute(_with_my_role(tx.principal).where(project.c.id == project_id)).one()
+    return _row(row, Role.READER, guest=False)
+
+
+def _with_my_role(principal: Principal) -> Select[Any]:
+    mine = and_(member.c.project_id == project.c.id, member.c.user_id == (principal.user_id or ""))
+    return select(project, member.c.role).select_from(project.outerjoin(member, mine))
+
+
+def _as_seen(principal: Principal, row: Row[Any]) -> ProjectRow | None:
+    """The project with the caller's role in it; None where he may not know it."""
+    if principal.kind == "attempt":
+        return _row(row, Role.READER, guest=False) if principal.project_id == row.id else None
+    if any(scope.partition("!project=")[2] in ("", row.name) for scope in principal.scopes):
+        role = Role.OWNER if principal.administrator else row.role
+        if role is not None:
+            return _row(row, Role(role), guest=False)
+    return _row(row, Role.READER, guest=True) if row.visibility == Visibility.PUBLIC else None
+
+
+def _row(row: Row[Any], role: Role, *, guest: bool) -> ProjectRow:
     return ProjectRow(
         row.id, row.name, row.title, row.description, Visibility(row.visibility),
         row.created_us, row.updated_us, row.deleted_us, row.rev, role, guest,
     )  # fmt: skip
 
 
-def find_by_id(tx: Transaction, project_id: str) -> ProjectRow:
-    """The project of a job, for what the queue does for the job's author, who was authorised at submission."""
-    row = tx.execute(select(project).where(project.c.id == project_id)).one()
-    return ProjectRow(
-        row.id, row.name, row.title, row.description, Visibility(row.visibility),
-        row.created_us, row.updated_us, row.deleted_us, row.rev, Role.CONTRIBUTOR, False,
-    )  # fmt: skip
-
-
-def _refuse(principal: Principal, name: str, need: Role) -> None:
-    if principal.kind == "anonymous":
-        raise Unauthenticated(f"Sign in to do this in {name!r}.")
-    raise Forbidden(f"This needs the role {need.value} in {name!r}.", code="insufficient-role")
-
-
-def _role_in(
-    principal: Principal, project_id: str, name: str, visibility: str, role: str | None
-) -> tuple[Role | None, bool]:
-    """The caller's role, and whether only as a guest."""
-    is_public = visibility == Visibility.PUBLIC
-    if principal.kind == "attempt":
-        return (Role.READER, False) if principal.project_id == project_id else (None, False)
-    if _reaches(principal, name):
-        if principal.administrator:
-            return Role.OWNER, False
-        if role is not None:
-            return Role(role), False
-    return (Role.READER, True) if is_public else (None, False)
-
-
-def _reaches(principal: Principal, name: str) -> bool:
-    """Whether any scope of the credential is about this project."""
-    return any(scope.partition("!project=")[2] in ("", name) for scope in principal.scopes)
-
-
 def is_visible(principal: Principal) -> ColumnElement[bool]:
-    """Condition on `project` rows: alive, and readable by the caller."""
+    """Condition on rows of `project`: alive, and readable by the caller."""
     alive = project.c.deleted_us.is_(None)
     if principal.kind == "attempt":
         return and_(alive, project.c.id == (principal.project_id or ""))
-    own: ColumnElement[bool] = (
-        true()
-        if principal.administrator
-        else project.c.id.in_(select(member.c.project_id).where(member.c.user_id == (principal.user_id or "")))
-    )
+    own: ColumnElement[bool] = true()
+    if not principal.administrator:
+        own = project.c.id.in_(select(member.c.project_id).where(member.c.user_id == (principal.user_id or "")))
     if not scopes.allows(principal.scopes, "read"):
         names = [scope.partition("!project=")[2] for scope in principal.scopes if scope.startswith("read!")]
         own = and_(own, project.c.name.in_(names)) if names else false()
     return and_(alive, or_(own, project.c.visibility == Visibility.PUBLIC.value))
+
+
+# -- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read_project(tx: Transaction, name: str) -> Project:
+    """A project."""
+    return require(tx, name).shown()
+
+
+def list_projects(
+    tx: Transaction, *, sort: str = "name", cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
+) -> Page:
+    """The projects that the caller may read."""
+    order = listing.parse_order(sort, SORT_KEYS)
+    identity = ["projects", tx.principal.user_id]
+    statement = _with_my_role(tx.principal).where(is_visible(tx.principal))
+    rows, next_cursor = listing.read_page(tx, statement, order, identity, cursor, limit)
+    seen = (_as_seen(tx.principal, row) for row in rows)
+    return Page(items=tuple(one.shown() for one in seen if one is not None), next_cursor=next_cursor)
+
+
+# -- changing ---------------------------------------------------------------------------------------------------------
+
+
+def create_project(tx: Transaction, request: ProjectCreate) -> Project:
+    """A new project, owned by the caller. Raises `Conflict` where the name is taken."""
+    principal = tx.principal
+    if principal.kind == "anonymous":
+        raise Unauthenticated("Sign in to create a project.")
+    if principal.kind == "attempt" or not scopes.allows(principal.scopes, "write", request.name):
+        raise Forbidden("This token may not create projects.", code="insufficient-scope")
+    made = ProjectRow(
+        new_id("project"), request.name, request.title, request.description, request.visibility,
+        tx.now_us, tx.now_us, None, 1, Role.OWNER, False,
+    )  # fmt: skip
+    values = {
+        "id": made.id, "name": made.name, "title": made.title, "description": made.description,
+        "visibility": made.visibility.value, "created_us": made.created_us, "updated_us": made.updated_us,
+    }  # fmt: skip
+    with taken(_name_taken(request.name)):
+        tx.execute(insert(project), values)
+    if principal.user_id is not None:
+        owner = {"project_id": made.id, "user_id": principal.user_id, "role": Role.OWNER.value, "since_us": tx.now_us}
+        tx.execute(insert(member), owner)
+    tx.emit("project.created", made.id, project_id=made.id, name=made.name)
+    return made.shown()
+
+
+def _name_taken(name: str) -> Conflict:
+    return Conflict(f"The name {name!r} is taken by another project.", code="name-taken")
+
+
+def change_project(tx: Transaction, name: str, request: ProjectChange, *, expected_rev: int | None) -> Project:
+    """Change title, description or visibility."""
+    seen = require(tx, name, Role.OWNER, "write")
+    values = {field: getattr(request, field) for field in request.model_fields_set}
+    if values.get("visibility") is not None:
+        values["visibility"] = request.visibility.value if request.visibility else None
+    values = {key: value for key, value in values.items() if value is not None or key == "title"}
+    changed = _change(tx, seen, values, expected_rev, project.c.deleted_us.is_(None))
+    tx.emit("project.changed", seen.id, project_id=seen.id, fields=sorted(values))
+    return changed
+
+
+def delete_project(tx: Transaction, name: str, *, expected_rev: int | None) -> None:
+    """Hide a project and everything in it; an owner can restore it."""
+    seen = require(tx, name, Role.OWNER, "write")
+    _change(tx, seen, {"deleted_us": tx.now_us}, expected_rev, project.c.deleted_us.is_(None))
+    tx.emit("project.deleted", seen.id, project_id=seen.id, name=name)
+
+
+def restore_project(tx: Transaction, name: str, *, expected_rev: int | None = None) -> Project:
+    """Bring back the project of this name that was deleted last. Raises `Conflict` where the name is taken again."""
+    seen = require(tx, name, Role.OWNER, "write", deleted=True)
+    with taken(_name_taken(name)):
+        restored = _change(tx, seen, {"deleted_us": None}, expected_rev, project.c.deleted_us.is_not(None))
+    tx.emit("project.restored", seen.id, project_id=seen.id, name=name)
+    return restored
+
+
+def _change(
+    tx: Transaction, seen: ProjectRow, values: dict[str, Any], expected_rev: int | None, state: ColumnElement[bool]
+) -> Project:
+    row = change_row(
+        tx, project, (project.c.id == seen.id, state), {**values, "updated_us": tx.now_us},
+        expected_rev=expected_rev, absent=NotFound(f"There is no project {seen.name!r}.", code="no-project"),
+    )  # fmt: skip
+    return _row(row, seen.role, guest=False).shown()

@@ -2,14 +2,31 @@
 
 from __future__ import annotations
 
-from sqlalchemy import select
+from typing import Any
 
+from sqlalchemy import Row, delete, insert, or_, select, update
+
+from marey_schemas.access import NewToken, Token, TokenCreate
+from marey_schemas.items import Page
 from marey_schemas.jobs import JobState
+from marey_server.access import scopes
 from marey_server.access.principal import Principal
-from marey_server.access.secret_tokens import attempt_secret, hash_secret, secret_matches, split_user_token
-from marey_server.errors import Unauthenticated
+from marey_server.access.secret_tokens import (
+    attempt_secret,
+    hash_secret,
+    issue_user_token,
+    secret_matches,
+    split_user_token,
+)
+from marey_server.errors import Forbidden, NotFound, Unauthenticated
+from marey_server.store import listing
+from marey_server.store.clock import datetime_of
 from marey_server.store.database import Transaction
+from marey_server.store.ids import new_id
 from marey_server.store.tables import attempt, job, token, user
+
+NOTE_USE_EVERY_S = 3600
+"""How exactly `last_used_at` is kept: writing it on every request would make every read a write."""
 
 _ATTEMPT_SCOPES = ("read",)
 
@@ -64,3 +81,73 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
         fence=row.fence,
         project_id=row.project_id if running else None,
     )
+
+
+# -- a user's tokens --------------------------------------------------------------------------------------------------
+
+
+def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
+    """A new token of the caller, reaching no further than the credential it is made with. The secret is shown once."""
+    user_id = _require_user(tx.principal, "write")
+    if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
+        raise Forbidden(f"Your own credential does not reach {beyond[0]!r}.", code="insufficient-scope")
+    issued = issue_user_token()
+    lifetime_s = request.expires_in_s
+    row = {
+        "id": new_id("token"), "user_id": user_id, "name": request.name, "prefix": issued.prefix,
+        "secret_hash": issued.secret_hash, "scopes": list(request.scopes), "created_us": tx.now_us,
+        "expires_us": None if lifetime_s is None else tx.now_us + lifetime_s * 1_000_000,
+    }  # fmt: skip
+    made = tx.execute(insert(token).values(**row).returning(*token.c)).one()
+    tx.emit("token.created", made.id, name=made.name, scopes=list(request.scopes))
+    return NewToken(**_shown(made).model_dump(), secret=issued.text)
+
+
+def list_tokens(tx: Transaction, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT) -> Page:
+    """The caller's tokens, newest first, without their secrets."""
+    user_id = _require_user(tx.principal, "read")
+    order = listing.parse_order("-id", {"id": token.c.id})
+    statement = select(token).where(token.c.user_id == user_id)
+    rows, next_cursor = listing.read_page(tx, statement, order, ["tokens", user_id], cursor, limit)
+    return Page(items=tuple(_shown(row) for row in rows), next_cursor=next_cursor)
+
+
+def revoke_token(tx: Transaction, token_id: str) -> None:
+    """End one of the caller's tokens, or as an administrator anybody's. Raises `NotFound`.
+
+    A token may always end itself.
+    """
+    principal = tx.principal
+    if principal.kind != "user" or token_id != principal.token_id:
+        _require_user(principal, "write")
+    statement = delete(token).where(token.c.id == token_id)
+    if not (principal.administrator and scopes.allows(principal.scopes, "admin")):
+        statement = statement.where(token.c.user_id == principal.user_id)
+    if tx.execute(statement).rowcount == 0:
+        raise NotFound(f"You have no token {token_id!r}.", code="no-token")
+    tx.emit("token.revoked", token_id)
+
+
+def note_use(tx: Transaction, token_id: str) -> None:
+    """Remember that a token is in use, once an hour."""
+    before = tx.now_us - NOTE_USE_EVERY_S * 1_000_000
+    stale = or_(token.c.last_used_us.is_(None), token.c.last_used_us < before)
+    tx.execute(update(token).where(token.c.id == token_id, stale).values(last_used_us=tx.now_us))
+
+
+def _require_user(principal: Principal, scope: str) -> str:
+    if principal.kind == "anonymous":
+        raise Unauthenticated("Sign in to see your tokens.")
+    if principal.kind != "user" or principal.user_id is None:
+        raise Forbidden("Only users have tokens.", code="users-only")
+    if not scopes.allows(principal.scopes, scope):
+        raise Forbidden(f"This token does not reach {scope!r}.", code="insufficient-scope")
+    return principal.user_id
+
+
+def _shown(row: Row[Any]) -> Token:
+    return Token(
+        id=row.id, name=row.name, prefix=row.prefix, scopes=tuple(row.scopes), created_at=datetime_of(row.created_us),
+        expires_at=None if row.expires_us is None else datetime_of(row.expires_us),
+        last_used_at=None if row.last_used_us is None else datetime_of(row.last_used_us),
+    )  # fmt: skip

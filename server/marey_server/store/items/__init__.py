@@ -1,6 +1,16 @@
 """Items: named things with revisions. This package is the only one that writes them."""
 
+from marey_server.store.items.changing import (
+    change_item,
+    create_item,
+    delete_item,
+    prepare_part,
+    prepare_parts,
+    put_part,
+    restore_item,
+)
 from marey_server.store.items.drafts import Draft, Published, StoredDocument
+from marey_server.store.items.history import list_revisions, read_lineage, read_revision, read_staleness
 from marey_server.store.items.listing import ItemFilters, list_items
 from marey_server.store.items.publishing import publish
 from marey_server.store.items.reading import Part, read_item, read_part
@@ -11,8 +21,19 @@ __all__ = [
     "Part",
     "Published",
     "StoredDocument",
+    "change_item",
+    "create_item",
+    "delete_item",
     "list_items",
+    "list_revisions",
+    "prepare_part",
+    "prepare_parts",
     "publish",
+    "put_part",
     "read_item",
+    "read_lineage",
     "read_part",
+    "read_revision",
+    "read_staleness",
+    "restore_item",
 ]

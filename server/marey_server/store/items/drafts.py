@@ -24,8 +24,8 @@ PartContent = PreparedDocument | StoredDocument | dict[str, Any]
 class Draft:
     """An item or revision to be.
 
-    `reuse`: `new` makes an item and refuses a name that is taken; `by_name` adds a revision to the item of that name, if
-    there is one; `by_content` takes any item of the project whose required parts are equal, and otherwise makes one.
+    `reuse`: `new` makes an item and refuses a name that is taken; `by_name` adds a revision to the item of that name,
+    if there is one; `by_content` takes any item of the project whose required parts are equal, and otherwise makes one.
     """
 
     name_in_batch: str

@@ -6,13 +6,13 @@ from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, func, or_, select
+from sqlalchemy import ColumnElement, func, select
 
 from marey_schemas.access import Role
 from marey_schemas.items import Item, Page
 from marey_schemas.kinds import Kind
 from marey_server.errors import BadRequest
-from marey_server.store import listing, projects
+from marey_server.store import collections, listing, projects
 from marey_server.store.database import Transaction
 from marey_server.store.items.reading import item_rows, shown_items
 from marey_server.store.tables import collection, item, item_tag
@@ -66,10 +66,7 @@ def list_items(
     total = None
     if count:
         total = tx.execute(select(func.count()).select_from(item).where(*conditions)).scalar_one()
-    if cursor is not None:
-        conditions.append(order.after(listing.read_cursor(tx, cursor, order, identity)))
-    statement = item_rows().where(*conditions).order_by(*order.clauses()).limit(limit + 1)
-    rows, next_cursor = listing.page_of(tx, tx.execute(statement).all(), limit, order, identity)
+    rows, next_cursor = listing.read_page(tx, item_rows().where(*conditions), order, identity, cursor, limit)
     return Page(items=tuple(_shown(tx, rows, fields)), next_cursor=next_cursor, count=total)
 
 
@@ -111,10 +108,7 @@ def _conditions(project_id: str, kind: Kind, filters: ItemFilters) -> list[Colum
 
 
 def _below(project_id: str, path: str) -> Any:
-    return select(collection.c.id).where(
-        collection.c.project_id == project_id,
-        or_(collection.c.path == path, func.substr(collection.c.path, 1, len(path) + 1) == f"{path}/"),
-    )
+    return select(collection.c.id).where(collection.c.project_id == project_id, collections.at_or_below(path))
 
 
 def _named(name: str) -> list[ColumnElement[bool]]:

@@ -39,8 +39,8 @@ def publish(
 ) -> list[Published]:
     """Turn drafts into items and revisions; all of them or none. Answers in the order of the drafts.
 
-    `{"output": name}` in a document refers to another draft and becomes its item and revision. Content that stands there
-    already makes no new revision. The caller has authorised the write.
+    `{"output": name}` in a document refers to another draft and becomes its item and revision. Content that stands
+    there already makes no new revision. The caller has authorised the write.
 
     Raises `Invalid` where a draft makes no sense, `Conflict` where a name is taken.
     """

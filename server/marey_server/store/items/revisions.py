@@ -7,10 +7,12 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, insert, select, update
 
+from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_server.store.database import Transaction
 from marey_server.store.documents import load_body
 from marey_server.store.items.summaries import summarise
+from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import item, revision, revision_part
 
 
@@ -69,3 +71,11 @@ def write_revision(
             for part, digest in parts.items()
         ],
     )
+
+
+def emit_item(tx: Transaction, event: str, project_row: ProjectRow, subject: Item, **body: Any) -> None:
+    """Record what happened to an item."""
+    tx.emit(
+        event, subject.id, project_id=project_row.id, item_kind=subject.kind.value, name=subject.name,
+        collection=subject.collection, **body,
+    )  # fmt: skip

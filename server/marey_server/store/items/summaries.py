@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,7 @@ class Summary:
     skeleton_id: str | None = None
 
 
-def summarise(kind: Kind, bodies: dict[str, dict[str, Any]]) -> Summary:
+def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
     """Summary of a revision from its parts' bodies (arrays as references)."""
     if kind is Kind.SKELETON:
         return Summary({"joints": len(bodies["hierarchy"]["joints"])})

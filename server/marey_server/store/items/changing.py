@@ -1,0 +1,145 @@
+"""Changes of items: a new one, a new revision of a part, another name or place, deletion."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import delete, insert
+
+from marey_schemas.access import Role
+from marey_schemas.items import Item, ItemChange, ItemCreate
+from marey_schemas.kinds import PARTS, Kind
+from marey_schemas.problems import FieldError
+from marey_server.errors import Conflict, Invalid
+from marey_server.store import collections, documents, projects
+from marey_server.store.database import Transaction
+from marey_server.store.documents import PreparedDocument
+from marey_server.store.items import references
+from marey_server.store.items.drafts import Draft
+from marey_server.store.items.publishing import publish
+from marey_server.store.items.reading import find_item, no_item, shown_items
+from marey_server.store.items.revisions import emit_item, read_part_digests, write_head, write_revision
+from marey_server.store.projects import ProjectRow
+from marey_server.store.revs import change_row, moved_on
+from marey_server.store.tables import item, item_tag
+from marey_server.store.violations import taken
+
+
+def prepare_parts(kind: Kind, parts: dict[str, Any]) -> dict[str, PreparedDocument]:
+    """Check and encode the documents of a request; give them to `create_item` or `put_part` in place of the trees.
+
+    Needs no database and much of the time. Raises `Invalid` with pointers that start with the part.
+    """
+    return {part: prepare_part(kind, part, tree) for part, tree in parts.items()}
+
+
+def prepare_part(kind: Kind, part: str, tree: Any) -> PreparedDocument:
+    """Check and encode the document of one part."""
+    spec = PARTS[kind].get(part)
+    if spec is None:
+        detail = f"A {kind} has no part {part!r}; it has {', '.join(PARTS[kind])}."
+        raise Invalid(detail, code="no-part", errors=[FieldError(pointer=f"/{part}", code="no-part", detail=detail)])
+    try:
+        return documents.prepared(tree, schema=spec.schema)
+    except Invalid as error:
+        moved = [found.model_copy(update={"pointer": f"/{part}{found.pointer}"}) for found in error.errors]
+        raise Invalid(error.detail, code=error.error_code, errors=moved, context=error.context) from error
+
+
+def create_item(tx: Transaction, project: str, kind: Kind, request: ItemCreate) -> Item:
+    """A new item. Raises `Conflict` where the name is taken in its collection."""
+    project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    draft = Draft(
+        name_in_batch="", kind=kind, item_name=request.name, parts=request.parts, collection=request.collection,
+        tags=request.tags, reuse="new", message=request.message,
+    )  # fmt: skip
+    made = publish(tx, project_row, [draft], author_id=tx.principal.user_id)[0]
+    return _shown(tx, project_row, kind, made.item)
+
+
+def put_part(
+    tx: Transaction,
+    project: str,
+    kind: Kind,
+    item_id: str,
+    part: str,
+    content: Any,
+    *,
+    expected_rev: int | None,
+    message: str = "",
+) -> Item:
+    """A new revision in which one part is replaced; the same content makes none.
+
+    Raises `PreconditionFailed` where the item is not at `expected_rev` any more.
+    """
+    project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    found = find_item(tx, project_row, kind, item_id)
+    prepared = prepare_part(kind, part, content)
+    digest = documents.store_document(tx, prepared)
+    references.require_references(tx, project_row, kind, {part: prepared.body})
+    while expected_rev in (None, found.rev):
+        parts = read_part_digests(tx, item_id, found.head)
+        if parts.get(part) == digest:
+            return _shown(tx, project_row, kind, item_id)
+        parts[part] = digest
+        if write_head(tx, kind, item_id, parts, {part: prepared.body}, item.c.rev == found.rev):
+            write_revision(tx, item_id, found.head + 1, parts, tx.principal.user_id, message, None)
+            shown = _shown(tx, project_row, kind, item_id)
+            emit_item(tx, "item.revised", project_row, shown, revision=shown.revision, job=None)
+            return shown
+        found = find_item(tx, project_row, kind, item_id)
+    raise moved_on(found.rev)
+
+
+def change_item(
+    tx: Transaction, project: str, kind: Kind, item_id: str, request: ItemChange, *, expected_rev: int | None
+) -> Item:
+    """Rename, move or tag an item. Raises `Conflict` where the name is taken at its new place."""
+    project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    values: dict[str, Any] = {"updated_us": tx.now_us}
+    if request.name is not None:
+        values["name"] = request.name
+    if request.collection is not None:
+        values["collection_id"] = collections.ensure(tx, project_row, request.collection)
+    which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_(None))
+    with taken(Conflict(f"There is a {kind} of that name there already.", code="name-taken")):
+        change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))
+    if request.tags is not None:
+        tx.execute(delete(item_tag).where(item_tag.c.item_id == item_id))
+        if request.tags:
+            tx.execute(insert(item_tag), [{"item_id": item_id, "tag": tag} for tag in dict.fromkeys(request.tags)])
+    shown = _shown(tx, project_row, kind, item_id)
+    emit_item(tx, "item.changed", project_row, shown, fields=sorted(request.model_fields_set))
+    return shown
+
+
+def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: int | None) -> None:
+    """Hide an item; it can be restored. What refers to its revisions stays right."""
+    project_row = projects.require(tx, project, Role.MAINTAINER, "write")
+    which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_(None))
+    gone = _shown(tx, project_row, kind, item_id)
+    absent = no_item(kind, item_id)
+    change_row(tx, item, which, {"deleted_us": tx.now_us}, expected_rev=expected_rev, absent=absent)
+    emit_item(tx, "item.deleted", project_row, gone)
+
+
+def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: int | None = None) -> Item:
+    """Bring back a deleted item, and its collection if that is gone. Raises `Conflict` where its name is taken."""
+    project_row = projects.require(tx, project, Role.MAINTAINER, "write")
+    gone = find_item(tx, project_row, kind, item_id, deleted=True)
+    collection_id = collections.ensure(tx, project_row, gone.path)
+    which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_not(None))
+    values = {"deleted_us": None, "updated_us": tx.now_us, "collection_id": collection_id}
+    with taken(Conflict(f"There is another {kind} {gone.name!r} in its place now.", code="name-taken")):
+        change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))
+    shown = _shown(tx, project_row, kind, item_id)
+    emit_item(tx, "item.restored", project_row, shown)
+    return shown
+
+
+def _this(project_row: ProjectRow, kind: Kind, item_id: str) -> tuple[Any, ...]:
+    return item.c.id == item_id, item.c.project_id == project_row.id, item.c.kind == kind.value
+
+
+def _shown(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str) -> Item:
+    return shown_items(tx, [find_item(tx, project_row, kind, item_id)])[0]

@@ -1,0 +1,127 @@
+"""The past of an item: its revisions, what they were made from, and whether that is still current."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+from sqlalchemy import Row, Select, and_, select, tuple_
+
+from marey_schemas.items import Lineage, LineageEdge, Page, Revision, Staleness
+from marey_schemas.kinds import Kind
+from marey_server.errors import NotFound
+from marey_server.store import listing, projects
+from marey_server.store.clock import datetime_of
+from marey_server.store.database import Transaction
+from marey_server.store.items.reading import find_item, read_parts
+from marey_server.store.tables import item, job, lineage, project, revision, user
+
+MAX_EDGES = 1000
+
+
+def list_revisions(
+    tx: Transaction,
+    project_name: str,
+    kind: Kind,
+    item_id: str,
+    *,
+    cursor: str | None = None,
+    limit: int = listing.DEFAULT_LIMIT,
+) -> Page:
+    """Revisions of an item, newest first."""
+    find_item(tx, projects.require(tx, project_name), kind, item_id)
+    order = listing.parse_order("-number", {"number": revision.c.number}, unique="number")
+    statement = _revision_rows().where(revision.c.item_id == item_id)
+    rows, next_cursor = listing.read_page(tx, statement, order, ["revisions", item_id], cursor, limit)
+    return Page(items=tuple(_shown(tx, rows)), next_cursor=next_cursor)
+
+
+def read_revision(tx: Transaction, project_name: str, kind: Kind, item_id: str, number: int) -> Revision:
+    """One revision of an item."""
+    find_item(tx, projects.require(tx, project_name), kind, item_id)
+    return _shown(tx, [_find_revision(tx, item_id, number)])[0]
+
+
+def _revision_rows() -> Select[Any]:
+    return select(revision, user.c.name.label("author")).outerjoin(user, user.c.id == revision.c.author_id)
+
+
+def _find_revision(tx: Transaction, item_id: str, number: int) -> Row[Any]:
+    row = tx.execute(_revision_rows().where(revision.c.item_id == item_id, revision.c.number == number)).first()
+    if row is None:
+        raise NotFound(f"{item_id!r} has no revision {number}.", code="no-revision")
+    return row
+
+
+def _shown(tx: Transaction, rows: Collection[Row[Any]]) -> list[Revision]:
+    parts = read_parts(tx, [(row.item_id, row.number) for row in rows]) if rows else {}
+    return [
+        Revision(
+            item=row.item_id, revision=row.number, author=row.author, message=row.message, job=row.job_id,
+            created_at=datetime_of(row.created_us), parts=parts.get((row.item_id, row.number), {}),
+        )
+        for row in rows
+    ]  # fmt: skip
+
+
+def read_lineage(
+    tx: Transaction, project_name: str, kind: Kind, item_id: str, *, revision_number: int | None = None
+) -> Lineage:
+    """What a revision was made from, how, and what was made of it, as far as the caller may see; newest by default."""
+    found = find_item(tx, projects.require(tx, project_name), kind, item_id)
+    number = revision_number or found.head
+    made = _find_revision(tx, item_id, number)
+    how = None if made.job_id is None else tx.execute(select(job).where(job.c.id == made.job_id)).first()
+    source = and_(lineage.c.item_id == item_id, lineage.c.number == number)
+    inputs = _edges(tx, lineage.c.input_item_id, lineage.c.input_number, source)
+    target = and_(lineage.c.input_item_id == item_id, lineage.c.input_number == number)
+    outputs = _edges(tx, lineage.c.item_id, lineage.c.number, target)
+    return Lineage(
+        item=item_id, revision=number, inputs=inputs, outputs=outputs,
+        job_kind=how.kind if how else None, params=how.params if how else None, seed=how.seed if how else None,
+        code_version=how.code_version if how else None, environment=(how.environment or {}) if how else {},
+    )  # fmt: skip
+
+
+def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[LineageEdge, ...]:
+    """The other ends of the lineage rows that meet `condition`."""
+    statement = (
+        select(other.label("item"), number.label("revision"), item.c.kind, item.c.name)
+        .add_columns(lineage.c.job_id.label("job"), lineage.c.role)
+        .join(item, item.c.id == other)
+        .join(project, project.c.id == item.c.project_id)
+        .where(condition, projects.is_visible(tx.principal))
+        .order_by(lineage.c.role, lineage.c.position, other, number)
+        .limit(MAX_EDGES)
+    )
+    return tuple(LineageEdge(**row._mapping) for row in tx.execute(statement))
+
+
+def read_staleness(tx: Transaction, project_name: str, kind: Kind, item_id: str) -> Staleness:
+    """Whether anything the newest revision was made from, directly or through others, has a newer revision."""
+    found = find_item(tx, projects.require(tx, project_name), kind, item_id)
+    ancestry = (
+        select(lineage.c.input_item_id.label("item_id"), lineage.c.input_number.label("number"))
+        .where(lineage.c.item_id == item_id, lineage.c.number == found.head)
+        .cte("ancestry", recursive=True)
+    )
+    further = select(lineage.c.input_item_id, lineage.c.input_number).join(
+        ancestry, and_(lineage.c.item_id == ancestry.c.item_id, lineage.c.number == ancestry.c.number)
+    )
+    ancestry = ancestry.union(further)
+    outdated = select(ancestry.c.item_id, ancestry.c.number).join(item, item.c.id == ancestry.c.item_id)
+    old = {(row.item_id, row.number) for row in tx.execute(outdated.where(item.c.head > ancestry.c.number))}
+    edges = _edges(
+        tx, lineage.c.input_item_id, lineage.c.input_number,
+        and_(
+            tuple_(lineage.c.input_item_id, lineage.c.input_number).in_(old),
+            tuple_(lineage.c.item_id, lineage.c.number).in_(
+                select(ancestry.c.item_id, ancestry.c.number).union(
+                    select(revision.c.item_id, revision.c.number).where(
+                        revision.c.item_id == item_id, revision.c.number == found.head
+                    )
+                )
+            ),
+        ),
+    ) if old else ()  # fmt: skip
+    return Staleness(item=item_id, revision=found.head, stale=bool(old), because=edges)

@@ -1,0 +1,115 @@
+"""Who belongs to a project, in which role. A project always keeps an owner."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import Row, delete, func, select
+
+from marey_schemas.access import Member, MemberChange, Role
+from marey_schemas.items import Page
+from marey_server.errors import Conflict, NotFound, PreconditionFailed
+from marey_server.store import listing, projects
+from marey_server.store.clock import datetime_of
+from marey_server.store.database import Transaction
+from marey_server.store.projects import ProjectRow
+from marey_server.store.revs import change_row, moved_on
+from marey_server.store.tables import member, project, user
+
+
+def list_members(
+    tx: Transaction, project_name: str, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
+) -> Page:
+    """Members by name. Guests of a public project may not know them."""
+    project_row = projects.require(tx, project_name, public=False)
+    statement = select(user.c.name, member).join(user, user.c.id == member.c.user_id)
+    statement = statement.where(member.c.project_id == project_row.id)
+    order = listing.parse_order("name", {"name": user.c.name}, unique="name")
+    rows, next_cursor = listing.read_page(tx, statement, order, ["members", project_row.id], cursor, limit)
+    return Page(items=tuple(_shown(row.name, row) for row in rows), next_cursor=next_cursor)
+
+
+def read_member(tx: Transaction, project_name: str, user_name: str) -> Member:
+    """One member."""
+    project_row = projects.require(tx, project_name, public=False)
+    statement = select(user.c.name, member).join(user, user.c.id == member.c.user_id)
+    row = tx.execute(statement.where(member.c.project_id == project_row.id, user.c.name == user_name)).first()
+    if row is None:
+        raise _no_member(user_name)
+    return _shown(row.name, row)
+
+
+def put_member(
+    tx: Transaction,
+    project_name: str,
+    user_name: str,
+    request: MemberChange,
+    *,
+    expected_rev: int | None = None,
+    absent: bool = False,
+) -> Member:
+    """Make somebody a member, or change the role. `absent`: only if he is none yet.
+
+    Raises `NotFound` where there is no such user, `Conflict` where the project would lose its last owner.
+    """
+    project_row = _lock(tx, project_name)
+    user_id = tx.execute(select(user.c.id).where(user.c.name == user_name, user.c.disabled.is_(False))).scalar()
+    if user_id is None:
+        raise NotFound(f"There is no user {user_name!r}.", code="no-user")
+    which = (member.c.project_id == project_row.id, member.c.user_id == user_id)
+    row = {"project_id": project_row.id, "user_id": user_id, "role": request.role.value, "since_us": tx.now_us}
+    added = None
+    if expected_rev is None:
+        added = tx.execute(tx.insert_or_ignore(member, row).returning(*member.c)).first()
+        if added is None and absent:
+            raise PreconditionFailed(f"{user_name!r} is a member already.", code="member-exists")
+    changed = added or change_row(
+        tx, member, which, {"role": request.role.value}, expected_rev=expected_rev, absent=_no_member(user_name)
+    )
+    _require_owner(tx, project_row)
+    tx.emit(
+        "member.changed" if added is None else "member.added",
+        project_row.id,
+        project_id=project_row.id,
+        user=user_name,
+        role=request.role.value,
+    )
+    return _shown(user_name, changed)
+
+
+def remove_member(tx: Transaction, project_name: str, user_name: str, *, expected_rev: int | None) -> None:
+    """End a membership. Raises `Conflict` where the project would lose its last owner."""
+    project_row = _lock(tx, project_name)
+    which = (
+        member.c.project_id == project_row.id,
+        member.c.user_id.in_(select(user.c.id).where(user.c.name == user_name)),
+    )
+    statement = delete(member).where(*which)
+    if expected_rev is not None:
+        statement = statement.where(member.c.rev == expected_rev)
+    if tx.execute(statement).rowcount == 0:
+        current = tx.execute(select(member.c.rev).where(*which)).scalar()
+        raise _no_member(user_name) if current is None else moved_on(current)
+    _require_owner(tx, project_row)
+    tx.emit("member.removed", project_row.id, project_id=project_row.id, user=user_name)
+
+
+def _lock(tx: Transaction, project_name: str) -> ProjectRow:
+    """Members of a project change one after another, so that two owners cannot remove each other."""
+    project_row = projects.require(tx, project_name, Role.OWNER, "write")
+    tx.execute(select(project.c.id).where(project.c.id == project_row.id).with_for_update(key_share=True))
+    return project_row
+
+
+def _require_owner(tx: Transaction, project_row: ProjectRow) -> None:
+    owners = select(func.count()).where(member.c.project_id == project_row.id, member.c.role == Role.OWNER.value)
+    if tx.execute(owners).scalar_one() == 0:
+        raise Conflict("A project keeps at least one owner; make somebody else an owner first.", code="last-owner")
+
+
+def _no_member(user_name: str) -> NotFound:
+    return NotFound(f"{user_name!r} is no member of this project.", code="no-member")
+
+
+def _shown(name: str, row: Row[Any]) -> Member:
+    return Member(user=name, role=Role(row.role), since=datetime_of(row.since_us), rev=row.rev)

@@ -1,0 +1,18 @@
+"""Whether the store can serve."""
+
+from __future__ import annotations
+
+from marey_server.store.database import Transaction
+from marey_server.store.schema import schema_at_head
+
+
+def find_faults(tx: Transaction) -> list[str]:
+    """What keeps the server from serving, in words for its operator; empty where all is well."""
+    faults = []
+    if not schema_at_head(tx.connection):
+        faults.append("the database's tables are not those of this version: run `marey db upgrade`")
+    try:
+        tx.blobs.check_writable()
+    except OSError as error:
+        faults.append(f"blobs cannot be written: {error.strerror}")
+    return faults

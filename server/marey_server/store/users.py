@@ -1,0 +1,199 @@
+"""Users: people and services that sign in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import ColumnElement, Row, func, insert, select
+
+from marey_schemas.access import Scope, User, UserChange, UserCreate
+from marey_schemas.items import Page
+from marey_server.access import passwords, scopes
+from marey_server.access.principal import Principal
+from marey_server.errors import Conflict, Forbidden, NotFound, PreconditionFailed, Unauthenticated
+from marey_server.store import listing
+from marey_server.store.clock import datetime_of
+from marey_server.store.database import Transaction
+from marey_server.store.ids import new_id
+from marey_server.store.revs import change_row
+from marey_server.store.tables import user
+from marey_server.store.violations import taken
+
+FIRST_ADMINISTRATOR = "admin"
+_ADMINISTRATORS = "administrators"
+
+
+def create_user(tx: Transaction, request: UserCreate, *, password_hash: str | None = None) -> User:
+    """A new user. `password_hash` comes from `passwords.hash_password`, which takes too long for a transaction.
+
+    Raises `Conflict` where the name is taken.
+    """
+    require_administrator(tx.principal)
+    return _insert(tx, request.name, request.display_name, request.administrator, password_hash)
+
+
+def _insert(
+    tx: Transaction, name: str, display_name: str | None, administrator: bool, password_hash: str | None
+) -> User:
+    row = {
+        "id": new_id("user"), "name": name, "display_name": display_name, "password_hash": password_hash,
+        "administrator": administrator, "disabled": False, "created_us": tx.now_us, "rev": 1,
+    }  # fmt: skip
+    with taken(Conflict(f"The name {name!r} is taken by another user.", code="name-taken")):
+        made = tx.execute(insert(user).values(**row).returning(*user.c)).one()
+    tx.emit("user.created", made.id, name=name, administrator=administrator)
+    return _shown(made)
+
+
+def find_user(tx: Transaction, name: str) -> User:
+    """A user, for administrators and for himself. Raises `NotFound`."""
+    if tx.principal.kind != "user" or tx.principal.user_name != name:
+        require_administrator(tx.principal, hidden=_no_user(name))
+    row = tx.execute(select(user).where(user.c.name == name)).first()
+    if row is None:
+        raise _no_user(name)
+    return _shown(row)
+
+
+def list_users(tx: Transaction, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT) -> Page:
+    """All users by name, for administrators."""
+    require_administrator(tx.principal)
+    order = listing.parse_order("name", {"name": user.c.name}, unique="name")
+    rows, next_cursor = listing.read_page(tx, select(user), order, ["users"], cursor, limit)
+    return Page(items=tuple(_shown(row) for row in rows), next_cursor=next_cursor)
+
+
+def change_user(
+    tx: Transaction,
+    name: str,
+    request: UserChange,
+    *,
+    expected_rev: int | None,
+    password_hash: str | None = None,
+    verified_hash: str | None = None,
+) -> User:
+    """Change a user: administrators anything, users their own display name and password.
+
+    `password_hash`: of `request.password`. `verified_hash`: what `request.current_password` was checked against (see
+    `verify_password`); it must still be the user's when the change is written.
+    """
+    itself = tx.principal.kind == "user" and tx.principal.user_name == name
+    administrates = is_administrator(tx.principal)
+    if not itself:
+        require_administrator(tx.principal, hidden=_no_user(name))
+    elif not scopes.allows(tx.principal.scopes, "write"):
+        raise Forbidden("This token may not change the user.", code="insufficient-scope")
+    if not administrates and (request.administrator is not None or request.disabled is not None):
+        raise Forbidden("Only administrators make administrators and disable users.", code="administrators-only")
+    which: tuple[ColumnElement[bool], ...] = (user.c.name == name,)
+    if request.password is not None and itself:
+        if verified_hash is None:
+            raise Forbidden("Give the current password too.", code="wrong-password")
+        which += (user.c.password_hash == verified_hash,)
+    values = _values(request, password_hash)
+    tx.lock(_ADMINISTRATORS)
+    try:
+        row = change_row(tx, user, which, values, expected_rev=expected_rev, absent=_no_user(name))
+    except NotFound:
+        if verified_hash is None:
+            raise
+        raise PreconditionFailed("The password was changed meanwhile.", code="wrong-password") from None
+    _require_some_administrator(tx)
+    tx.emit("user.changed", row.id, name=name, fields=sorted(values))
+    return _shown(row)
+
+
+def _values(request: UserChange, password_hash: str | None) -> dict[str, Any]:
+    given = request.model_fields_set
+    values: dict[str, Any] = {"display_name": request.display_name} if "display_name" in given else {}
+    if request.administrator is not None:
+        values["administrator"] = request.administrator
+    if request.disabled is not None:
+        values["disabled"] = request.disabled
+    if password_hash is not None:
+        values["password_hash"] = password_hash
+    return values
+
+
+def delete_user(tx: Transaction, name: str, *, expected_rev: int | None) -> None:
+    """Disable a user: the name stays with what he did, his tokens and password stop working."""
+    require_administrator(tx.principal)
+    change_user(tx, name, UserChange(disabled=True), expected_rev=expected_rev)
+
+
+def _require_some_administrator(tx: Transaction) -> None:
+    left = select(func.count()).where(user.c.administrator.is_(True), user.c.disabled.is_(False))
+    if tx.execute(left).scalar_one() == 0:
+        raise Conflict("Somebody must stay an administrator.", code="last-administrator")
+
+
+# -- signing in -------------------------------------------------------------------------------------------------------
+
+
+def stored_hash(tx: Transaction, name: str) -> str | None:
+    """The hash a password is checked against, None where nobody of this name can sign in with one."""
+    statement = select(user.c.password_hash).where(user.c.name == name, user.c.disabled.is_(False))
+    found: str | None = tx.execute(statement).scalar()
+    return found
+
+
+def verify_password(tx: Transaction, name: str, password: str) -> Principal:
+    """Who signs in with this name and password; run it as a read, it takes 0.1 s whether the user exists or not.
+
+    Raises `Unauthenticated`.
+    """
+    row = tx.execute(select(user).where(user.c.name == name, user.c.disabled.is_(False))).first()
+    if not passwords.password_matches(password, None if row is None else row.password_hash) or row is None:
+        raise Unauthenticated("Name or password is wrong.", code="wrong-password")
+    return _principal(row)
+
+
+def _principal(row: Row[Any]) -> Principal:
+    reach = tuple(scope.value for scope in Scope if scope is not Scope.ADMIN or row.administrator)
+    return Principal("user", row.id, row.name, row.administrator, reach)
+
+
+def ensure_first_administrator(tx: Transaction) -> User | None:
+    """The user `admin` of a database that has no users yet; None where it has some."""
+    tx.lock(_ADMINISTRATORS)
+    if tx.execute(select(user.c.id).limit(1)).first() is not None:
+        return None
+    return _insert(tx, FIRST_ADMINISTRATOR, "Administrator", True, None)
+
+
+def administrator_principal(tx: Transaction, name: str = FIRST_ADMINISTRATOR) -> Principal:
+    """An administrator, for who has the database in hands anyway. Raises `NotFound`."""
+    row = tx.execute(
+        select(user).where(user.c.name == name, user.c.administrator.is_(True), user.c.disabled.is_(False))
+    ).first()
+    if row is None:
+        raise _no_user(name)
+    return _principal(row)
+
+
+# -- rules ------------------------------------------------------------------------------------------------------------
+
+
+def is_administrator(principal: Principal) -> bool:
+    """Whether the caller administrates the server, with a credential that reaches so far."""
+    return principal.administrator and scopes.allows(principal.scopes, "admin")
+
+
+def require_administrator(principal: Principal, *, hidden: NotFound | None = None) -> None:
+    """Raise `Forbidden` (or `hidden`) unless the caller administrates the server."""
+    if is_administrator(principal):
+        return
+    if principal.kind == "anonymous":
+        raise Unauthenticated("Sign in as an administrator.")
+    raise hidden or Forbidden("Only administrators may do this.", code="administrators-only")
+
+
+def _no_user(name: str) -> NotFound:
+    return NotFound(f"There is no user {name!r} that you may see.", code="no-user")
+
+
+def _shown(row: Row[Any]) -> User:
+    return User(
+        id=row.id, name=row.name, display_name=row.display_name, administrator=row.administrator,
+        disabled=row.disabled, created_at=datetime_of(row.created_us), rev=row.rev,
+    )  # fmt: skip
