@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 import json
 import logging
+import os
 import signal
 import time
 from collections.abc import AsyncIterator
@@ -13,6 +14,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 from tornado.httpserver import HTTPServer
@@ -21,6 +23,8 @@ from tornado.routing import AnyMatches, Rule
 from tornado.web import Application as TornadoApplication
 from tornado.web import RequestHandler
 
+from marey_schemas.access import TokenCreate
+from marey_server.access.principal import SYSTEM
 from marey_server.docs_page import render_page
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.handlers.resource import Resource
@@ -29,10 +33,14 @@ from marey_server.observe import access_log, configure_logging
 from marey_server.openapi import build_document
 from marey_server.services import Description, Services
 from marey_server.settings import Settings
-from marey_server.store.database import Database
+from marey_server.store import tokens, users
+from marey_server.store.blob_backings import DirectoryBlobs
+from marey_server.store.database import Database, Transaction
+from marey_server.store.schema import upgrade_schema
 
 log = logging.getLogger(__name__)
 
+ADMIN_TOKEN_FILE = "admin.token"  # noqa: S105 - the name of a file
 READ_CHUNK_BYTES = 256 * 1024
 READ_BUFFER_BYTES = 1024 * 1024
 
@@ -62,7 +70,7 @@ class Application(TornadoApplication):
 def _fields(handler: Resource, route: str, status: int, duration_s: float) -> dict[str, Any]:
     return {
         "request_id": handler.request_id,
-        "principal": handler.principal_name,
+        "principal": handler.principal.actor if handler.principal is not None else None,
         "method": handler.request.method,
         "route": route,
         "status": status,
@@ -130,16 +138,40 @@ async def _drain(services: Services, server: HTTPServer) -> None:
     services.close()
 
 
-def prepare_database(settings: Settings) -> Database:
-    """The database of a server: its folder made, its schema current, its administrator there."""
+def open_database(settings: Settings) -> Database:
+    """The database of a server: its folder made, its schema current, its first administrator there."""
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
-    return Database(settings.resolved_database_url, readers=settings.database_threads)
+    url = settings.resolved_database_url
+    upgrade_schema(url)
+    blobs = DirectoryBlobs(settings.data / "blobs") if settings.blobs == "directory" else None
+    database = Database(url, readers=settings.database_threads, blobs=blobs)
+    database.write(SYSTEM, make_first_administrator, settings.data / ADMIN_TOKEN_FILE)
+    return database
+
+
+def make_first_administrator(tx: Transaction, token_file: Path) -> None:
+    """The user `admin` of an empty database, with a token that is written to a file only its owner may read.
+
+    The file is written before the transaction commits: a server that dies in between makes both anew.
+    """
+    if users.ensure_first_administrator(tx) is None:
+        return
+    tx.principal = users.administrator_principal(tx)
+    wanted = TokenCreate(name="first start", scopes=tx.principal.scopes, expires_in_s=None)
+    secret = tokens.create_token(tx, wanted).secret
+    partial_file = token_file.with_suffix(".partial")
+    partial_file.unlink(missing_ok=True)
+    with open(os.open(partial_file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
+        file.write(f"{secret}\n")
+        file.flush()
+        os.fsync(file.fileno())
+    partial_file.replace(token_file)
 
 
 async def serve(settings: Settings) -> None:
     """Run a server until SIGTERM or SIGINT."""
     configure_logging(settings.log_form, settings.log_level)
-    database = prepare_database(settings)
+    database = open_database(settings)
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

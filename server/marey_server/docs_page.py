@@ -102,7 +102,10 @@ def _type(schema: Schema) -> str:
 
 
 def _problems() -> Iterator[str]:
-    known = [errors.MareyError, *sorted(_subclasses(errors.MareyError), key=lambda error: (error.status, error.code))]
+    known: list[type[errors.MareyError]] = [
+        errors.MareyError,
+        *sorted(_subclasses(errors.MareyError), key=lambda error: (error.status, error.code)),
+    ]
     for error in known:
         code, title = escape(error.code), escape(_first_line(error.__doc__ or ""))
         yield f"<tr id='problem-{code}'><td>{error.status}<td><code>{code}</code><td>{title}"

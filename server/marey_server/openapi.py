@@ -44,10 +44,11 @@ _HEADERS = {
     "Prefer": "wait=20: answer when the job has ended, or after so many seconds.",
     "Range": "bytes=0-1023: only these bytes.",
     "If-Range": "The ETag whose bytes the range continues.",
+    "Last-Event-ID": "Number of the last event received, when a stream is taken up again.",
     "Upload-Offset": "How many bytes the server has; it must be right.",
     "Idempotency-Key": "A text of your own; the same request with it again gives the same answer, for seven days.",
 }
-_TOKEN_NEEDED = [{"bearer": []}]
+_TOKEN_NEEDED: list[Schema] = [{"bearer": []}]
 _TOKEN_OPTIONAL: list[Schema] = [{}, {"bearer": []}]
 
 
@@ -86,12 +87,12 @@ class _Models:
         wanted: dict[tuple[type[BaseModel], JsonSchemaMode], None] = {(Problem, "serialization"): None}
         for route in routes:
             operation = route.operation
-            for model in (operation.answer, *(model for _, model in operation.also)):
-                if model is not None and issubclass(model, BaseModel):
-                    wanted[model, "serialization"] = None
-            for model in (operation.body and operation.body.content, operation.body and operation.body.alternative):
-                if model is not None and issubclass(model, BaseModel):
-                    wanted[model, "validation"] = None
+            for answer in (operation.answer, *(model for _, model in operation.also)):
+                if answer is not None and issubclass(answer, BaseModel):
+                    wanted[answer, "serialization"] = None
+            for taken in (operation.body.content, operation.body.alternative) if operation.body else ():
+                if taken is not None and issubclass(taken, BaseModel):
+                    wanted[taken, "validation"] = None
         wanted |= {(model, "validation"): None for model in SCHEMAS.values()}
         self._refs, definitions = models_json_schema(list(wanted), ref_template=_REF)
         self.components: dict[str, Schema] = definitions.get("$defs", {})
@@ -236,11 +237,13 @@ def _answer_content(operation: Operation, models: _Models) -> Schema:
     if answer is Document:
         return {str(form): ({"schema": models.document()} if form.form == "json" else {}) for form in DOCUMENT_FORMS}
     assert answer is not None
+    assert issubclass(answer, BaseModel)
     schema = models.writing(answer)
     if operation.paged:
         selectable = operation.query is not None and "fields" in operation.query.model_fields
         schema = _page_schema(models.partial(answer) if selectable else schema)
-    return {name: {"schema": schema} for name in operation.answer_types or MEDIA_TYPES}
+    streams: Schema = {"text/event-stream": {}} if operation.stream else {}
+    return {name: {"schema": schema} for name in operation.answer_types or MEDIA_TYPES} | streams
 
 
 def _page_schema(element: Schema) -> Schema:

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import os
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ParamSpec, TypeVar
 
+from marey_server.access.limits import TryLimit
+from marey_server.access.principal import SYSTEM, Principal
 from marey_server.observe import Metrics
 from marey_server.settings import Settings
+from marey_server.store import tokens
 from marey_server.store.database import Database
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+SIGN_INS_AT_ONCE = 2
+"""A password takes 32 MiB and 0.1 s to check."""
 
 
 @dataclass(frozen=True)
@@ -26,25 +33,43 @@ class Description:
     tag: str
 
 
-@dataclass
 class Services:
     """Database, threads, metrics and the state of a server that is starting, serving or draining."""
 
-    settings: Settings
-    database: Database
-    description: Callable[[], Description]
-    metrics: Metrics = field(default_factory=Metrics)
-    draining: asyncio.Event = field(default_factory=asyncio.Event)
-    in_flight: set[Any] = field(default_factory=set)
-    compute: ThreadPoolExecutor = field(
-        default_factory=lambda: ThreadPoolExecutor(max(2, os.cpu_count() or 2), thread_name_prefix="marey-compute")
-    )
+    def __init__(self, settings: Settings, database: Database, description: Callable[[], Description]) -> None:
+        self.settings = settings
+        self.database = database
+        self.description = description
+        self.metrics = Metrics()
+        self.draining = asyncio.Event()
+        self.in_flight: set[Any] = set()
+        self.sign_in_places = asyncio.Semaphore(SIGN_INS_AT_ONCE)
+        self._compute = ThreadPoolExecutor(max(2, os.cpu_count() or 2), thread_name_prefix="marey-compute")
+        self._tries_by_name = TryLimit(settings.login_tries_per_minute)
+        self._tries_by_address = TryLimit(10 * settings.login_tries_per_minute)
+        self._tokens_noted: dict[str, float] = {}
 
     def submit(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Run numeric work or file work in a thread, away from the event loop."""
-        return self.compute.submit(function, *args, **kwargs)
+        return self._compute.submit(function, *args, **kwargs)
+
+    def limit_sign_in(self, name: str, address: str) -> None:
+        """Count one attempt to sign in. Raises `TooManyRequests`."""
+        self._tries_by_address.take(address)
+        self._tries_by_name.take(name)
+
+    def note_use(self, principal: Principal) -> None:
+        """Remember that a token was used, at most once in `NOTE_USE_EVERY_S` for each."""
+        token_id, now = principal.token_id, time.monotonic()
+        if (
+            token_id is None
+            or now - self._tokens_noted.get(token_id, -tokens.NOTE_USE_EVERY_S) < tokens.NOTE_USE_EVERY_S
+        ):
+            return
+        self._tokens_noted[token_id] = now
+        self.database.submit_write(SYSTEM, tokens.note_use, token_id)
 
     def close(self) -> None:
         """Wait for what runs, then let go of everything."""
-        self.compute.shutdown(wait=True)
+        self._compute.shutdown(wait=True)
         self.database.close()

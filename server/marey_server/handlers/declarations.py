@@ -95,6 +95,7 @@ class Operation:
     also: tuple[tuple[int, type[Answer] | None], ...]
     public: bool
     headers: tuple[str, ...]
+    stream: bool
 
     @property
     def may_create(self) -> bool:
@@ -115,6 +116,7 @@ def reads(
     also: tuple[tuple[int, type[Answer] | None], ...] = (),
     public: bool = True,
     headers: tuple[str, ...] = (),
+    stream: bool = False,
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes nothing.
 
@@ -123,7 +125,7 @@ def reads(
     """
     return _declare(
         access=access, scope=scope, query=query, answer=answer, paged=paged, etag=etag, status=status,
-        answer_types=answer_types, also=also, public=public, headers=headers,
+        answer_types=answer_types, also=also, public=public, headers=headers, stream=stream,
     )  # fmt: skip
 
 
@@ -169,6 +171,7 @@ def _declare(
     answer_types: tuple[str, ...] = (),
     public: bool = True,
     headers: tuple[str, ...] = (),
+    stream: bool = False,
 ) -> Callable[[Method], Declared]:
     def attach(method: Method) -> Declared:
         @wraps(method)
@@ -178,7 +181,7 @@ def _declare(
         summary, _, description = (inspect.getdoc(method) or "").partition("\n")
         perform.operation = Operation(  # type: ignore[attr-defined]
             method.__name__.upper(), summary.rstrip("."), description.strip(), access, scope, query, body, answer,
-            status, paged, etag, precondition, idempotency, answer_types, also, public, headers,
+            status, paged, etag, precondition, idempotency, answer_types, also, public, headers, stream,
         )  # fmt: skip
         return perform
 

@@ -59,3 +59,6 @@ class MetricsPage(Resource):
         """Figures in the text format of Prometheus."""
         text, media_type = self.services.metrics.exposition()
         return Reply(text, media_type=media_type, headers={"Cache-Control": "no-store"})
+
+
+RESOURCES: tuple[type[Resource], ...] = (Healthz, Readyz, MetricsPage)

@@ -30,6 +30,8 @@ BSON = MediaType(codecs.BSON, "bson")
 MSGPACK_BLOCKS = MediaType(codecs.MSGPACK, "msgpack-blocks", "blocks")
 BSON_BLOCKS = MediaType(codecs.BSON, "bson-blocks", "blocks")
 
+EVENT_STREAM = MediaType("text/event-stream", "events")
+
 MODEL_FORMS = (JSON, MSGPACK, BSON)
 """What every answer without arrays comes in."""
 

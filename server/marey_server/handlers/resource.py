@@ -29,7 +29,7 @@ from urllib.parse import urlencode
 from pydantic import BaseModel
 from tornado.web import HTTPError, RequestHandler, stream_request_body
 
-from marey_server.access.principal import ANONYMOUS
+from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.errors import BadRequest, MareyError, MethodNotAllowed, TooLarge
 from marey_server.handlers import negotiation, problem
 from marey_server.handlers.calls import Call, Caller, only_identify, run_call, run_plain
@@ -101,10 +101,10 @@ class Resource(RequestHandler):
         return services
 
     @property
-    def principal_name(self) -> str | None:
-        """Who asked, as far as it is known."""
-        caller = getattr(self, "caller", None)
-        return caller.principal.actor if caller is not None and caller.principal is not None else None
+    def principal(self) -> Principal | None:
+        """Who asked, once it is known."""
+        caller: Caller | None = getattr(self, "caller", None)  # absent where the request was refused before
+        return caller.principal if caller is not None else None
 
     # -- for the methods of resources ---------------------------------------------------------------------------------
 
@@ -137,7 +137,7 @@ class Resource(RequestHandler):
         """The answer that `to_reply` makes of what `function(tx, ...)` returns, both in the transaction's thread."""
         key = self._idempotency_key()
         fingerprint = self._fingerprint() if key else ""
-        call = Call(self.caller, self.form, to_reply, function, args, kwargs, key, fingerprint)
+        call = Call(self.caller, self.answer_form, to_reply, function, args, kwargs, key, fingerprint)
         database = self.services.database
         submit = database.submit_read if self.operation.method == "GET" else database.submit_write
         return await asyncio.wrap_future(submit(ANONYMOUS, run_call, call))
@@ -155,13 +155,16 @@ class Resource(RequestHandler):
         return True
 
     @property
-    def form(self) -> Form:
+    def answer_form(self) -> Form:
         """How the caller wants the answer."""
         reading = self.request.method in ("GET", "HEAD")
         return Form(self.media, self.request.headers.get("If-None-Match") if reading else None, self.operation.status)
 
-    async def begin(self, **path: Any) -> None:
-        """Called before the first byte of a streamed body, with the path's variables."""
+    async def _begin(self, **_path: Any) -> None:
+        pass
+
+    begin: Declared = _begin
+    """Called before the first byte of a streamed body, with the path's variables."""
 
     async def receive(self, chunk: bytes) -> None:
         """Called with each piece of a streamed body."""
@@ -188,6 +191,7 @@ class Resource(RequestHandler):
             self._check_head()
             body = self.operation.body
             if body is not None and body.streamed:
+                self.request.connection.set_body_timeout(self.services.settings.upload_timeout_s)  # type: ignore[union-attr]
                 await self.begin(**self.path_variables)
             elif self.declared_length() > EARLY_CHECK_BYTES:
                 await self.look_up(only_identify)
@@ -218,6 +222,8 @@ class Resource(RequestHandler):
     def _offers(self, operation: Operation) -> tuple[negotiation.MediaType, ...]:
         if operation.answer_types:
             return tuple(negotiation.MediaType(name, "bytes") for name in operation.answer_types)
+        if operation.stream:
+            return (*negotiation.MODEL_FORMS, negotiation.EVENT_STREAM)
         return negotiation.DOCUMENT_FORMS if operation.answer is Document else negotiation.MODEL_FORMS
 
     def _check_body_head(self, operation: Operation) -> None:
@@ -284,7 +290,7 @@ class Resource(RequestHandler):
             arguments["body"] = await self._read_body()
         outcome = await method(self, **arguments)
         if isinstance(outcome, Reply):
-            outcome = render(outcome, self.form)
+            outcome = render(outcome, self.answer_form)
         if outcome is not None:
             self.send(outcome)
 
@@ -369,6 +375,8 @@ class Resource(RequestHandler):
 
     def on_finish(self) -> None:
         """The answer is on its way."""
+        if self.principal is not None:
+            self.services.note_use(self.principal)
         self.services.in_flight.discard(self)
 
     def on_connection_close(self) -> None:

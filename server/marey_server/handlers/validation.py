@@ -44,7 +44,7 @@ def parse_query(model: type[Model] | None, arguments: Mapping[str, Sequence[byte
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise _bad_query(_field_errors(error, values, ".".join)) from None
+        raise _bad_query(field_errors(error, values, ".".join)) from None
 
 
 def _known_parameters(known: Mapping[str, Any]) -> str:
@@ -75,7 +75,7 @@ def validate_body(model: type[Model], tree: Any) -> Model:
             return model.model_validate(tree)
         return model.model_validate_json(json.dumps(tree), strict=True)
     except ValidationError as error:
-        faults = _field_errors(error, tree, json_pointer)
+        faults = field_errors(error, tree, json_pointer)
         first = f"{faults[0].pointer or 'the body'}: {faults[0].detail}"
         raise Invalid(f"The body does not fit: {first}", code="invalid-body", errors=faults) from None
 
@@ -97,7 +97,7 @@ def json_pointer(steps: Sequence[str]) -> str:
     return "".join("/" + step.replace("~", "~0").replace("/", "~1") for step in steps)
 
 
-def _field_errors(error: ValidationError, tree: Any, pointer: Callable[[list[str]], str]) -> list[FieldError]:
+def field_errors(error: ValidationError, tree: Any, pointer: Callable[[list[str]], str]) -> list[FieldError]:
     entries = error.errors(include_url=False, include_context=False, include_input=False)
     return [
         FieldError(

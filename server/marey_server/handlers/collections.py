@@ -1,0 +1,94 @@
+"""The folders of a project."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from marey_schemas.items import Collection, CollectionChange, CollectionCreate
+from marey_server.handlers.declarations import Access, reads, writes
+from marey_server.handlers.queries import PageQuery
+from marey_server.handlers.reply import Rendered, Reply
+from marey_server.handlers.resource import Resource
+from marey_server.store import collections
+
+
+class CollectionsQuery(PageQuery):
+    """Which folders."""
+
+    path: str = Field("", max_length=1024, description="This folder and those below it.")
+    deleted: bool = Field(False, description="Among the deleted ones.")
+
+
+class Collections(Resource):
+    """All folders."""
+
+    path = "/projects/{project}/collections"
+    tag = "Collections"
+
+    @reads(access=Access.READER, query=CollectionsQuery, answer=Collection, paged=True)
+    async def get(self, project: str, query: CollectionsQuery) -> Rendered:
+        """Folders, by path."""
+        return await self.answer(
+            collections.list_collections,
+            project,
+            path=query.path,
+            deleted=query.deleted,
+            cursor=query.cursor,
+            limit=query.limit,
+        )
+
+    @writes(
+        access=Access.CONTRIBUTOR,
+        body=CollectionCreate,
+        answer=Collection,
+        status=201,
+        etag=True,
+        idempotency="key",
+    )
+    async def post(self, project: str, body: CollectionCreate) -> Rendered:
+        """Make a folder, with those above it."""
+        return await self.answer_with(
+            lambda made: Reply(made, rev=made.rev, location=f"/projects/{project}/collections/{made.id}"),
+            collections.create_collection,
+            project,
+            body,
+        )
+
+
+class CollectionResource(Resource):
+    """One folder."""
+
+    path = "/projects/{project}/collections/{collection}"
+    tag = "Collections"
+
+    @reads(access=Access.READER, answer=Collection, etag=True)
+    async def get(self, project: str, collection: str) -> Rendered:
+        """A folder."""
+        return await self.answer(collections.read_collection, project, collection)
+
+    @writes(access=Access.CONTRIBUTOR, body=CollectionChange, answer=Collection, precondition="required", etag=True)
+    async def patch(self, project: str, collection: str, body: CollectionChange) -> Rendered:
+        """Rename or move a folder with all it holds."""
+        expected_rev = self.precondition.expected_rev
+        return await self.answer(collections.move_collection, project, collection, body, expected_rev=expected_rev)
+
+    @writes(access=Access.MAINTAINER, precondition="required")
+    async def delete(self, project: str, collection: str) -> Rendered:
+        """Delete a folder with all it holds; it can be restored."""
+        expected_rev = self.precondition.expected_rev
+        return await self.answer(collections.delete_collection, project, collection, expected_rev=expected_rev)
+
+
+class CollectionRestoration(Resource):
+    """Bringing a deleted folder back."""
+
+    path = "/projects/{project}/collections/{collection}/restore"
+    tag = "Collections"
+
+    @writes(access=Access.MAINTAINER, answer=Collection, etag=True)
+    async def post(self, project: str, collection: str) -> Rendered:
+        """Restore a folder with what was deleted along with it."""
+        return await self.answer(collections.restore_collection, project, collection)
+
+
+RESOURCES: tuple[type[Resource], ...] = (Collections, CollectionResource, CollectionRestoration)

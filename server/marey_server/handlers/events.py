@@ -1,0 +1,83 @@
+"""What happens in a project: asked for page by page, or followed as server-sent events."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+from pydantic import Field
+
+from marey_schemas.base import Request
+from marey_schemas.items import Event, Page
+from marey_server.errors import BadRequest
+from marey_server.handlers.declarations import Access, reads
+from marey_server.handlers.negotiation import EVENT_STREAM
+from marey_server.handlers.reply import Reply
+from marey_server.handlers.resource import Resource
+from marey_server.store import events
+
+POLL_S = 1.0
+KEEP_ALIVE_S = 15.0
+WRITE_TIMEOUT_S = 30.0
+
+
+class EventsQuery(Request):
+    """Which events."""
+
+    after: int = Field(0, ge=0, le=2**62, description="Number of the last event received; 0 from the beginning.")
+    limit: int = Field(100, ge=1, le=events.MAX_EVENTS, description="Longest page.")
+
+
+class Events(Resource):
+    """The events of a project."""
+
+    path = "/projects/{project}/events"
+    tag = "Events"
+
+    @reads(
+        access=Access.READER,
+        query=EventsQuery,
+        answer=Event,
+        paged=True,
+        public=False,
+        stream=True,
+        headers=("Last-Event-ID",),
+    )
+    async def get(self, project: str, query: EventsQuery) -> Reply | None:
+        """What happened, in the order it became visible; as text/event-stream, also what happens from now on."""
+        after = self._last_received(query)
+        found = await self.look_up(events.list_events, project, after=after, limit=query.limit)
+        if self.media is not EVENT_STREAM:
+            return Reply(Page(items=tuple(found)))
+        self.set_header("Content-Type", "text/event-stream")
+        self.set_header("Cache-Control", "no-store")
+        await self._follow(project, after, found)
+        return None
+
+    def _last_received(self, query: EventsQuery) -> int:
+        text = self.request.headers.get("Last-Event-ID")
+        if text is None:
+            return query.after
+        if not text.isascii() or not text.isdigit() or len(text) > 18:
+            raise BadRequest("Last-Event-ID is the number of an event.", code="bad-event-id")
+        return int(text)
+
+    async def _follow(self, project: str, after: int, found: list[Event]) -> None:
+        """Send events as they come, until the caller goes away or the server stops."""
+        self.write(": follow\n\n")
+        sent_at = time.monotonic()
+        while True:
+            for event in found:
+                self.write(f"id: {event.seq}\nevent: {event.kind}\ndata: {event.model_dump_json()}\n\n")
+                after = event.seq
+            if not found and time.monotonic() - sent_at >= KEEP_ALIVE_S:
+                self.write(": still here\n\n")
+            if self._write_buffer:
+                await asyncio.wait_for(self.flush(), WRITE_TIMEOUT_S)
+                sent_at = time.monotonic()
+            if not found and await self.pause(POLL_S):
+                return
+            found = await self.look_up(events.list_events, project, after=after, limit=events.MAX_EVENTS)
+
+
+RESOURCES: tuple[type[Resource], ...] = (Events,)

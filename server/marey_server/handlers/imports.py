@@ -1,0 +1,231 @@
+"""Motion files in: sent with the request, or named by digest where the server has the bytes already."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from marey_schemas.imports import ImportAnswer, ImportEntry, ImportOptions, ImportRequest, Refusal
+from marey_schemas.jobs import Job, JobCreate
+from marey_server import importing
+from marey_server.errors import BadRequest, Invalid, MareyError, TooLarge
+from marey_server.handlers.declarations import MIB, Access, Body, Files, writes
+from marey_server.handlers.multipart import MultipartReader, PartHead, Piece, boundary_of
+from marey_server.handlers.negotiation import body_type
+from marey_server.handlers.receiving import Receiver
+from marey_server.handlers.reply import Reply
+from marey_server.handlers.resource import Resource
+from marey_server.handlers.validation import decode_body, field_errors, json_pointer, validate_body
+from marey_server.importing import PreparedImport, SourceFile
+from marey_server.store import blobs, submission
+from marey_server.store.database import Transaction
+
+if TYPE_CHECKING:
+    from marey_motion.importing import PlannedFile
+
+MAX_FILES = 1000
+MAX_UPLOAD_BYTES = 2048 * MIB
+MAX_FORM_BYTES = 256 * 1024
+FILES_AHEAD = 2
+"""Files that are read while the one before them is being published."""
+REFUSED_ALTOGETHER = (401, 403, 404, 503, 507)
+"""Refusals that concern the request, not one of its files."""
+
+
+class Imports(Resource):
+    """Bringing motion files into a project."""
+
+    path = "/projects/{project}/imports"
+    tag = "Imports"
+
+    async def begin(self, project: str) -> None:
+        """Check that the caller may import, before the files come."""
+        await self.look_up(importing.require_importer, project)
+        content_type = self.request.headers.get("Content-Type", "")
+        self.fields: dict[str, bytearray] = {}
+        self.files: list[SourceFile] = []
+        self.parts: MultipartReader | None = None
+        if content_type.lower().startswith("multipart/"):
+            self.parts = MultipartReader(boundary_of(content_type), max_parts=MAX_FILES + 32)
+        else:
+            body_type(content_type)
+        self.body = bytearray()
+        self._file: tuple[str, Receiver] | None = None
+        self._field: bytearray | None = None
+
+    async def receive(self, chunk: bytes) -> None:
+        """Take the next bytes of the files."""
+        if self.parts is None:
+            self.body += chunk
+            if len(self.body) > MIB:
+                raise TooLarge(f"A list of files may have {MIB} bytes.")
+            return
+        for piece in self.parts.feed(chunk):
+            await self._take(piece)
+
+    async def _take(self, piece: Piece) -> None:
+        if isinstance(piece, PartHead):
+            if piece.file_name is None:
+                self._field = self.fields.setdefault(piece.field, bytearray())
+            else:
+                self._file = (piece.file_name, Receiver(self.services))
+        elif isinstance(piece, bytes) and self._file is not None:
+            await self._file[1].write(piece)
+        elif isinstance(piece, bytes) and self._field is not None:
+            self._field += piece
+            if sum(map(len, self.fields.values())) > MAX_FORM_BYTES:
+                raise TooLarge(f"The form fields may have {MAX_FORM_BYTES} bytes together.")
+        elif self._file is not None:
+            await self._take_file(*self._file)
+            self._file = None
+        else:
+            self._field = None
+
+    async def _take_file(self, name: str, receiver: Receiver) -> None:
+        """Keep a file at hand; once they are too many for one request, store it for the job that will import them."""
+        spool = await receiver.finish()
+        file = SourceFile(name, spool.digest, spool.size_bytes, spool)
+        if self._is_large([*self.files, file]):
+            with spool:
+                await self.change(blobs.put_blob, spool)
+            file = SourceFile(name, file.digest, file.size_bytes, None)
+        self.files.append(file)
+
+    def _is_large(self, files: Sequence[SourceFile]) -> bool:
+        settings = self.services.settings
+        size = sum(file.size_bytes for file in files)
+        return len(files) > settings.import_files_now or size > settings.import_bytes_now
+
+    @writes(
+        access=Access.CONTRIBUTOR,
+        body=Body(Files, max_bytes=MAX_UPLOAD_BYTES, alternative=ImportRequest, streamed=True),
+        answer=ImportAnswer,
+        also=((202, Job),),
+    )
+    async def post(self, project: str) -> Reply:
+        """Import motion files: one entry per file, and one bad file harms no other.
+
+        Send files as multipart/form-data, with the options as form fields, or name files by digest. Files of the same
+        content change nothing. Many files, or many bytes, become a job (202), whose result is the same answer.
+        """
+        if self.parts is not None:
+            self.parts.finish()
+            options = _form_options(self.fields)
+        else:
+            request = await self._read_request()
+            options = ImportOptions.model_validate(request.model_dump(exclude={"files"}, exclude_unset=True))
+            self.files = await self.look_up(_stored_files, request)
+        if not self.files:
+            raise BadRequest("The request holds no files.", code="no-files")
+        if self._is_large(self.files):
+            return await self._submit(project, options)
+        return Reply(ImportAnswer(entries=tuple(await self._import_now(project, options))))
+
+    async def _read_request(self) -> ImportRequest:
+        tree = decode_body(bytes(self.body), body_type(self.request.headers.get("Content-Type")))
+        return validate_body(ImportRequest, tree)
+
+    async def _submit(self, project: str, options: ImportOptions) -> Reply:
+        for file in self.files:
+            if isinstance(file.content, blobs.Spool):
+                with file.content as spool:
+                    await self.change(blobs.put_blob, spool)
+        files = [{"name": file.name, "blob": file.digest} for file in self.files]
+        params = {**options.model_dump(mode="json", exclude_unset=True), "files": files}
+        (job,) = await self.change(submission.submit, project, [JobCreate(kind="import", params=params)])
+        return Reply(job, status=202, location=f"/jobs/{job.id}", headers={"Retry-After": "1"})
+
+    async def _import_now(self, project: str, options: ImportOptions) -> list[ImportEntry]:
+        skeleton = None
+        if options.skeleton is not None:
+            skeleton = await self.look_up(importing.read_skeleton, project, options.skeleton)
+        request = await self.compute(importing.motion_request, options, skeleton)
+        plans = await self.compute(importing.plan, [file.name for file in self.files])
+        by_name = {file.name: file for file in reversed(self.files)}
+        entries = []
+        ahead: deque[tuple[PlannedFile, asyncio.Task[PreparedImport]]] = deque()
+        for planned in plans:
+            companion = by_name.get(planned.companion or "")
+            file = by_name[planned.name]
+            work = self._prepare(planned, file, companion, options, request)
+            ahead.append((planned, asyncio.ensure_future(work)))
+            if len(ahead) > FILES_AHEAD:
+                entries.append(await self._publish(project, by_name, *ahead.popleft()))
+        while ahead:
+            entries.append(await self._publish(project, by_name, *ahead.popleft()))
+        return entries
+
+    async def _prepare(
+        self, planned: PlannedFile, file: SourceFile, companion: SourceFile | None, options: ImportOptions, request: Any
+    ) -> PreparedImport:
+        if planned.role in ("refused", "companion"):
+            detail = f"{planned.name}: {planned.reason}"
+            return PreparedImport(planned.name, refusal=Refusal(code=planned.code, detail=detail))
+        read = [await self._with_bytes(one) for one in (file, companion) if one is not None]
+        return await self.compute(
+            importing.prepare, planned, read[0], read[1] if len(read) > 1 else None, options, request
+        )
+
+    async def _with_bytes(self, file: SourceFile) -> SourceFile:
+        if file.content is not None:
+            return file
+        data = await self.look_up(blobs.read_range, file.digest, 0, file.size_bytes)
+        return SourceFile(file.name, file.digest, file.size_bytes, data)
+
+    async def _publish(
+        self,
+        project: str,
+        by_name: dict[str, SourceFile],
+        planned: PlannedFile,
+        work: asyncio.Task[PreparedImport],
+    ) -> ImportEntry:
+        prepared = await work
+        if planned.role == "companion":
+            entry = ImportEntry(name=planned.name, status="companion")
+        elif prepared.refusal is not None:
+            entry = importing.entry_of(prepared, ())
+        else:
+            sources = [by_name[name] for name in (planned.name, planned.companion) if name is not None]
+            try:
+                entry = importing.entry_of(prepared, await self.change(importing.publish, project, prepared, sources))
+            except MareyError as error:
+                if error.status in REFUSED_ALTOGETHER:
+                    raise
+                refusal = Refusal(code=error.error_code, detail=error.detail)
+                entry = ImportEntry(name=planned.name, status="failed", error=refusal)
+        self.services.metrics.imports.labels(entry.status).inc()
+        return entry
+
+    def on_finish(self) -> None:
+        """Drop what was received."""
+        super().on_finish()
+        for file in getattr(self, "files", ()):
+            if isinstance(file.content, blobs.Spool):
+                file.content.close()
+
+
+def _form_options(form: dict[str, bytearray]) -> ImportOptions:
+    """Options from form fields. Raises `Invalid` naming the field."""
+    try:
+        values: dict[str, Any] = {name: value.decode() for name, value in form.items()}
+    except UnicodeDecodeError:
+        raise BadRequest("Form fields are UTF-8.", code="bad-multipart") from None
+    if "tags" in values:
+        values["tags"] = [tag for tag in values["tags"].split(",") if tag]
+    try:
+        return ImportOptions.model_validate(values)
+    except ValidationError as error:
+        faults = field_errors(error, values, json_pointer)
+        raise Invalid(f"{faults[0].pointer}: {faults[0].detail}", code="invalid-form", errors=faults) from None
+
+
+def _stored_files(tx: Transaction, request: ImportRequest) -> list[SourceFile]:
+    """Files named by digest. Raises `NotFound` where the caller may not read one."""
+    return [SourceFile(file.name, file.blob, blobs.require_readable(tx, file.blob), None) for file in request.files]
+
+
+RESOURCES: tuple[type[Resource], ...] = (Imports,)

@@ -1,0 +1,200 @@
+"""Items of every kind: one set of declarations serves skeletons, clips, models and all others."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from marey_schemas.base import Request
+from marey_schemas.items import Item, ItemChange, ItemCreate, Lineage, Revision, Staleness
+from marey_schemas.kinds import Kind
+from marey_server.errors import NotFound
+from marey_server.handlers.declarations import MIB, Access, Body, reads, writes
+from marey_server.handlers.queries import MAX_INTEGER, CommaSeparated, CountedPageQuery, PageQuery
+from marey_server.handlers.reply import Rendered, Reply
+from marey_server.handlers.resource import Resource
+from marey_server.store import items
+from marey_server.store.items import ItemFilters
+
+MAX_DOCUMENT_BYTES = 128 * MIB
+
+
+class ItemsQuery(CountedPageQuery):
+    """Which items, in which order, and how much of each."""
+
+    collection: str | None = Field(None, max_length=1024, description="In this folder or below it.")
+    path: str | None = Field(None, max_length=1300, description="Folder and name of one item.")
+    name: str | None = Field(None, max_length=255, description="Exactly this name, or with a final * its beginning.")
+    tag_in: CommaSeparated = Field((), alias="tag.in", description="With any of these tags.")
+    skeleton: str | None = Field(None, max_length=64, description="Clips on this skeleton.")
+    frames_gte: int | None = Field(None, alias="frames.gte", ge=0, le=MAX_INTEGER, description="At least so long.")
+    frames_lte: int | None = Field(None, alias="frames.lte", ge=0, le=MAX_INTEGER, description="At most so long.")
+    q: str | None = Field(None, max_length=255, description="Part of the name, in any case.")
+    deleted: bool = Field(False, description="Among the deleted ones.")
+    sort: str = Field("-created_at,id", max_length=100, description="Of id, name, created_at, updated_at, frames.")
+    fields: CommaSeparated | None = Field(None, description="Only these members of each item.")
+
+    def filters(self) -> ItemFilters:
+        """What the store filters by."""
+        return ItemFilters(
+            collection=self.collection,
+            path=self.path,
+            name=self.name,
+            tags=self.tag_in,
+            skeleton=self.skeleton,
+            frames_gte=self.frames_gte,
+            frames_lte=self.frames_lte,
+            q=self.q,
+            deleted=self.deleted,
+        )
+
+
+def kind_of(plural: str) -> Kind:
+    """The kind that a segment of the address names. Raises `NotFound`."""
+    try:
+        return Kind.from_plural(plural)
+    except KeyError:
+        raise NotFound(f"There is no kind of item called {plural!r}.", code="no-kind") from None
+
+
+class Items(Resource):
+    """The items of a kind in a project."""
+
+    path = "/projects/{project}/{kind}"
+    tag = "Items"
+
+    @reads(access=Access.READER, query=ItemsQuery, answer=Item, paged=True)
+    async def get(self, project: str, kind: str, query: ItemsQuery) -> Rendered:
+        """Items of a kind, filtered and sorted."""
+        return await self.answer(
+            items.list_items,
+            project,
+            kind_of(kind),
+            query.filters(),
+            sort=query.sort,
+            cursor=query.cursor,
+            limit=query.limit,
+            fields=query.fields,
+            count=query.count is not None,
+        )
+
+    @writes(
+        access=Access.CONTRIBUTOR,
+        body=Body(ItemCreate, max_bytes=MAX_DOCUMENT_BYTES),
+        answer=Item,
+        status=201,
+        etag=True,
+        idempotency="key",
+    )
+    async def post(self, project: str, kind: str, body: ItemCreate) -> Rendered:
+        """Make an item from its documents."""
+        prepared = body.model_copy(update={"parts": await self.compute(items.prepare_parts, kind_of(kind), body.parts)})
+        return await self.answer_with(
+            lambda made: Reply(made, rev=made.rev, location=f"/projects/{project}/{kind}/{made.id}"),
+            items.create_item,
+            project,
+            kind_of(kind),
+            prepared,
+        )
+
+
+class ItemResource(Resource):
+    """One item."""
+
+    path = "/projects/{project}/{kind}/{item}"
+    tag = "Items"
+
+    @reads(access=Access.READER, answer=Item, etag=True)
+    async def get(self, project: str, kind: str, item: str) -> Rendered:
+        """An item at its newest revision: name, place, tags, summary, documents."""
+        return await self.answer(items.read_item, project, kind_of(kind), item)
+
+    @writes(access=Access.CONTRIBUTOR, body=ItemChange, answer=Item, precondition="required", etag=True)
+    async def patch(self, project: str, kind: str, item: str, body: ItemChange) -> Rendered:
+        """Rename, move or tag an item."""
+        expected_rev = self.precondition.expected_rev
+        return await self.answer(items.change_item, project, kind_of(kind), item, body, expected_rev=expected_rev)
+
+    @writes(access=Access.MAINTAINER, precondition="required")
+    async def delete(self, project: str, kind: str, item: str) -> Rendered:
+        """Delete an item; it can be restored."""
+        expected_rev = self.precondition.expected_rev
+        return await self.answer(items.delete_item, project, kind_of(kind), item, expected_rev=expected_rev)
+
+
+class ItemRestoration(Resource):
+    """Bringing a deleted item back."""
+
+    path = "/projects/{project}/{kind}/{item}/restore"
+    tag = "Items"
+
+    @writes(access=Access.MAINTAINER, answer=Item, etag=True)
+    async def post(self, project: str, kind: str, item: str) -> Rendered:
+        """Restore a deleted item."""
+        return await self.answer(items.restore_item, project, kind_of(kind), item)
+
+
+class Revisions(Resource):
+    """The history of an item."""
+
+    path = "/projects/{project}/{kind}/{item}/revisions"
+    tag = "Items"
+
+    @reads(access=Access.READER, query=PageQuery, answer=Revision, paged=True)
+    async def get(self, project: str, kind: str, item: str, query: PageQuery) -> Rendered:
+        """The revisions of an item, newest first."""
+        return await self.answer(
+            items.list_revisions, project, kind_of(kind), item, cursor=query.cursor, limit=query.limit
+        )
+
+
+class RevisionResource(Resource):
+    """One revision."""
+
+    path = "/projects/{project}/{kind}/{item}/revisions/{revision:int}"
+    tag = "Items"
+
+    @reads(access=Access.READER, answer=Revision)
+    async def get(self, project: str, kind: str, item: str, revision: int) -> Rendered:
+        """One revision: author, message, job, documents."""
+        return await self.answer(items.read_revision, project, kind_of(kind), item, revision)
+
+
+class LineageQuery(Request):
+    """Of which revision."""
+
+    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Absent: the newest.")
+
+
+class LineageResource(Resource):
+    """Where a revision comes from."""
+
+    path = "/projects/{project}/{kind}/{item}/lineage"
+    tag = "Items"
+
+    @reads(access=Access.READER, query=LineageQuery, answer=Lineage)
+    async def get(self, project: str, kind: str, item: str, query: LineageQuery) -> Rendered:
+        """What a revision was made from, by which job, and what was made of it."""
+        return await self.answer(items.read_lineage, project, kind_of(kind), item, revision_number=query.revision)
+
+
+class StalenessResource(Resource):
+    """Whether an item is outdated."""
+
+    path = "/projects/{project}/{kind}/{item}/stale"
+    tag = "Items"
+
+    @reads(access=Access.READER, answer=Staleness)
+    async def get(self, project: str, kind: str, item: str) -> Rendered:
+        """Whether something the item was made from has a newer revision."""
+        return await self.answer(items.read_staleness, project, kind_of(kind), item)
+
+
+RESOURCES: tuple[type[Resource], ...] = (
+    Items,
+    ItemResource,
+    ItemRestoration,
+    Revisions,
+    RevisionResource,
+    LineageResource,
+    StalenessResource,
+)

@@ -1,0 +1,107 @@
+"""The documents of items: read whole or cut, and replaced by a new revision."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import Field, StringConstraints
+
+from marey_schemas.base import Request
+from marey_schemas.items import Item
+from marey_schemas.names import Message
+from marey_server.handlers.declarations import Access, Body, Document, reads, writes
+from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
+from marey_server.handlers.queries import MAX_INTEGER, CommaSeparated
+from marey_server.handlers.reply import Rendered, Reply
+from marey_server.handlers.resource import Resource
+from marey_server.store import items
+from marey_server.store.items import Part
+
+IMMUTABLE = "private, max-age=31536000, immutable"
+FrameRange = Annotated[str, StringConstraints(pattern=r"^\d{0,9}:\d{0,9}$")]
+
+
+class PartQuery(Request):
+    """Which revision of a part, and how much of it."""
+
+    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Absent: the newest.")
+    frames: FrameRange | None = Field(None, description="Half-open range, as in 100:200, :200 or 100:.")
+    joints: CommaSeparated | None = Field(None, description="Names of joints, in the order wanted.")
+
+    def frame_slice(self) -> slice | None:
+        """`frames` as a slice."""
+        if self.frames is None:
+            return None
+        start, _, stop = self.frames.partition(":")
+        return slice(int(start) if start else None, int(stop) if stop else None)
+
+
+class PartChange(Request):
+    """What to note about the revision that a change makes."""
+
+    message: Message = Field("", description="Shown in the history.")
+
+
+def part_reply(query: PartQuery) -> Any:
+    """Answers a part: what names its revision never changes."""
+
+    def reply(part: Part) -> Reply:
+        if query.revision is None:
+            return Reply(part.tree, rev=part.rev)
+        return Reply(part.tree, rev=f"r{part.revision}", headers={"Cache-Control": IMMUTABLE})
+
+    return reply
+
+
+class PartResource(Resource):
+    """One document of an item: a clip's motion, a skeleton's mapping."""
+
+    path = "/projects/{project}/{kind}/{item}/parts/{part}"
+    tag = "Items"
+
+    @reads(access=Access.READER, query=PartQuery, answer=Document, etag=True)
+    async def get(self, project: str, kind: str, item: str, part: str, query: PartQuery) -> Rendered:
+        """A document, whole or some frames and joints of it.
+
+        As MessagePack or BSON with `arrays=blocks` in the media type, arrays come compressed as they are stored.
+        """
+        return await self.answer_with(
+            part_reply(query),
+            items.read_part,
+            project,
+            kind_of(kind),
+            item,
+            part,
+            revision=query.revision,
+            frames=query.frame_slice(),
+            joints=query.joints,
+        )
+
+    @writes(
+        access=Access.CONTRIBUTOR,
+        query=PartChange,
+        body=Body(Document, max_bytes=MAX_DOCUMENT_BYTES),
+        answer=Item,
+        precondition="required",
+        etag=True,
+    )
+    async def put(
+        self, project: str, kind: str, item: str, part: str, query: PartChange, body: Mapping[str, Any]
+    ) -> Rendered:
+        """Replace a document; the item gets a new revision that shares its other documents."""
+        prepared = await self.compute(items.prepare_part, kind_of(kind), part, body)
+        expected_rev = self.precondition.expected_rev
+        return await self.answer(
+            items.put_part,
+            project,
+            kind_of(kind),
+            item,
+            part,
+            prepared,
+            expected_rev=expected_rev,
+            message=query.message,
+        )
+
+
+RESOURCES: tuple[type[Resource], ...] = (PartResource,)

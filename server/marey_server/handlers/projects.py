@@ -1,0 +1,119 @@
+"""Projects and who belongs to them."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from marey_schemas.access import Member, MemberChange, Project, ProjectChange, ProjectCreate
+from marey_server.handlers.declarations import Access, reads, writes
+from marey_server.handlers.queries import PageQuery
+from marey_server.handlers.reply import Rendered, Reply
+from marey_server.handlers.resource import Resource
+from marey_server.store import members, projects
+
+
+class ProjectsQuery(PageQuery):
+    """Which page, in which order."""
+
+    sort: str = Field("name", max_length=100, description="Of id, name, created_at, updated_at; - for falling.")
+
+
+class Projects(Resource):
+    """Every project the caller may see."""
+
+    path = "/projects"
+    tag = "Projects"
+
+    @reads(access=Access.ANYONE, query=ProjectsQuery, answer=Project, paged=True)
+    async def get(self, query: ProjectsQuery) -> Rendered:
+        """Your projects, and public ones."""
+        return await self.answer(projects.list_projects, sort=query.sort, cursor=query.cursor, limit=query.limit)
+
+    @writes(access=Access.USER, body=ProjectCreate, answer=Project, status=201, etag=True, idempotency="key")
+    async def post(self, body: ProjectCreate) -> Rendered:
+        """Make a project; you become its owner."""
+        return await self.answer_with(
+            lambda made: Reply(made, rev=made.rev, location=f"/projects/{made.name}"), projects.create_project, body
+        )
+
+
+class ProjectResource(Resource):
+    """One project."""
+
+    path = "/projects/{project}"
+    tag = "Projects"
+
+    @reads(access=Access.READER, answer=Project, etag=True)
+    async def get(self, project: str) -> Rendered:
+        """A project, and your role in it."""
+        return await self.answer(projects.read_project, project)
+
+    @writes(access=Access.OWNER, body=ProjectChange, answer=Project, precondition="required", etag=True)
+    async def patch(self, project: str, body: ProjectChange) -> Rendered:
+        """Change title, description or visibility."""
+        expected_rev = self.precondition.expected_rev
+        return await self.answer(projects.change_project, project, body, expected_rev=expected_rev)
+
+    @writes(access=Access.OWNER, precondition="required")
+    async def delete(self, project: str) -> Rendered:
+        """Delete a project with all it holds; it can be restored."""
+        return await self.answer(projects.delete_project, project, expected_rev=self.precondition.expected_rev)
+
+
+class ProjectRestoration(Resource):
+    """Bringing a deleted project back."""
+
+    path = "/projects/{project}/restore"
+    tag = "Projects"
+
+    @writes(access=Access.OWNER, answer=Project, etag=True)
+    async def post(self, project: str) -> Rendered:
+        """Restore the project of this name that was deleted last."""
+        return await self.answer(projects.restore_project, project)
+
+
+class Members(Resource):
+    """Who belongs to a project."""
+
+    path = "/projects/{project}/members"
+    tag = "Projects"
+
+    @reads(access=Access.READER, query=PageQuery, answer=Member, paged=True, public=False)
+    async def get(self, project: str, query: PageQuery) -> Rendered:
+        """Members and their roles."""
+        return await self.answer(members.list_members, project, cursor=query.cursor, limit=query.limit)
+
+
+class MemberResource(Resource):
+    """One member."""
+
+    path = "/projects/{project}/members/{user}"
+    tag = "Projects"
+
+    @reads(access=Access.READER, answer=Member, etag=True, public=False)
+    async def get(self, project: str, user: str) -> Rendered:
+        """The role of a member."""
+        return await self.answer(members.read_member, project, user)
+
+    @writes(access=Access.OWNER, body=MemberChange, answer=Member, precondition="optional", etag=True)
+    async def put(self, project: str, user: str, body: MemberChange) -> Rendered:
+        """Make a user a member, or change the role."""
+        believed = self.precondition
+        return await self.answer(
+            members.put_member, project, user, body, expected_rev=believed.expected_rev, absent=believed.absent
+        )
+
+    @writes(access=Access.OWNER, precondition="required")
+    async def delete(self, project: str, user: str) -> Rendered:
+        """End a membership; a project keeps at least one owner."""
+        expected_rev = self.precondition.expected_rev
+        return await self.answer(members.remove_member, project, user, expected_rev=expected_rev)
+
+
+RESOURCES: tuple[type[Resource], ...] = (
+    Projects,
+    ProjectResource,
+    ProjectRestoration,
+    Members,
+    MemberResource,
+)
