@@ -1,0 +1,321 @@
+"""How jobs get a worker, keep it, and end."""
+
+import pytest
+from queue_desk import Desk, desk, test_kinds  # noqa: F401
+
+from marey_schemas.jobs import BatchCompletion, JobCreate, Progress
+from marey_server.access.principal import SYSTEM, Principal
+from marey_server.errors import Forbidden, Invalid, LeaseLost, NotFound
+from marey_server.store import completion, queue
+
+
+def test_a_job_is_claimed_once_and_completed(desk: Desk) -> None:
+    job = desk.submit()
+    assert desk.state(job) == "queued"
+
+    lease = desk.claim()
+    assert (lease.job, lease.project, lease.fence, lease.attempt) == (job, "lab", 1, 1)
+    assert desk.claim_many() == []
+    assert desk.state(job) == "running"
+
+    answer = desk.complete(lease, result={"frames": 12})
+    assert answer.state == "succeeded"
+    assert desk.job(job).result == {"frames": 12, "outputs": 0}
+    assert desk.state(job) == "succeeded"
+
+
+def test_what_an_attempt_staged_is_published_when_it_completes_and_not_before(desk: Desk) -> None:
+    job = desk.submit(into="results")
+    lease = desk.claim()
+    assert desk.stage(lease, "a", "b", collection="deep") == 2
+    assert desk.outputs(job) == []
+
+    answer = desk.complete(lease)
+    assert [one.name for one in answer.outputs] == ["a", "b"]
+    assert [(one.name, one.revision, one.created) for one in desk.outputs(job)] == [("a", 1, True), ("b", 1, True)]
+
+
+def test_a_worker_that_lost_its_lease_cannot_publish(desk: Desk) -> None:
+    job = desk.submit()
+    slept = desk.claim()
+    desk.stage(slept, "stale")
+    desk.clock.advance(slept.lease_ttl_s + 1)
+    assert desk.reap() == 1
+    awake = desk.claim()
+    assert awake.fence > slept.fence
+
+    for act in (
+        lambda: desk.heartbeat(slept),
+        lambda: desk.stage(slept, "late"),
+        lambda: desk.complete(slept),
+        lambda: desk.fail(slept),
+    ):
+        with pytest.raises(LeaseLost):
+            act()
+    desk.stage(awake, "fresh")
+    desk.complete(awake)
+    with pytest.raises(LeaseLost):
+        desk.complete(slept)
+    assert [one.name for one in desk.outputs(job)] == ["fresh"]
+
+
+def test_jobs_are_picked_by_priority_and_then_by_age(desk: Desk) -> None:
+    first = desk.submit()
+    second = desk.submit()
+    urgent = desk.submit(priority=5)
+    idle = desk.submit(priority=-5)
+    assert [lease.job for lease in desk.claim_many()] == [urgent, first, second, idle]
+
+
+def test_a_worker_gets_only_kinds_and_labels_that_it_names(desk: Desk) -> None:
+    gpu = desk.submit(labels={"gpu": "a100", "site": "lyon"})
+    other_kind = desk.submit("sum")
+    assert desk.claim_many(kinds=("errand",)) == []
+    assert desk.claim_many(kinds=("errand",), labels={"gpu": "a100"}) == []
+    held = desk.claim_many(kinds=("errand",), labels={"site": "lyon", "gpu": "a100", "disk": "ssd"})
+    assert [lease.job for lease in held] == [gpu]
+    assert [lease.job for lease in desk.claim_many(kinds=("sum",))] == [other_kind]
+
+
+def test_too_many_labels_are_refused(desk: Desk) -> None:
+    with pytest.raises(Invalid, match="labels"):
+        desk.claim_many(labels={f"label{n}": "x" for n in range(7)})
+
+
+def test_at_most_one_job_runs_with_a_concurrency_key_and_others_are_passed_over(desk: Desk) -> None:
+    keyed = [desk.submit(concurrency_key="camera") for _ in range(3)]
+    free = desk.submit(priority=-1)
+    leases = desk.claim_many()
+    assert [lease.job for lease in leases] == [keyed[0], free]
+    assert desk.claim_many() == []
+
+    desk.complete(leases[0])
+    assert [lease.job for lease in desk.claim_many()] == [keyed[1]]
+
+
+def test_a_keyed_job_that_this_worker_cannot_do_does_not_stop_those_behind_it(desk: Desk) -> None:
+    desk.submit(concurrency_key="camera", labels={"gpu": "a100"}, priority=5)
+    plain = desk.submit(concurrency_key="camera")
+    assert [lease.job for lease in desk.claim_many()] == [plain]
+
+
+def test_only_the_job_that_is_asked_for_is_claimed(desk: Desk) -> None:
+    desk.submit()
+    wanted = desk.submit()
+    assert [lease.job for lease in desk.claim_many(job=wanted)] == [wanted]
+    assert desk.claim_many(job=wanted) == []
+
+
+def test_a_late_heartbeat_keeps_a_lease_that_nobody_took(desk: Desk) -> None:
+    desk.submit()
+    lease = desk.claim()
+    desk.clock.advance(lease.lease_ttl_s * 3)
+    assert desk.heartbeat(lease).lease_ttl_s == pytest.approx(60, abs=5)
+    assert desk.reap() == 0
+    desk.complete(lease)
+
+
+def test_progress_is_shown_while_the_job_runs(desk: Desk) -> None:
+    job = desk.submit()
+    lease = desk.claim()
+    desk.heartbeat(lease, Progress(done=3, total=12, note="third"))
+    progress = desk.job(job).progress
+    assert progress is not None
+    assert (progress.done, progress.total, progress.note) == (3, 12, "third")
+
+
+def test_a_lease_cannot_be_kept_beyond_the_time_limit_and_its_grace(desk: Desk) -> None:
+    job = desk.submit(resources={"time_limit_s": 100})
+    lease = desk.claim()
+    assert desk.heartbeat(lease).deadline_s == pytest.approx(100, abs=5)
+    desk.clock.advance(99)
+    assert desk.heartbeat(lease).lease_ttl_s == pytest.approx(31, abs=5)
+    desk.clock.advance(40)
+    answer = desk.heartbeat(lease)
+    assert answer.deadline_s == 0
+    assert answer.lease_ttl_s == 0
+    assert desk.reap() == 1
+    failure = desk.job(job).failure
+    assert failure is not None
+    assert failure.reason == "timeout"
+    with pytest.raises(LeaseLost):
+        desk.complete(lease)
+
+
+def test_the_same_write_gets_the_same_answer_and_another_one_none(desk: Desk) -> None:
+    desk.submit()
+    lease = desk.claim()
+    desk.stage(lease, "a")
+    first = desk.complete(lease, write_id="write-one")
+    assert desk.complete(lease, write_id="write-one") == first
+    with pytest.raises(LeaseLost):
+        desk.complete(lease, write_id="write-two")
+    with pytest.raises(LeaseLost):
+        desk.fail(lease, write_id="write-one")
+
+
+def test_a_failure_said_twice_counts_once(desk: Desk) -> None:
+    job = desk.submit()
+    lease = desk.claim()
+    first = desk.fail(lease, write_id="write-one")
+    assert desk.fail(lease, write_id="write-one") == first
+    assert first.retry_in_s == 10
+    desk.clock.advance(11)
+    again = desk.claim()
+    assert desk.fail(lease, write_id="write-one") == first
+    assert desk.state(job) == "running"
+    with pytest.raises(LeaseLost):
+        desk.complete(lease, write_id="write-one")
+    desk.complete(again)
+
+
+def test_a_failed_job_rests_longer_each_time_and_then_has_failed(desk: Desk) -> None:
+    job = desk.submit(max_attempts=4)
+    rests = []
+    for _ in range(3):
+        rests.append(desk.fail(desk.claim(), detail="no luck").retry_in_s)
+        assert desk.claim_many() == []
+        desk.clock.advance(rests[-1] + 1)
+    assert rests == [10, 40, 160]
+    desk.fail(desk.claim(), detail="no luck")
+    failure = desk.job(job).failure
+    assert failure is not None
+    assert failure.reason == "attempts_exhausted"
+    assert "no luck" in failure.detail
+
+
+def test_an_error_that_trying_again_cannot_help_fails_the_job_at_once(desk: Desk) -> None:
+    job = desk.submit()
+    desk.fail(desk.claim(), "bad-input", retryable=False, detail="line 3 holds no number")
+    failure = desk.job(job).failure
+    assert failure is not None
+    assert (failure.reason, failure.code, failure.detail) == ("error", "bad-input", "line 3 holds no number")
+
+
+def test_a_job_that_brings_two_workers_down_in_the_same_way_is_not_given_to_a_third(desk: Desk) -> None:
+    job = desk.submit(max_attempts=10)
+    desk.fail(desk.claim(), "killed", signature="exit:SIGKILL")
+    desk.clock.advance(11)
+    desk.fail(desk.claim(), "raised", signature="exception:KeyError")
+    desk.clock.advance(41)
+    desk.fail(desk.claim(), "killed", signature="exit:SIGKILL")
+    failure = desk.job(job).failure
+    assert failure is not None
+    assert failure.reason == "poison"
+
+
+def test_interruptions_are_counted_apart_from_attempts(desk: Desk) -> None:
+    job = desk.submit(max_attempts=1)
+    for _ in range(20):
+        assert desk.fail(desk.claim(), "stopped", interrupted=True).retry_in_s == 0
+    assert (desk.job(job).attempt, desk.job(job).interruptions) == (0, 20)
+    assert desk.fail(desk.claim(), "stopped", interrupted=True).state == "failed"
+
+
+def test_a_lost_job_is_tried_again_until_its_attempts_are_used_up(desk: Desk) -> None:
+    job = desk.submit(max_attempts=2)
+    for _ in range(2):
+        desk.claim()
+        desk.clock.advance(61)
+        assert desk.reap() == 1
+    failure = desk.job(job).failure
+    assert failure is not None
+    assert (failure.reason, failure.code) == ("attempts_exhausted", "worker-lost")
+
+
+def test_a_queued_job_is_cancelled_at_once(desk: Desk) -> None:
+    job = desk.submit()
+    assert desk.cancel(job).state == "cancelled"
+    assert desk.cancel(job).state == "cancelled"
+    assert desk.claim_many() == []
+
+
+def test_a_running_job_is_cancelled_when_its_worker_stops(desk: Desk) -> None:
+    job = desk.submit()
+    lease = desk.claim()
+    assert desk.cancel(job).cancel_requested
+    assert desk.heartbeat(lease).cancel_requested
+    assert desk.fail(lease, "cancelled").state == "cancelled"
+    assert desk.state(job) == "cancelled"
+
+
+def test_a_worker_that_does_not_stop_loses_a_cancelled_job_after_a_grace(desk: Desk) -> None:
+    job = desk.submit()
+    lease = desk.claim()
+    desk.cancel(job)
+    desk.clock.advance(25)
+    desk.heartbeat(lease)
+    assert desk.reap() == 0
+    desk.clock.advance(10)
+    assert desk.reap() == 1
+    assert desk.state(job) == "cancelled"
+    with pytest.raises(LeaseLost):
+        desk.complete(lease)
+
+
+def test_a_result_that_comes_before_the_worker_hears_of_the_cancellation_stands(desk: Desk) -> None:
+    job = desk.submit()
+    lease = desk.claim()
+    desk.cancel(job)
+    assert desk.complete(lease).state == "succeeded"
+    assert desk.state(job) == "succeeded"
+
+
+def test_many_jobs_are_claimed_and_completed_at_once_each_with_its_own_answer(desk: Desk) -> None:
+    desk.submit_many(*(JobCreate(kind="errand", params={"number": n}) for n in range(20)))
+    leases = desk.claim_many()
+    desk.stage(leases[3], "staged")
+    desk.complete(leases[5], write_id="completed-alone")
+    asked = [BatchCompletion(job=one.job, fence=one.fence, write_id=f"write-{one.job[-8:]}") for one in leases]
+    asked.append(BatchCompletion(job="job_unknown", fence=1, write_id="12345678"))
+    results = desk.database.write(desk.user, completion.complete_many, asked)
+
+    assert [one.job for one in results] == [one.job for one in asked]
+    refused = [index for index, one in enumerate(results) if one.answer is None]
+    assert refused == [5, 20]
+    assert (results[5].code, results[20].code) == ("lease-lost", "not-found")
+    assert results[3].answer is not None
+    assert [one.name for one in results[3].answer.outputs] == ["staged"]
+    assert desk.database.write(desk.user, completion.complete_many, asked) == results
+
+
+def test_a_worker_cannot_complete_what_another_token_claimed(desk: Desk) -> None:
+    job = desk.submit()
+    lease = desk.claim()
+    stranger = Principal("user", desk.user.user_id, "ann", scopes=("work",), token_id="token_other")
+    asked = [BatchCompletion(job=job, fence=lease.fence, write_id="12345678")]
+    (result,) = desk.database.write(stranger, completion.complete_many, asked)
+    assert result.code == "not-found"
+    assert desk.state(job) == "running"
+
+
+def test_an_attempts_token_works_for_its_own_attempt_only(desk: Desk) -> None:
+    desk.submit()
+    desk.submit()
+    mine, other = desk.claim_many()
+    me = desk.attempt(mine)
+    assert (me.kind, me.job_id, me.fence) == ("attempt", mine.job, mine.fence)
+    from marey_schemas.jobs import CompleteRequest
+
+    with pytest.raises(NotFound):
+        desk.database.write(me, completion.complete, other.job, other.fence, CompleteRequest(write_id="12345678"))
+
+
+def test_only_a_token_with_the_scope_work_may_claim(desk: Desk) -> None:
+    desk.submit()
+    idle = Principal("user", desk.user.user_id, "ann", scopes=("read", "jobs"))
+    from marey_schemas.jobs import ClaimRequest
+
+    with pytest.raises(Forbidden):
+        desk.database.write(idle, queue.claim, ClaimRequest(worker="w", kinds=("errand",)))
+    elsewhere = Principal("user", desk.user.user_id, "ann", scopes=("work!project=other",))
+    assert desk.database.write(elsewhere, queue.claim, ClaimRequest(worker="w", kinds=("errand",))) == []
+    stranger = Principal("user", "user_stranger", "bob", scopes=("work",))
+    assert desk.database.write(stranger, queue.claim, ClaimRequest(worker="w", kinds=("errand",))) == []
+    everywhere = desk.database.write(SYSTEM, queue.claim, ClaimRequest(worker="w", kinds=("errand",)))
+    assert len(everywhere) == 1
+
+
+def test_another_version_of_the_protocol_is_refused(desk: Desk) -> None:
+    with pytest.raises(Invalid, match="protocol"):
+        desk.claim_many(protocol=99)
