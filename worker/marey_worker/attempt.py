@@ -24,7 +24,7 @@ from marey_worker.cache import InputCache
 from marey_worker.child_process import ChildProcess
 from marey_worker.environment import environment
 from marey_worker.keeper import LeaseKeeper
-from marey_worker.messages import Done, Failed, Made, PutFile, ReadBlob, ReadPart, Reply, Request, Run, Stage
+from marey_worker.messages import Done, Failed, Made, PutFile, ReadBlob, ReadItem, ReadPart, Reply, Request, Run, Stage
 
 log = logging.getLogger(__name__)
 
@@ -107,8 +107,9 @@ class Attempt:
         self._watch = Watch(lease, self._keeper, stopping, self._log_path, time.monotonic())
         self._transfers = ThreadPoolExecutor(TRANSFERS_AT_ONCE, thread_name_prefix="marey-transfer")
 
-    def run(self, child: ChildProcess) -> None:
+    def run(self, child: ChildProcess) -> Done | Failed | Stop | None:
         """Have `child` do the job and tell the server how it went. Afterwards the child is idle, or dead."""
+        end: Done | Failed | Stop | None = None
         try:
             child.send(self._order())
             end = self._attend(child)
@@ -124,6 +125,7 @@ class Attempt:
             self._keeper.stop()
             self._transfers.shutdown(wait=False, cancel_futures=True)
             shutil.rmtree(self._scratch, ignore_errors=True)
+        return end
 
     def _order(self) -> Run:
         lease = self._lease
@@ -167,6 +169,8 @@ class Attempt:
         match request:
             case ReadPart(_, kind, item, revision, part):
                 return self._kept(f"{item}@{revision}/{part}", lambda: self._api.read_part(kind, item, revision, part))
+            case ReadItem(_, kind, item):
+                return self._api.read_item(kind, item)
             case ReadBlob(_, digest):
                 return self._kept(digest, lambda: self._api.read_blob(digest))
             case PutFile(_, path):

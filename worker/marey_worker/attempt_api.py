@@ -13,6 +13,7 @@ from marey_client.blobs import Blobs
 from marey_client.errors import Conflict, LeaseLost, Unauthenticated
 from marey_client.retries import Retries
 from marey_client.transport import BLOCKS, Transport, as_json, read_model
+from marey_schemas.items import Item
 from marey_schemas.jobs import (
     ClaimRequest,
     CompleteRequest,
@@ -83,6 +84,11 @@ class AttemptApi:
         path = f"/projects/{self._project}/{kind.plural}/{item}/parts/{part}"
         with _dead_token_is_lost_lease():
             return self._transport.send("GET", path, params={"revision": revision}, headers={"Accept": BLOCKS}).content
+
+    def read_item(self, kind: Kind, item: str) -> Item:
+        """An item as it is now."""
+        with _dead_token_is_lost_lease():
+            return self._transport.get(Item, f"/projects/{self._project}/{kind.plural}/{item}")
 
     def read_blob(self, digest: str) -> bytes:
         """Bytes by digest."""

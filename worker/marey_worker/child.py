@@ -47,7 +47,11 @@ def main() -> None:
 def load(kinds: list[str]) -> None:
     """Import what the kinds need, so that the first job does not wait for it."""
     for name in kinds:
-        importlib.import_module(find_kind(name).implementation.partition(":")[0])
+        module = find_kind(name).implementation.partition(":")[0]
+        try:
+            importlib.import_module(module)
+        except ImportError as error:  # jobs of this kind will fail and say so; those of others need not
+            sys.stderr.write(f"jobs of kind {name} cannot run here: {error}\n")
 
 
 def run_job(run: Run, pipe: Connection) -> End:

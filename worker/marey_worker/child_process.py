@@ -13,10 +13,17 @@ from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
+from marey_worker import signatures
 from marey_worker.limits import resident_bytes
+from marey_worker.messages import Ready
 
 TERMINATE_S = 10.0
+READY_S = 60.0
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+class ChildBroken(Exception):
+    """A child died before it had been given anything to do."""
 
 
 class ChildProcess:
@@ -34,6 +41,14 @@ class ChildProcess:
             )
         self._pipe = Connection(ours.detach())
         self._sending = threading.Lock()
+
+    def wait_until_ready(self) -> None:
+        """Wait until the child has loaded what it needs. Raises `ChildBroken` where it dies before."""
+        try:
+            while not isinstance(self.receive(READY_S), Ready):
+                continue
+        except EOFError as error:
+            raise ChildBroken(signatures.told_exit(self.wait())) from error
 
     @property
     def pid(self) -> int:

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from marey_schemas.codecs import MSGPACK, decode_tree, encode_tree
+from marey_schemas.items import Item
 from marey_schemas.jobs import PinnedInput, Progress, StagedOutput, StageRequest
 from marey_schemas.kinds import Kind
-from marey_worker.messages import Made, PutFile, ReadBlob, ReadPart, Reply, Request, Run, Stage
+from marey_worker.messages import Made, PutFile, ReadBlob, ReadItem, ReadPart, Reply, Request, Run, Stage
 
 T = TypeVar("T")
 
@@ -65,6 +66,11 @@ class Context:
                 pins, lambda pin, request: ReadPart(request, pin.kind, pin.item, pin.revision, part)
             )
         )
+
+    def item(self, kind: Kind, item: str) -> Item:
+        """An item as it is now. Raises `NoSuchThing` where there is none."""
+        found: Item = self._ask(lambda request: ReadItem(request, kind, item))
+        return found
 
     def blob(self, digest: str) -> bytes:
         """Bytes by digest."""

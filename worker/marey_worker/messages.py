@@ -57,6 +57,15 @@ class ReadPart:
 
 
 @dataclass(frozen=True)
+class ReadItem:
+    """Read an item as it is now."""
+
+    request: int
+    kind: Kind
+    item: str
+
+
+@dataclass(frozen=True)
 class ReadBlob:
     """Read bytes by digest."""
 
@@ -104,5 +113,5 @@ class Failed:
     retryable: bool
 
 
-Request = ReadPart | ReadBlob | PutFile | Stage
+Request = ReadPart | ReadItem | ReadBlob | PutFile | Stage
 End = Done | Failed

@@ -19,10 +19,10 @@ from marey_client.transport import Transport
 from marey_schemas.job_kinds import job_kinds
 from marey_schemas.jobs import ClaimRequest, Lease
 from marey_worker import faults
-from marey_worker.attempt import Attempt
+from marey_worker.attempt import Attempt, Stop
 from marey_worker.attempt_api import AttemptApi, claim
 from marey_worker.cache import InputCache
-from marey_worker.child_process import ChildProcess
+from marey_worker.child_process import ChildBroken, ChildProcess
 
 log = logging.getLogger(__name__)
 
@@ -64,6 +64,7 @@ class Supervisor:
         self._cache = InputCache(options.cache, options.cache_bytes)
         self._stopping = threading.Event()
         self._running: set[str] = set()
+        self._interrupted = False
         self._refusal: MareyError | None = None
 
     def stop(self) -> None:
@@ -77,13 +78,12 @@ class Supervisor:
             slot.start()
         log.info("%s works for %s: %s", self._options.name, self._transport.url, ", ".join(self._options.kinds))
         self._stopping.wait()
-        interrupted = bool(self._running)
         while self._running:  # slots that only wait for work hold nothing and may be left
             time.sleep(0.02)
         if self._refusal is not None:
             log.error("the server refuses this worker: %s", self._refusal)
             return REFUSED_STATUS
-        return INTERRUPTED_STATUS if interrupted else 0
+        return INTERRUPTED_STATUS if self._interrupted else 0
 
     # -- one slot --
 
@@ -91,14 +91,14 @@ class Supervisor:
         failures = 0
         with _Bench(self._options) as bench:
             while not self._stopping.is_set():
-                child = bench.child()
                 try:
+                    child = bench.child()
                     leases = self._claim()
                 except (Unauthenticated, Forbidden, Invalid) as error:
                     self._refusal = error
                     self.stop()
                     break
-                except MareyError as error:
+                except (MareyError, ChildBroken) as error:
                     failures += 1
                     log.warning("no work: %s", error)
                     self._stopping.wait(_pause_s(failures))
@@ -123,7 +123,8 @@ class Supervisor:
             faults.point("worker.after_claim")
             log.info("%s: %s, attempt %d", lease.job, lease.kind, lease.attempt)
             api = AttemptApi(self._transport, lease)
-            Attempt(api, lease, self._cache, self._transport.url, self._stopping).run(child)
+            end = Attempt(api, lease, self._cache, self._transport.url, self._stopping).run(child)
+            self._interrupted |= end is Stop.INTERRUPTED
         finally:
             self._running.discard(lease.job)
 
@@ -151,6 +152,7 @@ class _Bench:
         if self._child is None:
             threads = max(1, self._options.threads // self._options.slots)
             self._child, self._jobs = ChildProcess(self._options.kinds, threads=threads), 0
+            self._child.wait_until_ready()
         self._jobs += 1
         return self._child
 

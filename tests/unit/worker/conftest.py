@@ -1,0 +1,208 @@
+"""A small server that speaks the worker protocol and remembers what it heard, and workers to run against it."""
+
+import hashlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import defaultdict
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from marey_schemas.codecs import MSGPACK, decode_tree, encode_tree
+
+THIRD_PARTY = Path(__file__).parent / "thirdparty"
+ATTEMPT = re.compile(r"/api/v1/jobs/(\w+)/attempts/(\d+)/(\w+)")
+PART = re.compile(r"/api/v1/projects/lab/(\w+)/(\w+)/parts/(\w+)\?revision=(\d+)")
+BLOB = re.compile(r"/api/v1/blobs/(sha256:[0-9a-f]{64})")
+
+
+class FakeServer:
+    """Jobs to hand out, documents to read, and everything workers said, by job."""
+
+    def __init__(self):
+        self.jobs = []
+        self.documents = {}
+        self.blobs = {}
+        self.reads = []
+        self.heartbeats = defaultdict(list)
+        self.logs = defaultdict(bytes)
+        self.staged = defaultdict(list)
+        self.completed = {}
+        self.failed = {}
+        self.cancelled = set()
+        self.lost = set()
+        self.silent = set()
+        self.ttl_s, self.heartbeat_s = 60.0, 15.0
+        self.tokens_seen = set()
+        self._claims = 0
+        self._lock = threading.Lock()
+        self.http = ThreadingHTTPServer(("127.0.0.1", 0), _handler(self))
+        self.http.daemon_threads = True
+        threading.Thread(target=self.http.serve_forever, daemon=True).start()
+
+    @property
+    def url(self):
+        return f"http://127.0.0.1:{self.http.server_address[1]}"
+
+    def submit(self, kind, params=None, inputs=None, *, time_limit_s=60, memory_limit_mb=4096, job=None):
+        with self._lock:
+            job = job or f"job{len(self.jobs) + 1}x{self._claims}"
+            self.jobs.append((job, kind, params or {}, inputs or {}, time_limit_s, memory_limit_mb))
+        return job
+
+    def claim(self, wanted):
+        deadline = time.monotonic() + min(wanted["wait_s"], 2)
+        while time.monotonic() < deadline:
+            with self._lock:
+                for job in self.jobs:
+                    if job[1] in wanted["kinds"]:
+                        self.jobs.remove(job)
+                        self._claims += 1
+                        return [self._lease(*job)]
+            time.sleep(0.01)
+        return []
+
+    def _lease(self, job, kind, params, inputs, time_limit_s, memory_limit_mb):
+        return {
+            "job": job, "project": "lab", "kind": kind, "params": params, "inputs": inputs, "into": "out", "seed": 0,
+            "resources": {"time_limit_s": time_limit_s, "memory_limit_mb": memory_limit_mb}, "fence": self._claims,
+            "attempt": 1, "attempt_token": f"mareyjob_secret_of_{job}", "lease_ttl_s": self.ttl_s,
+            "heartbeat_s": self.heartbeat_s,
+        }  # fmt: skip
+
+    def until(self, condition, timeout_s=60):
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline, f"waited in vain; failed: {self.failed}, completed: {self.completed}"
+            time.sleep(0.01)
+
+    def ended(self, job, timeout_s=60):
+        self.until(lambda: job in self.completed or job in self.failed, timeout_s)
+        return self.completed.get(job) or self.failed[job]
+
+
+def _handler(server):
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def log_message(self, *_):
+            pass
+
+        def reply(self, status, body=b"", media_type="application/json"):
+            self.send_response(status)
+            self.send_header("Content-Type", media_type)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def problem(self, status, code, **context):
+            told = {"type": "", "title": "", "status": status, "detail": code, "instance": "r1", "code": code}
+            self.reply(status, json.dumps({**told, "context": context}).encode(), "application/problem+json")
+
+        def body(self):
+            return self.rfile.read(int(self.headers.get("Content-Length", 0)))
+
+        def do_POST(self):
+            body = self.body()
+            server.tokens_seen.add(self.headers["Authorization"])
+            if self.path == "/api/v1/leases":
+                return self.reply(200, json.dumps({"leases": server.claim(json.loads(body))}).encode())
+            job, _fence, what = ATTEMPT.fullmatch(self.path).groups()
+            if job in server.lost:
+                return self.problem(409, "lease-lost")
+            if job in server.silent:
+                return self.problem(503, "unavailable")
+            return getattr(self, f"on_{what}")(job, body)
+
+        def on_heartbeat(self, job, body):
+            server.heartbeats[job].append(json.loads(body).get("progress"))
+            answer = {"lease_ttl_s": server.ttl_s, "cancel_requested": job in server.cancelled}
+            self.reply(200, json.dumps(answer).encode())
+
+        def on_log(self, job, body):
+            if int(self.headers["Upload-Offset"]) != len(server.logs[job]):
+                return self.problem(409, "offset", offset=len(server.logs[job]))
+            server.logs[job] += body
+            return self.reply(204)
+
+        def on_outputs(self, job, body):
+            server.staged[job] += decode_tree(body, MSGPACK)["outputs"]
+            self.reply(204)
+
+        def on_complete(self, job, body):
+            server.completed[job] = json.loads(body)
+            self.reply(200, json.dumps({"job": job, "state": "succeeded"}).encode())
+
+        def on_fail(self, job, body):
+            server.failed[job] = json.loads(body)
+            self.reply(200, json.dumps({"job": job, "state": "queued"}).encode())
+
+        def do_GET(self):
+            if found := PART.fullmatch(self.path):
+                _, item, part, revision = found.groups()
+                server.reads.append((item, int(revision), part))
+                document = server.documents.get((item, int(revision), part))
+                if document is None:
+                    return self.problem(404, "not-found")
+                body = encode_tree(document, MSGPACK, arrays="blocks")
+                return self.reply(200, body, "application/msgpack; arrays=blocks")
+            data = server.blobs.get(BLOB.fullmatch(self.path)[1])
+            return self.problem(404, "not-found") if data is None else self.reply(200, data)
+
+        def do_PUT(self):
+            data = self.body()
+            digest = BLOB.fullmatch(self.path)[1]
+            assert digest == f"sha256:{hashlib.sha256(data).hexdigest()}"
+            server.blobs[digest] = data
+            self.reply(204)
+
+    return Handler
+
+
+@pytest.fixture
+def server():
+    fake = FakeServer()
+    yield fake
+    fake.http.shutdown()
+    fake.http.server_close()
+
+
+class Worker:
+    """A worker process, as `marey serve` starts one."""
+
+    def __init__(self, server, folder, *options, env=None):
+        paths = [str(THIRD_PARTY), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), **(env or {})}
+        command = [sys.executable, "-m", "marey_worker", "--attached", "--server", server.url]
+        self.process = subprocess.Popen(
+            [*command, "--cache", str(folder / "cache"), *options], stdin=subprocess.PIPE, env=environment
+        )
+        self.process.stdin.write(b"marey_worker_token\n")
+        self.process.stdin.flush()
+
+    def stop(self):
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(30)
+
+
+@pytest.fixture
+def start_worker(server, tmp_path):
+    workers = []
+
+    def start(*options, env=None):
+        workers.append(Worker(server, tmp_path, *options, env=env))
+        return workers[-1]
+
+    yield start
+    for worker in workers:
+        if worker.process.poll() is None:
+            worker.process.kill()
+            worker.process.wait()
+        worker.process.stdin.close()

@@ -1,0 +1,197 @@
+"""A worker process against a server that remembers what it heard."""
+
+import os
+import signal
+import time
+
+import psutil
+import pytest
+
+
+def alive(pid):
+    return psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+
+
+def test_a_kind_of_another_distribution_runs_and_its_result_log_and_progress_arrive(server, start_worker):
+    start_worker()
+    job = server.submit("add", {"a": 2, "b": 3})
+    end = server.ended(job)
+    assert end["result"]["sum"] == 5
+    assert end["code_version"] == "add@1"
+    assert "numpy" in end["environment"]
+    assert b"adding 2 and 3" in server.logs[job]
+
+
+def test_a_child_stays_warm_between_jobs(server, start_worker):
+    start_worker()
+    ends = [server.ended(server.submit("add", {"a": 1, "b": n})) for n in range(3)]
+    assert len({end["result"]["pid"] for end in ends}) == 1
+
+
+def test_the_attempts_own_token_is_used_for_the_attempt(server, start_worker):
+    start_worker()
+    job = server.submit("add", {"a": 1, "b": 1})
+    server.ended(job)
+    assert server.tokens_seen == {"Bearer marey_worker_token", f"Bearer mareyjob_secret_of_{job}"}
+
+
+def test_no_secret_stands_in_arguments_or_environment(server, start_worker):
+    worker = start_worker()
+    server.ended(server.submit("add", {"a": 1, "b": 1}))
+    process = psutil.Process(worker.process.pid)
+    for member in [process, *process.children(recursive=True)]:
+        seen = " ".join(member.cmdline()) + " ".join(member.environ().values())
+        assert "marey_worker_token" not in seen
+        assert "mareyjob_" not in seen
+
+
+@pytest.mark.parametrize(
+    ("how", "code", "retryable", "detail"),
+    [
+        ("raise", "exception", True, "the numbers do not add up"),
+        ("refuse", "not-today", False, "this cannot be done"),
+        ("segfault", "worker-process-died", True, "SIGSEGV"),
+        ("exit", "worker-process-died", True, "status 7"),
+        ("eat", "memory-limit", True, "512 MB"),
+    ],
+)
+def test_each_way_to_fail_is_told_apart_and_the_worker_goes_on(server, start_worker, how, code, retryable, detail):
+    start_worker()
+    failed = server.ended(server.submit("misbehave", {"how": how}, memory_limit_mb=512))
+    assert (failed["code"], failed["retryable"], failed["interrupted"]) == (code, retryable, False)
+    assert detail in failed["detail"]
+    assert server.ended(server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
+
+
+def test_the_same_crash_has_the_same_signature_and_another_has_another(server, start_worker):
+    start_worker()
+    signatures = [
+        server.ended(server.submit("misbehave", {"how": how}))["signature"]
+        for how in ("raise", "raise", "segfault", "segfault", "exit")
+    ]
+    assert signatures[0] == signatures[1]
+    assert signatures[2] == signatures[3]
+    assert len(set(signatures)) == 3
+
+
+def test_a_crash_leaves_its_traceback_in_the_log(server, start_worker):
+    start_worker()
+    job = server.submit("misbehave", {"how": "segfault"})
+    server.ended(job)
+    assert b"Segmentation fault" in server.logs[job]
+    assert b"_segfault" in server.logs[job]
+
+
+def test_memory_hoarded_by_a_grandchild_is_noticed_and_all_are_killed(server, start_worker):
+    start_worker()
+    failed = server.ended(server.submit("misbehave", {"how": "hoard"}, memory_limit_mb=512))
+    assert failed["code"] == "memory-limit"
+    assert failed["signature"] == "memory-limit"
+    time.sleep(0.2)
+    hoarders = [process for process in psutil.process_iter() if _holds_more_than(process, 400 << 20)]
+    assert not hoarders
+
+
+def _holds_more_than(process, size):
+    try:
+        return "marey_worker.child" in process.cmdline() and process.memory_info().rss > size
+    except psutil.Error:
+        return False
+
+
+def test_a_job_is_stopped_at_its_time_limit(server, start_worker):
+    start_worker()
+    failed = server.ended(server.submit("misbehave", {"how": "sleep", "seconds": 60}, time_limit_s=1))
+    assert failed["code"] == "time-limit"
+
+
+def test_a_cancelled_job_is_stopped(server, start_worker):
+    server.heartbeat_s = 0.3
+    start_worker()
+    job = server.submit("misbehave", {"how": "sleep", "seconds": 60})
+    server.until(lambda: server.heartbeats[job])
+    server.cancelled.add(job)
+    assert server.ended(job)["code"] == "cancelled"
+    assert server.ended(server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
+
+
+def test_a_job_whose_lease_was_lost_is_given_up_without_another_word(server, start_worker):
+    server.heartbeat_s = 0.3
+    start_worker()
+    job = server.submit("misbehave", {"how": "sleep", "seconds": 60})
+    server.until(lambda: server.heartbeats[job])
+    server.lost.add(job)
+    assert server.ended(server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
+    assert job not in server.completed
+    assert job not in server.failed
+
+
+def test_a_job_goes_on_while_the_server_is_away_and_is_published_when_it_is_back(server, start_worker):
+    server.heartbeat_s, server.ttl_s = 0.2, 0.6
+    start_worker()
+    job = server.submit("misbehave", {"how": "sleep", "seconds": 2})
+    server.until(lambda: server.heartbeats[job])
+    server.silent.add(job)
+    time.sleep(2.5)
+    assert job not in server.completed
+    heard = len(server.heartbeats[job])
+    server.silent.clear()
+    assert server.ended(job)["result"] == {"slept": True}
+    assert len(server.heartbeats[job]) > heard
+
+
+def test_on_sigterm_a_running_job_is_given_back_and_the_exit_status_says_so(server, start_worker):
+    worker = start_worker()
+    job = server.submit("misbehave", {"how": "sleep", "seconds": 60})
+    server.until(lambda: not server.jobs)
+    time.sleep(0.5)
+    assert worker.stop() != 0
+    assert server.failed[job]["interrupted"] is True
+
+
+def test_on_sigterm_an_idle_worker_exits_with_success(server, start_worker):
+    worker = start_worker()
+    server.ended(server.submit("add", {"a": 1, "b": 1}))
+    assert worker.stop() == 0
+
+
+def test_a_worker_stops_when_whoever_started_it_has_gone(server, start_worker):
+    worker = start_worker()
+    server.ended(server.submit("add", {"a": 1, "b": 1}))
+    worker.process.stdin.close()
+    assert worker.process.wait(30) == 0
+
+
+def test_children_do_not_outlive_a_worker_that_was_killed(server, start_worker):
+    worker = start_worker()
+    server.submit("misbehave", {"how": "sleep", "seconds": 60})
+    server.until(lambda: not server.jobs)
+    time.sleep(0.5)
+    children = [child.pid for child in psutil.Process(worker.process.pid).children(recursive=True)]
+    assert children
+    os.kill(worker.process.pid, signal.SIGKILL)
+    worker.process.wait()
+    server.until(lambda: not any(alive(pid) for pid in children), 10)
+
+
+def test_slots_run_jobs_at_the_same_time(server, start_worker):
+    start_worker("--slots", "2")
+    server.ended(server.submit("add", {"a": 1, "b": 1}))
+    jobs = [server.submit("misbehave", {"how": "sleep", "seconds": 1.5}, job=f"both{n}") for n in range(2)]
+    server.until(lambda: not server.jobs, 5)
+    assert not server.completed.keys() & set(jobs)
+    assert all(server.ended(job)["result"] == {"slept": True} for job in jobs)
+
+
+def test_a_file_that_a_job_made_is_sent_and_named_by_its_digest(server, start_worker):
+    start_worker()
+    end = server.ended(server.submit("misbehave", {"how": "put"}))
+    assert server.blobs[end["result"]["digest"]] == b"bytes that a job made"
+
+
+@pytest.mark.parametrize("point", ["worker.after_claim", "worker.before_complete", "worker.after_complete"])
+def test_fault_points_kill_the_worker_where_they_say(server, start_worker, point):
+    worker = start_worker(env={"MAREY_FAULT": f"{point}:kill"})
+    job = server.submit("add", {"a": 1, "b": 1})
+    assert worker.process.wait(60) == -signal.SIGKILL
+    assert (job in server.completed) == (point == "worker.after_complete")

@@ -1,0 +1,92 @@
+"""Kinds of job from another distribution, as a worker sees them: one that works, one that fails in every way."""
+
+import ctypes
+import os
+import sys
+import time
+
+from marey_schemas.base import Request
+from marey_schemas.job_kinds import KindDeclaration
+from marey_worker.context import JobRefused
+
+
+class AddParams(Request):
+    a: int
+    b: int
+
+
+class MisbehaveParams(Request):
+    how: str
+    seconds: float = 0.0
+
+
+def add(context, params):
+    context.log(f"adding {params.a} and {params.b}")
+    context.progress(1, 2, "half way")
+    return {"sum": params.a + params.b, "pid": os.getpid()}
+
+
+def misbehave(context, params):
+    return {
+        "raise": _raise, "refuse": _refuse, "segfault": _segfault, "exit": _exit, "eat": _eat, "hoard": _hoard,
+        "sleep": lambda: _sleep(params.seconds), "shout": _shout, "ignore-term": lambda: _ignore_term(params.seconds),
+        "put": lambda: _put(context),
+    }[params.how]()  # fmt: skip
+
+
+def _raise():
+    raise ArithmeticError("the numbers do not add up")
+
+
+def _refuse():
+    raise JobRefused("not-today", "this cannot be done")
+
+
+def _segfault():
+    ctypes.string_at(0)
+
+
+def _exit():
+    os._exit(7)
+
+
+def _eat():
+    return {"bytes": len(bytearray(8 << 30))}
+
+
+def _hoard():
+    """Memory in small helpings, which no single allocation gives away; in a process of its own."""
+    if os.fork() == 0:
+        hoard = []
+        while True:
+            hoard.append(b"x" * (4 << 20))
+            time.sleep(0.001)
+    time.sleep(60)
+
+
+def _sleep(seconds):
+    time.sleep(seconds)
+    return {"slept": True}
+
+
+def _ignore_term(seconds):
+    import signal
+
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    return _sleep(seconds)
+
+
+def _shout():
+    print("said on standard output")
+    print("said on standard error", file=sys.stderr)
+    return {}
+
+
+def _put(context):
+    path = context.scratch / "result.bin"
+    path.write_bytes(b"bytes that a job made")
+    return {"digest": context.put_file(path)}
+
+
+ADD = KindDeclaration("add", "Adds.", AddParams, "marey_test_kinds:add", 1, {})
+MISBEHAVE = KindDeclaration("misbehave", "Fails.", MisbehaveParams, "marey_test_kinds:misbehave", 1, {})
