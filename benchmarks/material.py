@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion import quaternions
 from marey_motion.clip import Clip
 from marey_motion.skeleton import Skeleton
 
@@ -19,18 +20,25 @@ def real_folder() -> Path | None:
 
 
 def noisy_clip(frames: int, joints: int, seed: int = 0) -> Clip:
-    """Smooth rotations of every joint with capture noise of 2e-4 rad and 0.05 mm: nothing a codec could guess."""
+    """Five harmonics per Euler angle with capture noise of 2e-4 rad and 0.05 mm, at 60 Hz."""
     rng = np.random.default_rng(seed)
-    time = np.arange(frames)[:, None, None] / 60.0
-    axes = rng.normal(size=(1, joints, 3))
-    phase, rate = rng.uniform(0, 6.28, (1, joints, 1)), rng.uniform(0.5, 2.0, (1, joints, 1))
-    half = 0.3 * axes * np.sin(phase + 6.28 * rate * time) + rng.normal(scale=1e-4, size=(frames, joints, 3))
-    rotations = np.concatenate([np.ones((frames, joints, 1)), half], axis=2)
-    rotations /= np.linalg.norm(rotations, axis=2, keepdims=True)
-    root = np.concatenate([np.sin(time[:, :, 0]), 0.9 + 0.02 * np.sin(9 * time[:, :, 0]), 1.3 * time[:, :, 0]], axis=1)
-    root += rng.normal(scale=5e-5, size=root.shape)
+    seconds = np.arange(frames) / 60.0
+    angles = _harmonics(seconds, (joints, 3), 0.3, rng) + rng.normal(scale=2e-4, size=(frames, joints, 3))
+    root = _harmonics(seconds, (3,), 0.2, rng) + rng.normal(scale=5e-5, size=(frames, 3))
+    root += np.stack([0.2 * seconds, np.full(frames, 0.9), 1.3 * seconds], axis=1)
+    rotations = quaternions.unroll(quaternions.from_euler("zxy", angles))
     poses = np.concatenate([root, rotations.reshape(frames, 4 * joints)], axis=1).astype(np.float32)
     return Clip(chain_skeleton(joints, rng), 60.0, poses, None, ())
+
+
+def _harmonics(
+    seconds: NDArray[np.float64], channels: tuple[int, ...], amplitude: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    orders = np.arange(1, 6)
+    phases = rng.uniform(0, 2 * np.pi, (*channels, 5))
+    sizes = rng.normal(scale=amplitude, size=(*channels, 5)) / orders
+    waves = np.sin(2 * np.pi * 0.5 * seconds.reshape(-1, *([1] * (len(channels) + 1))) * orders + phases)
+    return np.asarray((waves * sizes).sum(axis=-1))
 
 
 def chain_skeleton(joints: int, rng: np.random.Generator) -> Skeleton:

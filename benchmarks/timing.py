@@ -21,7 +21,7 @@ class Timing:
 class Row:
     """One line of the report.
 
-    `ratio` compares with the peer of the same run and is above 1 where Marey is better; None where the goal is absolute.
+    `ratio` compares with the peer of the same run, above 1 where Marey is better; None where the goal is absolute.
     """
 
     job: str

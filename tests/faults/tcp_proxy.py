@@ -12,9 +12,9 @@ from typing import Self
 class TcpProxy:
     """Forwards connections to `target_port` on loopback.
 
-    `drop_requests` and `drop_answers` swallow bytes of that direction while set; `cut_after_request` closes the connection
-    of the next exchange as soon as the server starts to answer, so that the server has done the work and the client never
-    hears of it.
+    `drop_requests` and `drop_answers` swallow bytes of that direction while set; `cut_after_request` closes the
+    connection of the next exchange as soon as the server starts to answer, so that the server has done the work and the
+    client never hears of it.
     """
 
     def __init__(self, target_port: int) -> None:

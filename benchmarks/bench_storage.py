@@ -1,0 +1,61 @@
+"""Bytes per pose of stored clips against the usual forms, and the speed of the block codec."""
+
+from __future__ import annotations
+
+import bson
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from benchmarks.material import noisy_clip
+from benchmarks.timing import Row, time_alone
+from marey_schemas import blocks
+
+FRAMES = 3000
+GOAL_BYTES = 500
+
+
+def run() -> list[Row]:
+    """Exact float32 at 63 and 31 joints."""
+    rows = []
+    for joints in (63, 31):
+        poses = noisy_clip(FRAMES, joints).poses
+        rows.append(_size_row(poses, joints))
+    rows += _speed_rows(noisy_clip(FRAMES, 63).poses)
+    return rows
+
+
+def _size_row(poses: NDArray[np.float32], joints: int) -> Row:
+    encoded = blocks.encode(poses)
+    assert np.array_equal(blocks.decode(encoded).view(np.uint32), poses.view(np.uint32)), "the codec must be exact"
+    ours = len(encoded) / len(poses)
+    doubles = len(bson.encode({"poses": poses.astype(np.float64).tolist()})) / len(poses)
+    squeezed = len(zstandard.ZstdCompressor(level=1).compress(poses.tobytes())) / len(poses)
+    return Row(
+        "stored bytes per pose",
+        f"{FRAMES} frames x {joints} joints, synthetic capture noise",
+        f"{ours:.0f} B",
+        f"BSON of doubles {doubles:.0f} B; zstd of float32 {squeezed:.0f} B",
+        doubles / ours,
+        f"≤ {GOAL_BYTES} B" if joints == 63 else "",
+        ours <= GOAL_BYTES,
+    )
+
+
+def _speed_rows(poses: NDArray[np.float32]) -> list[Row]:
+    encoded = blocks.encode(poses)
+    encoding, decoding = time_alone(lambda: blocks.encode(poses)), time_alone(lambda: blocks.decode(encoded))
+    megabytes = poses.size * 8 / 1e6  # counted as doubles, as the measured peers were
+    size = f"{FRAMES} frames x 63 joints, MB of doubles"
+    return [
+        Row(
+            "encode blocks",
+            size,
+            f"{megabytes / encoding.median_s:.0f} MB/s",
+            "",
+            None,
+            "≥ 150 MB/s",
+            megabytes / encoding.median_s >= 150,
+        ),
+        Row("decode blocks", size, f"{megabytes / decoding.median_s:.0f} MB/s", "", None, "", True),
+    ]
