@@ -37,21 +37,21 @@ CODES = {
     "up-axis-converted": "Another axis than y points up in the file; the motion was turned.",
     "left-handed": "Left is on the right: the file may be left-handed.",
     # What the motion shows.
-    "rest-pose-frame": "The motion begins or ends with a rest pose, which spoils means and coverage; it can be trimmed.",
+    "rest-pose-frame": "The motion begins or ends with a rest pose, which spoils means; it can be trimmed.",
     "floor-offset": "The feet stand above or below height zero.",
     "floor-penetration": "Feet go below the ground they otherwise stand on.",
     "foot-skate": "Feet slide while they stand.",
     "in-place-gait": "The body walks without travelling, as on a treadmill; leave it out of speed coverage.",
     "teleport": "The root jumps between two frames.",
     "rotation-jump": "A joint turns implausibly far between two frames.",
-    "dead-joints": "Joints never turn although others do.",
+    "dead-joints": "Whole limbs never turn although other joints do.",
 }
 
 REST_TOLERANCE_RAD = 0.01
 FLOOR_TOLERANCE_M = 0.1
 PENETRATION_M = 0.05
 SKATE_HEIGHT_M = 0.025
-SKATE_SPEED_M_S = 0.35
+SKATE_SPEED_M_S = 0.6
 IN_PLACE_FOOT_SPEED_M_S = 0.4
 TELEPORT_SPEED_M_S = 15.0
 JUMP_RAD = np.radians(60.0)
@@ -107,13 +107,13 @@ class _Tracks:
         return float(np.quantile(self.sole_heights().min(axis=1), 0.05))
 
 
-def check_clip(clip: Clip) -> tuple[CheckWarning, ...]:
-    """Everything worth knowing about a clip, in the order of `CODES`."""
-    tracks = _track(clip)
+def check_clip(clip: Clip, landmarks: Landmarks | None = None) -> tuple[CheckWarning, ...]:
+    """Everything worth knowing about a clip; `landmarks` of its skeleton, where they are known already."""
+    tracks = _track(clip, landmarks)
     warnings = [_position_channels(clip), *_rest_poses(clip, tracks)]
     if tracks.soles:
-        warnings += [_floor_offset(tracks), _floor_penetration(clip, tracks), *_gait(clip, tracks)]
-    warnings += [_teleports(clip), _rotation_jumps(clip), _dead_joints(clip)]
+        warnings += [_floor_offset(tracks), _floor_penetration(tracks), *_gait(clip, tracks)]
+    warnings += [_teleports(clip), _rotation_jumps(clip), _dead_joints(clip, tracks)]
     return tuple(warning for warning in warnings if warning is not None)
 
 
@@ -126,7 +126,7 @@ def without_rest_pose(clip: Clip) -> tuple[Clip, tuple[int, int]]:
 
 
 def on_the_floor(clip: Clip) -> tuple[Clip, float]:
-    """The clip with its ground at height zero, and how many metres were added to every height; unchanged without feet."""
+    """The clip with its ground at height zero, and the metres that were added to every height; itself without feet."""
     tracks = _track(clip)
     if not tracks.soles:
         return clip, 0.0
@@ -136,9 +136,9 @@ def on_the_floor(clip: Clip) -> tuple[Clip, float]:
     return replace(clip, poses=poses), shift_m
 
 
-def _track(clip: Clip) -> _Tracks:
+def _track(clip: Clip, landmarks: Landmarks | None = None) -> _Tracks:
     skeleton = clip.skeleton
-    landmarks = find_landmarks(skeleton.joint_names, skeleton.parents)
+    landmarks = landmarks or find_landmarks(skeleton)
     soles = tuple(_sole(skeleton, foot) for foot in landmarks.feet or ())
     bodies = [joint for pair in (landmarks.hands, landmarks.feet) if pair for joint in pair]
     points = sorted({0, landmarks.hips or 0, *bodies, *(point for sole in soles for point in sole)})
@@ -220,10 +220,9 @@ def _in_t_pose(clip: Clip, tracks: _Tracks) -> NDArray[np.bool_]:
     landmarks = tracks.landmarks
     if landmarks.hands is None or landmarks.feet is None or landmarks.hips is None:
         return np.zeros(clip.frame_count, np.bool_)
-    parents, offsets = clip.skeleton.parents, clip.skeleton.offsets
-    chest = common_ancestor(parents, landmarks.hands)
-    span = sum(path_length(parents, offsets, chest, hand) for hand in landmarks.hands)
-    leg = path_length(parents, offsets, landmarks.hips, landmarks.feet[0])
+    chest = common_ancestor(clip.skeleton.parents, landmarks.hands)
+    span = sum(path_length(clip.skeleton, chest, hand) for hand in landmarks.hands)
+    leg = path_length(clip.skeleton, landmarks.hips, landmarks.feet[0])
     hands, feet, hips = tracks.of(*landmarks.hands), tracks.of(*landmarks.feet), tracks.of(landmarks.hips)
     across = hands[:, 0] - hands[:, 1]
     apart = np.hypot(across[:, 0], across[:, 2]) > 0.9 * span
@@ -243,12 +242,11 @@ def _floor_offset(tracks: _Tracks) -> CheckWarning | None:
     return CheckWarning(
         "floor-offset",
         f"the feet stand at a height of {height:.2f} m; bring them to the ground with --align-floor (align_floor)",
-        joints=(),
         values={"floor_height_m": height},
     )
 
 
-def _floor_penetration(clip: Clip, tracks: _Tracks) -> CheckWarning | None:
+def _floor_penetration(tracks: _Tracks) -> CheckWarning | None:
     depths = tracks.floor_height() - tracks.sole_heights().min(axis=1)
     below = np.flatnonzero(depths > PENETRATION_M)
     if below.size == 0:
@@ -270,16 +268,15 @@ def _gait(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
     """
     if clip.frame_count < 3:
         return []
-    heights = tracks.sole_heights()[1:] - tracks.floor_height()
-    feet = np.stack([tracks.positions[:, sole].mean(axis=1) for sole in tracks.soles], axis=1)
-    steps = np.linalg.norm(np.diff(feet[..., [0, 2]], axis=0), axis=2)
+    soles = tracks.positions[:, np.concatenate(tracks.soles)]
+    heights = soles[1:, :, 1] - tracks.floor_height()
     weights = np.clip(2.0 - 2.0 ** (np.clip(heights, 0.0, None) / SKATE_HEIGHT_M), 0.0, 1.0)
-    standing = weights.sum()
+    standing = float(weights.sum())
     if standing < 2:
         return []
-    slide_m_s = float((steps * weights).sum() / standing * clip.frame_rate_hz)
-    hips = tracks.of(tracks.landmarks.hips or 0)[:, 0]
-    travel_m_s = float(np.linalg.norm(hips[-1, [0, 2]] - hips[0, [0, 2]]) / len(steps) * clip.frame_rate_hz)
+    steps = np.linalg.norm(np.diff(soles[..., [0, 2]], axis=0), axis=2)
+    slide_m_s = float((steps * weights).sum()) / standing * clip.frame_rate_hz
+    travel_m_s = _travel_speed(tracks.of(tracks.landmarks.hips or 0)[:, 0], clip.frame_rate_hz)
     values = {"slide_m_s": slide_m_s, "travel_m_s": travel_m_s}
     if slide_m_s > IN_PLACE_FOOT_SPEED_M_S and travel_m_s < 0.2 * slide_m_s:
         message = f"standing feet slide at {slide_m_s:.2f} m/s while the body travels {travel_m_s:.2f} m/s"
@@ -287,6 +284,13 @@ def _gait(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
     if slide_m_s > SKATE_SPEED_M_S:
         return [CheckWarning("foot-skate", f"standing feet slide at {slide_m_s:.2f} m/s on average", values=values)]
     return []
+
+
+def _travel_speed(hips: NDArray[np.float32], frame_rate_hz: float) -> float:
+    """Mean speed on the ground of hips (F, 3) over spans of a second, which leaves out their swaying, m/s."""
+    span = min(max(1, round(frame_rate_hz)), len(hips) - 1)
+    ways = np.linalg.norm(hips[span:, [0, 2]] - hips[:-span, [0, 2]], axis=1)
+    return float(ways.mean()) / span * frame_rate_hz
 
 
 # Continuity
@@ -325,16 +329,24 @@ def _rotation_jumps(clip: Clip) -> CheckWarning | None:
     )
 
 
-def _dead_joints(clip: Clip) -> CheckWarning | None:
-    if clip.frame_count < 2:
-        return None
+def _dead_joints(clip: Clip, tracks: _Tracks) -> CheckWarning | None:
+    """Limbs or a head none of whose joints ever turns, while others do."""
+    landmarks = tracks.landmarks
     still = (clip.rotations == clip.rotations[0]).all(axis=(0, 2))
-    has_children = np.zeros(clip.skeleton.joint_count, np.bool_)
-    has_children[clip.skeleton.parents[1:]] = True
-    names = tuple(clip.skeleton.joint_names[joint] for joint in np.flatnonzero(still & has_children))
-    if not names or still.all():
+    if clip.frame_count < 2 or still.all() or not (landmarks.hands and landmarks.feet):
         return None
-    return CheckWarning("dead-joints", f"{len(names)} joints with children never turn", joints=names)
+    chest = common_ancestor(clip.skeleton.parents, landmarks.hands)
+    limbs = [(chest, hand) for hand in landmarks.hands] + [(landmarks.hips or 0, foot) for foot in landmarks.feet]
+    dead: list[int] = []
+    for top, end in limbs:
+        path = clip.skeleton.path_to_root(end)
+        limb = list(path[: path.index(top)])
+        if still[limb].all():
+            dead += limb
+    if not dead:
+        return None
+    names = tuple(clip.skeleton.joint_names[joint] for joint in sorted(dead))
+    return CheckWarning("dead-joints", f"{len(names)} joints of whole limbs never turn", joints=names)
 
 
 def _step_cosines(rotations: NDArray[np.float32]) -> NDArray[np.float32]:

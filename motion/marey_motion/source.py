@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -85,6 +86,13 @@ class SourceMotion:
     declared: tuple[str, ...] = ()
     channels: tuple[tuple[str, ...], ...] = ()
     warnings: list[CheckWarning] = field(default_factory=list)
+
+    @cached_property
+    def skeleton(self) -> Skeleton:
+        """The joints in the file's unit and axes."""
+        return Skeleton(
+            self.joint_names, self.parents, self.offsets, self.rest_rotations, display_names=self.display_names
+        )
 
 
 @dataclass(frozen=True)

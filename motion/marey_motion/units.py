@@ -8,16 +8,16 @@ user is asked.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.errors import AmbiguousUnits
 from marey_motion.checks import CheckWarning
-from marey_motion.source import Handedness, ImportOptions, SourceMotion, UpAxis
+from marey_motion.errors import AmbiguousUnits, MotionError
 from marey_motion.kinematics import forward_kinematics
-from marey_motion.landmarks import Landmarks, find_landmarks, path_length
-from marey_motion.skeleton import Skeleton
+from marey_motion.landmarks import Landmarks, path_length
+from marey_motion.source import Handedness, ImportOptions, SourceMotion, UpAxis
 
 # Metres per unit: the units that motion files have been seen in. The CMU data base counts in 1/0.45 inch.
 UNITS_M = {
@@ -30,15 +30,25 @@ UNITS_M = {
     "m": 1.0,
 }
 CONVENTIONAL_UNITS = ("m", "cm", "mm")
-# From the joint that carries both legs down the bones to the ankle, in adults. Under these bounds no length fits two units.
+# Adults, from the joint that carries both legs down the bones to the ankle. No length fits two units in these bounds.
 LEG_LENGTH_M = (0.72, 1.2)
 ANIMAL_LEG_LENGTH_M = (0.1, 1.5)
 
 _SAMPLED_FRAMES = 64
 _CLEAR_COSINE = 0.8
-_MIRRORED_COSINE = -0.5
+_MIRRORED_COSINE = -0.2
 _FLAT_GROUND = 0.1
 _CLEARLY_FLATTER = 3.0
+
+
+def unit_in_metres(unit: str | float) -> float:
+    """Metres of a unit given by name (`UNITS_M`) or as its size in metres."""
+    metres = UNITS_M.get(unit.lower()) if isinstance(unit, str) else float(unit)
+    if metres is None or not (np.isfinite(metres) and metres > 0):
+        raise MotionError(
+            f"the unit {unit!r} is none of {', '.join(UNITS_M)} nor a size in metres", code="unit_unknown"
+        )
+    return metres
 
 
 @dataclass(frozen=True)
@@ -68,24 +78,29 @@ class _Body:
     warnings: list[CheckWarning] = field(default_factory=list)
 
 
-def infer_conversion(source: SourceMotion, file: str, options: ImportOptions) -> Conversion:
+def infer_conversion(source: SourceMotion, landmarks: Landmarks, file: str, options: ImportOptions) -> Conversion:
     """Decide unit and upward axis: what the options say, else what the format fixes, else what the body shows.
+
+    Parameters
+    ----------
+    landmarks : of the source's skeleton
+    file : its name, for messages
 
     Raises
     ------
     AmbiguousUnits    naming the option to set and the candidates, when the body does not decide
     """
-    body = _measure(source, file)
+    body = _measure(source, landmarks, file)
     up_axis = _choose_up_axis(source, body, options)
     unit_scale_m = _choose_unit(source, body, options, up_axis)
     _look_for_mirroring(source, body, options, up_axis)
     return Conversion(unit_scale_m, up_axis, options.handedness, tuple(body.evidence), tuple(body.warnings))
 
 
-def _measure(source: SourceMotion, file: str) -> _Body:
-    skeleton = Skeleton(source.joint_names, source.parents, source.offsets, source.rest_rotations)
+def _measure(source: SourceMotion, landmarks: Landmarks, file: str) -> _Body:
+    skeleton = source.skeleton
     rest = skeleton.rest_global_positions
-    positions = rest[None]
+    positions: NDArray[np.floating[Any]] = rest[None]
     if source.rotations is not None and source.root_positions is not None:
         frames = np.unique(np.linspace(0, len(source.rotations) - 1, _SAMPLED_FRAMES).astype(np.int64))
         rotations = source.rotations[frames].astype(np.float64).reshape(len(frames), -1)
@@ -96,11 +111,10 @@ def _measure(source: SourceMotion, file: str) -> _Body:
             translations=translations,
             translated_joints=source.translated_joints,
         )
-    landmarks = find_landmarks(source.joint_names, source.parents)
     leg = None
     if landmarks.feet and landmarks.hips is not None:
-        leg = float(np.mean([path_length(source.parents, source.offsets, landmarks.hips, f) for f in landmarks.feet]))
-    return _Body(file, landmarks, positions, rest, leg or None)
+        leg = float(np.mean([path_length(skeleton, landmarks.hips, foot) for foot in landmarks.feet]))
+    return _Body(file, landmarks, positions.astype(np.float64), rest, leg or None)
 
 
 # Up axis
@@ -114,12 +128,14 @@ def _choose_up_axis(source: SourceMotion, body: _Body, options: ImportOptions) -
         body.evidence.append(f"up axis {source.up_axis}: fixed by the format")
         return source.up_axis
     if body.leg is None:
-        body.evidence.append("up axis y: the usual one, assumed because the joint names tell no feet")
-        body.warnings.append(CheckWarning("up-axis-assumed", "no feet were found to tell which way is up; y is assumed"))
+        body.evidence.append("up axis y: the usual one, assumed because no feet were found")
+        body.warnings.append(CheckWarning("up-axis-assumed", "no feet tell which way is up; y is assumed"))
         return "y"
     standing = _body_axis(body.positions, body.landmarks)
     if standing[0] == "y" and standing[1] >= _CLEAR_COSINE:
-        body.evidence.append(f"up axis y: head above feet, mean cosine {standing[1]:.2f} over {len(body.positions)} frames")
+        body.evidence.append(
+            f"up axis y: head above feet, mean cosine {standing[1]:.2f} over {len(body.positions)} frames"
+        )
         return "y"
     return _settle_up_axis(body, *standing)
 
@@ -139,7 +155,9 @@ def _settle_up_axis(body: _Body, axis: UpAxis, cosine: float) -> UpAxis:
     if cosine >= _CLEAR_COSINE:
         grounded = [candidate for candidate in (axis, rest_axis) if _stands_on_origin(body, candidate)]
         if len(set(grounded)) == 1:
-            body.evidence.append(f"up axis {grounded[0]}: the ground through the origin bears the body; {standing}; {resting}")
+            body.evidence.append(
+                f"up axis {grounded[0]}: the ground through the origin bears the body; {standing}; {resting}"
+            )
             return grounded[0]
     raise AmbiguousUnits(
         f"which axis points up is not clear: {standing}; {resting}; name it with --up-axis (up_axis), "
@@ -200,15 +218,19 @@ def _heights(positions: NDArray[np.float64], up_axis: UpAxis) -> NDArray[np.floa
 def _choose_unit(source: SourceMotion, body: _Body, options: ImportOptions, up_axis: UpAxis) -> float:
     hip_height = _hip_height(body, up_axis)
     if options.unit_scale_m is not None:
-        body.evidence.append(f"unit {options.unit_scale_m:g} m: given by the user{_as_hips(hip_height, options.unit_scale_m)}")
+        body.evidence.append(
+            f"unit {options.unit_scale_m:g} m: given by the user{_as_hips(hip_height, options.unit_scale_m)}"
+        )
         return options.unit_scale_m
-    if source.unit_scale_m is not None and (not source.declared or body.leg is None or _is_leg(body.leg * source.unit_scale_m)):
+    if source.unit_scale_m is not None and (
+        not source.declared or body.leg is None or _is_leg(body.leg * source.unit_scale_m)
+    ):
         why = "; ".join(source.declared) or "fixed by the format"
         body.evidence.append(f"unit {source.unit_scale_m:g} m: {why}{_as_hips(hip_height, source.unit_scale_m)}")
         return source.unit_scale_m
     if body.leg is None:
         raise AmbiguousUnits(
-            "the unit of length is not clear: no two feet were found in the joint names to measure a leg; "
+            "the unit of length is not clear: no two legs were found to measure; "
             "name it with --unit (unit_scale_m), such as cm",
             file=body.file,
         )
@@ -217,13 +239,12 @@ def _choose_unit(source: SourceMotion, body: _Body, options: ImportOptions, up_a
 
 def _unit_of_leg(body: _Body, hip_height: float, up_axis: UpAxis) -> float:
     assert body.leg is not None
+    (low, high), known, reason = LEG_LENGTH_M, tuple(UNITS_M), "legs"
     if _walks_on_hands(body, up_axis):
-        low, high = ANIMAL_LEG_LENGTH_M
-        fitting = [name for name in CONVENTIONAL_UNITS if low <= body.leg * UNITS_M[name] <= high]
-        reason = "hands stay on the ground as an animal's do, legs"
-    else:
-        fitting = [name for name, scale in UNITS_M.items() if _is_leg(body.leg * scale)]
-        reason = "legs"
+        (low, high), known, reason = ANIMAL_LEG_LENGTH_M, CONVENTIONAL_UNITS, "hands stay on the ground, and legs"
+    elif not body.landmarks.by_names:
+        known, reason = CONVENTIONAL_UNITS, "the build is a body's, and legs"
+    fitting = [name for name in known if low <= body.leg * UNITS_M[name] <= high]
     if len(fitting) != 1:
         raise _ambiguous_unit(body, hip_height)
     scale = UNITS_M[fitting[0]]
@@ -243,10 +264,14 @@ def _unit_of_leg(body: _Body, hip_height: float, up_axis: UpAxis) -> float:
 def _ambiguous_unit(body: _Body, hip_height: float) -> AmbiguousUnits:
     assert body.leg is not None
     by_fit = sorted(UNITS_M, key=lambda name: abs(np.log((body.leg or 1.0) * UNITS_M[name] / 0.9)))
-    listed = [f"{name} (legs {body.leg * UNITS_M[name]:.2f} m, hips {hip_height * UNITS_M[name]:.2f} m)" for name in by_fit[:3]]
+    listed = [
+        f"{name} (legs {body.leg * UNITS_M[name]:.2f} m, hips {hip_height * UNITS_M[name]:.2f} m)"
+        for name in by_fit[:3]
+    ]
     low, high = LEG_LENGTH_M
     return AmbiguousUnits(
-        f"the unit of length is not clear: legs of {body.leg:.4g} units are no adult's {low} to {high} m in any known unit; "
+        f"the unit of length is not clear: legs of {body.leg:.4g} units fit no known unit "
+        f"(adults have {low} to {high} m); "
         f"name it with --unit (unit_scale_m); candidates: {', '.join(listed)}",
         file=body.file,
     )
@@ -293,12 +318,15 @@ def _look_for_mirroring(source: SourceMotion, body: _Body, options: ImportOption
         return
     up = np.zeros(3)
     up["xyz".index(up_axis[-1])] = -1.0 if up_axis[0] == "-" else 1.0
-    thighs = [_leg_top(source.parents, landmarks, foot) for foot in landmarks.feet]
-    leftwards = body.positions[:, thighs[0]] - body.positions[:, thighs[1]]
-    forwards = (body.positions[:, list(landmarks.toes)] - body.positions[:, list(landmarks.feet)]).mean(axis=1)
-    expected = np.cross(up, forwards)
-    norms = np.linalg.norm(expected, axis=1) * np.linalg.norm(leftwards, axis=1)
-    cosine = float(np.sum((expected * leftwards).sum(axis=1)[norms > 0] / norms[norms > 0]) / len(norms))
+    left, right = (body.positions[:, _leg_joints(source.parents, landmarks, foot)] for foot in landmarks.feet)
+    leftwards = left.mean(axis=1) - right.mean(axis=1)
+    # The lower foot stands; the other may point anywhere.
+    feet, toes = body.positions[:, list(landmarks.feet)], body.positions[:, list(landmarks.toes)]
+    standing = _heights(feet, up_axis).argmin(axis=1)
+    frames = np.arange(len(feet))
+    expected = np.cross(up, (toes - feet)[frames, standing])
+    scale = float(np.sum(np.linalg.norm(expected, axis=1) * np.linalg.norm(leftwards, axis=1)))
+    cosine = float(np.sum(expected * leftwards)) / scale if scale > 0 else 0.0
     if cosine < _MIRRORED_COSINE:
         body.warnings.append(
             CheckWarning(
@@ -310,8 +338,9 @@ def _look_for_mirroring(source: SourceMotion, body: _Body, options: ImportOption
         )
 
 
-def _leg_top(parents: NDArray[np.int32], landmarks: Landmarks, foot: int) -> int:
-    """The joint below the hips on the way to a foot."""
-    while int(parents[foot]) != landmarks.hips:
-        foot = int(parents[foot])
-    return foot
+def _leg_joints(parents: NDArray[np.int32], landmarks: Landmarks, foot: int) -> list[int]:
+    """The joints from a foot up to, but without, the hips."""
+    joints = [foot]
+    while int(parents[joints[-1]]) != landmarks.hips:
+        joints.append(int(parents[joints[-1]]))
+    return joints

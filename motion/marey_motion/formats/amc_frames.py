@@ -219,13 +219,16 @@ def _fail(
     if stopped == _BAD_NUMBER:
         raise lines.error(number_problem(excerpt(word[0])), code="bad_number", joint=bone.name)
     if stopped == _UNKNOWN_BONE:
-        raise lines.error(f"the skeleton has no bone {excerpt(word[0])!r}; is this the AMC's own ASF?", code="unknown_bone")
+        raise lines.error(
+            f"the skeleton has no bone {excerpt(word[0])!r}; is this the AMC's own ASF?", code="unknown_bone"
+        )
     if stopped == _REPEATED_BONE:
         raise lines.error(f"the bone stands twice in frame {state[_NUMBER]}", joint=bone.name)
     if stopped == _WRONG_WIDTH:
         cut = state[_FOUND] < len(bone.channels) and not lines.data[state[_POSITION] :].strip(b"\r\n\t ").count(b"\n")
         raise lines.error(
-            f"{state[_FOUND]} values for {len(bone.channels)} degrees of freedom" + ("; the file is cut off" if cut else ""),
+            f"{state[_FOUND]} values for {len(bone.channels)} degrees of freedom"
+            + ("; the file is cut off" if cut else ""),
             code="file_truncated" if cut else "frame_width",
             joint=bone.name,
         )

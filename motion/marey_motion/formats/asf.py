@@ -21,6 +21,7 @@ from marey_motion.formats.text_lines import TextLines, decode_name
 
 ROOT = "root"
 _AXES = "xyz"
+_CHANNELS = {kind + axis for kind in "rt" for axis in _AXES}
 
 
 @dataclass
@@ -150,7 +151,9 @@ class _AsfReader:
         elif keyword == b"dof":
             bone.channels = self._channels(words[1:])
             if any(channel[0] != "r" for channel in bone.channels):
-                raise self.lines.error("only the root may have other degrees of freedom than rx, ry, rz", joint=bone.name)
+                raise self.lines.error(
+                    "only the root may have other degrees of freedom than rx, ry, rz", joint=bone.name
+                )
 
     def _end_bone(self, bone: Bone) -> None:
         if not bone.name or len(bone.name) > MAX_NAME_LENGTH:
@@ -175,7 +178,9 @@ class _AsfReader:
 
     def _channels(self, words: list[bytes]) -> tuple[str, ...]:
         channels = tuple(word.lower().decode("latin-1") for word in words)
-        if any(len(c) != 2 or c[0] not in "rt" or c[1] not in _AXES for c in channels) or len(set(channels)) < len(words):
+        if any(len(c) != 2 or c[0] not in "rt" or c[1] not in _AXES for c in channels) or len(set(channels)) < len(
+            words
+        ):
             raise self.lines.error(f"{excerpt(b' '.join(words))!r} are no different ones of TX TY TZ RX RY RZ")
         return channels
 
@@ -195,7 +200,9 @@ class _AsfReader:
 
     def _assembled(self) -> AsfSkeleton:
         self.root.frame = self._frame(self.root_orientation, self.root_axis)
-        bones, parents, waiting = [], [], [(ROOT, -1)]
+        bones: list[Bone] = []
+        parents: list[int] = []
+        waiting = [(ROOT, -1)]
         placed: set[str] = set()
         while waiting:
             name, parent = waiting.pop()

@@ -13,17 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.checks import CheckWarning
 from marey_motion.formats.amc_frames import scan_frames
 from marey_motion.formats.asf import AsfSkeleton, read_asf
 from marey_motion.formats.euler import NO_COLUMN, rotations_from_euler
 from marey_motion.formats.numeric_text import excerpt
-from marey_motion.checks import CheckWarning
-from marey_motion.source import SourceMotion
 from marey_motion.formats.text_lines import TextLines
+from marey_motion.source import SourceMotion
 
 FORMAT = "asf-amc"
 DEFAULT_RATE_HZ = 120.0
 INCH_M = 0.0254
+
 
 @dataclass(frozen=True)
 class Pairing:
@@ -108,7 +109,8 @@ def read_asf_amc(
 def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
     """A skeleton without motion."""
     names = tuple(bone.name for bone in skeleton.bones)
-    scale, declared = None, ()
+    scale: float | None = None
+    declared: tuple[str, ...] = ()
     if skeleton.length_unit is not None:
         scale = INCH_M / skeleton.length_unit
         declared = (f"the ASF gives length {skeleton.length_unit:g}: one unit is 1/{skeleton.length_unit:g} inch",)

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.checks import CheckWarning
 from marey_motion.formats.bvh_hierarchy import BvhHeader, read_header
 from marey_motion.formats.euler import NO_COLUMN, rotations_from_euler
 from marey_motion.formats.frame_times import frame_rate_of
 from marey_motion.formats.joint_names import unique_names
 from marey_motion.formats.numeric_text import BadToken, scan_numbers
-from marey_motion.checks import CheckWarning
-from marey_motion.source import SourceMotion
 from marey_motion.formats.text_lines import TextLines, number_problem
+from marey_motion.source import SourceMotion
 
 FORMAT = "bvh"
 # Offsets and positions of the same joint agree to this part of the largest offset where exporters rounded both.
@@ -135,7 +135,7 @@ def _warn_of_layout(header: BvhHeader, frames: int, wrapped: bool, warnings: lis
             )
         )
     if wrapped:
-        warnings.append(CheckWarning("frames-wrapped", "frames run over several lines; they were joined by their count"))
+        warnings.append(CheckWarning("frames-wrapped", "frames run over several lines; they were joined by count"))
     if frames == 0:
         warnings.append(CheckWarning("no-frames", "the file holds no frames; its skeleton is read"))
 

@@ -103,7 +103,8 @@ class _HierarchyReader:
         header = self.header
         if keyword == b"ROOT" and header.names:
             raise self.lines.error(
-                "a second ROOT; a file holds one skeleton here, so split it into one file per ROOT", code="several_roots"
+                "a second ROOT; a file holds one skeleton here, so split it into one file per ROOT",
+                code="several_roots",
             )
         if not self.open and keyword == b"JOINT":
             raise self.lines.error("a JOINT outside of any joint; the first one must be ROOT")

@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import checks
-from marey_motion.clip import Clip
 from marey_motion.checks import CheckWarning
-from marey_motion.source import ImportedMotion, ImportOptions, SourceInfo, SourceMotion, UpAxis
+from marey_motion.clip import Clip
+from marey_motion.errors import ClipError, FormatError, SkeletonError
+from marey_motion.landmarks import find_landmarks
 from marey_motion.skeleton import EndSite, Skeleton
+from marey_motion.source import ImportedMotion, ImportOptions, SourceInfo, SourceMotion, UpAxis
 from marey_motion.units import infer_conversion
 
 Real = TypeVar("Real", np.float32, np.float64)
@@ -34,16 +36,20 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
     ------
     AmbiguousUnits    when neither the file, its body nor the options tell the unit or the upward axis
     """
-    found = infer_conversion(source, file, options)
-    axes = np.array(_TO_Y_UP[found.up_axis], np.float64)
-    if found.handedness == "left":
-        axes[0] = -axes[0]
-    skeleton = _converted_skeleton(source, axes, found.unit_scale_m)
-    warnings = [*source.warnings, *found.warnings, *_notices(source, found.up_axis)]
-    clip = _converted_clip(source, skeleton, axes, found.unit_scale_m)
+    try:
+        landmarks = find_landmarks(source.skeleton)
+        found = infer_conversion(source, landmarks, file, options)
+        axes = np.array(_TO_Y_UP[found.up_axis], np.float64)
+        if found.handedness == "left":
+            axes[0] = -axes[0]
+        skeleton = _converted_skeleton(source, axes, found.unit_scale_m)
+        warnings = [*source.warnings, *found.warnings, *_notices(source, found.up_axis)]
+        clip = _converted_clip(source, skeleton, axes, found.unit_scale_m)
+    except (SkeletonError, ClipError) as error:
+        raise FormatError(str(error), code=error.code, file=file) from error
     trimmed, floor_shift_m = (0, 0), 0.0
     if clip is not None:
-        warnings += checks.check_clip(clip)
+        warnings += checks.check_clip(clip, landmarks)
         if options.trim_rest_pose:
             clip, trimmed = checks.without_rest_pose(clip)
         if options.align_floor:
@@ -68,9 +74,9 @@ def _converted_skeleton(source: SourceMotion, axes: NDArray[np.float64], scale: 
     return Skeleton(
         joint_names=source.joint_names,
         parents=source.parents,
-        offsets=source.offsets @ axes.T * scale,
+        offsets=_moved(source.offsets, axes, scale),
         rest_rotations=_turned(source.rest_rotations, axes),
-        end_sites=tuple(EndSite(joint, axes @ offset * scale) for joint, offset in source.end_sites),
+        end_sites=tuple(EndSite(joint, _moved(offset, axes, scale)) for joint, offset in source.end_sites),
         display_names=source.display_names,
     )
 
@@ -80,15 +86,21 @@ def _converted_clip(source: SourceMotion, skeleton: Skeleton, axes: NDArray[np.f
         return None
     frames = len(source.rotations)
     poses = np.empty((frames, 3 + 4 * skeleton.joint_count), np.float32)
-    poses[:, :3] = source.root_positions @ axes.T * scale
+    poses[:, :3] = _moved(source.root_positions, axes, scale)
     poses[:, 3:] = _turned(source.rotations, axes).reshape(frames, -1)
     # The source is not needed any more; a long file must not be held three times.
     source.rotations = source.root_positions = None
     translations = None
     if source.translations is not None:
-        translations = (source.translations @ axes.T * scale).astype(np.float32)
+        translations = _moved(source.translations, axes, scale).astype(np.float32)
         source.translations = None
     return Clip(skeleton, source.frame_rate_hz, poses, translations, source.translated_joints)
+
+
+def _moved(vectors: NDArray[np.float64], axes: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+    """The same vectors (..., 3) in other axes and metres; to the bit where nothing changes."""
+    turned = vectors if np.array_equal(axes, np.eye(3)) else vectors @ axes.T
+    return turned if scale == 1.0 else turned * scale
 
 
 def _turned(rotations: NDArray[Real], axes: NDArray[np.float64]) -> NDArray[Real]:
@@ -115,9 +127,7 @@ def _notices(source: SourceMotion, up_axis: UpAxis) -> list[CheckWarning]:
         listed = sorted(orders)
         message = f"rotation orders differ between joints ({', '.join(listed)}); each joint is read in its own"
         notices.append(CheckWarning("mixed-rotation-orders", message, values={"orders": listed}))
-    repeated = [
-        name for name, shown in zip(source.joint_names, source.display_names, strict=True) if name != shown
-    ]
+    repeated = [name for name, shown in zip(source.joint_names, source.display_names, strict=True) if name != shown]
     if repeated:
         message = f"{len(repeated)} joint names repeat in the file; they are told apart by their parent"
         notices.append(CheckWarning("duplicate-joint-names", message, joints=tuple(repeated)))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from marey_motion.errors import FormatError
 from marey_motion.checks import CheckWarning
+from marey_motion.errors import FormatError
 
 KNOWN_RATES_HZ = (
     *(10.0, 12.0, 12.5, 15.0, 20.0, 24.0, 25.0, 30.0, 40.0, 48.0, 50.0, 60.0, 72.0, 75.0, 80.0, 90.0, 96.0, 100.0),
@@ -11,6 +11,8 @@ KNOWN_RATES_HZ = (
     *(24000 / 1001, 30000 / 1001, 60000 / 1001, 120000 / 1001, 240000 / 1001),
 )
 SNAP_TOLERANCE = 1e-4
+# What six decimals of a frame time leave open needs no mention.
+NOTABLE_DEVIATION = 2e-5
 HIGHEST_RATE_HZ = 100_000.0
 
 
@@ -31,7 +33,7 @@ def frame_rate_of(frame_time_s: float, file: str, warnings: list[CheckWarning]) 
     deviation = abs(nearest_hz - declared_hz) / nearest_hz
     if deviation > SNAP_TOLERANCE:
         return declared_hz
-    if deviation > 1e-9:
+    if deviation > NOTABLE_DEVIATION:
         warnings.append(
             CheckWarning(
                 "frame-time-snapped",

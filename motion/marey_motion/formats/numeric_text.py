@@ -27,7 +27,7 @@ class NumberTable:
     """Numbers of a text block, row after row.
 
     `values` is flat; `rows` counts the lines that hold numbers. `ragged_line` is the first line (from 1) that does not
-    hold `ragged_count` = the wanted number of values, 0 when every line does; `last_line` is the last line with numbers.
+    hold the wanted number of values, but `ragged_count`; 0 when every line does. `last_line` is the last line read.
     """
 
     values: NDArray[np.float64]
@@ -37,7 +37,7 @@ class NumberTable:
     last_line: int
 
 
-class BadToken(ValueError):  # noqa: N818 - carries a place in the text; the readers turn it into their own errors
+class BadToken(ValueError):
     """A token that is no finite decimal number: its text, its line and which value of the block it stands for."""
 
     def __init__(self, token: str, line: int, index: int, in_line: int) -> None:
@@ -86,7 +86,8 @@ def parse_number(text, start, end):  # type: ignore[no-untyped-def]
         first_power = i
         power = 0
         while i < end and np.uint8(text[i] - 48) < 10:
-            power = min(power * 10 + np.uint8(text[i] - 48), 100000)
+            if power < 100000:
+                power = 10 * power + int(np.uint8(text[i] - 48))
             i += 1
         well_formed = i > first_power
         exponent += -power if falling else power

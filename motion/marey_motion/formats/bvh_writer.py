@@ -1,0 +1,154 @@
+"""BVH: writing.
+
+The root and every joint with translations of its own get six channels, all others three, positions first: the layout
+that every loader reads. Positions replace offsets, as this project's reader and the common ones understand them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from marey_motion.clip import Clip
+from marey_motion.errors import FormatError
+from marey_motion.formats.euler import euler_from_rotations
+from marey_motion.skeleton import Skeleton
+from marey_motion.source import SourceInfo
+from marey_motion.units import unit_in_metres
+
+DEFAULT_ORDER = "zxy"
+_DECIMALS = 6
+_LARGEST = 1e12
+
+
+def write_bvh(
+    clip: Clip, *, unit: str | float = "cm", rotation_order: str = DEFAULT_ORDER, source: SourceInfo | None = None
+) -> bytes:
+    """Write a clip as BVH, Y up.
+
+    Parameters
+    ----------
+    unit : unit of length by name ("cm", "m", "inch", …) or in metres
+    rotation_order : order of the turns, outermost first, for joints of which `source` does not tell one
+    source : record of the file the clip was imported from; its joints keep their rotation orders
+
+    Raises
+    ------
+    FormatError    when a length in that unit has more than twelve digits before the point
+    """
+    order = _depth_first(clip.skeleton)
+    axes = np.array([_axes_of(clip.skeleton, joint, rotation_order, source) for joint in order])
+    scale = 1.0 / unit_in_metres(unit)
+    lines = _hierarchy(clip, order, axes, scale)
+    lines += ["MOTION", f"Frames: {clip.frame_count}", f"Frame Time: {1.0 / clip.frame_rate_hz!r}", ""]
+    return "\n".join(lines).encode() + format_table(_channel_values(clip, order, axes, scale))
+
+
+def _axes_of(skeleton: Skeleton, joint: int, rotation_order: str, source: SourceInfo | None) -> list[int]:
+    if source is not None and len(source.channels) == skeleton.joint_count:
+        turns = [name[0].lower() for name in source.channels[joint] if name.endswith("rotation")]
+        if len(turns) == 3:
+            rotation_order = "".join(turns)
+    if sorted(rotation_order.lower()) != ["x", "y", "z"]:
+        raise FormatError(f"the rotation order {rotation_order!r} is no order of x, y and z", code="rotation_order")
+    return ["xyz".index(axis) for axis in rotation_order.lower()]
+
+
+def _depth_first(skeleton: Skeleton) -> list[int]:
+    """Joint indices in the order a nested file lists them; their own order wherever that is one."""
+    order, waiting = [], [0]
+    while waiting:
+        joint = waiting.pop()
+        order.append(joint)
+        waiting.extend(reversed(skeleton.children[joint]))
+    return order
+
+
+def _hierarchy(clip: Clip, order: list[int], axes: NDArray[np.int64], scale: float) -> list[str]:
+    skeleton = clip.skeleton
+    tips: dict[int, list[NDArray[np.float64]]] = {}
+    for site in skeleton.end_sites:
+        tips.setdefault(site.joint, []).append(site.offset)
+    lines, depths = ["HIERARCHY"], {-1: -1}
+    open_joints: list[int] = []
+    for joint, turns in zip(order, axes, strict=True):
+        parent = int(skeleton.parents[joint])
+        while open_joints and open_joints[-1] != parent:
+            lines.append("\t" * depths[open_joints.pop()] + "}")
+        depth = depths[joint] = depths[parent] + 1
+        open_joints.append(joint)
+        tab = "\t" * depth
+        names = [f"{axis}position" for axis in "XYZ"] if joint == 0 or joint in clip.translated_joints else []
+        names += [f"{'XYZ'[axis]}rotation" for axis in turns]
+        lines += [
+            f"{tab}{'JOINT' if depth else 'ROOT'} {_written_name(skeleton.display_names[joint])}",
+            f"{tab}{{",
+            f"{tab}\tOFFSET {_written_offset(skeleton.offsets[joint], scale)}",
+            f"{tab}\tCHANNELS {len(names)} {' '.join(names)}",
+        ]
+        for tip in tips.get(joint, ()):
+            lines += [f"{tab}\tEnd Site", f"{tab}\t{{", f"{tab}\t\tOFFSET {_written_offset(tip, scale)}", f"{tab}\t}}"]
+    lines += ["\t" * depths[joint] + "}" for joint in reversed(open_joints)]
+    return lines
+
+
+def _written_name(name: str) -> str:
+    """The name without what would end it in the file."""
+    return "".join("_" if character in "{}\n\r" else character for character in name)
+
+
+def _written_offset(offset: NDArray[np.float64], scale: float) -> str:
+    return " ".join(f"{value * scale + 0.0:.10g}" for value in offset)
+
+
+def _channel_values(clip: Clip, order: list[int], axes: NDArray[np.int64], scale: float) -> NDArray[np.float64]:
+    """(F, C) the numbers of the file, frame by frame."""
+    angles_deg = np.empty((clip.frame_count, len(order), 3))
+    euler_from_rotations(np.ascontiguousarray(clip.rotations[:, order]), axes, angles_deg)
+    columns: list[NDArray[np.floating]] = []
+    for index, joint in enumerate(order):
+        if joint == 0:
+            columns.append(clip.root_translations.astype(np.float64) * scale)
+        elif clip.translations is not None and joint in clip.translated_joints:
+            slot = clip.translated_joints.index(joint)
+            columns.append(clip.translations[:, slot].astype(np.float64) * scale)
+        columns.append(angles_deg[:, index])
+    return np.concatenate(columns, axis=1)
+
+
+def format_table(values: NDArray[np.float64]) -> bytes:
+    """Lines of numbers with six decimals, separated by blanks."""
+    largest = float(np.abs(values).max(initial=0.0))
+    if not largest < _LARGEST:
+        raise FormatError(f"a value of {largest:.3g} does not fit a BVH file", code="value_range")
+    widest = len(str(int(largest))) + _DECIMALS + 3
+    text = np.empty(values.size * widest, np.uint8)
+    return text[: _format(values, text)].tobytes()
+
+
+@njit(cache=True, nogil=True)
+def _format(values, text):  # type: ignore[no-untyped-def]
+    """Write `values` into `text`; the number of bytes written."""
+    digits = np.empty(24, np.uint8)
+    at = 0
+    for frame in range(values.shape[0]):
+        for column in range(values.shape[1]):
+            rest = np.int64(np.rint(abs(values[frame, column]) * 1e6))
+            if values[frame, column] < 0 and rest > 0:
+                text[at] = 45
+                at += 1
+            count = 0
+            while rest > 0 or count <= _DECIMALS:
+                digits[count] = 48 + rest % 10
+                rest //= 10
+                count += 1
+            for k in range(count - 1, -1, -1):
+                text[at] = digits[k]
+                at += 1
+                if k == _DECIMALS:
+                    text[at] = 46
+                    at += 1
+            text[at] = 10 if column == values.shape[1] - 1 else 32
+            at += 1
+    return at

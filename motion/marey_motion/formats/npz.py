@@ -1,0 +1,181 @@
+"""npz: a clip or skeleton as plain numpy arrays, exact, for scripts.
+
+A zip archive of .npy members, never pickled; the same clip always gives the same bytes. Members:
+
+    format            "marey/clip-npz@1"
+    joint_names, display_names    (J,) text
+    parents           (J,) int32, -1 for the root
+    offsets           (J, 3) float64, metres
+    rest_rotations    (J, 4) float64, w x y z
+    end_site_joints, end_site_offsets    (E,) int32, (E, 3) float64
+    frame_rate_hz     () float64                              these only where there is motion
+    poses             (F, 3 + 4 J) float32                    as in `Clip`
+    translated_joints, translations    (k,) int32, (F, k, 3) float32    only where joints below the root move
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.clip import Clip
+from marey_motion.errors import FormatError, FormatLimit
+from marey_motion.formats.joint_names import MAX_JOINTS
+from marey_motion.formats.quaternion_rows import as_rotations
+from marey_motion.skeleton import Skeleton
+from marey_motion.source import SourceMotion
+
+FORMAT = "npz"
+MARK = "marey/clip-npz@1"
+MAX_BYTES = 1 << 29
+_FIXED_DATE = (1980, 1, 1, 0, 0, 0)
+_SKELETON_MEMBERS = (
+    "joint_names",
+    "display_names",
+    "parents",
+    "offsets",
+    "rest_rotations",
+    "end_site_joints",
+    "end_site_offsets",
+)
+_MOTION_MEMBERS = ("frame_rate_hz", "poses")
+_OPTIONAL_MEMBERS = ("translated_joints", "translations")
+# Everything that a damaged or hostile archive makes the standard library and numpy raise.
+_ARCHIVE_ERRORS = (
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    OSError,
+    OverflowError,
+    NotImplementedError,
+    RuntimeError,
+    ValueError,
+)
+
+
+def write_npz(motion: Clip | Skeleton) -> bytes:
+    """Write a clip, or a skeleton alone."""
+    skeleton = motion.skeleton if isinstance(motion, Clip) else motion
+    arrays: dict[str, NDArray[Any]] = {
+        "format": np.array(MARK),
+        "joint_names": np.array(skeleton.joint_names),
+        "display_names": np.array(skeleton.display_names),
+        "parents": skeleton.parents,
+        "offsets": skeleton.offsets,
+        "rest_rotations": skeleton.rest_rotations,
+        "end_site_joints": np.array([site.joint for site in skeleton.end_sites], np.int32),
+        "end_site_offsets": np.array([site.offset for site in skeleton.end_sites], np.float64).reshape(-1, 3),
+    }
+    if isinstance(motion, Clip):
+        arrays |= {"frame_rate_hz": np.array(motion.frame_rate_hz), "poses": motion.poses}
+        if motion.translations is not None:
+            joints = np.array(motion.translated_joints, np.int32)
+            arrays |= {"translated_joints": joints, "translations": motion.translations}
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as members:
+        for name, array in arrays.items():
+            content = io.BytesIO()
+            np.lib.format.write_array(content, np.ascontiguousarray(array).reshape(array.shape), allow_pickle=False)
+            members.writestr(zipfile.ZipInfo(f"{name}.npy", _FIXED_DATE), content.getvalue())
+    return archive.getvalue()
+
+
+def read_npz(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> SourceMotion:
+    """Read what `write_npz` wrote, or any archive with the same members.
+
+    Raises
+    ------
+    FormatError    naming the member that is missing or wrong; nothing larger than `MAX_BYTES` is unpacked
+    """
+    arrays = _read_members(data, file)
+    if "format" not in arrays or str(arrays["format"]) != MARK:
+        raise FormatError(f"member 'format' must say {MARK}", code="not_npz", file=file)
+    needed = _SKELETON_MEMBERS + (_MOTION_MEMBERS if "poses" in arrays else ())
+    missing = [name for name in needed if name not in arrays]
+    if missing:
+        raise FormatError(f"the archive has no member {missing[0]!r}", file=file)
+    return _source(arrays, file, frame_rate_hz)
+
+
+def _source(arrays: dict[str, NDArray[Any]], file: str, frame_rate_hz: float | None) -> SourceMotion:
+    joints = arrays["joint_names"].size
+    names = tuple(str(name) for name in arrays["joint_names"])
+    if not 1 <= joints <= MAX_JOINTS:
+        raise FormatLimit(f"{joints} joints; 1 to {MAX_JOINTS} are accepted", file=file)
+    sites = _array(arrays, "end_site_joints", "i", (arrays["end_site_joints"].size,), file)
+    tips = _array(arrays, "end_site_offsets", "f", (len(sites), 3), file).astype(np.float64)
+    source = SourceMotion(
+        format=FORMAT,
+        joint_names=names,
+        display_names=tuple(str(name) for name in arrays["display_names"]),
+        parents=_array(arrays, "parents", "i", (joints,), file).astype(np.int32),
+        offsets=_array(arrays, "offsets", "f", (joints, 3), file).astype(np.float64),
+        rest_rotations=_array(arrays, "rest_rotations", "f", (joints, 4), file).astype(np.float64),
+        end_sites=tuple((int(joint), tip) for joint, tip in zip(sites, tips, strict=True)),
+        unit_scale_m=1.0,
+        up_axis="y",
+    )
+    if "poses" in arrays:
+        frames = len(np.atleast_1d(arrays["poses"]))
+        poses = _array(arrays, "poses", "f", (frames, 3 + 4 * joints), file)
+        quaternions = poses[:, 3:].reshape(frames, joints, 4)
+        source.root_positions = poses[:, :3].astype(np.float64)
+        source.rotations = as_rotations(quaternions, names, file, source.warnings).astype(np.float32)
+        source.frame_rate_hz = frame_rate_hz or float(_array(arrays, "frame_rate_hz", "f", (), file))
+    if "poses" in arrays and "translations" in arrays and "translated_joints" in arrays:
+        moved = _array(arrays, "translated_joints", "i", (arrays["translated_joints"].size,), file)
+        source.translated_joints = tuple(moved.tolist())
+        translations = _array(arrays, "translations", "f", (len(poses), len(moved), 3), file)
+        source.translations = translations.astype(np.float64)
+    return source
+
+
+def _array(arrays: dict[str, NDArray[Any]], name: str, kind: str, shape: tuple[int, ...], file: str) -> NDArray[Any]:
+    array = arrays[name]
+    if array.dtype.kind != kind or array.shape != shape:
+        raise FormatError(
+            f"member {name!r} is {array.dtype} of shape {array.shape}; "
+            f"{'integers' if kind == 'i' else 'floating point'} of shape {shape} is needed",
+            file=file,
+        )
+    if kind == "f" and not np.isfinite(array).all():
+        raise FormatError(f"member {name!r} holds numbers that are not finite", code="bad_number", file=file)
+    return array
+
+
+def _read_members(data: bytes, file: str) -> dict[str, NDArray[Any]]:
+    known = {"format", *_SKELETON_MEMBERS, *_MOTION_MEMBERS, *_OPTIONAL_MEMBERS}
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = [info for info in archive.infolist() if info.filename.removesuffix(".npy") in known]
+            total = sum(info.file_size for info in members)
+            if total > MAX_BYTES or len(members) > len(known):
+                raise FormatLimit(f"the archive unpacks to {total} bytes; {MAX_BYTES} are accepted", file=file)
+            return {info.filename.removesuffix(".npy"): _read_member(archive, info) for info in members}
+    except _ARCHIVE_ERRORS as error:
+        if isinstance(error, FormatError):
+            raise
+        raise FormatError(f"the archive is damaged: {error}", code="not_npz", file=file) from error
+
+
+def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
+    """One array, whose header must announce exactly the bytes that follow it."""
+    content = archive.read(info)
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    if version != (1, 0):
+        raise ValueError(f"member {info.filename} is .npy version {version}, 1.0 is needed")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    size = dtype.itemsize
+    for length in shape:
+        size *= length
+    if dtype.hasobject or size != len(content) - stream.tell():
+        raise ValueError(f"member {info.filename} announces {size} bytes and holds {len(content) - stream.tell()}")
+    stream.seek(0)
+    array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+    return array

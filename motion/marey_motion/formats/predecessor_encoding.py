@@ -1,0 +1,61 @@
+"""The predecessor's blobs: a document as JSON, BSON, or BSON compressed with bz2."""
+
+from __future__ import annotations
+
+import bz2
+import json
+from typing import Any, Literal
+
+import bson
+
+from marey_motion.errors import FormatError, FormatLimit
+
+Encoding = Literal["json", "bson", "bson.bz2"]
+MAX_BYTES = 1 << 27
+_BZ2_MARK = b"BZh"
+
+
+def encode_document(document: dict[str, Any], encoding: Encoding) -> bytes:
+    """Bytes of a document."""
+    if encoding == "json":
+        return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    blob: bytes = bson.encode(document)
+    return bz2.compress(blob) if encoding == "bson.bz2" else blob
+
+
+def decode_document(data: bytes, file: str) -> dict[str, Any]:
+    """The document in a blob; nothing larger than `MAX_BYTES` is unpacked.
+
+    Raises
+    ------
+    FormatError    when the bytes are none of the three encodings or hold no document
+    """
+    if data.startswith(_BZ2_MARK):
+        data = _decompressed(data, file)
+    try:
+        if data.lstrip()[:1] == b"{" and not _is_bson(data):
+            document = json.loads(data.decode("utf-8-sig"))
+        else:
+            document = bson.decode(data)
+    except (ValueError, RecursionError, OverflowError, bson.errors.BSONError) as error:
+        raise FormatError(f"the document cannot be read: {error}", code="document_damaged", file=file) from error
+    if not isinstance(document, dict):
+        raise FormatError("the file holds no document", code="document_damaged", file=file)
+    return document
+
+
+def _is_bson(data: bytes) -> bool:
+    return len(data) >= 5 and int.from_bytes(data[:4], "little") == len(data) and data[-1] == 0
+
+
+def _decompressed(data: bytes, file: str) -> bytes:
+    decompressor = bz2.BZ2Decompressor()
+    try:
+        document = decompressor.decompress(data, MAX_BYTES + 1)
+    except (OSError, ValueError, EOFError) as error:
+        raise FormatError(f"the bz2 data is damaged: {error}", code="document_damaged", file=file) from error
+    if len(document) > MAX_BYTES:
+        raise FormatLimit(f"the document unpacks to more than {MAX_BYTES} bytes", file=file)
+    if not decompressor.eof:
+        raise FormatError("the bz2 data is cut off", code="file_truncated", file=file)
+    return document

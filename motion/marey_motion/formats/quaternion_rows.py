@@ -1,0 +1,49 @@
+"""Rotations that a file gives as quaternions: checked, normalised, and continuous in sign."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import quaternions
+from marey_motion.checks import CheckWarning
+from marey_motion.errors import FormatError
+
+_NOTABLE_DEVIATION = 1e-3
+_ROUNDING = 1e-6
+
+
+def as_rotations(
+    values: NDArray[np.floating], joint_names: tuple[str, ...], file: str, warnings: list[CheckWarning]
+) -> NDArray[np.float64]:
+    """Unit, sign-continuous quaternions (F, J, 4) from what a file holds (w, x, y, z); says what had to be mended.
+
+    Raises
+    ------
+    FormatError    with the joint whose quaternion is zero or not finite, and its frame
+    """
+    values = np.asarray(values, np.float64)
+    norms = np.linalg.norm(values, axis=2)
+    wrong = ~(np.isfinite(norms) & (norms > 1e-6))
+    if wrong.any():
+        frame, joint = (int(index) for index in np.argwhere(wrong)[0])
+        raise FormatError(
+            f"frame {frame} holds no rotation but {values[frame, joint].tolist()}",
+            code="bad_number",
+            file=file,
+            joint=joint_names[joint],
+        )
+    deviating = (np.abs(norms - 1.0) > _NOTABLE_DEVIATION).any(axis=0)
+    if deviating.any():
+        names = tuple(name for name, is_one in zip(joint_names, deviating, strict=True) if is_one)
+        worst = float(np.abs(norms - 1.0).max())
+        message = f"rotations of {len(names)} joints differ from unit length by up to {worst:.2g}; they were normalised"
+        warnings.append(CheckWarning("non-unit-quaternions", message, joints=names, values={"deviation": worst}))
+    flips = np.sum(values[1:] * values[:-1], axis=2) < 0
+    if flips.any():
+        names = tuple(name for name, is_one in zip(joint_names, flips.any(axis=0), strict=True) if is_one)
+        message = f"rotations of {len(names)} joints jump to their negative {int(flips.sum())} times; unrolled"
+        warnings.append(CheckWarning("sign-flips-unrolled", message, joints=names, values={"count": int(flips.sum())}))
+    # Rounded unit quaternions stay as they are, to the bit.
+    unit = values / np.where(np.abs(norms - 1.0) > _ROUNDING, norms, 1.0)[..., None]
+    return np.asarray(quaternions.unroll(unit), np.float64) if flips.any() else unit
