@@ -4,8 +4,8 @@
 body's left when the limb hangs down or the trunk stands: the axis about which knees and elbows hinge. An arm that is
 raised sideways takes its swing axis along, so that in a T-pose with palms down it is up on the left, down on the right.
 
-The twist follows from offsets alone. The swing of a limb follows from the rest pose only where that is the pose of a
-standing body; many files put all bones on one line at rest, and there it is read off a motion.
+The twist mostly follows from offsets alone. The swing of a limb follows from the rest pose only where that is the pose
+of a standing body; many files put all bones on one line at rest, and there it is read off a motion.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ def guess_axes(skeleton: Skeleton, mapping: JointMapping, motion: Clip | None = 
     axes = {}
     for standard in (name for name in STANDARD_JOINTS if name in joints):
         body = rest if _part(standard) in rest.readable_parts else moving
-        twist = _twist(standard, rest, body)
-        swing = body.in_joint(standard, _swing(standard, body)) if (own := _knuckles(standard, rest)) is None else own
+        twist = _twist(standard, body)
+        swing = body.in_joint(standard, _swing(standard, body))
         axes[skeleton.joint_names[joints[standard]]] = JointAxes(_triple(twist), _triple(_across(swing, twist)))
     return axes
 
@@ -185,16 +185,16 @@ def _part(standard: str) -> str:
     return f"{side} leg" if joint in _LEG else f"{side} arm"
 
 
-def _twist(standard: str, rest: _Body, body: _Body) -> Vectors:
+def _twist(standard: str, body: _Body) -> Vectors:
     """Unit direction (3,) of a joint's bone in its frame."""
     side, _, joint = standard.partition("_")
     prefix, joint = (f"{side}_", joint) if side in SIDES else ("", standard)
     for target in _TOWARDS.get(joint, ()):
-        way = rest.way(standard, prefix + target)
+        way = body.way(standard, prefix + target)
         if way is not None and np.any(way):
-            return _unit(rest.in_joint(standard, way))
+            return _unit(body.in_joint(standard, way))
     if prefix:
-        tip = _tip(rest.skeleton, rest.joints[standard])
+        tip = _tip(body.skeleton, body.joints[standard])
         if tip is not None:
             return tip
         before = f"{prefix}{_BEFORE.get(joint, 'elbow')}"
@@ -228,6 +228,11 @@ def _swing(standard: str, body: _Body) -> Vectors:
         return body.hips_left if shank is None or foot is None else np.cross(foot, shank)
     if joint == "clavicle":
         return body.up if side == "left" else -body.up
+    knuckles = body.way(f"{side}_pinky_finger_base", f"{side}_index_finger_base")
+    if joint == "wrist" and knuckles is not None and np.any(knuckles):
+        # Across the palm: out of the back of a left hand, out of the palm of a right one.
+        hand = _twist(standard, body)
+        return np.cross(knuckles, quaternions.rotate_vectors(body.rotations[:, body.joints[standard]], hand))
     return _arm_hinge(side, joint, body)
 
 
@@ -254,17 +259,6 @@ def _arm_hinge(side: str, joint: str, body: _Body) -> Vectors:
     forward = np.cross(body.hips_left, body.up)
     raised = quaternions.between_vectors(-body.up, bone, half_turn_axis=forward)
     return quaternions.rotate_vectors(raised, body.hips_left).astype(np.float64)
-
-
-def _knuckles(standard: str, rest: _Body) -> Vectors | None:
-    """Swing axis (3,) of a hand that has fingers: across the palm, out of its back on the left side."""
-    side, _, joint = standard.partition("_")
-    if joint != "wrist":
-        return None
-    across = rest.way(f"{side}_pinky_finger_base", f"{side}_index_finger_base")
-    if across is None or not np.any(across):
-        return None
-    return np.cross(rest.in_joint(standard, across), _twist(standard, rest, rest))
 
 
 def _across(swing: Vectors, twist: Vectors) -> Vectors:

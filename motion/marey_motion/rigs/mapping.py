@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from marey_motion.errors import MappingError
 from marey_motion.rigs import by_geometry, by_names
 from marey_motion.rigs.names import parse_name
-from marey_motion.rigs.standard import ESSENTIAL_JOINTS, SIDES, mirrored
+from marey_motion.rigs.standard import ESSENTIAL_JOINTS, SIDES, STANDARD_JOINTS, mirrored
 from marey_motion.skeleton import Skeleton
 
 Method = Literal["names", "geometry", "manual"]
@@ -79,7 +79,7 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
     if signs:
         confidence = min(confidence, ANIMAL_CONFIDENCE)
         notes.append(f"{signs}; hind and front legs were taken for legs and arms, check before use")
-    named = {standard: skeleton.joint_names[index] for standard, index in joints.items()}
+    named = {standard: skeleton.joint_names[joints[standard]] for standard in STANDARD_JOINTS if standard in joints}
     return JointMapping(rig, named, round(confidence, 3), method, tuple(notes))
 
 
@@ -129,10 +129,10 @@ def _spine(skeleton: Skeleton, joints: Mapping[str, int]) -> dict[str, int]:
 def _animal_signs(skeleton: Skeleton, joints: Mapping[str, int]) -> str:
     """What speaks for four legs, in words; nothing for a human."""
     for index, name in enumerate(skeleton.display_names):
-        if any(word in parse_name(name).base for word in _ANIMAL_WORDS):
-            # Hair in a pony tail grows on heads.
-            if joints.get("head") not in skeleton.path_to_root(index):
-                return f"a joint such as {name} belongs to an animal"
+        is_animal = any(word in parse_name(name).base for word in _ANIMAL_WORDS)
+        # Hair in a pony tail grows on heads.
+        if is_animal and joints.get("head") not in skeleton.path_to_root(index):
+            return f"a joint such as {name} belongs to an animal"
     if not set(ESSENTIAL_JOINTS) | {"spine_2"} <= joints.keys():
         return ""
     positions = skeleton.rest_global_positions

@@ -1,0 +1,238 @@
+"""Twist and swing axes mean the same anatomically, whatever a rig's frames, rest pose and proportions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from marey_motion import kinematics, quaternions
+from marey_motion.clip import Clip
+from marey_motion.errors import MappingError
+from marey_motion.rigs import JointMapping, guess_axes, map_joints, rest_pose_doubts
+from marey_motion.skeleton import Skeleton
+
+X, Y, Z = np.eye(3)
+PARTS = ("trunk", "left arm", "left leg", "right arm", "right leg")
+
+
+def at_rest(skeleton, axes, name):
+    """Twist and swing of a joint in the world of the rest pose."""
+    rotation = skeleton.rest_global_rotations[skeleton.index_of(name)]
+    return tuple(quaternions.rotate_vectors(rotation, axis) for axis in (axes[name].twist, axes[name].swing))
+
+
+def with_arms(body, direction_left):
+    """The body with straight arms in another direction; the right arm mirrors the left one."""
+    offsets = body.offsets.copy()
+    for name in ("LeftForeArm", "LeftHand"):
+        length = np.linalg.norm(offsets[body.index_of(name)])
+        offsets[body.index_of(name)] = length * np.array(direction_left)
+        offsets[body.index_of(name.replace("Left", "Right"))] = length * np.array(direction_left) * (-1, 1, 1)
+    return replace(body, offsets=offsets, end_sites=())
+
+
+@pytest.mark.parametrize(
+    ("joint", "twist", "swing"),
+    [
+        ("Hips", Y, X),
+        ("Spine", Y, X),
+        ("Spine2", Y, X),
+        ("Head", Y, X),
+        ("LeftUpLeg", -Y, X),
+        ("RightUpLeg", -Y, X),
+        ("RightLeg", -Y, X),
+        ("LeftToeBase", Z, X),
+        ("LeftArm", X, Y),
+        ("LeftForeArm", X, Y),
+        ("LeftHand", X, Y),
+        ("RightArm", -X, -Y),
+        ("RightForeArm", -X, -Y),
+        ("RightHand", -X, -Y),
+    ],
+)
+def test_in_a_t_pose_the_axes_are_those_of_a_drawing(body, joint, twist, swing):
+    axes = guess_axes(body, map_joints(body))
+
+    np.testing.assert_allclose(axes[joint].twist, twist, atol=1e-12)
+    np.testing.assert_allclose(axes[joint].swing, swing, atol=1e-12)
+    assert rest_pose_doubts(body, map_joints(body)) == ()
+
+
+def test_every_mapped_joint_has_unit_axes_at_a_right_angle(body):
+    mapping = map_joints(body)
+    axes = guess_axes(body, mapping)
+
+    assert set(axes) == set(mapping.joints.values())
+    for one in axes.values():
+        assert np.linalg.norm(one.twist) == pytest.approx(1.0)
+        assert np.linalg.norm(one.swing) == pytest.approx(1.0)
+        assert np.dot(one.twist, one.swing) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("lowered", np.radians([0, 20, 45, 70, 90]))
+def test_an_arm_lowered_sideways_takes_its_swing_axis_along(body, lowered):
+    posed = with_arms(body, (np.cos(lowered), -np.sin(lowered), 0.0))
+    axes = guess_axes(posed, map_joints(posed))
+
+    np.testing.assert_allclose(axes["LeftForeArm"].swing, [np.sin(lowered), np.cos(lowered), 0], atol=1e-12)
+    np.testing.assert_allclose(axes["RightForeArm"].swing, [np.sin(lowered), -np.cos(lowered), 0], atol=1e-12)
+
+
+def test_arms_stretched_forward_hinge_about_the_left_as_hanging_ones_do(body):
+    posed = with_arms(body, (0.0, 0.0, 1.0))
+    axes = guess_axes(posed, map_joints(posed))
+
+    np.testing.assert_allclose(axes["LeftArm"].swing, X, atol=1e-12)
+    np.testing.assert_allclose(axes["RightArm"].swing, X, atol=1e-12)
+
+
+def test_a_hand_with_fingers_swings_across_its_palm(body):
+    hand = body.index_of("LeftHand")
+    skeleton = Skeleton(
+        (*body.joint_names, "LeftHandIndex1", "LeftHandPinky1"),
+        np.append(body.parents, [hand, hand]),
+        np.concatenate((body.offsets, [[0.09, 0.03, 0.0], [0.09, -0.03, 0.0]])),  # thumb side up
+        quaternions.identity(body.joint_count + 2),
+    )
+    axes = guess_axes(skeleton, map_joints(skeleton))
+
+    # The thumb is up, so the back of the left hand looks backwards while the elbow's axis still points up.
+    np.testing.assert_allclose(axes["LeftHand"].swing, -Z, atol=1e-12)
+    np.testing.assert_allclose(axes["LeftForeArm"].swing, Y, atol=1e-12)
+
+
+def reframed(clip, seed):
+    """The same motion on a rig with other local frames, and with all its bones on odd lines at rest."""
+    body = clip.skeleton
+    random = np.random.default_rng(seed)
+    frames = quaternions.normalise(random.normal(size=(body.joint_count, 4)))
+    above = frames[body.parents[1:]]
+    offsets = body.offsets.copy()
+    offsets[1:] = quaternions.rotate_vectors(quaternions.conjugate(above), offsets[1:])
+    sites = tuple(
+        replace(site, offset=quaternions.rotate_vectors(quaternions.conjugate(frames[site.joint]), site.offset))
+        for site in body.end_sites
+    )
+    skeleton = replace(body, offsets=offsets, end_sites=sites)
+    rotations = quaternions.multiply(kinematics.global_rotations(clip).astype(np.float64), frames)
+    local = kinematics.as_local_rotations(skeleton, rotations)
+    poses = np.concatenate((clip.root_translations, local.reshape(clip.frame_count, -1)), axis=1).astype(np.float32)
+    return Clip(skeleton, clip.frame_rate_hz, poses), frames
+
+
+@pytest.fixture
+def exercising(body):
+    """Knees and elbows bend and the body turns, from a T-pose with the arms let down."""
+    frames = 50
+    phase = np.linspace(0, 4 * np.pi, frames)
+    rotations = quaternions.identity(frames, body.joint_count)
+    bend = 0.6 + 0.5 * np.sin(phase)
+
+    def turn(joint, axis, angle):
+        at = body.index_of(joint)
+        rotations[:, at] = quaternions.multiply(
+            rotations[:, at], quaternions.from_axis_angle(np.tile(axis, (frames, 1)), angle)
+        )
+
+    turn("Hips", Y, 0.3 * phase)
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        turn(f"{side}UpLeg", X, -0.5 * bend)
+        turn(f"{side}Leg", X, bend)
+        turn(f"{side}Arm", Z, np.full(frames, -sign * 1.2))
+        turn(f"{side}ForeArm", Y, -sign * bend)
+    poses = np.concatenate((np.tile([0.0, 0.95, 0.0], (frames, 1)), rotations.reshape(frames, -1)), axis=1)
+    return Clip(body, 60.0, poses.astype(np.float32))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_axes_do_not_depend_on_the_frames_that_a_rig_gives_its_joints(body, exercising, seed):
+    clip, frames = reframed(exercising, seed)
+    rotated = replace(
+        clip.skeleton,
+        rest_rotations=kinematics.as_local_rotations(clip.skeleton, frames),
+        offsets=np.concatenate((body.offsets[:1], clip.skeleton.offsets[1:])),
+    )
+    np.testing.assert_allclose(rotated.rest_global_positions, body.rest_global_positions, atol=1e-12)
+    axes, expected = guess_axes(rotated, map_joints(rotated)), guess_axes(body, map_joints(body))
+
+    for name in expected:
+        for found, wanted in zip(at_rest(rotated, axes, name), at_rest(body, expected, name), strict=True):
+            np.testing.assert_allclose(found, wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_where_the_rest_pose_is_no_body_a_motion_tells_the_same_axes(body, exercising, seed):
+    clip, frames = reframed(exercising, seed)
+    mapping = map_joints(clip.skeleton)
+    assert rest_pose_doubts(clip.skeleton, mapping) == PARTS
+    axes, expected = guess_axes(clip.skeleton, mapping, clip), guess_axes(body, map_joints(body))
+
+    for name in expected:
+        for kind in ("twist", "swing"):
+            in_body = quaternions.rotate_vectors(frames[body.index_of(name)], getattr(axes[name], kind))
+            angle = np.degrees(np.arccos(np.clip(in_body @ getattr(expected[name], kind), -1, 1)))
+            assert angle < 12.0, (name, kind, angle)
+
+
+def test_only_the_part_that_rests_oddly_is_doubted(body):
+    offsets = body.offsets.copy()
+    for name in ("LeftForeArm", "LeftHand"):
+        offsets[body.index_of(name)] = [0.0, 0.3, 0.0]
+    raised = replace(body, offsets=offsets)
+
+    assert rest_pose_doubts(raised, map_joints(raised)) == ("left arm",)
+
+
+def test_a_tip_that_an_exporter_misplaced_is_not_the_end_of_a_hand(body):
+    sites = tuple(replace(site, offset=np.array([9.0, 9.0, 9.0])) for site in body.end_sites if site.joint == 15)
+    odd = replace(body, end_sites=sites)
+
+    np.testing.assert_allclose(guess_axes(odd, map_joints(odd))["LeftHand"].twist, X, atol=1e-12)
+
+
+def test_axes_need_two_sides(body):
+    mapping = JointMapping(None, {"pelvis": "Hips", "head": "Head"}, 0.1, "manual")
+    with pytest.raises(MappingError, match="both"):
+        guess_axes(body, mapping)
+
+
+WALKS = (
+    "bandai-namco-1/dataset-1_walk_normal_001.bvh",
+    "cmu-iclone-bvh/002_01.bvh",
+    "rigs/game-engine/custom_skeleton_walk_example.bvh",
+    "rigs/makehuman/walk1.bvh",
+    "rigs/misc/walk01.bvh",
+    "rigs/snu-mass/walk.bvh",
+    "rigs/snu-mss/walk.bvh",
+)
+
+
+@pytest.mark.parametrize("file", WALKS)
+def test_in_a_real_walk_bones_point_down_and_hinges_point_left_on_every_rig(mocap, file):
+    from marey_motion.formats import read_motion
+
+    path = mocap / file
+    clip = read_motion(path.read_bytes(), path.name).clip
+    skeleton, mapping = clip.skeleton, map_joints(clip.skeleton)
+    axes = guess_axes(skeleton, mapping, clip)
+    positions, rotations = kinematics.global_positions(clip), kinematics.global_rotations(clip)
+    hips = mapping.indices(skeleton, ("left_hip", "right_hip"))
+    left = positions[:, hips[0]] - positions[:, hips[1]]
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+
+    def mean_along(joint, kind, direction):
+        turned = quaternions.rotate_vectors(
+            rotations[:, skeleton.index_of(mapping.joints[joint])], getattr(axes[mapping.joints[joint]], kind)
+        )
+        return float(np.mean(np.sum(turned * direction, axis=1)))
+
+    for side in ("left", "right"):
+        for joint in ("hip", "knee"):
+            assert mean_along(f"{side}_{joint}", "twist", -Y) > 0.75
+            assert mean_along(f"{side}_{joint}", "swing", left) > 0.9
+        assert mean_along(f"{side}_ankle", "swing", left) > 0.85
+        assert mean_along(f"{side}_shoulder", "twist", -Y) > 0.7
+        assert mean_along(f"{side}_elbow", "swing", left) > 0.4
+    for joint in ("pelvis", "spine_2", "head"):
+        assert mean_along(joint, "twist", Y) > 0.85
+        assert mean_along(joint, "swing", left) > 0.9

@@ -1,0 +1,357 @@
+"""Known rigs are recognised by their names, unknown ones by their build, and animals are not passed off as people."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from marey_motion import quaternions
+from marey_motion.errors import MappingError
+from marey_motion.rigs import ESSENTIAL_JOINTS, STANDARD_JOINTS, map_joints, mirrored, symmetric_joints
+from marey_motion.rigs.known import KNOWN_RIGS
+from marey_motion.skeleton import Skeleton
+
+LIMBS = ("UpLeg", "Leg", "Foot", "ToeBase", "Shoulder", "Arm", "ForeArm", "Hand")
+STANDARD_LIMBS = ("hip", "knee", "ankle", "toe", "clavicle", "shoulder", "elbow", "wrist")
+# Pelvis, spine ×3, neck, head, the left limb joints in the order above, and how the left ones become right ones.
+RIGS = {
+    "mixamo": (
+        "mixamorig:Hips mixamorig:Spine mixamorig:Spine1 mixamorig:Spine2 mixamorig:Neck mixamorig:Head",
+        "mixamorig:LeftUpLeg mixamorig:LeftLeg mixamorig:LeftFoot mixamorig:LeftToeBase "
+        "mixamorig:LeftShoulder mixamorig:LeftArm mixamorig:LeftForeArm mixamorig:LeftHand",
+        ("Left", "Right"),
+    ),
+    "lafan1": (
+        "Hips Spine Spine1 Spine2 Neck Head",
+        "LeftUpLeg LeftLeg LeftFoot LeftToe LeftShoulder LeftArm LeftForeArm LeftHand",
+        ("Left", "Right"),
+    ),
+    "hik": (
+        "Hips Spine Spine1 Spine2 Neck Head",
+        "LeftUpLeg LeftLeg LeftFoot LeftToeBase LeftShoulder LeftArm LeftForeArm LeftHand",
+        ("Left", "Right"),
+    ),
+    "unreal": (
+        "pelvis spine_01 spine_02 spine_03 neck_01 head",
+        "thigh_l calf_l foot_l ball_l clavicle_l upperarm_l lowerarm_l hand_l",
+        ("_l", "_r"),
+    ),
+    "smpl": (
+        "pelvis spine1 spine2 spine3 neck head",
+        "left_hip left_knee left_ankle left_foot left_collar left_shoulder left_elbow left_wrist",
+        ("left", "right"),
+    ),
+    "biped": (
+        "Bip01_Pelvis Bip01_Spine Bip01_Spine1 Bip01_Spine2 Bip01_Neck Bip01_Head",
+        "Bip01_L_Thigh Bip01_L_Calf Bip01_L_Foot Bip01_L_Toe0 "
+        "Bip01_L_Clavicle Bip01_L_UpperArm Bip01_L_Forearm Bip01_L_Hand",
+        ("_L_", "_R_"),
+    ),
+    "rokoko": (
+        "Hips Spine1 Spine2 Spine3 Neck Head",
+        "LeftThigh LeftShin LeftFoot LeftToe LeftShoulder LeftArm LeftForeArm LeftHand",
+        ("Left", "Right"),
+    ),
+    "xsens": (
+        "Pelvis L5 T12 T8 Neck Head",
+        "LeftUpperLeg LeftLowerLeg LeftFoot LeftToe LeftShoulder LeftUpperArm LeftForeArm LeftHand",
+        ("Left", "Right"),
+    ),
+    "biovision": (
+        "Hips Chest Spine2 Spine3 Neck Head",
+        "LeftHip LeftKnee LeftAnkle LeftToe LeftCollar LeftShoulder LeftElbow LeftWrist",
+        ("Left", "Right"),
+    ),
+    "daz": (
+        "hip abdomen abdomen2 chest neck head",
+        "lThigh lShin lFoot lToe lCollar lShldr lForeArm lHand",
+        ("l", "r"),
+    ),
+    "vrm": (
+        "J_Bip_C_Hips J_Bip_C_Spine J_Bip_C_Chest J_Bip_C_UpperChest J_Bip_C_Neck J_Bip_C_Head",
+        "J_Bip_L_UpperLeg J_Bip_L_LowerLeg J_Bip_L_Foot J_Bip_L_ToeBase "
+        "J_Bip_L_Shoulder J_Bip_L_UpperArm J_Bip_L_LowerArm J_Bip_L_Hand",
+        ("_L_", "_R_"),
+    ),
+    "rigify": (
+        "spine spine.001 spine.002 spine.003 spine.004 spine.006",
+        "thigh.L shin.L foot.L toe.L shoulder.L upper_arm.L forearm.L hand.L",
+        (".L", ".R"),
+    ),
+}
+
+
+def renamed(body, rig):
+    """The body under another rig's names, with the names expected of each standard joint."""
+    centre, limbs, (left, right) = RIGS[rig]
+    limbs = limbs.split()
+    names = dict(zip(("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"), centre.split(), strict=True))
+    expected = dict(zip(("pelvis", "spine", "spine_1", "spine_2", "neck", "head"), centre.split(), strict=True))
+    for side, word in (("Left", left), ("Right", right)):
+        here = [name.replace(left, word, 1) for name in limbs]
+        names |= dict(zip((side + limb for limb in LIMBS), here, strict=True))
+        expected |= dict(zip((f"{side.lower()}_{limb}" for limb in STANDARD_LIMBS), here, strict=True))
+    new = tuple(names[name] for name in body.joint_names)
+    return replace(body, joint_names=new, display_names=new), expected
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_a_known_rig_is_recognised_and_every_joint_gets_its_standard_name(body, rig):
+    skeleton, expected = renamed(body, rig)
+    mapping = map_joints(skeleton)
+
+    assert (mapping.rig, mapping.method, mapping.confidence, mapping.notes) == (rig, "names", 1.0, ())
+    assert dict(mapping.joints) == {"root": expected["pelvis"]} | expected
+
+
+def test_a_prefix_before_all_names_does_not_matter(body):
+    names = tuple(f"Character1_{name}" for name in body.joint_names)
+    mapping = map_joints(replace(body, joint_names=names, display_names=names))
+
+    assert mapping.rig == "motionbuilder"
+    assert mapping.joints["left_knee"] == "Character1_LeftLeg"
+
+
+@pytest.mark.parametrize(("scale", "turn"), [(1.0, 0.0), (0.4, 2.0), (170.0, -1.0)])
+def test_a_body_without_telling_names_is_found_by_its_build_whatever_its_size_and_direction(body, scale, turn):
+    known = map_joints(body).joints
+    names = tuple(f"bone{index}" for index in range(body.joint_count))
+    around = quaternions.from_axis_angle([0, 1, 0], turn)
+    offsets = quaternions.rotate_vectors(around, body.offsets * scale)
+    sites = tuple(replace(s, offset=quaternions.rotate_vectors(around, s.offset * scale)) for s in body.end_sites)
+    skeleton = replace(body, joint_names=names, display_names=names, offsets=offsets, end_sites=sites)
+    mapping = map_joints(skeleton)
+
+    assert (mapping.rig, mapping.method) == (None, "geometry")
+    assert mapping.confidence < 0.75
+    assert {joint: skeleton.index_of(name) for joint, name in mapping.joints.items()} == {
+        joint: body.index_of(name) for joint, name in known.items()
+    }
+    assert any("rest pose alone" in note for note in mapping.notes)
+
+
+def test_sides_in_unknown_names_are_believed(body):
+    names = tuple(
+        f"{'R' if 'Right' in name else 'L' if 'Left' in name else 'C'}_b{i}x" for i, name in enumerate(body.joint_names)
+    )
+    mapping = map_joints(replace(body, joint_names=names, display_names=names))
+
+    assert mapping.method == "geometry"
+    assert mapping.joints["left_hip"].startswith("L_")
+    assert not any("rest pose alone" in note for note in mapping.notes)
+
+
+def test_half_a_body_says_what_it_lacks(body):
+    legs = Skeleton(body.joint_names[:9], body.parents[:9], body.offsets[:9], body.rest_rotations[:9])
+    mapping = map_joints(legs)
+
+    assert mapping.joints["right_knee"] == "RightLeg"
+    assert mapping.confidence == 0.5
+    assert mapping.notes == (
+        "not found: head, left_shoulder, left_elbow, left_wrist, right_shoulder, right_elbow, right_wrist",
+    )
+
+
+def test_what_is_no_body_is_said_to_be_none():
+    snake = Skeleton(
+        tuple(f"s{i}" for i in range(20)), np.arange(-1, 19), np.full((20, 3), 0.1), quaternions.identity(20)
+    )
+    mapping = map_joints(snake)
+
+    assert mapping.confidence == 0.0
+    assert mapping.joints == {"root": "s0"}
+    assert "does not look like a body" in mapping.notes[0]
+
+
+def test_a_tail_costs_the_confidence_and_a_pony_tail_does_not(body):
+    def with_tail(name, parent):
+        return Skeleton(
+            (*body.joint_names, name),
+            np.append(body.parents, np.int32(body.index_of(parent))),
+            np.concatenate((body.offsets, [[0, 0, -0.2]])),
+            quaternions.identity(body.joint_count + 1),
+        )
+
+    animal = map_joints(with_tail("Tail1", "Hips"))
+    assert animal.confidence <= 0.2
+    assert "animal" in animal.notes[0]
+    assert map_joints(with_tail("PonyTail", "Head")).confidence == 1.0
+
+
+def test_a_body_that_rests_on_all_fours_is_doubted(body):
+    offsets = body.offsets.copy()
+    for joint, name in enumerate(body.joint_names):
+        if "Spine" in name or name in ("Neck", "Head"):
+            offsets[joint] = [0, 0, abs(offsets[joint]).max()]
+        if "Arm" in name or "Hand" in name:
+            offsets[joint] = [0, -abs(offsets[joint]).max(), 0]
+    mapping = map_joints(replace(body, offsets=offsets))
+
+    assert mapping.confidence <= 0.2
+    assert "stands on arms and legs" in mapping.notes[0]
+
+
+def test_the_plainer_of_two_names_is_the_joint(body):
+    helpers = tuple(f"__{name}" for name in body.joint_names[1:])
+    doubled = Skeleton(
+        ("Hips", *(n for pair in zip(helpers, body.joint_names[1:], strict=True) for n in pair)),
+        np.array([-1, *(p for i, q in enumerate(body.parents[1:]) for p in (2 * q, 2 * i + 1))]),
+        np.concatenate([body.offsets[:1], *(np.stack((np.zeros(3), offset)) for offset in body.offsets[1:])]),
+        quaternions.identity(2 * body.joint_count - 1),
+    )
+    assert map_joints(doubled).joints["left_hip"] == "LeftUpLeg"
+
+
+def test_indices_of_standard_joints_and_the_ones_missing(body):
+    mapping = map_joints(body)
+
+    assert mapping.indices(body, ("left_hip", "head")) == (1, 21)
+    with pytest.raises(MappingError, match="left_heel") as caught:
+        mapping.indices(body, ("left_hip", "left_heel"))
+    assert caught.value.where == "left_heel"
+
+
+def test_the_partner_of_each_joint_is_across_the_body(body):
+    partners = symmetric_joints(body, map_joints(body))
+    names = [body.joint_names[partner] for partner in partners]
+
+    assert names[body.index_of("LeftHand")] == "RightHand"
+    assert names[body.index_of("RightFoot")] == "LeftFoot"
+    assert names[body.index_of("Spine")] == "Spine"
+    np.testing.assert_array_equal(partners[partners], np.arange(body.joint_count))
+
+
+def test_standard_names_are_unique_and_mirror_onto_each_other():
+    assert len(set(STANDARD_JOINTS)) == len(STANDARD_JOINTS)
+    assert {mirrored(name) for name in STANDARD_JOINTS} == set(STANDARD_JOINTS)
+    assert set(ESSENTIAL_JOINTS) <= set(STANDARD_JOINTS)
+    assert mirrored("left_knee") == "right_knee"
+    assert mirrored("pelvis") == "pelvis"
+
+
+@pytest.mark.parametrize("rig", KNOWN_RIGS, ids=lambda rig: rig.name)
+def test_dictionaries_speak_of_standard_joints_only_and_of_each_once(rig):
+    joints = [joint for joint, _ in rig.names()]
+
+    assert set(ESSENTIAL_JOINTS) <= set(joints) <= set(STANDARD_JOINTS)
+    assert max(Counter(joints).values()) == 1
+    assert max(Counter(name for _, names in rig.names() for name in names).values()) == 1
+
+
+def read_skeleton(path):
+    from marey_motion.formats import read_motion
+
+    companion = next(path.parent.glob("*.asf")).read_bytes() if path.suffix == ".amc" else None
+    return read_motion(path.read_bytes(), path.name, companion=companion).skeleton
+
+
+# Pelvis, left hip, knee, ankle, toe, shoulder, elbow, wrist, and head; "-" where the rig has none.
+REAL = {
+    "bandai-namco-1/dataset-1_bow_active_001.bvh": (
+        "bandai-namco",
+        "Hips UpperLeg_L LowerLeg_L Foot_L Toes_L UpperArm_L LowerArm_L Hand_L Head",
+    ),
+    "bandai-namco-2/dataset-2_raise-up-right-hand_active_001.bvh": (
+        "bandai-namco",
+        "Hips UpperLeg_L LowerLeg_L Foot_L Toes_L UpperArm_L LowerArm_L Hand_L Head",
+    ),
+    "cmu-amc/02/02_01.amc": ("cmu-asf", "root lfemur ltibia lfoot ltoes lhumerus lradius lwrist head"),
+    "cmu-bvh/01_01.bvh": (
+        "cmu-bvh",
+        "Hips LeftUpLeg LeftLeg LeftFoot LeftToeBase LeftArm LeftForeArm LeftHand Head",
+    ),
+    "cmu-iclone-bvh/002_01.bvh": (
+        "reallusion",
+        "CC_Base_Hip CC_Base_L_Thigh CC_Base_L_Calf CC_Base_L_Foot CC_Base_L_ToeBase "
+        "CC_Base_L_Upperarm CC_Base_L_Forearm CC_Base_L_Hand CC_Base_Head",
+    ),
+    "rigs/misc/test_freebvh.bvh": (
+        "mixamo",
+        "mixamorig:Hips mixamorig:LeftUpLeg mixamorig:LeftLeg mixamorig:LeftFoot mixamorig:LeftToeBase "
+        "mixamorig:LeftArm mixamorig:LeftForeArm mixamorig:LeftHand mixamorig:Head",
+    ),
+    "rigs/misc/test_mocapbank.bvh": (
+        "biovision",
+        "Hips LeftHip LeftKnee LeftAnkle - LeftShoulder LeftElbow LeftWrist Head",
+    ),
+    "rigs/misc/walk01.bvh": ("hik", "Hips LeftUpLeg LeftLeg LeftFoot - LeftArm LeftForeArm LeftHand Head"),
+    "rigs/game-engine/custom_skeleton_walk_example.bvh": (
+        "game-engine",
+        "FK_back1_jnt L_upLeg_jnt L_lowLeg_jnt L_foot_jnt L_toe_jnt L_upArm_jnt L_lowArm_jnt L_hand_jnt head_jnt",
+    ),
+    "rigs/game-engine/mh_cmu_skeleton_pose.bvh": (
+        "mh-cmu",
+        "Hips LeftUpLeg LeftLeg LeftFoot LeftToeBase LeftArm LeftForeArm LeftHand Head",
+    ),
+    "rigs/makehuman/walk1.bvh": ("makehuman-1", "Root UpLeg_L LoLeg_L Foot_L Toe_L UpArm_L LoArm_L Hand_L Head"),
+    "rigs/makehuman/tpose.bvh": (
+        "makehuman",
+        "root upperleg01.L lowerleg01.L foot.L toe1-1.L upperarm01.L lowerarm01.L wrist.L head",
+    ),
+    "rigs/geno/Geno_stance.bvh": (
+        "geno",
+        "Hips LeftUpLeg LeftLeg LeftFoot LeftToeBase LeftArm LeftForeArm LeftHand Head",
+    ),
+    "rigs/snu-mass/walk.bvh": (
+        "motionbuilder",
+        "Character1_Hips Character1_LeftUpLeg Character1_LeftLeg Character1_LeftFoot Character1_LeftToeBase "
+        "Character1_LeftArm Character1_LeftForeArm Character1_LeftHand Character1_Head",
+    ),
+    "rigs/snu-mss/walk.bvh": (
+        "motionbuilder",
+        "Character1_Hips Character1_LeftUpLeg Character1_LeftLeg Character1_LeftFoot Character1_LeftToeBase "
+        "Character1_LeftArm Character1_LeftForeArm Character1_LeftHand Character1_Head",
+    ),
+    "torture/pybvh-bvh_test2.bvh": (
+        "xsens-bvh",
+        "Hips LeftHip LeftKnee LeftAnkle LeftToe LeftShoulder LeftElbow LeftWrist Head",
+    ),
+}
+JOINTS = ("pelvis", *(f"left_{j}" for j in ("hip", "knee", "ankle", "toe", "shoulder", "elbow", "wrist")), "head")
+SWAPS = (("Left", "Right"), ("_L", "_R"), (".L", ".R"), ("L_", "R_"))
+
+
+def right_of(name):
+    for left, right in SWAPS:
+        if left in name:
+            return name.replace(left, right)
+    return "r" + name[1:]
+
+
+@pytest.mark.parametrize("file", REAL)
+def test_real_rigs_are_mapped_as_a_person_would(mocap, file):
+    rig, names = REAL[file]
+    mapping = map_joints(read_skeleton(mocap / file))
+
+    assert (mapping.rig, mapping.confidence) == (rig, 1.0)
+    for joint, name in zip(JOINTS, names.split(), strict=True):
+        assert mapping.joints.get(joint, "-") == name
+        if joint.startswith("left_") and name != "-":
+            assert mapping.joints[mirrored(joint)] == right_of(name)
+
+
+# Left and right of the one, and the joints among the twist bones of the other, cannot be told without names.
+UNTELLABLE = ("rigs/game-engine/custom_skeleton_walk_example.bvh", "rigs/makehuman/tpose.bvh")
+
+
+@pytest.mark.parametrize("file", [file for file in REAL if file not in UNTELLABLE])
+def test_real_rigs_without_their_names_are_found_by_build(mocap, file):
+    skeleton = read_skeleton(mocap / file)
+    known = map_joints(skeleton)
+    names = tuple(f"bone{index}" for index in range(skeleton.joint_count))
+    mapping = map_joints(replace(skeleton, joint_names=names, display_names=names))
+
+    assert mapping.method == "geometry"
+    for joint in JOINTS:
+        if joint in known.joints:
+            assert mapping.joints[joint] == names[skeleton.index_of(known.joints[joint])]
+
+
+@pytest.mark.parametrize("file", ["dog_run.bvh", "dog_walk.bvh"])
+def test_a_dog_is_not_passed_off_as_a_person(mocap, file):
+    mapping = map_joints(read_skeleton(mocap / "rigs" / "quadruped" / file))
+
+    assert mapping.rig is None
+    assert mapping.confidence <= 0.2
+    assert any("animal" in note for note in mapping.notes)
