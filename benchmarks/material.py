@@ -20,10 +20,11 @@ def real_folder() -> Path | None:
 
 
 def noisy_clip(frames: int, joints: int, seed: int = 0) -> Clip:
-    """Five harmonics per Euler angle with capture noise of 2e-4 rad and 0.05 mm, at 60 Hz."""
+    """Five harmonics per Euler angle about a bent pose, with capture noise of 2e-4 rad and 0.05 mm, at 60 Hz."""
     rng = np.random.default_rng(seed)
     seconds = np.arange(frames) / 60.0
-    angles = _harmonics(seconds, (joints, 3), 0.3, rng) + rng.normal(scale=2e-4, size=(frames, joints, 3))
+    angles = _harmonics(seconds, (joints, 3), 0.4, rng) + rng.normal(scale=0.3, size=(joints, 3))
+    angles += rng.normal(scale=2e-4, size=angles.shape)
     root = _harmonics(seconds, (3,), 0.2, rng) + rng.normal(scale=5e-5, size=(frames, 3))
     root += np.stack([0.2 * seconds, np.full(frames, 0.9), 1.3 * seconds], axis=1)
     rotations = quaternions.unroll(quaternions.from_euler("zxy", angles))
@@ -37,7 +38,7 @@ def _harmonics(
     orders = np.arange(1, 6)
     phases = rng.uniform(0, 2 * np.pi, (*channels, 5))
     sizes = rng.normal(scale=amplitude, size=(*channels, 5)) / orders
-    waves = np.sin(2 * np.pi * 0.5 * seconds.reshape(-1, *([1] * (len(channels) + 1))) * orders + phases)
+    waves = np.sin(2 * np.pi * 0.3 * seconds.reshape(-1, *([1] * (len(channels) + 1))) * orders + phases)
     return np.asarray((waves * sizes).sum(axis=-1))
 
 
