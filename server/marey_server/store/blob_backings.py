@@ -32,12 +32,16 @@ class BlobBacking(Protocol):
         """Bytes `start` to `stop` in pieces of at most `CHUNK_BYTES`; fewer where the backing lost some."""
         ...
 
-    def remove(self, connection: Connection, digest: str) -> None:
-        """Forget the bytes; nothing happens where there are none."""
+    def release(self, connection: Connection, digest: str) -> None:
+        """The blob's row is deleted in this transaction, which may still roll back."""
         ...
 
-    def stray_digests(self, connection: Connection, *, older_than_s: float) -> Iterator[str]:
-        """Digests of bytes kept for at least so long; some may have no row in `blob`."""
+    def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
+        """Digests of bytes that were written so long ago, and that may have no row."""
+        ...
+
+    def remove_stray(self, digest: str) -> None:
+        """Remove bytes that have no row."""
         ...
 
     def check_writable(self) -> None:
@@ -63,13 +67,16 @@ class DatabaseBlobs:
             base = position * CHUNK_BYTES
             yield data if start <= base and base + len(data) <= stop else data[max(start - base, 0) : stop - base]
 
-    def remove(self, connection: Connection, digest: str) -> None:
-        """Forget the bytes."""
+    def release(self, connection: Connection, digest: str) -> None:
+        """Delete the rows along with the blob's."""
         connection.execute(delete(blob_chunk).where(blob_chunk.c.digest == digest))
 
-    def stray_digests(self, connection: Connection, *, older_than_s: float) -> Iterator[str]:  # noqa: ARG002
+    def stray_digests(self, *, older_than_s: float) -> Iterator[str]:  # noqa: ARG002
         """None: a foreign key holds bytes and rows together."""
         return iter(())
+
+    def remove_stray(self, digest: str) -> None:
+        """Nothing: there are none."""
 
     def check_writable(self) -> None:
         """The database is checked by itself."""
@@ -118,14 +125,13 @@ class DirectoryBlobs:
                 start += len(chunk)
                 yield chunk
 
-    def remove(self, connection: Connection, digest: str) -> None:  # noqa: ARG002
-        """Forget the bytes."""
-        self._path(digest).unlink(missing_ok=True)
+    def release(self, connection: Connection, digest: str) -> None:
+        """Leave the file to the next sweep: a transaction that rolls back must find it again."""
 
-    def stray_digests(self, connection: Connection, *, older_than_s: float) -> Iterator[str]:  # noqa: ARG002
+    def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
         """Digests of files; half-written ones of a process that died are removed on the way."""
         newest = time.time() - older_than_s
-        for folder in sorted(self.root.iterdir()):
+        for folder in sorted(path for path in self.root.iterdir() if path.is_dir()):
             for path in folder.iterdir():
                 with suppress(FileNotFoundError):
                     if path.stat().st_mtime <= newest:
@@ -133,6 +139,10 @@ class DirectoryBlobs:
                             path.unlink()
                         else:
                             yield f"sha256:{folder.name}{path.name}"
+
+    def remove_stray(self, digest: str) -> None:
+        """Remove a file."""
+        self._path(digest).unlink(missing_ok=True)
 
     def check_writable(self) -> None:
         """Raise `OSError` where nothing can be written."""

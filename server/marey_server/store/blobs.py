@@ -5,15 +5,17 @@ from __future__ import annotations
 import hashlib
 import itertools
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
 from sqlalchemy import ColumnElement, Select, Table, select, update
 
+from marey_schemas.problems import FieldError
 from marey_server import faults
-from marey_server.access import scopes
-from marey_server.errors import Forbidden, Invalid, NotFound, Unauthenticated
+from marey_server.access.principal import Principal
+from marey_server.errors import Conflict, Forbidden, Invalid, NotFound, Unauthenticated
 from marey_server.store.blob_backings import CHUNK_BYTES
 from marey_server.store.database import Transaction
 from marey_server.store.projects import is_visible
@@ -75,6 +77,14 @@ class Spool:
         self.close()
 
 
+@dataclass(frozen=True, slots=True)
+class Pieces:
+    """Bytes that lie elsewhere, to be read in pieces of 1 MiB when they are wanted."""
+
+    size_bytes: int
+    chunks: Callable[[], Iterable[bytes]]
+
+
 def digest_of(data: bytes) -> str:
     """`sha256:<hex>` of bytes."""
     return f"sha256:{hashlib.sha256(data).hexdigest()}"
@@ -85,7 +95,7 @@ def put_blob(tx: Transaction, content: bytes | Spool, *, expected: str | None = 
 
     Raises `Invalid` where they are not the bytes that `expected` names.
     """
-    _require_sender(tx)
+    require_sender(tx.principal)
     digest = digest_of(content) if isinstance(content, bytes) else content.digest
     if expected is not None and digest != expected:
         raise Invalid(f"The bytes are {digest}, not {expected}: they were changed on the way.", code="digest-mismatch")
@@ -96,17 +106,15 @@ def put_blob(tx: Transaction, content: bytes | Spool, *, expected: str | None = 
     return digest
 
 
-def _require_sender(tx: Transaction) -> None:
-    principal = tx.principal
+def require_sender(principal: Principal) -> None:
+    """Raise unless the caller may send bytes: users with the scope `write`, whatever it is bound to, and attempts."""
     if principal.kind == "anonymous":
         raise Unauthenticated("Sign in to send bytes.")
-    if principal.kind == "user" and not any(
-        scopes.allows([scope.partition("!")[0]], "write") for scope in principal.scopes
-    ):
+    if principal.kind == "user" and not any(held.partition("!")[0] == "write" for held in principal.scopes):
         raise Forbidden("This token may not write.", code="insufficient-scope")
 
 
-def store_blob(tx: Transaction, digest: str, content: bytes | Spool) -> None:
+def store_blob(tx: Transaction, digest: str, content: bytes | Spool | Pieces) -> None:
     """Store bytes under their digest, once; bytes that are there already count as new again."""
     size_bytes = len(content) if isinstance(content, bytes) else content.size_bytes
     row = {"digest": digest, "size_bytes": size_bytes, "created_us": tx.now_us}
@@ -114,8 +122,8 @@ def store_blob(tx: Transaction, digest: str, content: bytes | Spool) -> None:
         tx.blobs.write(tx.connection, digest, _chunks(content))
 
 
-def _chunks(content: bytes | Spool) -> Iterable[bytes]:
-    if isinstance(content, Spool):
+def _chunks(content: bytes | Spool | Pieces) -> Iterable[bytes]:
+    if not isinstance(content, bytes):
         return content.chunks()
     if len(content) <= CHUNK_BYTES:
         return [content] if content else []
@@ -144,10 +152,29 @@ def add_holder(tx: Transaction, digest: str) -> None:
     tx.execute(tx.insert_or_ignore(blob_holder, row))
 
 
+def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
+    """Those of `digests` that the caller may refer to, locked so that they stay until this write has done so."""
+    allowed = sorted(readable(tx, digests))
+    renew = update(blob).values(created_us=tx.now_us).returning(blob.c.digest)
+    return {digest for digest in allowed if tx.execute(renew.where(blob.c.digest == digest)).first() is not None}
+
+
 def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
-    """Keep blobs that a job's parameters or result name; who may read the job's project may read them."""
-    for digest in sorted(set(digests)):
+    """Keep blobs that a job's parameters or result name; who may read the job's project may read them.
+
+    Raises `Conflict` (`missing-blobs`) where the caller may not refer to one, or it is not there.
+    """
+    wanted = set(digests)
+    if lacking := wanted - hold(tx, wanted):
+        raise missing_blobs(lacking)
+    for digest in sorted(wanted):
         tx.execute(tx.insert_or_ignore(job_blob, {"job_id": job_id, "blob_digest": digest}))
+
+
+def missing_blobs(digests: Iterable[str], errors: Sequence[FieldError] = ()) -> Conflict:
+    """Something names blobs that are not here."""
+    detail = "This names blobs that are not here; send them first."
+    return Conflict(detail, code="missing-blobs", context={"missing": sorted(set(digests))}, errors=errors)
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from marey_schemas.arrays import EncodedArray
 from marey_schemas.canonical import attach_arrays, canonical_json, detach_arrays
 from marey_schemas.documents import SCHEMAS
 from marey_schemas.problems import FieldError
-from marey_server.errors import Conflict, Invalid, NotFound
+from marey_server.errors import Invalid, NotFound
 from marey_server.store import blobs
 from marey_server.store.database import Transaction
 from marey_server.store.tables import blob, document, document_blob
@@ -70,12 +70,11 @@ def prepare_document(tree: Any, *, schema: str | None = None) -> PreparedDocumen
     if _NUL.search(canonical):
         raise Invalid("Text in documents must not hold the character U+0000.", code="bad-text")
     body = json.loads(canonical)
+    leaves, files = references_of(name, body)
     arrays = {
         pointer: (blobs.digest_of(encoded[leaf["content"]]), encoded[leaf["content"]])
-        for pointer, leaf in _members(body)
-        if _is_reference(leaf)
+        for pointer, leaf in leaves.items()
     }
-    files = _named_files(name, body)
     _check_pointers([*arrays, *files])
     size_bytes = len(canonical) + sum(len(data) for data in encoded.values())
     return PreparedDocument(blobs.digest_of(canonical), name, body, size_bytes, arrays, files)
@@ -133,14 +132,19 @@ def _members(value: Any, pointer: str = "") -> Iterator[tuple[str, Any]]:
             yield from _members(member, f"{pointer}/{index}")
 
 
-def _named_files(schema: str, body: Tree) -> dict[str, str]:
-    """Blobs that a document names: in the fields its schema has for them, and in members called `blob`."""
+def references_of(schema: str, body: Tree) -> tuple[dict[str, Tree], dict[str, str]]:
+    """What a stored document refers to, by JSON Pointer: its array leaves, and digests of blobs that it names.
+
+    Blobs are named in the fields that the schema has for them, and in members called `blob`.
+    """
     fixed = _FILE_POINTERS.get(schema, ())
-    return {
-        pointer: value
-        for pointer, value in _members(body)
-        if isinstance(value, str) and (pointer in fixed or pointer.endswith("/blob")) and _DIGEST.fullmatch(value)
-    }
+    leaves, files = {}, {}
+    for pointer, value in _members(body):
+        if _is_reference(value):
+            leaves[pointer] = value
+        elif isinstance(value, str) and (pointer in fixed or pointer.endswith("/blob")) and _DIGEST.fullmatch(value):
+            files[pointer] = value
+    return leaves, files
 
 
 def _check_pointers(pointers: list[str]) -> None:
@@ -196,17 +200,11 @@ def store_variant(tx: Transaction, digest: str, body: Tree) -> str:
 
 
 def _require_files(tx: Transaction, files: Mapping[str, str]) -> None:
-    allowed = blobs.readable(tx, files.values())
-    lacking = {pointer: digest for pointer, digest in files.items() if digest not in allowed}
+    held = blobs.hold(tx, files.values())
+    lacking = {pointer: digest for pointer, digest in files.items() if digest not in held}
     if lacking:
-        raise Conflict(
-            "The document names blobs that are not here; send them first.",
-            code="missing-blobs",
-            context={"missing": sorted(set(lacking.values()))},
-            errors=[
-                FieldError(pointer=pointer, code="missing-blob", detail=digest) for pointer, digest in lacking.items()
-            ],
-        )
+        errors = [FieldError(pointer=at, code="missing-blob", detail=digest) for at, digest in lacking.items()]
+        raise blobs.missing_blobs(lacking.values(), errors)
 
 
 def _refer(tx: Transaction, digest: str, held: Mapping[str, str]) -> None:
@@ -246,7 +244,7 @@ def attach_stored(
     )
     rows = tx.execute(statement.where(document_blob.c.document_digest == digest)).all()
     places = {row.pointer: row for row in rows}
-    leaves = {pointer: leaf for pointer, leaf in _members(body) if _is_reference(leaf)}
+    leaves, _ = references_of(OPEN_SCHEMA, body)
     loaded: dict[str, Any] = {}
     for pointer, leaf in leaves.items():
         if leaf["content"] not in loaded:

@@ -15,8 +15,12 @@ from marey_server.store.tables import event, project
 MAX_EVENTS = 1000
 
 
-def list_events(tx: Transaction, project_name: str | None = None, *, after: int = 0, limit: int = 100) -> list[Event]:
+def list_events(
+    tx: Transaction, project_name: str | None = None, *, after: int = 0, limit: int = 100, subject: str | None = None
+) -> list[Event]:
     """Events behind the one numbered `after`: of a project, or as an administrator of the whole server.
+
+    With `subject`, only those of one thing.
 
     Numbers come in the order of the feed, but on Postgres not always ascending: go on after the last one received.
     An event is never inserted before one that was handed out: those of transactions that began before a running one
@@ -27,6 +31,8 @@ def list_events(tx: Transaction, project_name: str | None = None, *, after: int 
         users.require_administrator(tx.principal)
     else:
         statement = statement.where(event.c.project_id == projects.require(tx, project_name, public=False).id)
+    if subject is not None:
+        statement = statement.where(event.c.subject == subject)
     statement = statement.where(_behind(tx, after))
     if tx.is_postgres:
         statement = statement.where(event.c.xid < text("pg_snapshot_xmin(pg_current_snapshot())::text::bigint"))

@@ -1,0 +1,201 @@
+"""Checks that everything stored is what its name says, and that everything referred to is there.
+
+Works beside a running server, in short reads of bounded size.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Row, Select, Table, and_, exists, func, select, text
+
+from marey_schemas.arrays import ArrayError, EncodedArray
+from marey_schemas.canonical import array_digest, canonical_json
+from marey_schemas.kinds import PARTS, Kind
+from marey_server.access.principal import SYSTEM
+from marey_server.store import documents
+from marey_server.store.blobs import digest_of, read_blob
+from marey_server.store.database import Database, Transaction
+from marey_server.store.items.summaries import summarise
+from marey_server.store.tables import (
+    blob,
+    collection,
+    document,
+    document_blob,
+    item,
+    revision,
+    revision_part,
+    upload,
+    upload_chunk,
+)
+
+PAGE = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong: a stable code, what it is about, and a sentence."""
+
+    code: str
+    subject: str
+    detail: str
+
+
+def check_store(database: Database, *, progress: Callable[[str, int], None] | None = None) -> Iterator[Finding]:
+    """Everything that is wrong, as it is found. `progress(what, count)` is called after each page."""
+    yield from database.read(SYSTEM, _check_file)
+    passes: tuple[tuple[str, Table, Callable[[Transaction, Row[Any]], list[Finding]]], ...] = (
+        ("blobs", blob, _check_blob),
+        ("documents", document, _check_document),
+        ("items", item, _check_item),
+        ("collections", collection, _check_collection),
+        ("uploads", upload, _check_upload),
+    )
+    for name, table, check in passes:
+        behind, count = "", 0
+        while page := database.read(SYSTEM, _check_page, table, check, behind):
+            behind, count = page[-1][0], count + len(page)
+            for _key, findings in page:
+                yield from findings
+            if progress is not None:
+                progress(name, count)
+
+
+def _check_page(
+    tx: Transaction, table: Table, check: Callable[[Transaction, Row[Any]], list[Finding]], behind: str
+) -> list[tuple[str, list[Finding]]]:
+    key = table.primary_key.columns[0]
+    rows = tx.execute(select(table).where(key > behind).order_by(key).limit(PAGE)).all()
+    return [(row._mapping[key], check(tx, row)) for row in rows]
+
+
+def _check_file(tx: Transaction) -> list[Finding]:
+    """What the database can tell of itself: Postgres holds its foreign keys; SQLite is asked."""
+    if tx.is_postgres:
+        return []
+    pages = [row[0] for row in tx.execute(text("PRAGMA integrity_check(100)")) if row[0] != "ok"]
+    findings = [Finding("broken-database", "database", line) for line in pages]
+    for table, rowid, parent, _ in tx.execute(text("PRAGMA foreign_key_check")):
+        findings.append(
+            Finding("dangling-reference", f"{table}/{rowid}", f"refers to a row that {parent} does not have")
+        )
+    return findings
+
+
+def _check_blob(tx: Transaction, row: Row[Any]) -> list[Finding]:
+    hashed, size = hashlib.sha256(), 0
+    for piece in tx.blobs.read(tx.connection, row.digest, 0, row.size_bytes):
+        hashed.update(piece)
+        size += len(piece)
+    if size != row.size_bytes:
+        return [Finding("blob-incomplete", row.digest, f"{size} of {row.size_bytes} bytes are there")]
+    if f"sha256:{hashed.hexdigest()}" != row.digest:
+        return [Finding("blob-corrupt", row.digest, "the bytes have another digest")]
+    return []
+
+
+def _check_document(tx: Transaction, row: Row[Any]) -> list[Finding]:
+    findings = []
+    if digest_of(canonical_json(row.body)) != row.digest:
+        findings.append(Finding("document-corrupt", row.digest, "the text has another digest"))
+    arrays, files = documents.references_of(row.schema, row.body)
+    statement = select(document_blob.c.pointer, document_blob.c.blob_digest, blob.c.size_bytes)
+    statement = statement.outerjoin(blob, blob.c.digest == document_blob.c.blob_digest)
+    held = {
+        found.pointer: found for found in tx.execute(statement.where(document_blob.c.document_digest == row.digest))
+    }
+    for pointer in sorted(held.keys() ^ (arrays.keys() | files.keys())):
+        what = "has no blob" if pointer not in held else "is no reference"
+        findings.append(Finding("document-reference", row.digest, f"{pointer} {what}"))
+    for pointer, named in files.items():
+        if pointer in held and held[pointer].blob_digest != named:
+            findings.append(Finding("document-reference", row.digest, f"{pointer} is held by another blob"))
+    for pointer, leaf in arrays.items():
+        if pointer in held and held[pointer].size_bytes is not None:
+            findings += _check_array(tx, row.digest, pointer, leaf, held[pointer])
+    return findings
+
+
+def _check_array(tx: Transaction, digest: str, pointer: str, leaf: dict[str, Any], held: Row[Any]) -> list[Finding]:
+    data = read_blob(tx, held.blob_digest, 0, held.size_bytes)
+    try:
+        content = array_digest(EncodedArray(leaf["dtype"], tuple(leaf["shape"]), data))
+    except ArrayError as error:
+        return [Finding("array-corrupt", digest, f"{pointer}: {error}")]
+    if content != leaf["content"]:
+        return [Finding("array-corrupt", digest, f"{pointer}: the array has another digest")]
+    return []
+
+
+def _check_item(tx: Transaction, row: Row[Any]) -> list[Finding]:
+    kind = Kind(row.kind)
+    counts = select(func.count(), func.max(revision.c.number)).where(revision.c.item_id == row.id)
+    count, newest = tuple(tx.execute(counts).one())
+    if (count, newest) != (row.head, row.head):
+        return [Finding("revisions-lost", row.id, f"{count} revisions up to {newest}; the newest should be {row.head}")]
+    findings = []
+    bodies, complete = {}, True
+    for found in tx.execute(_head_parts(row)):
+        complete = complete and found.body is not None
+        bodies[found.part] = found.body
+        if found.body is None:
+            detail = f"{found.part} of revision {row.head}: {found.document_digest}"
+            findings.append(Finding("document-lost", row.id, detail))
+    lacking = [part for part, spec in PARTS[kind].items() if spec.required and part not in bodies]
+    findings += [Finding("part-lost", row.id, f"revision {row.head} has no {part}") for part in lacking]
+    if complete and not lacking:
+        summary = summarise(kind, bodies)
+        if (summary.shown, summary.frames, summary.skeleton_id) != (row.summary, row.frames, row.skeleton_id):
+            findings.append(Finding("summary-wrong", row.id, "the summary is not that of the newest revision"))
+        findings += _check_named_items(tx, row, bodies)
+    place = tx.execute(select(collection).where(collection.c.id == row.collection_id)).first()
+    if place is None or place.project_id != row.project_id or (row.deleted_us is None) > (place.deleted_us is None):
+        findings.append(Finding("misplaced-item", row.id, "its collection is deleted, gone or of another project"))
+    return findings
+
+
+def _head_parts(row: Row[Any]) -> Select[Any]:
+    return (
+        select(revision_part.c.part, revision_part.c.document_digest, document.c.body)
+        .outerjoin(document, document.c.digest == revision_part.c.document_digest)
+        .where(revision_part.c.item_id == row.id, revision_part.c.number == row.head)
+    )
+
+
+def _check_named_items(tx: Transaction, row: Row[Any], bodies: dict[str, dict[str, Any]]) -> list[Finding]:
+    named = {"motion": ("motion", "skeleton"), "annotation": ("annotation", "clip")}
+    if row.kind not in (Kind.CLIP, Kind.ANNOTATION):
+        return []
+    part, member = named["motion" if row.kind == Kind.CLIP else "annotation"]
+    ref = bodies[part][member]
+    there = exists().where(and_(revision.c.item_id == ref["item"], revision.c.number == ref["revision"]))
+    if tx.execute(select(there)).scalar():
+        return []
+    return [Finding("dangling-reference", row.id, f"{member} {ref['item']} has no revision {ref['revision']}")]
+
+
+def _check_collection(tx: Transaction, row: Row[Any]) -> list[Finding]:
+    if not row.path or row.deleted_us is not None:
+        return []
+    parent = row.path.rpartition("/")[0]
+    above = exists().where(
+        collection.c.project_id == row.project_id, collection.c.path == parent, collection.c.deleted_us.is_(None)
+    )
+    if tx.execute(select(above)).scalar():
+        return []
+    return [Finding("orphan-collection", row.id, f"{row.path!r} lies in {parent!r}, which is not there")]
+
+
+def _check_upload(tx: Transaction, row: Row[Any]) -> list[Finding]:
+    if row.finished_digest is not None:
+        return []
+    held = select(func.coalesce(func.sum(func.length(upload_chunk.c.data)), 0)).where(
+        upload_chunk.c.upload_id == row.id
+    )
+    size = tx.execute(held).scalar_one()
+    return (
+        [] if size == row.offset else [Finding("upload-incomplete", row.id, f"{size} of {row.offset} bytes are there")]
+    )

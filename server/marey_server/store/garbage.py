@@ -1,0 +1,141 @@
+"""Garbage collection: documents and blobs that nothing refers to, uploads nobody continues, keys that have expired.
+
+Candidates are looked for in a read. Each batch is then deleted in a transaction of its own that locks the rows and
+looks again. Whoever takes up a document or blob renews its row first, so that either he finds it gone or we find it young.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from sqlalchemy import ColumnElement, Table, delete, exists, select
+
+from marey_server import faults
+from marey_server.access.principal import SYSTEM
+from marey_server.store import uploads
+from marey_server.store.blobs import GRACE_US
+from marey_server.store.database import Database, Transaction
+from marey_server.store.idempotency import LIFETIME_US as KEY_LIFETIME_US
+from marey_server.store.tables import (
+    blob,
+    blob_holder,
+    document,
+    document_blob,
+    idempotency_key,
+    job_blob,
+    revision_part,
+    staged_output,
+    upload,
+)
+
+BATCH = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Collected:
+    """How much was deleted."""
+
+    documents: int
+    blobs: int
+    stray_files: int
+    uploads: int
+    keys: int
+
+
+def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collected:
+    """Delete what nothing has referred to for `grace_us`. Safe at any time, beside anything, by several at once."""
+    return Collected(
+        documents=_collect(database, document, delete_documents, grace_us),
+        blobs=_collect(database, blob, delete_blobs, grace_us),
+        stray_files=_sweep_strays(database, grace_us),
+        uploads=database.write(SYSTEM, _drop_old_uploads),
+        keys=database.write(SYSTEM, _drop_old_keys),
+    )
+
+
+def _collect(
+    database: Database, table: Table, delete_some: Callable[[Transaction, Sequence[str], int], int], grace_us: int
+) -> int:
+    deleted, behind = 0, ""
+    while found := database.read(SYSTEM, _candidates, table, grace_us, behind):
+        deleted += database.write(SYSTEM, delete_some, found, grace_us)
+        behind = found[-1]
+    return deleted
+
+
+def _candidates(tx: Transaction, table: Table, grace_us: int, behind: str) -> list[str]:
+    statement = select(table.c.digest).where(table.c.digest > behind, *_garbage(tx, table, grace_us))
+    return list(tx.execute(statement.order_by(table.c.digest).limit(BATCH)).scalars())
+
+
+def _garbage(tx: Transaction, table: Table, grace_us: int) -> tuple[ColumnElement[bool], ...]:
+    """Conditions on rows that may go, staged documents aside."""
+    old = table.c.created_us < tx.now_us - grace_us
+    if table is document:
+        return old, ~exists().where(revision_part.c.document_digest == document.c.digest)
+    named = exists().where(document_blob.c.blob_digest == blob.c.digest)
+    return old, ~named, ~exists().where(job_blob.c.blob_digest == blob.c.digest)
+
+
+def _still_garbage(tx: Transaction, table: Table, digests: Sequence[str], grace_us: int) -> list[str]:
+    """Those of `digests` that may go now, locked so that it stays so."""
+    chosen = table.c.digest.in_(digests)
+    tx.execute(select(table.c.digest).where(chosen).order_by(table.c.digest).with_for_update()).all()
+    return list(tx.execute(select(table.c.digest).where(chosen, *_garbage(tx, table, grace_us))).scalars())
+
+
+def delete_documents(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_US) -> int:
+    """Delete those of these documents that nothing refers to."""
+    going = set(_still_garbage(tx, document, digests, grace_us)) - _staged_documents(tx)
+    tx.execute(delete(document_blob).where(document_blob.c.document_digest.in_(going)))
+    tx.execute(delete(document).where(document.c.digest.in_(going)))
+    faults.point("garbage.before_commit")
+    return len(going)
+
+
+def _staged_documents(tx: Transaction) -> set[str]:
+    """Documents that running attempts have staged. One staged after this was read is renewed, and so not garbage."""
+    drafts = tx.execute(select(staged_output.c.draft).execution_options(yield_per=1000)).scalars()
+    return {digest for draft in drafts for digest in draft["parts"].values()}
+
+
+def delete_blobs(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_US) -> int:
+    """Delete those of these blobs that nothing refers to."""
+    going = _still_garbage(tx, blob, digests, grace_us)
+    for digest in going:
+        tx.blobs.release(tx.connection, digest)
+    tx.execute(delete(blob_holder).where(blob_holder.c.digest.in_(going)))
+    tx.execute(delete(blob).where(blob.c.digest.in_(going)))
+    faults.point("garbage.before_commit")
+    return len(going)
+
+
+def _sweep_strays(database: Database, grace_us: int) -> int:
+    """Remove files of a directory that have no row: what transactions that never committed left, or deleted rows."""
+    return sum(
+        database.write(SYSTEM, _remove_stray, digest)
+        for digest in database.blobs.stray_digests(older_than_s=grace_us / 1_000_000)
+    )
+
+
+def _remove_stray(tx: Transaction, digest: str) -> int:
+    """Remove the bytes if there is no row; while we hold the row's place, nobody can store them anew."""
+    row = {"digest": digest, "size_bytes": 0, "created_us": tx.now_us}
+    if tx.execute(tx.insert_or_ignore(blob, row).returning(blob.c.digest)).first() is None:
+        return 0
+    tx.blobs.remove_stray(digest)
+    tx.execute(delete(blob).where(blob.c.digest == digest))
+    return 1
+
+
+def _drop_old_uploads(tx: Transaction) -> int:
+    old = upload.c.updated_us < tx.now_us - uploads.LIFETIME_US
+    found = list(tx.execute(select(upload.c.id).where(old).with_for_update(skip_locked=True)).scalars())
+    uploads.drop(tx, found)
+    return len(found)
+
+
+def _drop_old_keys(tx: Transaction) -> int:
+    old = idempotency_key.c.created_us < tx.now_us - KEY_LIFETIME_US
+    return tx.execute(delete(idempotency_key).where(old)).rowcount

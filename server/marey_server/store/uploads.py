@@ -1,0 +1,166 @@
+"""Resumable uploads: bytes that come in pieces, over many connections if need be, and become a blob at the end.
+
+Pieces are kept in rows until then. The offset moves by compare-and-swap, so that two senders cannot interleave.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Row, delete, insert, select, update
+
+from marey_server.errors import Conflict, Forbidden, Invalid, NotFound, TooLarge, Unauthenticated
+from marey_server.store import blobs
+from marey_server.store.blob_backings import CHUNK_BYTES
+from marey_server.store.database import Transaction
+from marey_server.store.ids import new_id
+from marey_server.store.tables import upload, upload_chunk
+
+MAX_UPLOAD_BYTES = 16 * 2**30
+LIFETIME_US = 7 * 86400 * 1_000_000
+"""An upload that nobody continued for so long is given up."""
+
+
+@dataclass(frozen=True, slots=True)
+class Upload:
+    """How far an upload is; `digest` once it is complete."""
+
+    id: str
+    length: int
+    offset: int
+    digest: str | None
+
+
+def create_upload(tx: Transaction, length: int, *, digest: str | None = None) -> Upload:
+    """Announce `length` bytes; with `digest`, they must turn out to be these."""
+    user_id = _sender(tx)
+    if not 0 < length <= MAX_UPLOAD_BYTES:
+        raise TooLarge(f"An upload holds 1 to {MAX_UPLOAD_BYTES} bytes.")
+    upload_id = new_id("upload")
+    row = {
+        "id": upload_id, "user_id": user_id, "length": length, "offset": 0, "digest": digest,
+        "created_us": tx.now_us, "updated_us": tx.now_us,
+    }  # fmt: skip
+    tx.execute(insert(upload), row)
+    return Upload(upload_id, length, 0, None)
+
+
+def read_upload(tx: Transaction, upload_id: str) -> Upload:
+    """How far an upload of the caller is. Raises `NotFound`."""
+    return _shown(_find(tx, upload_id))
+
+
+def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> Upload:
+    """Append a piece of at most a few MiB that starts at `offset`.
+
+    Raises `Conflict` with the true offset in `context.offset` where the upload is elsewhere.
+    """
+    found = _find(tx, upload_id)
+    if found.finished_digest is not None or found.offset != offset:
+        raise _elsewhere(found.offset)
+    if offset + len(data) > found.length:
+        raise TooLarge(f"The upload was announced with {found.length} bytes; this would make {offset + len(data)}.")
+    if not data:
+        return _shown(found)
+    moved = (
+        update(upload)
+        .where(upload.c.id == upload_id, upload.c.offset == offset, upload.c.finished_digest.is_(None))
+        .values(offset=offset + len(data), updated_us=tx.now_us)
+    )
+    if tx.execute(moved).rowcount == 0:
+        raise _elsewhere(_find(tx, upload_id).offset)
+    for start in range(0, len(data), CHUNK_BYTES):
+        piece = {"upload_id": upload_id, "offset": offset + start, "data": data[start : start + CHUNK_BYTES]}
+        tx.execute(insert(upload_chunk), piece)
+    return Upload(upload_id, found.length, offset + len(data), None)
+
+
+def finish(tx: Transaction, upload_id: str) -> str:
+    """Make a blob of a complete upload and return its digest; the same again once it is finished.
+
+    Raises `Conflict` where bytes are lacking. Bytes that are not the announced ones are dropped: `Invalid`.
+    """
+    found = _find(tx, upload_id)
+    if found.finished_digest is not None:
+        return str(found.finished_digest)
+    if found.offset != found.length:
+        raise _elsewhere(found.offset)
+    hashed = hashlib.sha256()
+    for piece in _pieces(tx, upload_id):
+        hashed.update(piece)
+    digest = f"sha256:{hashed.hexdigest()}"
+    if found.digest not in (None, digest):
+        detail = f"The bytes are {digest}, not {found.digest}. Upload them again."
+        raise Invalid(detail, code="digest-mismatch")
+    claimed = update(upload).where(upload.c.id == upload_id, upload.c.finished_digest.is_(None))
+    if tx.execute(claimed.values(finished_digest=digest, updated_us=tx.now_us)).rowcount == 0:
+        return digest
+    blobs.store_blob(tx, digest, blobs.Pieces(found.length, lambda: _even(_pieces(tx, upload_id))))
+    blobs.add_holder(tx, digest)
+    tx.execute(delete(upload_chunk).where(upload_chunk.c.upload_id == upload_id))
+    return digest
+
+
+def abandon(tx: Transaction, upload_id: str) -> None:
+    """Drop an upload; its blob, if it became one, stays."""
+    found = _find(tx, upload_id)
+    drop(tx, [found.id])
+
+
+def drop(tx: Transaction, upload_ids: list[str]) -> None:
+    """Delete uploads and what came of them so far."""
+    tx.execute(delete(upload_chunk).where(upload_chunk.c.upload_id.in_(upload_ids)))
+    tx.execute(delete(upload).where(upload.c.id.in_(upload_ids)))
+
+
+def _pieces(tx: Transaction, upload_id: str) -> Iterator[bytes]:
+    """The pieces in order, one in memory at a time."""
+    offset = 0
+    one = select(upload_chunk.c.data)
+    while data := tx.execute(
+        one.where(upload_chunk.c.upload_id == upload_id, upload_chunk.c.offset == offset)
+    ).scalar():
+        offset += len(data)
+        yield data
+
+
+def _even(pieces: Iterator[bytes]) -> Iterator[bytes]:
+    """The same bytes in pieces of `CHUNK_BYTES`, the last one shorter."""
+    held = bytearray()
+    for piece in pieces:
+        held += piece
+        while len(held) >= CHUNK_BYTES:
+            yield bytes(held[:CHUNK_BYTES])
+            del held[:CHUNK_BYTES]
+    if held:
+        yield bytes(held)
+
+
+def _sender(tx: Transaction) -> str:
+    blobs.require_sender(tx.principal)
+    if tx.principal.user_id is None:
+        raise Forbidden("Only users and their jobs upload.", code="users-only")
+    return tx.principal.user_id
+
+
+def _find(tx: Transaction, upload_id: str) -> Row[Any]:
+    if tx.principal.kind == "anonymous":
+        raise Unauthenticated("Sign in to upload.")
+    statement = select(upload).where(upload.c.id == upload_id, upload.c.user_id == (tx.principal.user_id or ""))
+    row = tx.execute(statement).first()
+    if row is None:
+        raise NotFound(f"You have no upload {upload_id!r}.", code="no-upload")
+    return row
+
+
+def _elsewhere(offset: int) -> Conflict:
+    return Conflict(
+        f"The upload is at byte {offset}; go on from there.", code="wrong-offset", context={"offset": offset}
+    )
+
+
+def _shown(row: Row[Any]) -> Upload:
+    return Upload(row.id, row.length, row.offset, row.finished_digest)
