@@ -1,0 +1,148 @@
+"""Bodies as lines: which bones to draw, seen from where, and which is in front."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import kinematics
+from marey_motion.clip import Clip
+from marey_motion.errors import MotionError
+from marey_motion.rigs import JointMapping, map_joints
+from marey_motion.rigs.standard import SIDES
+from marey_motion.skeleton import Skeleton
+
+Floats = NDArray[np.floating[Any]]
+Indices = NDArray[np.intp]
+
+LEFT, CENTRE, RIGHT = -1, 0, 1
+TIP_SHARE = 0.25  # of the body's size: longer ends are markers of something else
+HEADING_PAIRS = ("hip", "shoulder")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A parallel view of the ground from `direction_rad` about +Y (0 looks from +Z), `tilt_rad` from above."""
+
+    direction_rad: float
+    tilt_rad: float
+
+    def seen(self, points: Floats) -> Floats:
+        """Points (..., 3) as (right, up, towards the viewer) in metres, shape (..., 3)."""
+        turn, tilt = self.direction_rad, self.tilt_rad
+        right = points[..., 0] * np.cos(turn) - points[..., 2] * np.sin(turn)
+        near = points[..., 0] * np.sin(turn) + points[..., 2] * np.cos(turn)
+        up = points[..., 1] * np.cos(tilt) - near * np.sin(tilt)
+        return np.stack((right, up, near * np.cos(tilt) + points[..., 1] * np.sin(tilt)), axis=-1)
+
+
+@dataclass(frozen=True)
+class Body:
+    """What to draw of a skeleton.
+
+    Parameters
+    ----------
+    bones : (n, 2) indices of the points at the outer and the inner end: joints, then end sites
+    sides : (n,) LEFT, CENTRE or RIGHT
+    pelvis : the joint that figures are centred on
+    head : bone along which the middle of the head is, and how far from its inner (0) to its outer (1) end; None
+        where no head is known
+    facing : joints of the left and, matching, of the right side that tell where the body faces
+    """
+
+    bones: Indices
+    sides: Indices
+    pelvis: int
+    head: tuple[int, float] | None
+    facing: tuple[tuple[int, ...], tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class Stances:
+    """A body at K moments.
+
+    Parameters
+    ----------
+    points : (K, P, 3) positions over the floor, centred on the pelvis, metres
+    facing : (K, 2) unit (x, z) directions, None where the body does not tell
+    """
+
+    points: Floats
+    facing: Floats | None
+
+
+def body_of(skeleton: Skeleton) -> Body:
+    """The bones of a body, without roots on the floor, props and helpers; all bones where no pelvis is known."""
+    mapping = map_joints(skeleton)
+    standard = {skeleton.index_of(name): key for key, name in mapping.joints.items() if key != "root"}
+    pelvis = next((joint for joint, key in standard.items() if key == "pelvis"), None)
+    if pelvis is None:
+        bones = [(joint, int(parent)) for joint, parent in enumerate(skeleton.parents) if parent >= 0]
+        return Body(_pairs(bones), np.zeros(len(bones), dtype=np.intp), 0, None, ((), ()))
+    sides: dict[int, int] = {}
+    for joint, key in standard.items():
+        path = skeleton.path_to_root(joint)
+        for step in path[: path.index(pelvis)] if pelvis in path else ():
+            side = _side(standard.get(step, key))
+            # A joint without a standard name that leads to both sides is in the centre.
+            sides[step] = side if sides.get(step, side) == side else CENTRE
+    bones = [(joint, int(skeleton.parents[joint])) for joint in sides]
+    tips = _tips(skeleton, pelvis, sides)
+    ends = [skeleton.end_sites[number - skeleton.joint_count].joint for number, _ in tips]
+    heads = [(len(bones) + place, 0.5) for place, joint in enumerate(ends) if standard.get(joint) == "head"]
+    heads += [(place, 1.0) for place, (joint, _) in enumerate(bones) if standard.get(joint) == "head"]
+    return Body(
+        _pairs(bones + tips),
+        np.array([*sides.values(), *(sides[joint] for joint in ends)], dtype=np.intp),
+        pelvis,
+        next(iter(heads), None),
+        _facing_joints(skeleton, mapping),
+    )
+
+
+def stances_at(clip: Clip, body: Body, frames: Indices) -> Stances:
+    """The body in these frames (K,); only they are computed, however long the clip is."""
+    points = kinematics.forward_kinematics(
+        clip.skeleton,
+        clip.poses[frames].astype(np.float64),
+        translations=None if clip.translations is None else clip.translations[frames].astype(np.float64),
+        translated_joints=clip.translated_joints,
+        end_sites=True,
+    )
+    facing: Floats | None = None
+    if body.facing[0]:
+        try:
+            facing = kinematics.forward_directions(points, *body.facing)
+        except MotionError:
+            facing = None  # lies on its side throughout
+    return Stances(points - points[:, [body.pelvis]] * (1.0, 0.0, 1.0), facing)
+
+
+def _tips(skeleton: Skeleton, pelvis: int, sides: dict[int, int]) -> list[tuple[int, int]]:
+    """Bones to the end sites of the chains that are drawn."""
+    size = float(np.ptp(skeleton.rest_global_positions[[pelvis, *sides]], axis=0).max())
+    inner = {int(skeleton.parents[joint]) for joint in sides}
+    return [
+        (skeleton.joint_count + number, site.joint)
+        for number, site in enumerate(skeleton.end_sites)
+        if site.joint in sides and site.joint not in inner and np.linalg.norm(site.offset) < TIP_SHARE * size
+    ]
+
+
+def _facing_joints(skeleton: Skeleton, mapping: JointMapping) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    known = [pair for pair in HEADING_PAIRS if all(f"{side}_{pair}" in mapping.joints for side in SIDES)]
+    left, right = (mapping.indices(skeleton, [f"{side}_{pair}" for pair in known]) for side in SIDES)
+    return left, right
+
+
+def _side(standard: str) -> int:
+    if standard.startswith("left_"):
+        return LEFT
+    return RIGHT if standard.startswith("right_") else CENTRE
+
+
+def _pairs(bones: list[tuple[int, int]]) -> Indices:
+    return np.array(bones, dtype=np.intp).reshape(-1, 2)

@@ -1,0 +1,180 @@
+"""Contact sheets: what is drawn, and that it is drawn for any clip."""
+
+import io
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from marey_motion import quaternions
+from marey_motion.clip import Clip
+from marey_motion.errors import MotionError
+from marey_motion.figures import DPI, HEADER, MARGIN, PAGE_WIDTH, ROW, STAGE, TITLE, TakePair, contact_sheet
+from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
+from marey_motion.skeleton import EndSite, Skeleton
+from marey_motion.stick_figures import CENTRE, LEFT, RIGHT, Camera, body_of, stances_at
+
+BLUE, ORANGE = (0x1F, 0x6F, 0xB2), (0xE0, 0x7B, 0x1A)
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return generate_gait(1.3, 0.4, 2.0)
+
+
+def pixels_of(png):
+    return np.rint(imread(io.BytesIO(png))[..., :3] * 255).astype(int)
+
+
+def cell(pixels, row, column, columns):
+    """The pixels of one figure's ground; columns counts figures."""
+    width = (PAGE_WIDTH - 2 * MARGIN) / columns
+    left, top = MARGIN + column * width, HEADER + row * ROW + TITLE
+    return pixels[round(top * DPI) : round((top + STAGE) * DPI), round(left * DPI) : round((left + width) * DPI)]
+
+
+def share_of(pixels, colour):
+    return np.mean(np.abs(pixels - colour).max(axis=-1) < 12)
+
+
+def chain(names, offsets, tips=()):
+    count = len(names)
+    return Skeleton(names, np.arange(-1, count - 1), np.array(offsets), quaternions.identity(count), tips)
+
+
+def still(skeleton, frames=3):
+    pose = np.concatenate((skeleton.offsets[0], skeleton.rest_rotations.ravel()))
+    return Clip(skeleton, 30.0, np.tile(pose, (frames, 1)))
+
+
+def test_each_take_has_a_row_with_figures_of_both_sides_in_every_cell(walk):
+    png = contact_sheet([TakePair("one", walk, walk), TakePair("two", walk, walk)], moments=3)
+
+    pixels = pixels_of(png)
+    assert png.startswith(b"\x89PNG")
+    assert pixels.shape[:2] == (round((HEADER + 2 * ROW) * DPI), round(PAGE_WIDTH * DPI))
+    for row in range(2):
+        for column in range(6):
+            figure = cell(pixels, row, column, 6)
+            assert share_of(figure, BLUE) > 0.003
+            assert share_of(figure, ORANGE) > 0.003
+
+
+def test_source_and_result_are_drawn_at_one_scale(walk):
+    small = generate_gait(1.3, 0.4, 2.0, stature_m=0.9)
+    pixels = pixels_of(contact_sheet([TakePair("", walk, small)], moments=2))
+
+    def height(column):
+        dark = np.abs(cell(pixels, 0, column, 4) - BLUE).max(axis=-1) < 12
+        return np.ptp(np.flatnonzero(dark.any(axis=1)))
+
+    assert height(1) == pytest.approx(0.9 / 1.78 * height(0), rel=0.1)
+
+
+def test_a_title_is_taken_literally_and_a_long_one_is_cut(walk):
+    contact_sheet([TakePair(r"cost $5 and \frac{1}{0} ^_ {", walk, walk), TakePair("x" * 5000, walk, walk)])
+
+
+def test_the_same_takes_give_the_same_picture_in_many_threads(walk):
+    takes = [TakePair("walk", walk, walk)]
+
+    with ThreadPoolExecutor(4) as pool:
+        sheets = list(pool.map(lambda _: contact_sheet(takes), range(4)))
+    assert len(set(sheets)) == 1
+
+
+def test_only_the_frames_shown_are_computed(walk, monkeypatch):
+    computed = []
+    from marey_motion import kinematics
+
+    original = kinematics.forward_kinematics
+    monkeypatch.setattr(
+        kinematics,
+        "forward_kinematics",
+        lambda skeleton, poses, **options: computed.append(len(poses)) or original(skeleton, poses, **options),
+    )
+    contact_sheet([TakePair("long", walk, walk)], moments=5)
+    assert computed == [5, 5]
+
+
+def test_clips_of_one_frame_of_one_joint_and_of_no_extent_are_drawn():
+    point = chain(("point",), [(0.0, 0.0, 0.0)])
+    stick = chain(("a", "b"), [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0)], (EndSite(1, np.array((0.0, 0.5, 0.0))),))
+
+    for skeleton in (point, stick):
+        clip = still(skeleton, frames=1)
+        assert contact_sheet([TakePair("tiny", clip, clip)]).startswith(b"\x89PNG")
+
+
+def test_figures_below_the_floor_stay_on_their_ground(walk):
+    poses = walk.poses.copy()
+    poses[:, 1] -= 1.5
+    pixels = pixels_of(contact_sheet([TakePair("sunk", replace(walk, poses=poses), walk)], moments=2))
+
+    assert share_of(cell(pixels, 0, 0, 4), BLUE) > 0.001
+
+
+@pytest.mark.parametrize(("count", "moments"), [(0, 6), (101, 6), (1, 0), (1, 13)])
+def test_a_sheet_of_nothing_or_of_too_much_is_refused(walk, count, moments):
+    with pytest.raises(MotionError, match="1 to 100 takes at 1 to 12 moments"):
+        contact_sheet([TakePair("", walk, walk)] * count, moments=moments)
+
+
+def test_props_and_roots_on_the_floor_are_no_part_of_a_body():
+    skeleton = game_skeleton()
+    body = body_of(skeleton)
+
+    drawn = {skeleton.joint_names[joint] for joint in body.bones[:, 0] if joint < skeleton.joint_count}
+    assert not {"root", "pelvis", "weapon_r", "upperarm_twist_01_l"} & drawn
+    assert {"spine_02", "neck_02", "calf_l", "hand_r", "head"} <= drawn
+
+
+def test_bones_have_the_side_of_the_body_they_belong_to():
+    skeleton = game_skeleton()
+    body = body_of(skeleton)
+
+    sides = {
+        skeleton.joint_names[outer]: side
+        for (outer, _), side in zip(body.bones, body.sides, strict=True)
+        if outer < skeleton.joint_count
+    }
+    assert sides["thigh_l"] == sides["clavicle_l"] == LEFT
+    assert sides["thigh_r"] == sides["hand_r"] == RIGHT
+    assert sides["spine_02"] == sides["spine_04"] == sides["head"] == CENTRE
+
+
+def test_a_body_without_names_or_limbs_is_drawn_whole():
+    skeleton = chain(("a", "b", "c"), [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)])
+
+    assert body_of(skeleton).bones.tolist() == [[1, 0], [2, 1]]
+    assert stances_at(still(skeleton), body_of(skeleton), np.array([0])).facing is None
+
+
+def test_figures_are_centred_on_the_pelvis_and_face_their_heading():
+    clip = generate_gait(2.0, np.pi / 4, 4.0)
+    stances = stances_at(clip, body_of(clip.skeleton), np.array([0, 120]))
+
+    assert np.abs(stances.points[:, 0, ::2]).max() < 1e-12
+    assert stances.facing[0] == pytest.approx((0.0, 1.0), abs=0.05)
+    assert stances.facing[1] == pytest.approx((1.0, 0.0), abs=0.05)
+
+
+def test_a_camera_in_front_sees_the_left_side_on_the_right_and_near_things_lower():
+    camera = Camera(direction_rad=0.0, tilt_rad=np.radians(10))
+
+    left, near, up = camera.seen(np.eye(3)[[0, 2, 1]])
+    assert left == pytest.approx((1.0, 0.0, 0.0))
+    assert near[1] < 0.0 < near[2]
+    assert up[1] > 0.9
+
+
+def test_a_body_lying_on_its_side_is_drawn_without_an_arrow():
+    clip = still(studio_skeleton())
+    poses = clip.poses.copy()
+    poses[:, 3:7] = quaternions.from_axis_angle((0.0, 0.0, 1.0), np.pi / 2)
+    lying = replace(clip, poses=poses)
+
+    assert stances_at(lying, body_of(lying.skeleton), np.array([0])).facing is None
+    assert contact_sheet([TakePair("lying", lying, clip)]).startswith(b"\x89PNG")
