@@ -362,6 +362,12 @@ class BatchCompleteAnswer(Answer):
     results: tuple[BatchCompletionResult, ...]
 
 
+class StageAnswer(Answer):
+    """How many results the attempt has staged."""
+
+    staged: int
+
+
 class LogAnswer(Answer):
     """How long the attempt's log is now."""
 

@@ -16,6 +16,8 @@ from marey_server.observe import Metrics
 from marey_server.settings import Settings
 from marey_server.store import tokens
 from marey_server.store.database import Database
+from marey_server.store.queue_policy import QueuePolicy
+from marey_server.store.reaper import StartGrace
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -48,6 +50,8 @@ class Services:
         self._tries_by_name = TryLimit(settings.login_tries_per_minute)
         self._tries_by_address = TryLimit(10 * settings.login_tries_per_minute)
         self._tokens_noted: dict[str, float] = {}
+        self.queue_policy = QueuePolicy(settings.lease_ttl_s, settings.heartbeat_s, settings.cancel_grace_s)
+        self.start_grace = StartGrace(self.queue_policy)
 
     def submit(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Run numeric work or file work in a thread, away from the event loop."""

@@ -45,6 +45,11 @@ class Settings(BaseSettings):
     )
     import_files_now: int = Field(64, ge=0, description="Imports of more files become a job.")
     import_bytes_now: int = Field(64 * MIB, ge=0, description="Imports of more bytes become a job.")
+    lease_ttl_s: float = Field(60.0, ge=1, le=3600, description="How long a worker keeps a job without a sign of life.")
+    heartbeat_s: float = Field(15.0, ge=0.1, le=600, description="How often workers give a sign of life.")
+    cancel_grace_s: float = Field(
+        30.0, ge=0, le=3600, description="How long a worker may take to stop, once a job is cancelled or its time over."
+    )
     local_workers: int = Field(0, ge=0, le=256, description="Worker processes to start beside the server.")
 
     @classmethod

@@ -6,11 +6,15 @@ from marey_server.handlers import (
     collections,
     documentation,
     events,
+    exports,
     health,
     imports,
     items,
+    jobs,
+    leases,
     parts,
     projects,
+    uploads,
 )
 from marey_server.handlers.resource import Resource
 
@@ -20,8 +24,12 @@ RESOURCES: tuple[type[Resource], ...] = (
     *collections.RESOURCES,
     *items.RESOURCES,
     *parts.RESOURCES,
+    *exports.RESOURCES,
     *imports.RESOURCES,
+    *jobs.RESOURCES,
+    *leases.RESOURCES,
     *blobs.RESOURCES,
+    *uploads.RESOURCES,
     *events.RESOURCES,
     *documentation.RESOURCES,
     *health.RESOURCES,

@@ -154,6 +154,10 @@ class Resource(RequestHandler):
             return False
         return True
 
+    def is_awaited(self) -> bool:
+        """Whether an answer still has somebody to go to, and the server time to make one."""
+        return self in self.services.in_flight and not self.services.draining.is_set()
+
     @property
     def answer_form(self) -> Form:
         """How the caller wants the answer."""

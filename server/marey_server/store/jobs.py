@@ -8,12 +8,12 @@ from typing import Any
 from sqlalchemy import ColumnElement, Row, and_, case, func, select, update
 
 from marey_schemas.access import Role
-from marey_schemas.items import Event, Page
+from marey_schemas.items import Page
 from marey_schemas.job_kinds import UnknownKindError, find_kind
 from marey_schemas.jobs import Attempt, Job, JobCreate, JobOutput, JobState, Resources
 from marey_server.access import roles
 from marey_server.errors import Conflict, Forbidden, NotFound
-from marey_server.store import listing, projects
+from marey_server.store import events, listing, projects
 from marey_server.store.clock import datetime_of
 from marey_server.store.database import Transaction
 from marey_server.store.fencing import RUNNING, earlier
@@ -25,7 +25,7 @@ from marey_server.store.projects import ProjectRow
 from marey_server.store.queue_policy import DEFAULT_POLICY, QueuePolicy
 from marey_server.store.settling import settle
 from marey_server.store.submission import Submission, submit_checked
-from marey_server.store.tables import attempt, event, job, user
+from marey_server.store.tables import attempt, job, user
 
 SORT_KEYS: dict[str, ColumnElement[Any]] = {
     "id": job.c.id,
@@ -79,22 +79,23 @@ def list_jobs(
     return Page(items=tuple(as_documents(tx, rows)), next_cursor=next_cursor, count=total)
 
 
-def list_attempts(tx: Transaction, job_id: str) -> list[Attempt]:
+def list_attempts(tx: Transaction, job_id: str) -> Page:
     """Every try at a job, the first one first."""
     _find(tx, job_id)
     rows = tx.execute(select(attempt).where(attempt.c.job_id == job_id).order_by(attempt.c.fence))
-    return [
-        Attempt(
-            job=row.job_id,
-            fence=row.fence,
-            worker=row.worker,
-            started_at=datetime_of(row.started_us),
-            ended_at=None if row.ended_us is None else datetime_of(row.ended_us),
-            outcome=row.outcome,
-            detail=row.detail,
-        )
-        for row in rows
-    ]
+    return Page(items=tuple(_attempt_document(row) for row in rows))
+
+
+def _attempt_document(row: Row[Any]) -> Attempt:
+    return Attempt(
+        job=row.job_id,
+        fence=row.fence,
+        worker=row.worker,
+        started_at=datetime_of(row.started_us),
+        ended_at=None if row.ended_us is None else datetime_of(row.ended_us),
+        outcome=row.outcome,
+        detail=row.detail,
+    )
 
 
 def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
@@ -109,22 +110,10 @@ def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit:
     return Page(items=outputs, next_cursor=next_cursor)
 
 
-def list_events(tx: Transaction, job_id: str, after: int = 0, limit: int = listing.DEFAULT_LIMIT) -> list[Event]:
+def list_job_events(tx: Transaction, job_id: str, after: int = 0, limit: int = 100) -> Page:
     """What happened to a job, for members of its project."""
     _, project = _find(tx, job_id, public=False)
-    statement = select(event).where(event.c.subject == job_id, event.c.seq > after).order_by(event.c.seq).limit(limit)
-    return [
-        Event(
-            seq=row.seq,
-            at=datetime_of(row.at_us),
-            project=project.name,
-            kind=row.kind,
-            subject=row.subject,
-            actor=row.actor,
-            body=row.body,
-        )
-        for row in tx.execute(statement)
-    ]
+    return Page(items=tuple(events.list_events(tx, project.name, after=after, limit=limit, subject=job_id)))
 
 
 def read_job_log(tx: Transaction, job_id: str, offset: int = 0, limit: int = MOST_READ_BYTES) -> LogPage:

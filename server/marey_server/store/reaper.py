@@ -7,10 +7,12 @@ from typing import NamedTuple
 
 from sqlalchemy import and_, select, tuple_
 
+from marey_schemas.jobs import ClaimRequest, Lease
 from marey_server.store import job_cache
 from marey_server.store.database import Transaction
 from marey_server.store.fencing import RUNNING, held
 from marey_server.store.job_ends import AttemptEnd
+from marey_server.store.queue import claim
 from marey_server.store.queue_policy import DEFAULT_POLICY, QueuePolicy
 from marey_server.store.settling import settle
 from marey_server.store.tables import job
@@ -77,6 +79,16 @@ def reap_page(tx: Transaction, after: tuple[int, str] | None = None, limit: int 
         carry_out(tx, row, condition, verdict, end, fence=job.c.fence + 1)
     last = rows[-1] if len(rows) == limit else None
     return ReapedPage(len(rows), None if last is None else (last.lease_expires_us, last.id))
+
+
+def claim_after_reaping(
+    tx: Transaction, request: ClaimRequest, grace: StartGrace, policy: QueuePolicy = DEFAULT_POLICY
+) -> list[Lease]:
+    """Claim; where there is nothing to claim, take back what is overdue and look once more."""
+    leases = claim(tx, request, policy)
+    if not leases and grace.over(tx.now_us) and reap_page(tx).taken:
+        leases = claim(tx, request, policy)
+    return leases
 
 
 def share_waiting(tx: Transaction) -> int:

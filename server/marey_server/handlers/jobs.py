@@ -1,0 +1,280 @@
+"""Jobs: what can be done, what is asked for, and what became of it."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+
+from pydantic import Field
+
+from marey_schemas.base import Request
+from marey_schemas.items import Event, Page
+from marey_schemas.job_kinds import UnknownKindError, find_kind, job_kinds
+from marey_schemas.jobs import Attempt, Job, JobBatch, JobCreate, JobKind, JobList, JobOutput
+from marey_server.errors import NotFound
+from marey_server.handlers.declarations import MIB, Access, Body, Bytes, reads, writes
+from marey_server.handlers.queries import CommaSeparated, CountedPageQuery, PageQuery
+from marey_server.handlers.reply import Rendered, Reply
+from marey_server.handlers.resource import Resource
+from marey_server.store import events, jobs, submission
+from marey_server.store.job_logs import MOST_READ_BYTES, LogPage
+from marey_server.store.jobs import JobFilters
+from marey_server.store.wakeups import wakeups
+
+LONGEST_WAIT_S = 30.0
+LOOK_AGAIN_S = 2.0
+"""How often a waiting request looks by itself: another process may have ended the job."""
+
+MAX_SUBMISSION_BYTES = 32 * MIB
+_WAIT = re.compile(r"(?:^|[,;\s])wait=(\d{1,4})(?:$|[,;\s])")
+
+
+class JobKinds(Resource):
+    """What can be done."""
+
+    path = "/job-kinds"
+    tag = "Jobs"
+
+    @reads(access=Access.ANYONE, answer=JobKind, paged=True)
+    async def get(self) -> Reply:
+        """Every kind of job, with the inputs and parameters it takes."""
+        return Reply(Page(items=tuple(kind.document() for kind in job_kinds().values())))
+
+
+class JobKindResource(Resource):
+    """One thing that can be done."""
+
+    path = "/job-kinds/{kind}"
+    tag = "Jobs"
+
+    @reads(access=Access.ANYONE, answer=JobKind)
+    async def get(self, kind: str) -> Reply:
+        """A kind of job."""
+        try:
+            return Reply(find_kind(kind).document())
+        except UnknownKindError as error:
+            raise NotFound(f"{error}.".capitalize(), code="no-kind") from None
+
+
+class JobsQuery(CountedPageQuery):
+    """Which jobs, in which order."""
+
+    state: CommaSeparated = Field((), description="In any of these states.")
+    kind: CommaSeparated = Field((), description="Of any of these kinds.")
+    parent: str | None = Field(None, max_length=64, description="Tasks of this job; without it, no tasks are listed.")
+    author: str | None = Field(None, max_length=64, description="Name of who submitted them.")
+    sort: str = Field("-created_at", max_length=100, description="Of id, created_at, priority.")
+
+    def filters(self) -> JobFilters:
+        """What the store filters by."""
+        return JobFilters(self.state, self.kind, self.parent, self.author)
+
+
+class ProjectJobs(Resource):
+    """The jobs of a project."""
+
+    path = "/projects/{project}/jobs"
+    tag = "Jobs"
+
+    @reads(access=Access.READER, query=JobsQuery, answer=Job, paged=True)
+    async def get(self, project: str, query: JobsQuery) -> Rendered:
+        """Jobs, newest first."""
+        return await self.answer(
+            jobs.list_jobs,
+            project,
+            query.filters(),
+            sort=query.sort,
+            cursor=query.cursor,
+            limit=query.limit,
+            count=query.count is not None,
+        )
+
+    @writes(
+        access=Access.CONTRIBUTOR,
+        scope="jobs",
+        body=Body(JobCreate, max_bytes=MAX_SUBMISSION_BYTES),
+        answer=Job,
+        status=202,
+        idempotency="key",
+        headers=("Prefer",),
+    )
+    async def post(self, project: str, body: JobCreate) -> Rendered | Reply:
+        """Submit a job. Inputs are pinned to the revisions they have now; many of them are spread over many tasks.
+
+        `Prefer: wait=n` answers when the job has ended, at the latest after n seconds.
+        """
+        submitted = await self.answer_with(lambda made: _accepted(made[0]), submission.submit, project, (body,))
+        wait_s = wait_preferred(self)
+        job_id = submitted.headers["Location"].rpartition("/")[2]
+        if wait_s == 0:
+            return submitted
+        return _accepted(await wait_for_end(self, job_id, wait_s))
+
+
+def _accepted(job: Job) -> Reply:
+    headers = {} if job.state.terminal else {"Retry-After": "1"}
+    return Reply(job, location=f"/jobs/{job.id}", headers=headers)
+
+
+class ProjectJobBatch(Resource):
+    """Many jobs at once."""
+
+    path = "/projects/{project}/jobs/batch"
+    tag = "Jobs"
+
+    @writes(
+        access=Access.CONTRIBUTOR,
+        scope="jobs",
+        body=Body(JobBatch, max_bytes=MAX_SUBMISSION_BYTES),
+        answer=JobList,
+        status=202,
+        idempotency="key",
+    )
+    async def post(self, project: str, body: JobBatch) -> Rendered:
+        """Submit many jobs, all or none."""
+        return await self.answer_with(
+            lambda made: Reply(JobList(jobs=tuple(made))), submission.submit, project, body.jobs
+        )
+
+
+class JobResource(Resource):
+    """One job."""
+
+    path = "/jobs/{job}"
+    tag = "Jobs"
+
+    @reads(access=Access.READER, answer=Job, headers=("Prefer",))
+    async def get(self, job: str) -> Rendered | Reply:
+        """A job and how it stands. `Prefer: wait=n` answers when it has ended, at the latest after n seconds."""
+        wait_s = wait_preferred(self)
+        if wait_s == 0:
+            return await self.answer(jobs.read_job, job)
+        return Reply(await wait_for_end(self, job, wait_s))
+
+
+def wait_preferred(resource: Resource) -> float:
+    """How many seconds the caller would like to wait (RFC 7240), as far as we do that."""
+    found = _WAIT.search(resource.request.headers.get("Prefer", ""))
+    return min(float(found[1]), LONGEST_WAIT_S) if found else 0.0
+
+
+async def wait_for_end(resource: Resource, job_id: str, wait_s: float) -> Job:
+    """The job when it has ended, when the time is over, or when the caller or the server is going away."""
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + wait_s
+    with wakeups.listen([f"job:{job_id}"]) as listener:
+        while True:
+            job = await resource.look_up(jobs.read_job, job_id)
+            left_s = deadline - loop.time()
+            if job.state.terminal or left_s <= 0 or not resource.is_awaited():
+                return job
+            await listener.wait(min(left_s, LOOK_AGAIN_S))
+
+
+class JobAttempts(Resource):
+    """The tries at a job."""
+
+    path = "/jobs/{job}/attempts"
+    tag = "Jobs"
+
+    @reads(access=Access.READER, answer=Attempt, paged=True)
+    async def get(self, job: str) -> Rendered:
+        """Every try at a job: by which worker, when, and how it ended."""
+        return await self.answer(jobs.list_attempts, job)
+
+
+class JobOutputs(Resource):
+    """What a job made."""
+
+    path = "/jobs/{job}/outputs"
+    tag = "Jobs"
+
+    @reads(access=Access.READER, query=PageQuery, answer=JobOutput, paged=True)
+    async def get(self, job: str, query: PageQuery) -> Rendered:
+        """The revisions a job made, or its tasks; of those, a page holds what `limit` tasks made."""
+        return await self.answer(jobs.list_outputs, job, query.cursor, query.limit)
+
+
+class JobEventsQuery(Request):
+    """Which events."""
+
+    after: int = Field(0, ge=0, le=2**62, description="Number of the last event received; 0 from the beginning.")
+    limit: int = Field(100, ge=1, le=events.MAX_EVENTS, description="Longest page.")
+
+
+class JobEvents(Resource):
+    """What happened to a job."""
+
+    path = "/jobs/{job}/events"
+    tag = "Jobs"
+
+    @reads(access=Access.READER, query=JobEventsQuery, answer=Event, paged=True, public=False)
+    async def get(self, job: str, query: JobEventsQuery) -> Rendered:
+        """What happened to a job, in the order it became visible."""
+        return await self.answer(jobs.list_job_events, job, query.after, query.limit)
+
+
+class JobLogQuery(Request):
+    """Which piece of the log."""
+
+    offset: int = Field(0, ge=0, le=2**53, description="First byte.")
+    limit: int = Field(MOST_READ_BYTES, ge=1, le=MOST_READ_BYTES, description="Most bytes.")
+
+
+class JobLog(Resource):
+    """What a job's attempts printed."""
+
+    path = "/jobs/{job}/log"
+    tag = "Jobs"
+
+    @reads(access=Access.READER, query=JobLogQuery, answer=Bytes, answer_types=("text/plain",), public=False)
+    async def get(self, job: str, query: JobLogQuery) -> Rendered:
+        """What a job's attempts printed, one after another, from a byte on.
+
+        The header `Log-Offset` says where the next piece begins; `Log-Sealed: true` that there will be none.
+        """
+        return await self.answer_with(_log_reply, jobs.read_job_log, job, query.offset, query.limit)
+
+
+def _log_reply(page: LogPage) -> Reply:
+    headers = {"Log-Offset": str(page.offset), "Log-Sealed": str(page.sealed).lower()}
+    return Reply(page.data, media_type="text/plain; charset=utf-8", headers=headers)
+
+
+class JobCancellation(Resource):
+    """Stopping a job."""
+
+    path = "/jobs/{job}/cancel"
+    tag = "Jobs"
+
+    @writes(access=Access.CONTRIBUTOR, scope="jobs", answer=Job)
+    async def post(self, job: str) -> Rendered:
+        """Cancel a job and its tasks: at once where nobody works on it, else as soon as the worker stops."""
+        return await self.answer(jobs.cancel_job, job, self.services.queue_policy)
+
+
+class JobRetry(Resource):
+    """Trying a job again."""
+
+    path = "/jobs/{job}/retry"
+    tag = "Jobs"
+
+    @writes(access=Access.CONTRIBUTOR, scope="jobs", answer=Job, status=202, idempotency="key")
+    async def post(self, job: str) -> Rendered:
+        """Submit a failed or cancelled job again, with the inputs it had; the answer is the new job."""
+        return await self.answer_with(_accepted, jobs.retry_job, job)
+
+
+RESOURCES: tuple[type[Resource], ...] = (
+    JobKinds,
+    JobKindResource,
+    ProjectJobs,
+    ProjectJobBatch,
+    JobResource,
+    JobAttempts,
+    JobOutputs,
+    JobEvents,
+    JobLog,
+    JobCancellation,
+    JobRetry,
+)

@@ -1,0 +1,168 @@
+"""What workers say: give me work, I am alive, this is the result, this went wrong."""
+
+from __future__ import annotations
+
+import asyncio
+from functools import partial
+
+from marey_schemas.jobs import (
+    BatchCompleteAnswer,
+    BatchCompleteRequest,
+    ClaimRequest,
+    CompleteAnswer,
+    CompleteRequest,
+    FailAnswer,
+    FailRequest,
+    Heartbeat,
+    HeartbeatAnswer,
+    LeaseList,
+    LogAnswer,
+    StageAnswer,
+    StageRequest,
+)
+from marey_server.errors import BadRequest
+from marey_server.handlers.declarations import KIB, MIB, Access, Body, Bytes, writes
+from marey_server.handlers.reply import Rendered, Reply
+from marey_server.handlers.resource import Resource
+from marey_server.store import completion, job_logs, queue, reaper, staging
+from marey_server.store.staging import PreparedOutput
+from marey_server.store.wakeups import wakeups
+
+LOOK_AGAIN_S = 2.0
+"""How often a waiting worker's request looks by itself: jobs end their rest, other processes submit."""
+
+MAX_STAGED_BYTES = 256 * MIB
+MAX_LOG_BYTES = MIB
+
+
+class Leases(Resource):
+    """Work for workers."""
+
+    path = "/leases"
+    tag = "Work"
+
+    @writes(access=Access.WORKER, scope="work", body=ClaimRequest, answer=LeaseList)
+    async def post(self, body: ClaimRequest) -> Reply:
+        """Claim jobs; with `wait_s`, wait for some to come. A lease that is not renewed runs out."""
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + body.wait_s
+        with wakeups.listen([f"work:{kind}" for kind in body.kinds]) as listener:
+            while True:
+                leases = await self.change(
+                    reaper.claim_after_reaping, body, self.services.start_grace, self.services.queue_policy
+                )
+                left_s = deadline - loop.time()
+                if leases or left_s <= 0:
+                    return Reply(LeaseList(leases=tuple(leases)))
+                await listener.wait(min(left_s, LOOK_AGAIN_S))
+                if not self.is_awaited():  # claim nothing for a caller that has gone
+                    return Reply(LeaseList())
+
+
+class Completions(Resource):
+    """Many completions at once."""
+
+    path = "/leases/completions"
+    tag = "Work"
+
+    @writes(
+        access=Access.WORKER,
+        scope="work",
+        body=Body(BatchCompleteRequest, max_bytes=16 * MIB),
+        answer=BatchCompleteAnswer,
+    )
+    async def post(self, body: BatchCompleteRequest) -> Rendered:
+        """Complete many jobs that the caller claimed, in one transaction; each is refused by itself."""
+        return await self.answer_with(
+            lambda results: Reply(BatchCompleteAnswer(results=tuple(results))),
+            completion.complete_many,
+            body.completions,
+        )
+
+
+class AttemptHeartbeat(Resource):
+    """Signs of life."""
+
+    path = "/jobs/{job}/attempts/{fence:int}/heartbeat"
+    tag = "Work"
+
+    @writes(access=Access.ATTEMPT, scope=None, body=Body(Heartbeat, max_bytes=64 * KIB), answer=HeartbeatAnswer)
+    async def post(self, job: str, fence: int, body: Heartbeat) -> Rendered:
+        """Keep the lease; hear whether to stop."""
+        return await self.answer(queue.heartbeat, job, fence, body, self.services.queue_policy)
+
+
+class AttemptLog(Resource):
+    """What an attempt prints."""
+
+    path = "/jobs/{job}/attempts/{fence:int}/log"
+    tag = "Work"
+
+    @writes(
+        access=Access.ATTEMPT,
+        scope=None,
+        body=Body(Bytes, max_bytes=MAX_LOG_BYTES, required=False),
+        answer=LogAnswer,
+        headers=("Upload-Offset",),
+    )
+    async def post(self, job: str, fence: int, body: bytes | None) -> Rendered:
+        """Append to the attempt's log at `Upload-Offset`; 409 with the true offset where it goes on elsewhere."""
+        text = self.request.headers.get("Upload-Offset", "")
+        if not (text.isascii() and text.isdigit() and len(text) <= 15):
+            raise BadRequest("Upload-Offset says how many bytes the log has already.", code="bad-upload-offset")
+        policy = self.services.queue_policy
+        return await self.answer(job_logs.append_log, job, fence, int(text), body or b"", policy)
+
+
+class AttemptOutputs(Resource):
+    """Results of an attempt."""
+
+    path = "/jobs/{job}/attempts/{fence:int}/outputs"
+    tag = "Work"
+
+    @writes(access=Access.ATTEMPT, scope=None, body=Body(StageRequest, max_bytes=MAX_STAGED_BYTES), answer=StageAnswer)
+    async def post(self, job: str, fence: int, body: StageRequest) -> Rendered:
+        """Stage results: they become visible when the attempt completes. One of the same name replaces the earlier."""
+        prepared = await self.compute(partial(_prepare, body))
+        return await self.answer_with(
+            lambda staged: Reply(StageAnswer(staged=staged)), staging.stage, job, fence, prepared
+        )
+
+
+def _prepare(request: StageRequest) -> list[PreparedOutput]:
+    return [staging.prepare_output(output) for output in request.outputs]
+
+
+class AttemptCompletion(Resource):
+    """The end of an attempt that succeeded."""
+
+    path = "/jobs/{job}/attempts/{fence:int}/complete"
+    tag = "Work"
+
+    @writes(access=Access.ATTEMPT, scope=None, body=Body(CompleteRequest, max_bytes=16 * MIB), answer=CompleteAnswer)
+    async def post(self, job: str, fence: int, body: CompleteRequest) -> Rendered:
+        """Publish what is staged and end the job. The same `write_id` again gives the same answer."""
+        return await self.answer(completion.complete, job, fence, body)
+
+
+class AttemptFailure(Resource):
+    """The end of an attempt that did not succeed."""
+
+    path = "/jobs/{job}/attempts/{fence:int}/fail"
+    tag = "Work"
+
+    @writes(access=Access.ATTEMPT, scope=None, body=FailRequest, answer=FailAnswer)
+    async def post(self, job: str, fence: int, body: FailRequest) -> Rendered:
+        """End the attempt; the job is tried again or has failed. The same `write_id` again gives the same answer."""
+        return await self.answer(completion.fail, job, fence, body, self.services.queue_policy)
+
+
+RESOURCES: tuple[type[Resource], ...] = (
+    Leases,
+    Completions,
+    AttemptHeartbeat,
+    AttemptLog,
+    AttemptOutputs,
+    AttemptCompletion,
+    AttemptFailure,
+)
