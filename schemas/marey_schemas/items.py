@@ -7,7 +7,7 @@ from pydantic import Field
 
 from marey_schemas.base import Answer, Request
 from marey_schemas.kinds import Kind
-from marey_schemas.names import CollectionPath, ItemName, Message, Tag
+from marey_schemas.names import CollectionPath, Digest, ItemName, Message, Tag
 
 
 class CollectionCreate(Request):
@@ -145,6 +145,22 @@ class BlobsMissing(Answer):
     """The digests that must be sent."""
 
     missing: tuple[str, ...]
+
+
+class UploadCreate(Request):
+    """Announce bytes that come in pieces."""
+
+    length: int = Field(ge=1, le=16 * 2**30, description="How many bytes there will be.")
+    digest: Digest | None = Field(None, description="What they must turn out to be.")
+
+
+class Upload(Answer):
+    """How far a resumable upload is."""
+
+    id: str
+    length: int
+    offset: int = Field(description="Bytes received; the next piece starts here.")
+    digest: str | None = Field(None, description="The blob it became, once it is complete.")
 
 
 class Event(Answer):

@@ -2,48 +2,31 @@
 
 from __future__ import annotations
 
-import asyncio
-import base64
 import re
-from dataclasses import dataclass
 
 from marey_schemas.items import BlobsMissing, BlobsQuery
-from marey_server.errors import NotFound, TooLarge, Unavailable
+from marey_server.errors import NotFound
 from marey_server.handlers.calls import only_identify
 from marey_server.handlers.declarations import MIB, Access, Body, Bytes, reads, writes
-from marey_server.handlers.etags import entity_tag, matches
-from marey_server.handlers.ranges import ByteRange, parse_range
 from marey_server.handlers.receiving import Receiver
 from marey_server.handlers.reply import Rendered, Reply
 from marey_server.handlers.resource import Resource
+from marey_server.handlers.streaming import BlobSender
 from marey_server.store import blobs
-from marey_server.store.database import Transaction
 
-MAX_BLOB_BYTES = 256 * MIB
-PIECE_BYTES = MIB
-WRITE_TIMEOUT_S = 60
+MAX_BLOB_BYTES = 1024 * MIB
+"""More must come as a resumable upload."""
 _DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
 
 
-@dataclass(frozen=True, slots=True)
-class _Opened:
-    """A blob about to be sent: its size, the part of it that was asked for, and the first piece."""
-
-    size: int
-    start: int
-    stop: int
-    first: bytes
+def require_digest(text: str) -> str:
+    """The text, if it can name a blob. Raises `NotFound`."""
+    if not _DIGEST.fullmatch(text):
+        raise NotFound("Blobs are named sha256: and 64 hexadecimal digits.", code="no-blob")
+    return text
 
 
-def open_blob(tx: Transaction, digest: str, wanted: ByteRange | None, *, head: bool) -> _Opened:
-    """Decide what of a blob is sent, and read its first piece unless only the head is asked for."""
-    size = blobs.require_readable(tx, digest)
-    start, stop = wanted.within(size) if wanted is not None else (0, size)
-    first = b"" if head else blobs.read_blob(tx, digest, start, min(stop, start + PIECE_BYTES))
-    return _Opened(size, start, stop, first)
-
-
-class Blob(Resource):
+class Blob(BlobSender):
     """Bytes named by their SHA-256."""
 
     path = "/blobs/{digest}"
@@ -51,10 +34,7 @@ class Blob(Resource):
 
     async def begin(self, digest: str) -> None:
         """Look the credential up before the bytes come."""
-        if not _DIGEST.fullmatch(digest):
-            raise NotFound("Blobs are named sha256: and 64 hexadecimal digits.")
-        if self.declared_length() > MAX_BLOB_BYTES:
-            raise TooLarge("Send more than 256 MiB as a resumable upload: POST /api/v1/uploads.")
+        require_digest(digest)
         await self.look_up(only_identify)
         self.receiver = Receiver(self.services)
 
@@ -69,7 +49,7 @@ class Blob(Resource):
         They become visible when a document refers to them; bytes that nothing refers to are dropped after a day.
         """
         with await self.receiver.finish() as spool:
-            return await self.answer_with(lambda _digest: Reply(), blobs.put_blob, spool, expected=digest)
+            return await self.answer(blobs.put_blob, spool, expected=digest)
 
     @reads(
         access=Access.READER,
@@ -81,41 +61,7 @@ class Blob(Resource):
     )
     async def get(self, digest: str) -> Rendered | None:
         """Bytes by their digest, whole or a range."""
-        if not _DIGEST.fullmatch(digest):
-            raise NotFound("Blobs are named sha256: and 64 hexadecimal digits.")
-        etag = entity_tag(digest.removeprefix("sha256:"), "bytes")
-        wanted = parse_range(self.request.headers.get("Range"), self.request.headers.get("If-Range"), etag)
-        opened = await self.look_up(open_blob, digest, wanted, head=self.request.method == "HEAD")
-        headers = {
-            "ETag": etag,
-            "Cache-Control": "private, max-age=31536000, immutable",
-            "Repr-Digest": f"sha-256=:{base64.b64encode(bytes.fromhex(digest[7:])).decode()}:",
-            "Accept-Ranges": "bytes",
-            "Vary": "Accept, Accept-Encoding, Authorization",
-        }
-        if matches(self.request.headers.get("If-None-Match"), etag):
-            return Rendered(304, headers, b"")
-        if wanted is not None:
-            headers["Content-Range"] = f"bytes {opened.start}-{opened.stop - 1}/{opened.size}"
-        headers |= {"Content-Type": "application/octet-stream", "Content-Disposition": "attachment"}
-        await self._stream(digest, opened, Rendered(200 if wanted is None else 206, headers, opened.first))
-        return None
-
-    async def _stream(self, digest: str, opened: _Opened, first: Rendered) -> None:
-        """Send piece after piece, each read only when the one before has gone out."""
-        self.send(first)
-        self.set_header("Content-Length", str(opened.stop - opened.start))
-        if self.request.method == "HEAD":
-            return
-        position = opened.start + len(first.body)
-        while position < opened.stop:
-            await asyncio.wait_for(self.flush(), WRITE_TIMEOUT_S)
-            stop = min(opened.stop, position + PIECE_BYTES)
-            piece = await self.look_up(blobs.read_range, digest, position, stop)
-            if len(piece) != stop - position:
-                raise Unavailable(f"Bytes of {digest} are lost.", code="blob-damaged")
-            self.write(piece)
-            position = stop
+        return await self.send_blob(require_digest(digest))
 
 
 class MissingBlobs(Resource):

@@ -210,7 +210,9 @@ class Resource(RequestHandler):
             raise MethodNotAllowed(f"Here one can {allowed}.", headers={"Allow": allowed})
         self.operation = operation
         headers = self.request.headers
-        self.media = negotiation.choose(headers.get("Accept"), self._offers(operation))
+        offers = self._offers(operation)
+        chosen_otherwise = operation.answer is Bytes  # by the address: bytes have the one type they have
+        self.media = offers[0] if chosen_otherwise else negotiation.choose(headers.get("Accept"), offers)
         self.caller = Caller(negotiation.bearer_token(headers.get("Authorization")), operation)
         self.query = parse_query(operation.query, self.request.query_arguments)
         if operation.precondition == "required" or (

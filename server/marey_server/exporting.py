@@ -1,0 +1,101 @@
+"""Items as files: what a file needs is read in one transaction, and written in a thread."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from marey_schemas import codecs
+from marey_schemas.documents import Motion, SkeletonHierarchy
+from marey_schemas.items import Item
+from marey_schemas.kinds import Kind
+from marey_server.errors import Invalid, NotFound
+from marey_server.store import items
+from marey_server.store.database import Transaction
+
+ExportFormat = Literal["original", "bvh", "npz", "predecessor", "json"]
+
+
+@dataclass(frozen=True, slots=True)
+class ExportSource:
+    """An item's documents at one revision; for clips also the hierarchy of their skeleton."""
+
+    item: Item
+    revision: int
+    parts: dict[str, dict[str, Any]]
+    hierarchy: dict[str, Any] | None
+
+
+@dataclass(frozen=True, slots=True)
+class ExportedFile:
+    """A file to hand out."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class OriginalFile:
+    """The file that a clip was imported from, as it came."""
+
+    name: str
+    digest: str
+
+
+def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ExportSource:
+    """Everything that a file of an item can need. Raises `NotFound`."""
+    found = items.read_item(tx, project, kind, item_id)
+    number = found.revision if revision is None else revision
+    held = items.read_revision(tx, project, kind, item_id, number).parts
+    parts = {part: items.read_part(tx, project, kind, item_id, part, revision=number).tree for part in sorted(held)}
+    hierarchy = None
+    if kind is Kind.CLIP:
+        ref = parts["motion"]["skeleton"]
+        hierarchy = items.read_part(tx, project, Kind.SKELETON, ref["item"], "hierarchy", revision=ref["revision"]).tree
+    return ExportSource(found, number, parts, hierarchy)
+
+
+def find_original(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> OriginalFile:
+    """The file that an item was imported from. Raises `NotFound` where it was made otherwise."""
+    if kind is Kind.CLIP:
+        info = items.read_part(tx, project, kind, item_id, "info", revision=revision, arrays="none").tree
+        source = info.get("source", {})
+        if source.get("file"):
+            name = str(source.get("file_name") or item_id).replace("\\", "/").rpartition("/")[2]
+            return OriginalFile(name, source["file"])
+    raise NotFound("It was not made from a file.", code="no-original")
+
+
+def write_file(source: ExportSource, file_format: ExportFormat, unit: str) -> ExportedFile:
+    """The file of an item. Raises `Invalid` where the format cannot hold it."""
+    if file_format == "json":
+        return ExportedFile(f"{source.item.name}.json", codecs.JSON, codecs.encode_tree(_as_tree(source), codecs.JSON))
+    if source.item.kind is not Kind.CLIP or source.hierarchy is None:
+        raise Invalid(f"A {source.item.kind} is exported as json.", code="no-such-export")
+    from marey_motion.documents import clip_from_document, skeleton_from_document
+    from marey_motion.errors import MotionError
+    from marey_motion.exporting import write_clip_file
+
+    skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(source.hierarchy))
+    clip = clip_from_document(Motion.model_validate(source.parts["motion"]), skeleton)
+    try:
+        written = write_clip_file(clip, file_format, unit=unit, info=source.parts.get("info"))
+    except MotionError as error:
+        raise Invalid(str(error), code="cannot-be-exported") from error
+    return ExportedFile(source.item.name + written.suffix, written.media_type, written.data)
+
+
+def _as_tree(source: ExportSource) -> dict[str, Any]:
+    item = source.item
+    tree: dict[str, Any] = {
+        "schema": "marey/item@1",
+        "item": item.id,
+        "kind": item.kind.value,
+        "name": item.name,
+        "collection": item.collection,
+        "revision": source.revision,
+        "tags": list(item.tags),
+        "parts": source.parts,
+    }
+    return tree if source.hierarchy is None else {**tree, "skeleton": source.hierarchy}

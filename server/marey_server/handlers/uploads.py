@@ -1,0 +1,105 @@
+"""Resumable uploads: announce, send pieces, ask how far it got, go on. They end as blobs."""
+
+from __future__ import annotations
+
+from marey_schemas.items import Upload, UploadCreate
+from marey_server.errors import BadRequest, Conflict
+from marey_server.handlers.declarations import MIB, Access, Body, Bytes, reads, writes
+from marey_server.handlers.reply import Rendered, Reply
+from marey_server.handlers.resource import Resource
+from marey_server.store import uploads
+from marey_server.store.database import Transaction
+
+PIECE_BYTES = MIB
+"""What a piece that is cut off has kept is a multiple of this."""
+
+
+def upload_reply(upload: uploads.Upload) -> Reply:
+    """How far an upload is, in the body and in headers."""
+    shown = Upload(id=upload.id, length=upload.length, offset=upload.offset, digest=upload.digest)
+    headers = {"Upload-Offset": str(upload.offset), "Upload-Length": str(upload.length), "Cache-Control": "no-store"}
+    return Reply(shown, headers=headers)
+
+
+def finish_upload(tx: Transaction, upload_id: str) -> uploads.Upload:
+    """Make a blob of an upload whose last byte has come; leave any other as it is."""
+    upload = uploads.read_upload(tx, upload_id)
+    if upload.offset == upload.length:
+        uploads.finish(tx, upload_id)
+    return uploads.read_upload(tx, upload_id)
+
+
+class Uploads(Resource):
+    """Where uploads begin."""
+
+    path = "/uploads"
+    tag = "Blobs"
+
+    @writes(access=Access.SIGNED_IN, body=UploadCreate, answer=Upload, status=201, idempotency="key")
+    async def post(self, body: UploadCreate) -> Rendered:
+        """Announce bytes that come in pieces."""
+
+        def created(upload: uploads.Upload) -> Reply:
+            reply = upload_reply(upload)
+            return Reply(reply.content, location=f"/uploads/{upload.id}", headers=reply.headers)
+
+        return await self.answer_with(created, uploads.create_upload, body.length, digest=body.digest)
+
+
+class UploadResource(Resource):
+    """One upload."""
+
+    path = "/uploads/{upload}"
+    tag = "Blobs"
+
+    async def begin(self, upload: str) -> None:
+        """Check where the piece belongs before it comes."""
+        text = self.request.headers.get("Upload-Offset", "")
+        if not text.isascii() or not text.isdigit() or len(text) > 12:
+            raise BadRequest("Say in Upload-Offset where the piece starts.", code="bad-offset")
+        self.upload_id, self.offset, self.piece = upload, int(text), bytearray()
+        await self._append()
+
+    async def receive(self, chunk: bytes) -> None:
+        """Take the next bytes; what is complete is kept even if the connection breaks."""
+        self.piece += chunk
+        if len(self.piece) >= PIECE_BYTES:
+            await self._append()
+
+    async def _append(self) -> None:
+        data = bytes(self.piece)
+        self.piece.clear()
+        try:
+            moved = await self.change(uploads.append, self.upload_id, self.offset, data)
+        except Conflict as error:
+            error.headers["Upload-Offset"] = str(error.context.get("offset", ""))
+            raise
+        self.offset = moved.offset
+
+    @reads(access=Access.SIGNED_IN, answer=Upload)
+    async def get(self, upload: str) -> Rendered:
+        """How far an upload is."""
+        return await self.answer_with(upload_reply, uploads.read_upload, upload)
+
+    @writes(
+        access=Access.SIGNED_IN,
+        body=Body(Bytes, max_bytes=uploads.MAX_UPLOAD_BYTES, streamed=True, required=False),
+        answer=Upload,
+        headers=("Upload-Offset",),
+    )
+    async def patch(self, upload: str) -> Rendered:
+        """Send the next piece. With the last one the upload becomes a blob, whose digest is answered.
+
+        At the wrong offset the answer is 409 with the right one: in the header Upload-Offset and in the context.
+        """
+        if self.piece:
+            await self._append()
+        return await self.answer_with(upload_reply, finish_upload, upload)
+
+    @writes(access=Access.SIGNED_IN)
+    async def delete(self, upload: str) -> Rendered:
+        """Give an upload up."""
+        return await self.answer(uploads.abandon, upload)
+
+
+RESOURCES: tuple[type[Resource], ...] = (Uploads, UploadResource)
