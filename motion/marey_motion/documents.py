@@ -34,7 +34,7 @@ def skeleton_to_document(skeleton: Skeleton) -> schemas.SkeletonHierarchy:
         )
     )
     sites = tuple(schemas.EndSite(joint=site.joint, offset=tuple(site.offset.tolist())) for site in skeleton.end_sites)
-    return schemas.SkeletonHierarchy(schema="marey/skeleton@1", joints=joints, end_sites=sites)
+    return schemas.SkeletonHierarchy(joints=joints, end_sites=sites)
 
 
 def skeleton_from_document(document: schemas.SkeletonHierarchy) -> Skeleton:
@@ -53,7 +53,6 @@ def clip_to_document(clip: Clip, skeleton: schemas.RevisionRef | schemas.OutputR
     """Part `motion` of a clip whose skeleton is stored as `skeleton`."""
     names = clip.skeleton.joint_names
     return schemas.Motion(
-        schema="marey/motion@1",
         skeleton=skeleton,
         frame_rate_hz=clip.frame_rate_hz,
         joints=names,
@@ -90,7 +89,6 @@ def clip_from_document(document: schemas.Motion, skeleton: Skeleton) -> Clip:
 def mapping_to_document(mapping: JointMapping, axes: Mapping[str, JointAxes]) -> schemas.SkeletonMapping:
     """Part `mapping` of a skeleton."""
     return schemas.SkeletonMapping(
-        schema="marey/skeleton-mapping@1",
         rig=mapping.rig,
         method=mapping.method,
         confidence=mapping.confidence,

@@ -74,7 +74,15 @@ def forward_kinematics(
     turned = np.zeros(joints, dtype=np.bool_)
     turned[parents[1:]] = True
     out = np.empty((len(poses), 3 * points), dtype=poses.dtype)
-    kinematics_kernels.positions(poses, offsets.astype(poses.dtype), parents, translations, slots, turned, out)
+    kinematics_kernels.positions(
+        _as_kernel_input(poses),
+        _as_kernel_input(offsets.astype(poses.dtype)),
+        _as_kernel_input(parents),
+        _as_kernel_input(translations),
+        slots,
+        turned,
+        out,
+    )
     return out.reshape(len(poses), points, 3)
 
 
@@ -88,8 +96,15 @@ def as_global_rotations(skeleton: Skeleton, rotations: Floats) -> Floats:
         )
     flat = rotations.reshape(len(rotations), -1)
     out = np.empty(flat.shape, dtype=rotations.dtype)
-    kinematics_kernels.rotations(flat, skeleton.parents, out)
+    kinematics_kernels.rotations(_as_kernel_input(flat), _as_kernel_input(skeleton.parents), out)
     return out.reshape(rotations.shape)
+
+
+def _as_kernel_input(array: NDArray[Any]) -> NDArray[Any]:
+    """The array contiguous and read-only, so that each kernel is compiled for one layout only."""
+    view = np.ascontiguousarray(array).view()
+    view.setflags(write=False)
+    return view
 
 
 def as_local_rotations(skeleton: Skeleton, rotations: Floats) -> Floats:

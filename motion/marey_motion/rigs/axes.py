@@ -11,7 +11,7 @@ of a standing body; many files put all bones on one line at rest, and there it i
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
-from marey_motion.errors import MappingError
+from marey_motion.errors import ClipError, MappingError
 from marey_motion.rigs.mapping import JointMapping
-from marey_motion.rigs.standard import FINGERS, SIDES, STANDARD_JOINTS
-from marey_motion.skeleton import Skeleton
+from marey_motion.rigs.standard import CENTRE_JOINTS, FINGERS, SIDES, STANDARD_JOINTS
+from marey_motion.skeleton import Skeleton, same_hierarchy
 
 Vectors = NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -54,6 +54,12 @@ _TOWARDS: dict[str, tuple[str, ...]] = {
     },
 }
 _BEFORE = {"wrist": "elbow", "toe": "ankle", "finger": "wrist", "ankle": "knee"}
+# Heights of a body from the top; the upper two that are mapped tell where up is.
+_LEVELS = (
+    ("shoulder", "head", "neck", "spine_2", "spine_1", "spine"),
+    ("pelvis", "hip"),
+    ("ankle", "knee"),
+)
 _LEG = ("hip", "knee", "ankle", "toe", "heel")
 
 
@@ -76,36 +82,47 @@ def guess_axes(skeleton: Skeleton, mapping: JointMapping, motion: Clip | None = 
 
     Raises
     ------
-    MappingError    where the mapping lacks both hips and both shoulders, or names joints the skeleton does not have
+    MappingError    where the mapping lacks the joints that tell left and up
+    UnknownJoint    where it names joints that the skeleton does not have
+    ClipError    where the motion is of another skeleton
     """
-    joints = {standard: skeleton.index_of(name) for standard, name in mapping.joints.items()}
-    if not any({f"{side}_{joint}" for side in SIDES} <= joints.keys() for joint in ("hip", "shoulder")):
-        raise MappingError("axes need both hips or both shoulders in the mapping", where="left_hip")
-    rest = _Body(skeleton, joints, skeleton.rest_global_positions[None], skeleton.rest_global_rotations[None])
-    moving = rest if motion is None else _body_in_motion(motion, joints)
+    rest = _resting_body(skeleton, mapping)
+    moving = rest if motion is None else _moving_body(skeleton, motion, rest.joints)
     axes = {}
-    for standard in (name for name in STANDARD_JOINTS if name in joints):
+    for standard in (name for name in STANDARD_JOINTS if name in rest.joints):
         body = rest if _part(standard) in rest.readable_parts else moving
         twist = _twist(standard, body)
         swing = body.in_joint(standard, _swing(standard, body))
-        axes[skeleton.joint_names[joints[standard]]] = JointAxes(_triple(twist), _triple(_across(swing, twist)))
+        axes[skeleton.joint_names[rest.joints[standard]]] = JointAxes(_triple(twist), _triple(_across(swing, twist)))
     return axes
 
 
 def rest_pose_doubts(skeleton: Skeleton, mapping: JointMapping) -> tuple[str, ...]:
     """Parts of the body ("trunk", "left arm", ...) whose swing axes cannot be read from the rest pose."""
-    joints = {standard: skeleton.index_of(name) for standard, name in mapping.joints.items()}
-    rest = _Body(skeleton, joints, skeleton.rest_global_positions[None], skeleton.rest_global_rotations[None])
-    parts = dict.fromkeys(_part(standard) for standard in STANDARD_JOINTS if standard in joints)
+    rest = _resting_body(skeleton, mapping)
+    parts = dict.fromkeys(_part(standard) for standard in STANDARD_JOINTS if standard in rest.joints)
     return tuple(part for part in parts if part not in rest.readable_parts)
 
 
-def _body_in_motion(motion: Clip, joints: Mapping[str, int]) -> _Body:
+def _resting_body(skeleton: Skeleton, mapping: JointMapping) -> _Body:
+    joints = {standard: skeleton.index_of(name) for standard, name in mapping.joints.items()}
+    if not any({f"{side}_{joint}" for side in SIDES} <= joints.keys() for joint in ("hip", "shoulder")):
+        raise MappingError("axes need both hips or both shoulders in the mapping", where="left_hip")
+    return _Body(skeleton, joints, skeleton.rest_global_positions[None], skeleton.rest_global_rotations[None])
+
+
+def _moving_body(skeleton: Skeleton, motion: Clip, joints: Mapping[str, int]) -> _Body:
+    if not same_hierarchy(skeleton, motion.skeleton):
+        raise ClipError("the motion to read axes from is of another skeleton", where="motion")
     count = min(motion.frame_count, FRAMES_READ)
     frames = np.linspace(0, motion.frame_count - 1, count).round().astype(np.intp)
-    positions = kinematics.global_positions(motion)[frames].astype(np.float64)
-    rotations = kinematics.global_rotations(motion)[frames].astype(np.float64)
-    return _Body(motion.skeleton, joints, positions, rotations)
+    seen = replace(
+        motion,
+        poses=motion.poses[frames],
+        translations=None if motion.translations is None else motion.translations[frames],
+    )
+    positions = kinematics.global_positions(seen).astype(np.float64)
+    return _Body(skeleton, joints, positions, kinematics.global_rotations(seen).astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,16 +158,21 @@ class _Body:
 
     @cached_property
     def up(self) -> Vectors:
-        """From the pelvis to the middle of the shoulders, perpendicular to the hips."""
-        low = self._middle("hip") if "pelvis" not in self.joints else self.positions[:, self.joints["pelvis"]]
-        high = self._middle("shoulder") if "left_shoulder" in self.joints else self.positions[:, self.joints["head"]]
-        trunk = high - low
+        """From the pelvis to the middle of the shoulders, or what comes next to that, perpendicular to the hips."""
+        levels = [level for level in map(self._level, _LEVELS) if level is not None]
+        if len(levels) < 2:
+            raise MappingError("axes need hips and a joint above or below them in the mapping", where="pelvis")
+        trunk = levels[0] - levels[1]
         return _unit(trunk - _dot(trunk, self.hips_left) * self.hips_left)
 
-    def _middle(self, joint: str) -> Vectors:
-        pair = [self.joints[f"{side}_{joint}"] for side in SIDES]
-        middle: Vectors = self.positions[:, pair].mean(axis=1)
-        return middle
+    def _level(self, names: tuple[str, ...]) -> Vectors | None:
+        """Positions (K, 3) of the first of these that is mapped; both sides of it where it has sides."""
+        for name in names:
+            joints = (name,) if name in CENTRE_JOINTS else tuple(f"{side}_{name}" for side in SIDES)
+            if all(joint in self.joints for joint in joints):
+                middle: Vectors = self.positions[:, [self.joints[joint] for joint in joints]].mean(axis=1)
+                return middle
+        return None
 
     @cached_property
     def readable_parts(self) -> frozenset[str]:

@@ -7,7 +7,7 @@ import pytest
 
 from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
-from marey_motion.errors import MappingError
+from marey_motion.errors import ClipError, MappingError
 from marey_motion.rigs import JointMapping, guess_axes, map_joints, rest_pose_doubts
 from marey_motion.skeleton import Skeleton
 
@@ -194,6 +194,26 @@ def test_axes_need_two_sides(body):
     mapping = JointMapping(None, {"pelvis": "Hips", "head": "Head"}, 0.1, "manual")
     with pytest.raises(MappingError, match="both"):
         guess_axes(body, mapping)
+
+
+def test_legs_alone_have_axes_too(body):
+    legs = Skeleton(body.joint_names[:9], body.parents[:9], body.offsets[:9], body.rest_rotations[:9])
+    axes = guess_axes(legs, map_joints(legs))
+
+    np.testing.assert_allclose(axes["LeftLeg"].swing, X, atol=1e-12)
+    np.testing.assert_allclose(axes["Hips"].twist, Y, atol=1e-12)
+
+
+def test_hips_alone_do_not_tell_where_up_is(body):
+    mapping = JointMapping(None, {"left_hip": "LeftUpLeg", "right_hip": "RightUpLeg"}, 0.1, "manual")
+    with pytest.raises(MappingError, match="above or below"):
+        guess_axes(body, mapping)
+
+
+def test_a_motion_of_another_skeleton_tells_nothing(body, tumbling):
+    other = replace(body, offsets=body.offsets * 2)
+    with pytest.raises(ClipError, match="another skeleton"):
+        guess_axes(body, map_joints(body), tumbling(other))
 
 
 WALKS = (
