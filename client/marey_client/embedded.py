@@ -7,6 +7,8 @@ runs: a machine with the client alone stays a client.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,13 +23,16 @@ class NotInstalled(MareyError):
 
 def serve(**settings: Any) -> None:
     """Run a server until it is stopped; settings that are None come from the environment or `marey.toml`."""
-    _room("marey_server.commands", "server").serve(**_given(settings))
+    commands = _room("marey_server.commands", "server")
+    with _refusals_of(commands):
+        commands.serve(**_given(settings))
 
 
 def database(action: str, *, data: Path | None, database_url: str | None, **options: Any) -> None:
     """Run one of the database commands."""
     commands = _room("marey_server.commands", "server")
-    getattr(commands, action)(**_given({"data": data, "database_url": database_url}), **options)
+    with _refusals_of(commands):
+        getattr(commands, action)(**_given({"data": data, "database_url": database_url}), **options)
 
 
 def work(credential: Credential, **options: Any) -> None:
@@ -38,6 +43,15 @@ def work(credential: Credential, **options: Any) -> None:
 def demo(motion: Path | None, **options: Any) -> None:
     """Run the demonstration."""
     _room("marey_worker.demo", "all").demonstrate(motion, **options)
+
+
+@contextmanager
+def _refusals_of(commands: ModuleType) -> Iterator[None]:
+    """Turn the refusals of a room's commands into the client's own errors."""
+    try:
+        yield
+    except commands.CommandFailed as refusal:
+        raise MareyError(str(refusal)) from refusal
 
 
 def _given(settings: dict[str, Any]) -> dict[str, Any]:

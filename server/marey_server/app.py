@@ -29,6 +29,7 @@ from marey_server.docs_page import render_page
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.handlers.resource import Resource
 from marey_server.handlers.routes import RouteTable
+from marey_server.launchers.local import local_workers
 from marey_server.observe import access_log, configure_logging
 from marey_server.openapi import build_document
 from marey_server.services import Description, Services
@@ -41,6 +42,7 @@ from marey_server.store.schema import upgrade_schema
 log = logging.getLogger(__name__)
 
 ADMIN_TOKEN_FILE = "admin.token"  # noqa: S105 - the name of a file
+LOCAL_WORKER_TOKEN = "workers beside the server"  # noqa: S105 - the name of a token
 READ_CHUNK_BYTES = 256 * 1024
 READ_BUFFER_BYTES = 1024 * 1024
 
@@ -141,12 +143,16 @@ async def _drain(services: Services, server: HTTPServer) -> None:
 def open_database(settings: Settings) -> Database:
     """The database of a server: its folder made, its schema current, its first administrator there."""
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
-    url = settings.resolved_database_url
-    upgrade_schema(url)
-    blobs = DirectoryBlobs(settings.data / "blobs") if settings.blobs == "directory" else None
-    database = Database(url, readers=settings.database_threads, blobs=blobs)
+    upgrade_schema(settings.resolved_database_url)
+    database = connect_database(settings)
     database.write(SYSTEM, make_first_administrator, settings.data / ADMIN_TOKEN_FILE)
     return database
+
+
+def connect_database(settings: Settings) -> Database:
+    """The database as it stands."""
+    blobs = DirectoryBlobs(settings.data / "blobs") if settings.blobs == "directory" else None
+    return Database(settings.resolved_database_url, readers=settings.database_threads, blobs=blobs)
 
 
 def make_first_administrator(tx: Transaction, token_file: Path) -> None:
@@ -178,5 +184,23 @@ async def serve(settings: Settings) -> None:
         loop.add_signal_handler(number, stop.set)
     async with listening(create_app(settings, database)) as running:
         log.info("listening on %s", running.address)
-        await stop.wait()
-        log.info("stopping")
+        async with local_workers(
+            settings.local_workers,
+            url=running.address,
+            token=make_worker_token(database) if settings.local_workers else "",
+            cache=settings.data / "worker-cache",
+        ):
+            await stop.wait()
+            log.info("stopping")
+
+
+def make_worker_token(database: Database) -> str:
+    """A token for the workers that this process starts; those of earlier starts stop working."""
+    return database.write(SYSTEM, _replace_worker_token)
+
+
+def _replace_worker_token(tx: Transaction) -> str:
+    tx.principal = users.administrator_principal(tx)
+    tokens.revoke_named(tx, LOCAL_WORKER_TOKEN)
+    wanted = TokenCreate(name=LOCAL_WORKER_TOKEN, scopes=("read", "write", "work"), expires_in_s=None)
+    return tokens.create_token(tx, wanted).secret

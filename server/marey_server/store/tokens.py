@@ -128,6 +128,14 @@ def revoke_token(tx: Transaction, token_id: str) -> None:
     tx.emit("token.revoked", token_id)
 
 
+def revoke_named(tx: Transaction, name: str) -> None:
+    """End those of the caller's tokens that have this name."""
+    user_id = _require_user(tx.principal, "write")
+    ended = tx.execute(delete(token).where(token.c.user_id == user_id, token.c.name == name).returning(token.c.id))
+    for token_id in ended.scalars().all():
+        tx.emit("token.revoked", token_id)
+
+
 def note_use(tx: Transaction, token_id: str) -> None:
     """Remember that a token is in use, once an hour."""
     before = tx.now_us - NOTE_USE_EVERY_S * 1_000_000

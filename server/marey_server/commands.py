@@ -1,0 +1,137 @@
+"""What the `marey` command runs on the server's own machine: serve, and the care of its database.
+
+Functions print what people should see and raise `CommandFailed` with a sentence when they cannot do what was asked.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sqlite3
+import sys
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from marey_server.settings import Settings
+
+
+class CommandFailed(Exception):
+    """What was asked for could not be done; the text says why and what to do."""
+
+
+def serve(**settings: Any) -> None:
+    """Run a server, and the workers it is told to start, until SIGTERM or SIGINT."""
+    from marey_server.app import serve as serve_until_stopped
+
+    asyncio.run(serve_until_stopped(read_settings(**settings)))
+
+
+def read_settings(**given: Any) -> Settings:
+    """Settings from flags, variables and `marey.toml`; a wrong one is named in one line."""
+    try:
+        return Settings(**given)
+    except ValidationError as error:
+        wrong = "; ".join(f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors())
+        raise CommandFailed(f"a setting is wrong: {wrong}") from None
+
+
+def upgrade(**settings: Any) -> None:
+    """Bring the tables to this version's."""
+    from marey_server.store.schema import upgrade_schema
+
+    chosen = read_settings(**settings)
+    chosen.data.mkdir(parents=True, exist_ok=True, mode=0o700)
+    upgrade_schema(chosen.resolved_database_url)
+    _say("the database's schema is up to date")
+
+
+def backup(*, target: Path, **settings: Any) -> None:
+    """Copy an SQLite database as it is at one moment, while a server may be writing to it."""
+    source = _sqlite_file(read_settings(**settings), must_exist=True)
+    if target.exists():
+        raise CommandFailed(f"{target} exists; a backup never writes over a file")
+    partial = target.with_name(f"{target.name}.partial")
+    partial.unlink(missing_ok=True)
+    _copy_database(source, partial)
+    partial.replace(target)
+    _say(f"{target}: {target.stat().st_size:,} bytes")
+
+
+def restore(*, source: Path, **settings: Any) -> None:
+    """Put a backup in the place of a database that is not there."""
+    chosen = read_settings(**settings)
+    target = _sqlite_file(chosen, must_exist=False)
+    if target.exists():
+        raise CommandFailed(f"{target} exists; move it away first, so that nothing is lost")
+    if not source.is_file():
+        raise CommandFailed(f"{source} is no file")
+    chosen.data.mkdir(parents=True, exist_ok=True, mode=0o700)
+    partial = target.with_name(f"{target.name}.partial")
+    partial.unlink(missing_ok=True)
+    _copy_database(source, partial)
+    partial.replace(target)
+    _say(f"{target} is restored from {source}; `marey db fsck` verifies it")
+
+
+def fsck(*, as_json: bool = False, **settings: Any) -> None:
+    """Verify every digest and reference; fails when something is wrong."""
+    from marey_server.app import connect_database
+    from marey_server.store.fsck import check_store
+
+    chosen = read_settings(**settings)
+    if chosen.database_url is None:
+        _sqlite_file(chosen, must_exist=True)
+    checked: dict[str, int] = {}
+    database = connect_database(chosen)
+    try:
+        findings = list(check_store(database, progress=checked.__setitem__))
+    finally:
+        database.close()
+    if as_json:
+        import json
+
+        _say(json.dumps({"checked": checked, "findings": [vars(finding) for finding in findings]}, default=str))
+    else:
+        for finding in findings:
+            _say(str(finding))
+        _say(f"checked {', '.join(f'{count:,} {what}' for what, count in checked.items()) or 'nothing'}")
+    if findings:
+        raise CommandFailed(f"{len(findings)} things are wrong")
+
+
+def _sqlite_file(settings: Settings, *, must_exist: bool) -> Path:
+    from sqlalchemy import make_url
+
+    url = make_url(settings.resolved_database_url)
+    if url.get_backend_name() != "sqlite" or not url.database:
+        raise CommandFailed("this works on SQLite files; use pg_dump and pg_restore for Postgres")
+    file = Path(url.database)
+    if must_exist and not file.is_file():
+        raise CommandFailed(f"there is no database {file}; say where with --data")
+    return file
+
+
+def _copy_database(source: Path, target: Path) -> None:
+    os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+    try:
+        with (
+            closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro", uri=True)) as reading,
+            closing(sqlite3.connect(target)) as writing,
+        ):
+            reading.backup(writing)
+            (state,) = writing.execute("PRAGMA quick_check").fetchone()
+    except sqlite3.DatabaseError as error:
+        target.unlink()
+        raise CommandFailed(f"{source} is no sound database: {error}") from None
+    if state != "ok":
+        target.unlink()
+        raise CommandFailed(f"{source} is damaged: {state}")
+    with open(target, "rb") as file:
+        os.fsync(file.fileno())
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(f"{text}\n")
