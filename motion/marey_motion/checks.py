@@ -330,22 +330,18 @@ def _rotation_jumps(clip: Clip) -> CheckWarning | None:
 
 
 def _dead_joints(clip: Clip, tracks: _Tracks) -> CheckWarning | None:
-    """Limbs or a head none of whose joints ever turns, while others do."""
-    landmarks = tracks.landmarks
-    still = (clip.rotations == clip.rotations[0]).all(axis=(0, 2))
-    if clip.frame_count < 2 or still.all() or not (landmarks.hands and landmarks.feet):
+    """Limbs none of whose joints ever turns, while other joints do."""
+    landmarks, skeleton = tracks.landmarks, clip.skeleton
+    if clip.frame_count < 2 or not (landmarks.hands and landmarks.feet):
         return None
-    chest = common_ancestor(clip.skeleton.parents, landmarks.hands)
-    limbs = [(chest, hand) for hand in landmarks.hands] + [(landmarks.hips or 0, foot) for foot in landmarks.feet]
-    dead: list[int] = []
-    for top, end in limbs:
-        path = clip.skeleton.path_to_root(end)
-        limb = list(path[: path.index(top)])
-        if still[limb].all():
-            dead += limb
-    if not dead:
+    chest = common_ancestor(skeleton.parents, landmarks.hands)
+    ends = [(chest, hand) for hand in landmarks.hands] + [(landmarks.hips or 0, foot) for foot in landmarks.feet]
+    paths = [skeleton.path_to_root(end)[: skeleton.path_to_root(end).index(top)] for top, end in ends]
+    limbs = [list(path) for path in paths if (clip.rotations[:, path] == clip.rotations[0, path]).all()]
+    dead = sorted(joint for limb in limbs for joint in limb)
+    if not dead or (clip.rotations == clip.rotations[0]).all():
         return None
-    names = tuple(clip.skeleton.joint_names[joint] for joint in sorted(dead))
+    names = tuple(skeleton.joint_names[joint] for joint in dead)
     return CheckWarning("dead-joints", f"{len(names)} joints of whole limbs never turn", joints=names)
 
 

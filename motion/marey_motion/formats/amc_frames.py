@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from marey_motion.formats.asf import AsfSkeleton, Bone
-from marey_motion.formats.numeric_text import EXACT, LONG, excerpt, parse_number
+from marey_motion.formats.numeric_text import EXACT, LONG, ending_in_a_line, excerpt, parse_number
 from marey_motion.formats.text_lines import TextLines, number_problem
 
 # What stopped the scanner.
@@ -53,7 +53,7 @@ def scan_frames(lines: TextLines, skeleton: AsfSkeleton) -> tuple[NDArray[np.flo
     ------
     FormatError    with line and bone
     """
-    text = np.frombuffer(lines.data, np.uint8)
+    text = ending_in_a_line(np.frombuffer(lines.data, np.uint8))
     table = BoneTable.of(skeleton.bones)
     # Sized by what the text can hold: a frame takes at least its names and two bytes a value.
     shortest = int(table.name_ends[-1] + 2 * table.first_columns[-1] + 2)
@@ -176,7 +176,8 @@ def _read_bone(text, i, first_columns, values, long_tokens, state):  # type: ign
         if text[i] <= 32:
             i += 1
             continue
-        kind, value, stop = parse_number(text, i, text.size)
+        kind, value, after = parse_number(text, i)
+        stop = np.int64(after)
         if kind != EXACT and kind != LONG:
             state[_POSITION] = i
             return -1

@@ -16,6 +16,8 @@ EXACT, LONG, MALFORMED = 0, 1, 2
 
 _EXACT_POWERS = np.array([float(f"1e{k}") for k in range(23)])
 _LARGEST_EXACT = 1 << 53
+_ONE = np.uint64(1)
+_LINE_FEED = np.uint8(10)
 _LONG_TOKENS_PER_CALL = 1 << 14
 
 # Slots of the scanner's state, which survives between calls of the kernel.
@@ -49,51 +51,55 @@ class BadToken(ValueError):
 
 
 @njit(cache=True, nogil=True)
-def parse_number(text, start, end):  # type: ignore[no-untyped-def]
-    """Read one decimal number at `text[start:end]`.
+def parse_number(text, start):  # type: ignore[no-untyped-def]
+    """Read one decimal number at `text[start:]`, which must end in a line feed: no loop looks for the end of the text.
+
+    Positions are unsigned, because signed ones cost a test for negative indices at every byte.
 
     Returns
     -------
     (kind, value, stop) : `stop` is one past the token; `value` holds only when `kind` is `EXACT`
     """
-    i = start
-    negative = False
-    if text[i] == 45 or text[i] == 43:
-        negative = text[i] == 45
-        i += 1
+    i = np.uint64(start)
+    negative = text[i] == 45
+    if negative or text[i] == 43:
+        i += _ONE
     first_digit = i
     mantissa = np.int64(0)
-    exponent = 0
-    while i < end and np.uint8(text[i] - 48) < 10:
-        mantissa = mantissa * 10 + np.uint8(text[i] - 48)
-        i += 1
-    digits = i - first_digit
-    if i < end and text[i] == 46:
-        i += 1
+    digit = np.uint8(text[i] - 48)
+    while digit < 10:
+        mantissa = mantissa * 10 + digit
+        i += _ONE
+        digit = np.uint8(text[i] - 48)
+    digits = np.int64(i - first_digit)
+    exponent = np.int64(0)
+    if text[i] == 46:
+        i += _ONE
         first_decimal = i
-        while i < end and np.uint8(text[i] - 48) < 10:
-            mantissa = mantissa * 10 + np.uint8(text[i] - 48)
-            i += 1
-        exponent = first_decimal - i
+        digit = np.uint8(text[i] - 48)
+        while digit < 10:
+            mantissa = mantissa * 10 + digit
+            i += _ONE
+            digit = np.uint8(text[i] - 48)
+        exponent = np.int64(first_decimal) - np.int64(i)
         digits -= exponent
     well_formed = digits > 0
-    if well_formed and i < end and (text[i] == 101 or text[i] == 69):
-        i += 1
-        falling = False
-        if i < end and (text[i] == 45 or text[i] == 43):
-            falling = text[i] == 45
-            i += 1
+    if well_formed and (text[i] == 101 or text[i] == 69):
+        i += _ONE
+        falling = text[i] == 45
+        if falling or text[i] == 43:
+            i += _ONE
         first_power = i
-        power = 0
-        while i < end and np.uint8(text[i] - 48) < 10:
+        power = np.int64(0)
+        digit = np.uint8(text[i] - 48)
+        while digit < 10:
             if power < 100000:
-                power = 10 * power + int(np.uint8(text[i] - 48))
-            i += 1
+                power = power * 10 + digit
+            i += _ONE
+            digit = np.uint8(text[i] - 48)
         well_formed = i > first_power
         exponent += -power if falling else power
-    if not well_formed or (i < end and text[i] > 32):
-        while i < end and text[i] > 32:
-            i += 1
+    if not well_formed or text[i] > 32:
         return MALFORMED, 0.0, i
     if digits > 18 or mantissa > _LARGEST_EXACT or exponent > 22 or exponent < -22:
         return LONG, 0.0, i
@@ -108,14 +114,14 @@ def parse_number(text, start, end):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _scan(text, width, values, long_tokens, state):  # type: ignore[no-untyped-def]
     """Read numbers until the text ends, `values` or `long_tokens` is full (0) or a token is malformed (1)."""
-    end = text.size
-    i, line, count, in_line, rows = state[_POSITION], state[_LINE], state[_VALUES], state[_IN_LINE], state[_ROWS]
+    i, end = np.uint64(state[_POSITION]), np.uint64(text.size)
+    line, count, in_line, rows = state[_LINE], state[_VALUES], state[_IN_LINE], state[_ROWS]
     long_count = 0
     malformed = 0
     while i < end:
         byte = text[i]
         if byte == 32 or byte == 9 or byte == 11 or byte == 12:
-            i += 1
+            i += _ONE
         elif byte == 10 or byte == 13:
             if in_line > 0:
                 rows += 1
@@ -124,11 +130,13 @@ def _scan(text, width, values, long_tokens, state):  # type: ignore[no-untyped-d
                     state[_RAGGED_COUNT] = in_line
                 in_line = 0
             line += 1
-            i += 2 if byte == 13 and i + 1 < end and text[i + 1] == 10 else 1
+            i += _ONE
+            if byte == 13 and i < end and text[i] == 10:
+                i += _ONE
         else:
-            if count == values.size or long_count == long_tokens.shape[0]:
+            if long_count == long_tokens.shape[0]:
                 break
-            kind, value, stop = parse_number(text, i, end)
+            kind, value, stop = parse_number(text, i)
             if kind == MALFORMED:
                 malformed = 1
                 break
@@ -148,6 +156,11 @@ def _scan(text, width, values, long_tokens, state):  # type: ignore[no-untyped-d
     return malformed
 
 
+def ending_in_a_line(text: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The text itself where it ends in a line feed, else a copy that does."""
+    return text if text.size and text[-1] == _LINE_FEED else np.append(text, _LINE_FEED)
+
+
 def scan_numbers(text: NDArray[np.uint8], width: int, first_line: int) -> NumberTable:
     """Read a block of whitespace-separated numbers, one row a line.
 
@@ -161,6 +174,7 @@ def scan_numbers(text: NDArray[np.uint8], width: int, first_line: int) -> Number
     ------
     BadToken    at the first token that is no finite decimal number
     """
+    text = ending_in_a_line(text)
     # Sized by what the text can hold, never by what a header declares; untouched pages cost nothing.
     values = np.empty((text.size + 1) // 2, np.float64)
     long_tokens = np.empty((_LONG_TOKENS_PER_CALL, 5), np.int64)
@@ -172,16 +186,12 @@ def scan_numbers(text: NDArray[np.uint8], width: int, first_line: int) -> Number
         state[_LONG_TOKENS] = 0
         if malformed:
             raise _bad_token_at(text, state)
-    if state[_IN_LINE] > 0:
-        state[_ROWS] += 1
-        if state[_IN_LINE] != width and state[_RAGGED_LINE] == 0:
-            state[_RAGGED_LINE], state[_RAGGED_COUNT] = state[_LINE], state[_IN_LINE]
     return NumberTable(
         values=values[: state[_VALUES]],
         rows=int(state[_ROWS]),
         ragged_line=int(state[_RAGGED_LINE]),
         ragged_count=int(state[_RAGGED_COUNT]),
-        last_line=int(state[_LINE]),
+        last_line=int(state[_LINE]) - 1,
     )
 
 
