@@ -1,0 +1,99 @@
+"""Worker processes beside the server, on the same machine.
+
+A worker gets its token through a pipe to its standard input, which stays open: when the server goes, however it goes, the
+pipe closes and the worker stops. Nothing secret stands in an argument list or an environment.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+import sys
+import time
+from asyncio.subprocess import Process
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+log = logging.getLogger(__name__)
+
+FIRST_PAUSE_S = 0.5
+LONGEST_PAUSE_S = 30.0
+HEALTHY_AFTER_S = 30.0
+"""A worker that lived so long did not fail at the start: the next one starts soon."""
+
+STOP_S = 20.0
+
+
+@asynccontextmanager
+async def local_workers(count: int, *, url: str, token: str, cache: Path) -> AsyncIterator[None]:
+    """Keep `count` workers running inside the block; at its end, stop them politely.
+
+    Parameters
+    ----------
+    url : where this server listens
+    token : of a user who may work; scope `work`
+    cache : folder where the workers keep inputs
+    """
+    workers = [_LocalWorker(f"local-{number}", url, token, cache) for number in range(1, count + 1)]
+    keeping = [asyncio.create_task(worker.keep_running()) for worker in workers]
+    try:
+        yield
+    finally:
+        await asyncio.gather(*(worker.stop() for worker in workers))
+        await asyncio.gather(*keeping)
+
+
+class _LocalWorker:
+    """One worker: started again, with growing pauses, whenever it ends by itself."""
+
+    def __init__(self, name: str, url: str, token: str, cache: Path) -> None:
+        self._name = name
+        self._token = token
+        self._command = [
+            sys.executable, "-m", "marey_worker", "--attached", "--server", url, "--name", name, "--cache", str(cache),
+        ]  # fmt: skip
+        self._process: Process | None = None
+        self._stopping = asyncio.Event()
+
+    async def keep_running(self) -> None:
+        """Start the worker, wait for its end, start it again."""
+        quick_ends = 0
+        while not self._stopping.is_set():
+            started = time.monotonic()
+            self._process = await self._start()
+            status = await self._process.wait()
+            if self._stopping.is_set():
+                return
+            quick_ends = 0 if time.monotonic() - started > HEALTHY_AFTER_S else quick_ends + 1
+            pause_s = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0**quick_ends) * random.uniform(0.75, 1.0)  # noqa: S311
+            log.warning("worker %s ended with status %d; starting it again in %.1f s", self._name, status, pause_s)
+            await self._pause(pause_s)
+
+    async def stop(self) -> None:
+        """Ask the worker to give back what it does and end; insist after a while."""
+        self._stopping.set()
+        process = self._process
+        if process is None or process.returncode is not None:
+            return
+        process.terminate()
+        try:
+            await asyncio.wait_for(process.wait(), STOP_S)
+        except TimeoutError:
+            log.warning("worker %s does not stop; killing it", self._name)
+            process.kill()
+            await process.wait()
+
+    async def _start(self) -> Process:
+        process = await asyncio.create_subprocess_exec(*self._command, stdin=asyncio.subprocess.PIPE)
+        assert process.stdin is not None
+        process.stdin.write(self._token.encode() + b"\n")
+        log.info("worker %s is process %d", self._name, process.pid)
+        return process
+
+    async def _pause(self, seconds: float) -> None:
+        try:
+            await asyncio.wait_for(self._stopping.wait(), seconds)
+        except TimeoutError:
+            return
