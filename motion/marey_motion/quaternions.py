@@ -22,8 +22,8 @@ Wide = NDArray[np.float64]
 TINY = 1e-12
 # Sine below which an angle next to gimbal lock carries no information in float64.
 LOCKED = 1e-7
-# Length of the unnormalised quaternion between two directions below which its axis has lost too many digits.
-NEARLY_OPPOSITE = 1e-4
+# Length of the unnormalised quaternion between two directions below which its axis loses digits.
+NEARLY_OPPOSITE = 0.1
 # Blocks of so many rotations keep their temporaries in the first-level caches.
 EULER_BLOCK = 4096
 

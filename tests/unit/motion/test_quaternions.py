@@ -4,7 +4,7 @@ from itertools import permutations, product
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation, Slerp
@@ -187,8 +187,7 @@ def test_the_angle_between_rotations_is_that_of_the_shorter_way():
 @settings(max_examples=50)
 @given(rotations, rotations, st.floats(0.0, 1.0))
 def test_slerp_agrees_with_scipy(a, b, t):
-    if q.angle_between(a, b) > np.pi - 1e-3:
-        return
+    assume(q.angle_between(a, b) < np.pi - 1e-3)
     expected = Slerp([0.0, 1.0], Rotation.concatenate([scipy_of(a), scipy_of(b)]))(t).as_quat(scalar_first=True)
     assert same_rotation(q.slerp(a, b, t), expected, 1e-7)
 
@@ -210,7 +209,7 @@ def test_slerp_between_equal_or_opposite_signs_of_a_rotation_stays_there():
 @given(vectors, vectors)
 def test_the_rotation_between_vectors_brings_one_onto_the_other(start, end):
     turned = q.rotate_vectors(q.between_vectors(start, end), start / np.linalg.norm(start))
-    np.testing.assert_allclose(turned, end / np.linalg.norm(end), atol=1e-14)
+    np.testing.assert_allclose(turned, end / np.linalg.norm(end), atol=1e-13)
 
 
 @given(vectors, st.sampled_from([0.0, 1e-13, 1e-10, 1e-7, 1e-5, 1e-3]))
@@ -218,7 +217,7 @@ def test_nearly_opposite_vectors_are_met_exactly_too(start, off):
     start = start / np.linalg.norm(start)
     end = -start + off * np.roll(start, 1)
     turned = q.rotate_vectors(q.between_vectors(start, end), start)
-    np.testing.assert_allclose(turned, end / np.linalg.norm(end), atol=1e-14)
+    np.testing.assert_allclose(turned, end / np.linalg.norm(end), atol=1e-13)
 
 
 def test_opposite_vectors_turn_about_the_axis_asked_for():
