@@ -52,12 +52,18 @@ def stored_high_water_us(connection: Connection) -> int:
 
 
 def save_high_water(connection: Connection, now_us: int) -> None:
-    """Remember `now_us`, at most once a second, so that a restart cannot go back behind it."""
+    """See that no time up to `now_us` is ever used again, whatever the wall clock says after a restart.
+
+    Writes at most once a second: what is stored lies up to a second ahead.
+    """
     stored = stored_high_water_us(connection)
+    if now_us < stored:
+        return
+    ahead = now_us + _SAVE_EVERY_US
     if stored == 0:
-        connection.execute(insert(server_state).values(key=_HIGH_WATER, value=now_us))
-    elif now_us - stored >= _SAVE_EVERY_US:
-        connection.execute(update(server_state).where(server_state.c.key == _HIGH_WATER).values(value=now_us))
+        connection.execute(insert(server_state).values(key=_HIGH_WATER, value=ahead))
+    else:
+        connection.execute(update(server_state).where(server_state.c.key == _HIGH_WATER).values(value=ahead))
 
 
 def datetime_of(us: int) -> datetime:

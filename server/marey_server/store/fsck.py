@@ -78,10 +78,8 @@ def _check_file(tx: Transaction) -> list[Finding]:
         return []
     pages = [row[0] for row in tx.execute(text("PRAGMA integrity_check(100)")) if row[0] != "ok"]
     findings = [Finding("broken-database", "database", line) for line in pages]
-    for table, rowid, parent, _ in tx.execute(text("PRAGMA foreign_key_check")):
-        findings.append(
-            Finding("dangling-reference", f"{table}/{rowid}", f"refers to a row that {parent} does not have")
-        )
+    for row in tx.execute(text("PRAGMA foreign_key_check")):
+        findings.append(Finding("dangling-reference", f"{row[0]}/{row[1]}", f"refers to what {row[2]} does not hold"))
     return findings
 
 

@@ -1,7 +1,7 @@
 """Garbage collection: documents and blobs that nothing refers to, uploads nobody continues, keys that have expired.
 
 Candidates are looked for in a read. Each batch is then deleted in a transaction of its own that locks the rows and
-looks again. Whoever takes up a document or blob renews its row first, so that either he finds it gone or we find it young.
+looks again. Whoever takes up a document or blob renews its row first: either he finds it gone, or we find it young.
 """
 
 from __future__ import annotations
