@@ -36,6 +36,7 @@ PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
     "upload": ("Id of the upload.", _NAME),
     "digest": ("Name of the bytes.", {"type": "string", "pattern": "^sha256:[0-9a-f]{64}$"}),
     "job": ("Id of the job.", _NAME),
+    "job_kind": ("Name of the kind of job.", _NAME),
     "fence": ("Fence of the attempt.", {"type": "integer", "minimum": 0, "maximum": 999_999_999}),
 }  # fmt: skip
 _HEADERS = {

@@ -44,14 +44,14 @@ class JobKinds(Resource):
 class JobKindResource(Resource):
     """One thing that can be done."""
 
-    path = "/job-kinds/{kind}"
+    path = "/job-kinds/{job_kind}"
     tag = "Jobs"
 
     @reads(access=Access.ANYONE, answer=JobKind)
-    async def get(self, kind: str) -> Reply:
+    async def get(self, job_kind: str) -> Reply:
         """A kind of job."""
         try:
-            return Reply(find_kind(kind).document())
+            return Reply(find_kind(job_kind).document())
         except UnknownKindError as error:
             raise NotFound(f"{error}.".capitalize(), code="no-kind") from None
 
