@@ -39,7 +39,7 @@ class Users:
 
     def create(self, user: UserCreate) -> User:
         """Make a user."""
-        return self.transport.post(User, "/users", user)
+        return self.transport.post(User, "/users", user, repeatable=False)
 
     def change(self, name: str, change: UserChange) -> User:
         """Change a user; one's own password needs the current one."""
@@ -64,7 +64,7 @@ class Tokens:
 
     def create(self, token: TokenCreate) -> NewToken:
         """Make a token; its secret is in the answer and never shown again."""
-        return self.transport.post(NewToken, "/tokens", token)
+        return self.transport.post(NewToken, "/tokens", token, repeatable=False)
 
     def revoke(self, token_id: str) -> None:
         """Make a token useless, now."""

@@ -72,12 +72,12 @@ class Blobs:
 
             def once() -> None:
                 start = file.tell()
-                ranged = {"Range": f"bytes={start}-"} if start else {}
+                ranged = {"Accept-Encoding": "identity", **({"Range": f"bytes={start}-"} if start else {})}
                 with self.transport.stream(f"/blobs/{digest}", headers=ranged) as response:
                     if start and response.status_code != httpx.codes.PARTIAL_CONTENT:
                         file.seek(0)
                         file.truncate()
-                    for chunk in response.iter_bytes(CHUNK_BYTES):
+                    for chunk in response.iter_bytes():
                         file.write(chunk)
 
             self.transport.repeat(once, repeatable=True, what=f"GET /blobs/{digest}")

@@ -46,7 +46,7 @@ def download(transport: Transport, path: str, folder: Path, *, params: Params | 
         with transport.stream(path, params=params) as response:
             target = folder / safe_file_name(_offered_name(response.headers.get("Content-Disposition")) or name)
             with saved_atomically(target) as file:
-                for chunk in response.iter_bytes(1 << 20):
+                for chunk in response.iter_bytes():
                     file.write(chunk)
         return target
 

@@ -59,7 +59,7 @@ class Marey:
 
     def sign_in(self, login: Login) -> NewToken:
         """A token for a name and a password."""
-        return self.transport.post(NewToken, "/login", login)
+        return self.transport.post(NewToken, "/login", login, repeatable=False)
 
     def me(self) -> Me:
         """Whom the token belongs to, and what it allows."""

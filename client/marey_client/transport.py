@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -27,6 +28,9 @@ JSON = "application/json"
 BLOCKS = "application/msgpack; arrays=blocks"
 API = "/api/v1"
 MAX_ANSWER_BYTES = 1 << 28
+
+TRIES_TO_REACH = 3
+"""A server that has never answered is more likely to be absent than to be restarting."""
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +64,7 @@ class Transport:
     ) -> None:
         self.url = url.rstrip("/")
         self.retries = retries or Retries()
+        self._reached = threading.Event()
         self._auth = BearerToken(token) if token else None
         self._client = httpx.Client(
             base_url=self.url + API,
@@ -149,8 +154,11 @@ class Transport:
         started = time.monotonic()
         for tried in range(1, self.retries.tries + 1):
             try:
-                return once()
+                answer = once()
+                self._reached.set()
+                return answer
             except RequestFailed as error:
+                self._reached.set()
                 failure: Exception = error
                 again, wait_s = error.problem.status in BUSY_STATUSES or error.code == "in-flight", error.retry_after_s
             except httpx.TransportError as error:
@@ -159,7 +167,8 @@ class Transport:
                 again, wait_s = repeatable or isinstance(error, NEVER_ARRIVED), None
             delay_s = self.retries.delay_s(tried, wait_s)
             late = time.monotonic() - started + delay_s > self.retries.total_s
-            if not again or late or tried == self.retries.tries:
+            most = self.retries.tries if self._reached.is_set() else min(self.retries.tries, TRIES_TO_REACH)
+            if not again or late or tried >= most:
                 raise failure
             log.info("%s: %s; trying again in %.1f s", what, failure, delay_s)
             self.retries.sleep(delay_s)

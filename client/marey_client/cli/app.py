@@ -20,6 +20,14 @@ app = typer.Typer(
 )
 
 
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"marey {version('marey')}")
+        raise typer.Exit
+
+
 @app.callback()
 def marey(
     context: typer.Context,
@@ -28,14 +36,11 @@ def marey(
     ] = None,
     token_file: Annotated[Path | None, typer.Option(help="File that holds a token and nothing else.")] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell details, also of errors.")] = False,
-    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
+    version: Annotated[  # noqa: ARG001 - its callback does it
+        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
 ) -> None:
     """Motion capture goes in; it is versioned, checked, retargeted, and comes out right."""
-    if version:
-        from importlib.metadata import version as installed
-
-        typer.echo(f"marey {installed('marey')}")
-        raise typer.Exit
     context.obj = Invocation(server, token_file, verbose)
 
 

@@ -1,0 +1,71 @@
+"""Bytes by digest."""
+
+import hashlib
+
+import httpx
+import pytest
+
+from marey_client import errors
+from marey_client.blobs import Blobs, digest_of
+from marey_schemas.items import BlobsQuery
+
+DATA = bytes(range(256)) * 4096
+
+
+class Torn(httpx.SyncByteStream):
+    """An answer whose connection breaks after some bytes."""
+
+    def __init__(self, data):
+        self.data = data
+
+    def __iter__(self):
+        yield self.data
+        raise httpx.ReadError("connection reset")
+
+
+def test_a_file_is_streamed_with_its_length(script, tmp_path):
+    path = tmp_path / "walk.bvh"
+    path.write_bytes(DATA)
+    script.answers = [httpx.ReadError("lost"), httpx.Response(204)]
+    digest = script.marey().blobs.put_file(path)
+    assert digest == digest_of(DATA) == f"sha256:{hashlib.sha256(DATA).hexdigest()}"
+    assert [request.content for request in script.requests] == [DATA, DATA]
+    assert script.requests[0].headers["Content-Length"] == str(len(DATA))
+    assert script.requests[0].url.path.endswith(digest)
+
+
+def test_a_download_goes_on_where_the_connection_broke(script, tmp_path):
+    def rest(request):
+        start = int(request.headers["Range"].removeprefix("bytes=").rstrip("-"))
+        return httpx.Response(206, content=DATA[start:])
+
+    script.answers = [httpx.Response(200, stream=Torn(DATA[:1000])), rest]
+    target = script.marey().blobs.fetch_to(digest_of(DATA), tmp_path / "out" / "walk.bvh")
+    assert target.read_bytes() == DATA
+    assert script.requests[1].headers["Range"] == "bytes=1000-"
+
+
+def test_a_download_starts_again_where_ranges_are_not_known(script, tmp_path):
+    script.answers = [httpx.Response(200, stream=Torn(DATA[:1000])), httpx.Response(200, content=DATA)]
+    assert script.marey().blobs.fetch_to(digest_of(DATA), tmp_path / "walk").read_bytes() == DATA
+
+
+def test_other_bytes_than_those_asked_for_are_never_kept(script, tmp_path):
+    script.answers = [httpx.Response(200, content=b"other"), httpx.Response(200, content=b"other")]
+    blobs = script.marey().blobs
+    with pytest.raises(errors.DigestMismatch):
+        blobs.fetch(digest_of(DATA))
+    with pytest.raises(errors.DigestMismatch):
+        blobs.fetch_to(digest_of(DATA), tmp_path / "walk")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_thousands_of_digests_are_asked_for_in_few_questions(script):
+    digests = [f"sha256:{number:064x}" for number in range(12_000)]
+
+    def answer(request):
+        asked = BlobsQuery.model_validate_json(request.content).digests
+        return httpx.Response(200, json={"missing": asked[:1]})
+
+    script.answers = [answer, answer]
+    assert Blobs(script.marey().transport).missing(digests * 2) == {digests[0], digests[10_000]}

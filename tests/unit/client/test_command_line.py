@@ -1,0 +1,115 @@
+"""The command line where no server is needed."""
+
+import subprocess
+import sys
+
+import pytest
+
+from marey_client.cli import with_global_options_first
+from marey_client.cli.addresses import Address
+from marey_client.cli.failures import WrongUsage
+
+
+def marey(*arguments, env=None, stdin=""):
+    import os
+
+    command = [sys.executable, "-c", "from marey_client.cli import main; main()", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, input=stdin, env={**os.environ, **(env or {})})
+
+
+@pytest.fixture
+def nowhere(tmp_path):
+    """A user without stored logins, and a server that is not there."""
+    return {
+        "XDG_CONFIG_HOME": str(tmp_path), "MAREY_DATA": str(tmp_path), "MAREY_URL": "http://127.0.0.1:9",
+        "MAREY_TOKEN": "marey_very_secret",
+    }  # fmt: skip
+
+
+def test_help_loads_nothing_heavy():
+    probe = (
+        "import sys; from marey_client.cli.app import app\n"
+        "try: app(['--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'numpy', 'httpx', 'pydantic', 'rich', 'bson', 'marey_server', 'marey_worker', 'marey_motion'}\n"
+        "print(sorted(heavy & set(sys.modules)), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True)
+    assert done.stderr.strip() == "[]"
+    for command in ("serve", "worker", "demo", "db", "upload", "download", "retarget", "skeleton", "job", "why"):
+        assert command in done.stdout
+
+
+def test_every_command_explains_itself():
+    from typer.main import get_command
+
+    from marey_client.cli.app import app
+
+    def walk(command, path):
+        assert command.help, path
+        for name, child in getattr(command, "commands", {}).items():
+            walk(child, [*path, name])
+
+    walk(get_command(app), ["marey"])
+
+
+@pytest.mark.parametrize("arguments", [["nonsense"], ["ls", "--nonsense"], ["upload"], ["ls", "/"], ["job", "ls"]])
+def test_wrong_usage_exits_with_2(arguments, nowhere):
+    done = marey(*arguments, env=nowhere)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+
+
+def test_a_name_the_server_would_refuse_is_refused_before_it_is_sent(nowhere):
+    done = marey("project", "create", "Not A Name", env=nowhere)
+    assert done.returncode == 2
+    assert done.stderr.startswith("marey: name: ")
+
+
+def test_a_server_that_is_not_there_is_one_line_and_exit_status_1(nowhere):
+    done = marey("project", "ls", env=nowhere)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("marey: http://127.0.0.1:9 does not answer")
+    assert "marey_very_secret" not in done.stderr
+
+
+def test_with_v_the_whole_story_is_told_without_the_token(nowhere):
+    done = marey("project", "ls", "-v", env=nowhere)
+    assert done.returncode == 1
+    assert "Traceback" in done.stderr
+    assert "marey_very_secret" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (["ls", "lab", "-v"], ["-v", "ls", "lab"]),
+        (["ls", "--server", "http://x", "lab"], ["--server", "http://x", "ls", "lab"]),
+        (["ls", "--token-file=t", "lab"], ["--token-file=t", "ls", "lab"]),
+        (["show", "--", "-v"], ["show", "--", "-v"]),
+        (["ls", "--server"], ["--server", "ls"]),
+    ],
+)
+def test_options_of_marey_itself_may_stand_anywhere(given, expected):
+    assert with_global_options_first(given) == expected
+
+
+def test_addresses_have_a_project_a_path_and_perhaps_an_id():
+    address = Address.parse("lab/raw/walk")
+    assert (address.project, address.path, address.has_id) == ("lab", "raw/walk", False)
+    assert Address.parse("lab/clip_01m7ysc032mjg6sbhcx9q58xq7").has_id
+    assert str(Address.parse("lab/")) == "lab"
+    with pytest.raises(WrongUsage):
+        Address.parse("/")
+
+
+def test_completion_is_offered_for_the_users_shell(nowhere):
+    done = marey("--show-completion", "bash", env=nowhere)
+    assert done.returncode == 0, done.stderr
+    assert "marey" in done.stdout
+
+
+def test_version_is_told():
+    done = marey("--version")
+    assert done.stdout.startswith("marey ")

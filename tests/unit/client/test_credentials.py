@@ -1,0 +1,82 @@
+"""Which server and which token."""
+
+import json
+
+import pytest
+
+from marey_client import credentials, errors
+
+SERVER = "https://marey.example.org"
+
+
+@pytest.fixture
+def environment(tmp_path):
+    return {"XDG_CONFIG_HOME": str(tmp_path / "config"), "MAREY_DATA": str(tmp_path / "data")}
+
+
+def write_secret(path, text, mode=0o600):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    path.chmod(mode)
+    return path
+
+
+def test_a_token_file_comes_before_the_variable_and_that_before_the_stored_login(environment, tmp_path):
+    credentials.store_login(credentials.logins_path(environment), SERVER, "stored")
+    assert credentials.resolve(SERVER, None, environment).token == "stored"
+    environment["MAREY_TOKEN"] = "variable"
+    assert credentials.resolve(SERVER, None, environment).token == "variable"
+    file = write_secret(tmp_path / "token", "from-file\n")
+    assert credentials.resolve(SERVER, file, environment).token == "from-file"
+
+
+def test_the_server_is_the_one_named_or_the_one_logged_in_to_last(environment):
+    path = credentials.logins_path(environment)
+    assert credentials.resolve(None, None, environment).url == credentials.DEFAULT_URL
+    credentials.store_login(path, SERVER, "a")
+    assert credentials.resolve(None, None, environment).url == SERVER
+    assert credentials.resolve("http://other.test/", None, environment).url == "http://other.test"
+
+
+def test_the_administrators_token_serves_only_for_a_server_on_this_machine(environment, tmp_path):
+    write_secret(tmp_path / "data" / "admin.token", "local")
+    assert credentials.resolve("http://127.0.0.1:8460", None, environment).token == "local"
+    assert credentials.resolve(SERVER, None, environment).token is None
+
+
+def test_logins_are_readable_by_their_owner_alone_and_can_be_forgotten(environment):
+    path = credentials.logins_path(environment)
+    credentials.store_login(path, SERVER, "secret")
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert credentials.forget_login(path, SERVER)
+    assert "secret" not in path.read_text()
+    assert not credentials.forget_login(path, SERVER)
+    assert credentials.resolve(None, None, environment).url == credentials.DEFAULT_URL
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "reason"),
+    [
+        ("", 0o600, "one token"),
+        ("two words", 0o600, "one token"),
+        ("token", 0o644, "chmod 600"),
+        ("tökén", 0o600, "no token"),
+    ],
+)
+def test_files_that_hold_no_token_or_that_others_can_read_are_refused(tmp_path, text, mode, reason):
+    with pytest.raises(errors.BadCredentialFile, match=reason):
+        credentials.read_secret(write_secret(tmp_path / "token", text, mode))
+
+
+def test_a_damaged_file_of_logins_is_an_error_that_says_what_to_do(environment):
+    path = write_secret(credentials.logins_path(environment), json.dumps({"tokens": 3}))
+    with pytest.raises(errors.BadCredentialFile, match="log in again"):
+        credentials.read_logins(path)
+
+
+def test_tokens_do_not_show_in_representations(environment):
+    environment["MAREY_TOKEN"] = "secret-token"
+    credentials.store_login(credentials.logins_path(environment), SERVER, "secret-token")
+    found = credentials.resolve(SERVER, None, environment)
+    assert "secret-token" not in repr(found)
+    assert "secret-token" not in repr(credentials.read_logins(credentials.logins_path(environment)))

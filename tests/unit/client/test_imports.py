@@ -1,0 +1,101 @@
+"""Folders of files on their way to the server."""
+
+import json
+
+import httpx
+import pytest
+
+from marey_client import errors
+from marey_client.imports import FILES_PER_IMPORT, LocalFile, batches, find_files
+from marey_schemas.imports import ImportOptions
+
+
+def named(names, size=100):
+    return [LocalFile(name, None, size) for name in names]
+
+
+def names_of(portions):
+    return [[file.name for file in portion] for portion in portions]
+
+
+def test_folders_are_searched_and_other_files_are_named_as_left_out(tmp_path):
+    for name in ("b/walk.bvh", "a/01.asf", "a/01_01.AMC", "notes.txt", ".hidden/x.bvh", "b/.y.bvh"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("x")
+    found = find_files([tmp_path])
+    assert [file.name for file in found.files] == ["a/01.asf", "a/01_01.AMC", "b/walk.bvh"]
+    assert [path.name for path in found.left_out] == ["notes.txt"]
+
+
+def test_a_file_named_itself_is_taken_whatever_it_is(tmp_path):
+    path = tmp_path / "odd.ending"
+    path.write_text("x")
+    assert [file.name for file in find_files([path]).files] == ["odd.ending"]
+
+
+@pytest.mark.parametrize("place", ["absent", "."])
+def test_places_without_motion_are_an_error_that_says_so(tmp_path, place):
+    with pytest.raises(errors.NothingToUpload, match=r"does not exist|no motion files"):
+        find_files([tmp_path / place])
+
+
+def test_every_amc_travels_with_the_asf_of_its_folder():
+    takes = [f"16/16_{number:03d}.amc" for number in range(2 * FILES_PER_IMPORT)]
+    portions = names_of(batches(named(["16/16.asf", *takes])))
+    assert len(portions) > 2
+    assert all("16/16.asf" in portion for portion in portions)
+    assert sorted(name for portion in portions for name in portion if name != "16/16.asf") == takes
+
+
+def test_files_that_differ_in_their_ending_alone_stay_together():
+    names = [f"t/{number:03d}.{ending}" for number in range(FILES_PER_IMPORT) for ending in ("bvh", "npz")]
+    for portion in names_of(batches(named(names))):
+        stems = [name.partition(".")[0] for name in portion]
+        assert all(stems.count(stem) == 2 for stem in stems)
+        assert len(portion) <= FILES_PER_IMPORT
+
+
+def test_large_files_make_small_portions():
+    portions = names_of(batches(named([f"{number}.bvh" for number in range(6)], size=40 << 20)))
+    assert [len(portion) for portion in portions] == [1] * 6
+
+
+def test_only_bytes_the_server_lacks_are_sent_and_each_file_gets_its_entry(script, tmp_path):
+    for name in ("a.bvh", "b.bvh", "copy-of-b.bvh", "c.bvh"):
+        (tmp_path / name).write_text(name.removeprefix("copy-of-"))
+    sent, imported = [], []
+
+    def answer(request):
+        if request.method == "PUT":
+            sent.append(request.content)
+            return httpx.Response(204)
+        body = json.loads(request.content)
+        if request.url.path.endswith("/blobs/missing"):
+            assert len(body["digests"]) == 3
+            return httpx.Response(200, json={"missing": body["digests"][:2]})
+        imported.append(body)
+        entries = [
+            {"name": file["name"], "status": "failed" if file["name"] == "c.bvh" else "created", "frames": 10}
+            for file in body["files"]
+        ]
+        return httpx.Response(200, json={"entries": entries})
+
+    script.answers = [answer] * 10
+    told = []
+    entries = (
+        script.marey()
+        .project("lab")
+        .imports.upload(
+            find_files([tmp_path]).files,
+            ImportOptions(collection="raw", unit="cm"),
+            notice=lambda *news: told.append(news),
+        )
+    )
+    assert sorted(sent) == [b"a.bvh", b"b.bvh"]
+    assert [(entry.name, entry.status) for entry in entries] == [
+        ("a.bvh", "created"), ("b.bvh", "created"), ("c.bvh", "failed"), ("copy-of-b.bvh", "created"),
+    ]  # fmt: skip
+    assert imported[0]["collection"] == "raw"
+    assert imported[0]["unit"] == "cm"
+    assert "up_axis" not in imported[0]
+    assert told[-1] == ("importing", 4, 4)

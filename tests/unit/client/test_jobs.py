@@ -1,0 +1,71 @@
+"""Waiting for jobs, and saying why they wait."""
+
+from datetime import UTC, datetime, timedelta
+
+import httpx
+import pytest
+
+from marey_client import errors
+from marey_client.explanations import explain
+from marey_schemas.jobs import Attempt, Job
+
+NOW = datetime(2026, 1, 1, tzinfo=UTC)
+
+
+def job(**members):
+    given = {
+        "id": "job_1", "project": "lab", "kind": "retarget", "state": "queued", "params": {}, "inputs": {}, "into": "",
+        "priority": 0, "seed": 0, "attempt": 0, "fence": 0, "max_attempts": 3, "author": "ada", "created_at": NOW,
+        "run_at": NOW, "rev": 1,
+    }  # fmt: skip
+    return Job.model_validate({**given, **members})
+
+
+def answer(**members):
+    return httpx.Response(200, content=job(**members).model_dump_json())
+
+
+def test_waiting_ends_with_the_job_and_tells_its_progress(script):
+    script.answers = [answer(), answer(state="running", progress={"done": 1, "total": 2}), answer(state="succeeded")]
+    seen = []
+    ended = script.marey().jobs.wait("job_1", on_progress=lambda now: seen.append(now.state))
+    assert ended.state == "succeeded"
+    assert seen == ["queued", "running", "succeeded"]
+
+
+def test_a_job_that_failed_raises_with_its_reason(script):
+    failure = {"reason": "error", "code": "no-mapping", "detail": "nothing maps"}
+    script.answers = [answer(state="failed", failure=failure)] * 2
+    jobs = script.marey().jobs
+    with pytest.raises(errors.JobUnsuccessful, match="nothing maps") as caught:
+        jobs.wait("job_1")
+    assert caught.value.job.failure.code == "no-mapping"
+    assert jobs.wait("job_1", require_success=False).state == "failed"
+
+
+def test_waiting_gives_up_when_told_to(script):
+    script.answers = [answer(state="running")] * 100
+    with pytest.raises(errors.WaitedTooLong, match="still running"):
+        script.marey().jobs.wait("job_1", timeout_s=0.01)
+
+
+@pytest.mark.parametrize(
+    ("members", "running", "expected"),
+    [
+        ({"state": "waiting"}, [], "depends on"),
+        ({"state": "waiting", "size": 4, "children": {"queued": 3, "succeeded": 1}}, [], "3 queued, 1 succeeded"),
+        ({"run_at": NOW + timedelta(seconds=30), "attempt": 1}, [], "again in 30 s, after attempt 1 of 3"),
+        ({}, [job(state="running")], "busy with 1"),
+        ({}, [], "no worker has asked"),
+        ({"state": "running", "attempt": 2, "cancel_requested": True}, [], "asked to stop"),
+        ({"state": "failed", "failure": {"reason": "poison", "code": "x", "detail": "twice"}}, [], "poison, x"),
+        ({"state": "succeeded", "cached_from": "job_0"}, [], "job_0"),
+    ],
+)
+def test_every_state_has_its_reason(members, running, expected):
+    assert expected in explain(job(**members), [], running, NOW)[0]
+
+
+def test_earlier_attempts_are_told(script):
+    lost = Attempt(job="job_1", fence=1, worker="w1", started_at=NOW, ended_at=NOW, outcome="lost", detail=None)
+    assert "attempt 1 on w1 was lost" in explain(job(), [lost], [], NOW)

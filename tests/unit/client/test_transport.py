@@ -1,0 +1,194 @@
+"""What is sent again, what is not, and what becomes of answers."""
+
+import logging
+
+import httpx
+import numpy as np
+import pytest
+
+from marey_client import errors
+from marey_client.retries import Retries
+from marey_schemas.access import Login, NewToken, ProjectCreate, TokenCreate
+from marey_schemas.codecs import encode_tree
+from marey_schemas.items import ItemChange
+
+PROJECT = {
+    "id": "project_1", "name": "lab", "visibility": "private", "created_at": "2026-01-01T00:00:00Z",
+    "updated_at": "2026-01-01T00:00:00Z", "rev": 1,
+}  # fmt: skip
+ITEM = {
+    "id": "clip_1", "kind": "clip", "name": "walk", "collection": "raw", "revision": 1, "rev": 4,
+    "created_at": "2026-01-01T00:00:00Z", "updated_at": "2026-01-01T00:00:00Z",
+}  # fmt: skip
+LOST = httpx.ReadError("connection reset")
+NEVER_CONNECTED = httpx.ConnectError("refused")
+
+
+def ok(document, status=200):
+    return httpx.Response(status, json=document)
+
+
+def test_a_read_is_sent_again_when_the_connection_is_lost(script):
+    script.answers = [LOST, NEVER_CONNECTED, ok(PROJECT)]
+    assert script.marey().project("lab").read().name == "lab"
+    assert len(script.waited) == 2
+
+
+def test_a_post_is_sent_again_under_the_same_idempotency_key(script):
+    script.answers = [LOST, ok(PROJECT, 201), ok(PROJECT)]
+    script.marey().create_project(ProjectCreate(name="lab"))
+    keys = {request.headers["Idempotency-Key"] for request in script.requests}
+    assert len(script.requests) == 2
+    assert len(keys) == 1
+
+
+def test_two_posts_have_two_keys(script):
+    script.answers = [ok(PROJECT, 201), ok(PROJECT, 201)]
+    marey = script.marey()
+    for _ in range(2):
+        marey.create_project(ProjectCreate(name="lab"))
+    assert len({request.headers["Idempotency-Key"] for request in script.requests}) == 2
+
+
+def test_a_change_whose_answer_was_lost_is_not_sent_twice(script):
+    script.answers = [ok(ITEM), LOST]
+    clip = script.marey().project("lab").clips.get("clip_1")
+    with pytest.raises(errors.Unreachable):
+        clip.change(ItemChange(name="run"))
+    assert len(script.requests) == 2
+
+
+def test_a_change_that_never_arrived_is_sent_again(script):
+    script.answers = [ok(ITEM), NEVER_CONNECTED, ok({**ITEM, "name": "run", "rev": 5})]
+    clip = script.marey().project("lab").clips.get("clip_1")
+    assert clip.change(ItemChange(name="run")).name == "run"
+    assert script.requests[-1].headers["If-Match"] == '"4.json"'
+
+
+def test_a_token_is_not_made_twice(script):
+    script.answers = [LOST]
+    with pytest.raises(errors.Unreachable):
+        script.marey().tokens.create(TokenCreate(name="ci"))
+
+
+def test_a_busy_server_is_waited_for_as_long_as_it_asks(script, make_problem):
+    script.answers = [
+        make_problem(503, "unavailable", retry_after=7),
+        make_problem(429, "too-many-requests"),
+        ok(PROJECT),
+    ]
+    script.marey().project("lab").read()
+    assert script.waited[0] >= 7
+    assert script.waited[1] < 7
+
+
+def test_trying_again_ends(script):
+    script.answers = [ok(PROJECT), *[LOST] * 10]
+    project = script.marey(retries=Retries(tries=5, sleep=script.waited.append)).project("lab")
+    project.read()
+    with pytest.raises(errors.Unreachable, match=r"http://server\.test does not answer"):
+        project.read()
+    assert len(script.requests) == 1 + 5
+
+
+def test_a_server_that_was_never_there_is_given_up_sooner(script):
+    script.answers = [NEVER_CONNECTED] * 10
+    with pytest.raises(errors.Unreachable):
+        script.marey().project("lab").read()
+    assert len(script.requests) == 3
+
+
+@pytest.mark.parametrize(
+    ("status", "code", "expected"),
+    [
+        (401, "unauthenticated", errors.Unauthenticated),
+        (403, "forbidden", errors.Forbidden),
+        (404, "not-found", errors.NotFound),
+        (409, "conflict", errors.Conflict),
+        (409, "lease-lost", errors.LeaseLost),
+        (412, "precondition-failed", errors.PreconditionFailed),
+        (422, "invalid", errors.Invalid),
+        (418, "teapot", errors.RequestFailed),
+        (500, "internal", errors.ServerFailed),
+        (507, "storage-full", errors.StorageFull),
+    ],
+)
+def test_problems_become_errors_by_code_and_status(script, make_problem, status, code, expected):
+    field = {"pointer": "/name", "code": "taken", "detail": "is taken"}
+    script.answers = [make_problem(status, code, errors=[field], context={"revision": 3})]
+    with pytest.raises(expected) as caught:
+        script.marey().project("lab").read()
+    assert type(caught.value) is expected
+    assert (caught.value.code, caught.value.request_id) == (code, "req-1")
+    assert caught.value.errors[0].pointer == "/name"
+    assert caught.value.context == {"revision": 3}
+
+
+def test_an_error_of_something_in_between_is_told_too(script):
+    script.answers = [httpx.Response(413, text="<html>too large</html>")]
+    with pytest.raises(errors.TooLarge, match="413"):
+        script.marey().project("lab").read()
+
+
+def test_an_answer_of_something_else_is_no_traceback(script):
+    script.answers = [httpx.Response(200, text="<html>hello</html>")]
+    with pytest.raises(errors.UnexpectedAnswer, match="not a Project"):
+        script.marey().project("lab").read()
+
+
+def test_fields_that_a_newer_server_adds_are_ignored(script):
+    script.answers = [ok({**PROJECT, "colour": "green"})]
+    assert script.marey().project("lab").read().name == "lab"
+
+
+def test_lists_are_read_page_by_page(script):
+    script.answers = [ok({"items": [ITEM], "next_cursor": "c1"}), ok({"items": [{**ITEM, "id": "clip_2"}]})]
+    clips = script.marey().project("lab").clips.list(collection="raw", filters={"frames.gte": 10, "tag.in": None})
+    assert [clip.id for clip in clips] == ["clip_1", "clip_2"]
+    assert script.requests[1].url.params["cursor"] == "c1"
+    assert script.requests[1].url.params["frames.gte"] == "10"
+    assert "tag.in" not in script.requests[1].url.params
+
+
+def test_poses_come_as_arrays_in_blocks(script):
+    poses = np.arange(22, dtype="<f4").reshape(2, 11)
+    motion = {
+        "schema": "marey/motion@1", "skeleton": {"item": "skeleton_1", "revision": 1}, "frame_rate_hz": 30.0,
+        "joints": ["Hips", "Spine"], "poses": poses, "added later": 1,
+    }  # fmt: skip
+    body = encode_tree(motion, "application/msgpack", arrays="blocks")
+    answer = httpx.Response(200, content=body, headers={"Content-Type": "application/msgpack; arrays=blocks"})
+    script.answers = [ok(ITEM), answer]
+    read = script.marey().project("lab").clips.get("clip_1").motion(frames=slice(4, 6), joints=["Hips", "Spine"])
+    assert np.array_equal(read.root_translations, poses[:, :3])
+    assert np.array_equal(read.rotations, poses[:, 3:].reshape(2, 2, 4))
+    assert dict(script.requests[-1].url.params) == {"frames": "4:6", "joints": "Hips,Spine"}
+    assert "arrays=blocks" in script.requests[-1].headers["Accept"]
+
+
+@pytest.mark.parametrize("frames", [slice(0, 10, 2), slice(-5, None)])
+def test_frames_that_a_query_cannot_say_are_refused(script, frames):
+    script.answers = [ok(ITEM)]
+    with pytest.raises(ValueError, match=r"frames|negative"):
+        script.marey().project("lab").clips.get("clip_1").motion(frames=frames)
+
+
+def test_the_token_is_sent_and_shown_nowhere(script, caplog):
+    caplog.set_level(logging.DEBUG)
+    script.answers = [NEVER_CONNECTED, ok(PROJECT)]
+    marey = script.marey()
+    project = marey.project("lab")
+    project.read()
+    assert script.requests[0].headers["Authorization"] == "Bearer marey_secret"
+    shown = [repr(marey), repr(project), repr(vars(marey.transport)), repr(script.requests[0].headers), caplog.text]
+    assert not any("marey_secret" in text for text in shown)
+    assert "secret" not in str(script.requests[0].url)
+
+
+def test_a_password_is_sent_though_it_hides_itself(script):
+    token = {"id": "token_1", "name": "x", "prefix": "p", "scopes": ["read"], "created_at": "2026-01-01T00:00:00Z"}
+    script.answers = [ok({**token, "expires_at": None, "secret": "s"})]
+    login = Login(name="ada", password="correct horse")
+    assert isinstance(script.marey().sign_in(login), NewToken)
+    assert b"correct horse" in script.requests[0].content
+    assert "correct horse" not in repr(login)
