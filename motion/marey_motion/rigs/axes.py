@@ -33,6 +33,8 @@ FRAMES_READ = 300
 HINGE_BEND = 0.1
 # A tip nearer or farther than these shares of the bone before it is a marker of something else.
 TIP_LENGTHS = (0.05, 1.5)
+# Cosine above which two bones lie along one line.
+ALONG = 0.95
 
 _TOWARDS: dict[str, tuple[str, ...]] = {
     "pelvis": ("spine_2", "neck", "spine_1", "spine", "head"),
@@ -189,11 +191,23 @@ class _Body:
                 parts.add(f"{side} arm")
         return frozenset(parts)
 
+    def foot(self, side: str) -> Vectors | None:
+        """Directions (K, 3) from ankle to toe; to the tip of the toe where its joint lies straight below the ankle."""
+        shank, foot = self.way(f"{side}_knee", f"{side}_ankle"), self.way(f"{side}_ankle", f"{side}_toe")
+        if foot is None or shank is None or float(np.mean(np.sum(foot * shank, axis=-1))) < ALONG:
+            return foot
+        toe = self.joints[f"{side}_toe"]
+        tip = _tip(self.skeleton, toe)
+        if tip is None:
+            return foot
+        end = self.positions[:, toe] + quaternions.rotate_vectors(self.rotations[:, toe], tip)
+        return _unit(end - self.positions[:, self.joints[f"{side}_ankle"]])
+
     def _leg_stands(self, side: str, up: Vectors) -> bool:
         thigh, shank = self.way(f"{side}_hip", f"{side}_knee"), self.way(f"{side}_knee", f"{side}_ankle")
-        foot = self.way(f"{side}_ankle", f"{side}_toe")
+        foot = self.foot(side)
         straight = all(bone is None or bone[0] @ up < -0.7 for bone in (thigh, shank))
-        return straight and (foot is None or shank is None or abs(float(foot[0] @ shank[0])) < 0.95)
+        return straight and (foot is None or shank is None or abs(float(foot[0] @ shank[0])) < ALONG)
 
     def _arm_hangs_or_reaches_out(self, side: str, up: Vectors, outwards: Vectors) -> bool:
         bones = (self.way(f"{side}_shoulder", f"{side}_elbow"), self.way(f"{side}_elbow", f"{side}_wrist"))
@@ -212,13 +226,13 @@ def _twist(standard: str, body: _Body) -> Vectors:
     side, _, joint = standard.partition("_")
     prefix, joint = (f"{side}_", joint) if side in SIDES else ("", standard)
     for target in _TOWARDS.get(joint, ()):
-        way = body.way(standard, prefix + target)
+        way = body.foot(side) if joint == "ankle" else body.way(standard, prefix + target)
         if way is not None and np.any(way):
             return _unit(body.in_joint(standard, way))
     if prefix:
         tip = _tip(body.skeleton, body.joints[standard])
         if tip is not None:
-            return tip
+            return _unit(tip)
         before = f"{prefix}{_BEFORE.get(joint, 'elbow')}"
         way = body.way(before, standard)
         if way is not None and np.any(way):
@@ -227,13 +241,14 @@ def _twist(standard: str, body: _Body) -> Vectors:
 
 
 def _tip(skeleton: Skeleton, joint: int) -> Vectors | None:
-    """Unit direction (3,) to the farthest child or end site that can be the end of the joint's bone."""
+    """Offset (3,) of the farthest child or end site that can be the end of the joint's bone."""
     ends = [skeleton.offsets[child] for child in skeleton.children[joint]]
     ends += [site.offset for site in skeleton.end_sites if site.joint == joint]
-    bone = float(np.linalg.norm(skeleton.offsets[joint]))
-    shortest, longest = (share * bone for share in TIP_LENGTHS)
+    # The joint's own offset is short where it lies just below an ankle.
+    own, above = (float(np.linalg.norm(skeleton.offsets[index])) for index in (joint, skeleton.parents[joint]))
+    shortest, longest = (share * max(own, 0.5 * above) for share in TIP_LENGTHS)
     ends = [end for end in ends if shortest < np.linalg.norm(end) < longest]
-    return _unit(max(ends, key=lambda end: float(np.linalg.norm(end)))) if ends else None
+    return max(ends, key=lambda end: float(np.linalg.norm(end))) if ends else None
 
 
 def _swing(standard: str, body: _Body) -> Vectors:
@@ -246,7 +261,7 @@ def _swing(standard: str, body: _Body) -> Vectors:
     if joint in ("hip", "knee"):
         return _leg_hinge(side, body)
     if joint in ("ankle", "toe", "heel"):
-        shank, foot = body.way(f"{side}_knee", f"{side}_ankle"), body.way(f"{side}_ankle", f"{side}_toe")
+        shank, foot = body.way(f"{side}_knee", f"{side}_ankle"), body.foot(side)
         return body.hips_left if shank is None or foot is None else np.cross(foot, shank)
     if joint == "clavicle":
         return body.up if side == "left" else -body.up

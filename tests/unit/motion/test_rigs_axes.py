@@ -9,7 +9,7 @@ from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, MappingError
 from marey_motion.rigs import JointMapping, guess_axes, map_joints, rest_pose_doubts
-from marey_motion.skeleton import Skeleton
+from marey_motion.skeleton import EndSite, Skeleton
 
 X, Y, Z = np.eye(3)
 PARTS = ("trunk", "left arm", "left leg", "right arm", "right leg")
@@ -188,6 +188,23 @@ def test_a_tip_that_an_exporter_misplaced_is_not_the_end_of_a_hand(body):
     odd = replace(body, end_sites=sites)
 
     np.testing.assert_allclose(guess_axes(odd, map_joints(odd))["LeftHand"].twist, X, atol=1e-12)
+
+
+def test_a_toe_joint_straight_below_the_ankle_leaves_the_foot_pointing_forward(body):
+    offsets = body.offsets.copy()
+    sites = []
+    for side in ("Left", "Right"):
+        offsets[body.index_of(f"{side}ToeBase")] = [0.0, -0.04, 0.0]
+        sites.append(EndSite(body.index_of(f"{side}ToeBase"), np.array([0.0, 0.0, 0.2])))
+    odd = replace(body, offsets=offsets, end_sites=tuple(sites))
+    axes = guess_axes(odd, map_joints(odd))
+
+    assert rest_pose_doubts(odd, map_joints(odd)) == ()
+    for joint in ("LeftFoot", "RightFoot"):
+        assert axes[joint].twist[2] > 0.97
+    for joint in ("LeftFoot", "RightFoot", "LeftToeBase"):
+        np.testing.assert_allclose(axes[joint].swing, X, atol=1e-12)
+    np.testing.assert_allclose(axes["LeftToeBase"].twist, Z, atol=1e-12)
 
 
 def test_axes_need_two_sides(body):
