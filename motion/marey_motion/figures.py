@@ -62,7 +62,7 @@ def contact_sheet(takes: Sequence[TakePair], *, heading: str = "Retargeting", mo
     ----------
     takes : what to draw, at most `MAX_TAKES`
     heading : title of the page
-    moments : how many evenly spaced moments of each take to show, at most `MAX_MOMENTS`
+    moments : how many evenly spaced moments of each take to show, at most `MAX_MOMENTS` and one per frame
 
     Raises
     ------
@@ -84,7 +84,7 @@ def contact_sheet(takes: Sequence[TakePair], *, heading: str = "Retargeting", mo
     axes.axis("off")
     _draw_header(axes, height, heading, len(rows))
     for number, row in enumerate(rows):
-        _draw_row(axes, row, height - HEADER - number * ROW)
+        _draw_row(axes, row, height - HEADER - number * ROW, (PAGE_WIDTH - 2 * MARGIN) / moments)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI)
     return buffer.getvalue()
@@ -111,7 +111,7 @@ class _Row:
 def _staged(take: TakePair, moments: int) -> _Row:
     clips = (take.source, take.result)
     last_s = min((clip.frame_count - 1) / clip.frame_rate_hz for clip in clips)
-    times = np.linspace(0.0, last_s, moments)
+    times = np.linspace(0.0, last_s, min(moments, *(clip.frame_count for clip in clips)))
     actors = []
     for clip in clips:
         body = body_of(clip.skeleton)
@@ -159,15 +159,15 @@ def _draw_header(axes: Axes, top: float, heading: str, count: int) -> None:
     _write(axes, (right - 0.65, middle), "facing", 10.5, QUIET, va="center")
 
 
-def _draw_row(axes: Axes, row: _Row, top: float) -> None:
-    """Title, then one cell per moment with both figures over their floor."""
+def _draw_row(axes: Axes, row: _Row, top: float, cell: float) -> None:
+    """Title, then one cell per moment with both figures over their floor; places in inches."""
     _draw_titles(axes, row, top)
     low, high = row.extent_m
     scale = 0.80 * STAGE / max(high - low, 1e-6)
     bottom = top - TITLE - STAGE
-    width = 0.5 * (PAGE_WIDTH - 2 * MARGIN) / len(row.times_s)
+    width = 0.5 * cell
     for moment, time_s in enumerate(row.times_s):
-        left = MARGIN + 2 * moment * width
+        left = MARGIN + moment * cell
         _write(axes, (left + width, bottom - 0.21), f"{time_s:.2f} s", 9.5, QUIET, ha="center")
         for side, ground in enumerate(("white", TINT)):
             start = left + side * width

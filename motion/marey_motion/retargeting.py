@@ -33,6 +33,7 @@ Floats = NDArray[np.floating[Any]]
 FEWEST_ESSENTIAL = 8  # of the essential joints: a pelvis, and more than the legs or the arms alone
 SAME_SKELETON_M = 1e-5  # by which offsets may differ that went through a file
 SAME_DIRECTION = 0.94  # cosine of about 20 degrees: bones of one rig on two people differ by less
+STANDING = 0.7  # cosine between legs and trunk from which a rest pose is taken for one that stands
 FOOT_DROP = 0.45  # of the ankle-to-toe length: the height of the ankle above the toe of a foot that stands
 
 
@@ -226,21 +227,31 @@ def _hip_height_ratio(
     target: Skeleton,
     target_axes: Mapping[str, JointAxes],
 ) -> float:
-    heights = []
+    """Target by source height of the pelvis above the toes of bodies that stand straight.
+
+    Added up along the bones, because the rest pose of many files is not one that stands. What only one of the skeletons
+    can tell is left out of both.
+    """
+    parts = []
     for skeleton, axes, which in ((source, source_axes, "source"), (target, target_axes, "target")):
         joints = {pair.standard: skeleton.index_of(getattr(pair, which)) for pair in pairs}
-        heights.append(_hip_height(skeleton, joints, axes))
+        up = np.array(axes[skeleton.joint_names[joints["pelvis"]]].twist)
+        parts.append(np.mean([_heights(skeleton, joints, up, side) for side in SIDES], axis=0))
+    known = np.isfinite(parts[0]) & np.isfinite(parts[1])
+    heights = [float(np.sum(part[known])) for part in parts]
+    if min(heights) <= 0.0:
+        raise MappingError("legs without length have no hip height; give the scale yourself", where="left_hip")
     return heights[1] / heights[0]
 
 
-def _hip_height(skeleton: Skeleton, joints: Mapping[str, int], axes: Mapping[str, JointAxes]) -> float:
-    """Height of the pelvis above the toes of a body that stands straight, metres.
+def _heights(
+    skeleton: Skeleton, joints: Mapping[str, int], up: NDArray[np.float64], side: str
+) -> tuple[float, float, float]:
+    """Heights in metres of the pelvis above the hip, the leg and the foot; NaN where they cannot be told.
 
-    Added up along the bones, because the rest pose of many files is not one that stands.
+    `up` is the direction of the trunk in the pelvis' frame.
     """
-    missing = [
-        f"{side}_{joint}" for side in SIDES for joint in ("hip", "knee", "ankle") if f"{side}_{joint}" not in joints
-    ]
+    missing = [f"{side}_{joint}" for joint in ("hip", "knee", "ankle") if f"{side}_{joint}" not in joints]
     if missing:
         raise MappingError(
             f"the hip height needs both legs, but {', '.join(missing)} is not mapped on both sides; "
@@ -248,17 +259,15 @@ def _hip_height(skeleton: Skeleton, joints: Mapping[str, int], axes: Mapping[str
             where=missing[0],
         )
     positions, pelvis = skeleton.rest_global_positions, joints["pelvis"]
-    up = quaternions.rotate_vectors(
-        skeleton.rest_global_rotations[pelvis], np.array(axes[skeleton.joint_names[pelvis]].twist)
-    )
-    height = 0.0
-    for side in SIDES:
-        hip, knee, ankle = (positions[joints[f"{side}_{joint}"]] for joint in ("hip", "knee", "ankle"))
-        height += 0.5 * float((positions[pelvis] - hip) @ up / np.linalg.norm(up))
-        height += 0.5 * float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
-        if {"left_toe", "right_toe"} <= joints.keys():
-            height += 0.5 * FOOT_DROP * float(np.linalg.norm(positions[joints[f"{side}_toe"]] - ankle))
-    return height
+    hip, knee, ankle = (positions[joints[f"{side}_{joint}"]] for joint in ("hip", "knee", "ankle"))
+    leg = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
+    trunk = quaternions.rotate_vectors(skeleton.rest_global_rotations[pelvis], up / np.linalg.norm(up))
+    # Joints between pelvis and hip may be bent in any way at rest, unless that pose stands.
+    told = skeleton.parents[joints[f"{side}_hip"]] == pelvis or float((hip - ankle) @ trunk) > STANDING * leg
+    drop = float((positions[pelvis] - hip) @ trunk) if told else np.nan
+    toe = joints.get(f"{side}_toe")
+    foot = np.nan if toe is None else FOOT_DROP * float(np.linalg.norm(positions[toe] - ankle))
+    return drop, leg, foot
 
 
 def _are_same_rig(source: Skeleton, target: Skeleton) -> bool:

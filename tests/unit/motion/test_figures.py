@@ -108,6 +108,13 @@ def test_clips_of_one_frame_of_one_joint_and_of_no_extent_are_drawn():
         assert contact_sheet([TakePair("tiny", clip, clip)]).startswith(b"\x89PNG")
 
 
+def test_a_clip_of_two_frames_is_shown_at_two_moments(walk):
+    pixels = pixels_of(contact_sheet([TakePair("short", walk.sliced(0, 2), walk.sliced(0, 2))], moments=4))
+
+    assert share_of(cell(pixels, 0, 3, 8), BLUE) > 0.003
+    assert share_of(cell(pixels, 0, 4, 8), BLUE) == 0.0
+
+
 def test_figures_below_the_floor_stay_on_their_ground(walk):
     poses = walk.poses.copy()
     poses[:, 1] -= 1.5

@@ -338,6 +338,13 @@ def test_bodies_without_legs_need_an_explicit_scale(studio, game):
     assert plan_between(crippled, game, scale=1.5).scale == 1.5
 
 
+def test_legs_without_length_need_an_explicit_scale(studio, game):
+    flat = Actor(resting(replace(studio.skeleton, offsets=np.zeros_like(studio.skeleton.offsets))))
+
+    with pytest.raises(MappingError, match="give the scale"):
+        plan_between(flat, game)
+
+
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_scale_must_be_positive(studio, game, scale):
     with pytest.raises(MappingError, match="positive"):
@@ -384,6 +391,30 @@ def test_real_motion_points_all_bones_alike_on_another_rig(real, from_folder, to
     assert np.isfinite(result.poses).all()
     assert_bones_point_alike(source, target, result, plan)
     assert_no_flips_of_its_own(source, result, plan)
+
+
+@pytest.mark.parametrize(("from_folder", "to_folder"), list(permutations(FOLDERS, 2)))
+def test_real_feet_keep_their_height_over_the_floor(real, from_folder, to_folder):
+    source, target = real[from_folder], real[to_folder]
+    plan = plan_between(source, target)
+    result = retarget(source.clip, plan)
+
+    lowest = [
+        kinematics.global_positions(clip)[:, [actor.joint(f"{side}_toe") for side in SIDES], 1].min()
+        for actor, clip in ((source, source.clip), (target, result))
+    ]
+    assert lowest[1] == pytest.approx(plan.scale * lowest[0], abs=0.03)
+
+
+def test_the_hip_height_of_a_rig_that_lies_folded_at_rest_is_that_of_its_legs(mocap, studio):
+    path = mocap / "rigs/game-engine/vis_example.bvh"  # its thighs are drawn above the pelvis at rest
+    folded = Actor(read_motion(path.read_bytes(), path.name).clip)
+    legs = [
+        sum(np.linalg.norm(actor.skeleton.offsets[actor.joint(f"left_{joint}")]) for joint in ("knee", "ankle"))
+        for actor in (folded, studio)
+    ]
+
+    assert plan_between(folded, studio).scale == pytest.approx(legs[1] / legs[0], rel=0.03)
 
 
 @pytest.mark.parametrize(("from_folder", "to_folder"), list(permutations(FOLDERS, 2)))
