@@ -62,21 +62,20 @@ def forward_kinematics(
     joints = skeleton.joint_count
     if poses.ndim != 2 or poses.shape[1] != 3 + 4 * joints:
         raise MotionError(f"shape {poses.shape} where (frames, {3 + 4 * joints}) is needed", where="poses")
-    parents, offsets = skeleton.parents, skeleton.offsets
-    if end_sites and skeleton.end_sites:
-        parents = np.append(parents, np.array([site.joint for site in skeleton.end_sites], dtype=np.int32))
-        offsets = np.concatenate((offsets, [site.offset for site in skeleton.end_sites]))
+    sites = skeleton.end_sites if end_sites else ()
+    parents = np.array([*skeleton.parents, *(site.joint for site in sites)], dtype=np.int32)
+    offsets = np.array([*skeleton.offsets, *(site.offset for site in sites)], dtype=poses.dtype)
     points = len(parents)
     slots = np.full(points, -1, dtype=np.int32)
     slots[list(translated_joints)] = np.arange(len(translated_joints), dtype=np.int32)
     if translations is None:
         translations = np.empty((0, 0, 3), dtype=poses.dtype)
     turned = np.zeros(joints, dtype=np.bool_)
-    turned[parents[1:]] = True
+    turned[parents[1:]] = True  # a leaf's own rotation moves nothing
     out = np.empty((len(poses), 3 * points), dtype=poses.dtype)
     kinematics_kernels.positions(
         _as_kernel_input(poses),
-        _as_kernel_input(offsets.astype(poses.dtype)),
+        _as_kernel_input(offsets),
         _as_kernel_input(parents),
         _as_kernel_input(translations),
         slots,
