@@ -97,10 +97,6 @@ def plan_retarget(
     """
     pairs = _paired(source, source_mapping, target, target_mapping)
     _check_enough(pairs, source_mapping, target_mapping)
-    if scale is None:
-        scale = _hip_height_ratio(pairs, source, source_axes, target, target_axes)
-    elif not (np.isfinite(scale) and scale > 0):
-        raise MappingError(f"a scale of {scale} must be a positive number", code="scale_invalid", where="scale")
     sources = np.full(target.joint_count, -1, dtype=np.int32)
     corrections = quaternions.identity(target.joint_count).astype(np.float64)
     for pair in pairs:
@@ -108,11 +104,14 @@ def plan_retarget(
         sources[joint] = source.index_of(pair.source)
         axes = _axes_of(source_axes, pair.source, "source"), _axes_of(target_axes, pair.target, "target")
         corrections[joint] = quaternions.from_matrix(axes[0] @ axes[1].T)
+    if scale is None:
+        scale = _hip_height_ratio(pairs, source, source_axes, target, target_axes)
+    if not (np.isfinite(scale) and scale > 0):
+        raise MappingError(f"a scale of {scale} must be a positive number", code="scale_invalid", where="scale")
     followed = {pair.target for pair in pairs}
     others = tuple(name for name in target.joint_names if name not in followed)
     same_rig = _are_same_rig(source, target)
-    both = source_mapping.joints.keys() & target_mapping.joints.keys()
-    either = source_mapping.joints.keys() | target_mapping.joints.keys()
+    unshared = source_mapping.joints.keys() ^ target_mapping.joints.keys()
     return RetargetPlan(
         source,
         target,
@@ -120,7 +119,7 @@ def plan_retarget(
         pairs,
         carried=others if same_rig else (),
         at_rest=() if same_rig else others,
-        missing=tuple(name for name in STANDARD_JOINTS if name in either - both),
+        missing=tuple(name for name in STANDARD_JOINTS if name in unshared),
         sources=sources,
         corrections=corrections,
     )

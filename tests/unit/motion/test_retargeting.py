@@ -339,10 +339,15 @@ def test_bodies_without_legs_need_an_explicit_scale(studio, game):
 
 
 def test_legs_without_length_need_an_explicit_scale(studio, game):
-    flat = Actor(resting(replace(studio.skeleton, offsets=np.zeros_like(studio.skeleton.offsets))))
+    offsets = studio.skeleton.offsets.copy()
+    for side in SIDES:
+        offsets[[studio.joint(f"{side}_{joint}") for joint in ("hip", "knee", "ankle", "toe")]] = 0.0
+    legless = SimpleNamespace(
+        skeleton=replace(studio.skeleton, offsets=offsets), mapping=studio.mapping, axes=studio.axes
+    )
 
     with pytest.raises(MappingError, match="give the scale"):
-        plan_between(flat, game)
+        plan_between(legless, game)
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
