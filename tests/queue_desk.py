@@ -7,8 +7,8 @@ from types import MappingProxyType
 from typing import Any
 
 import pytest
-from database_fixtures import AdjustableClock
 
+from database_fixtures import AdjustableClock
 from marey_schemas import job_kinds
 from marey_schemas.access import ProjectCreate, UserCreate
 from marey_schemas.base import Request
@@ -169,9 +169,7 @@ class Desk:
     def complete(self, lease: Lease, *, write_id: str | None = None, **fields: Any) -> CompleteAnswer:
         """Complete the attempt."""
         request = CompleteRequest(write_id=write_id or self.write_id(), **fields)
-        return self.database.write(
-            self._attempt_of(lease), completion.complete, lease.job, lease.fence, request
-        )
+        return self.database.write(self._attempt_of(lease), completion.complete, lease.job, lease.fence, request)
 
     def fail(self, lease: Lease, code: str = "broken", *, write_id: str | None = None, **fields: Any) -> FailAnswer:
         """End the attempt without success."""
@@ -210,12 +208,12 @@ def document(**facts: Any) -> dict[str, Any]:
     return {"schema": "marey/document@1", **facts}
 
 
-def output(name: str, *, collection: str = "", facts: Mapping[str, Any] = MappingProxyType({}), **fields: Any) -> StagedOutput:
+def output(
+    name: str, *, collection: str = "", facts: Mapping[str, Any] = MappingProxyType({}), **fields: Any
+) -> StagedOutput:
     """A staged result that is a small document."""
     parts = {"motion": document(name=name, **facts)}
-    return StagedOutput(
-        name=name, kind=Kind.PROCESSED, item_name=name, collection=collection, parts=parts, **fields
-    )
+    return StagedOutput(name=name, kind=Kind.PROCESSED, item_name=name, collection=collection, parts=parts, **fields)
 
 
 @pytest.fixture

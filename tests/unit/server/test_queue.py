@@ -1,12 +1,12 @@
 """How jobs get a worker, keep it, and end."""
 
 import pytest
-from queue_desk import Desk, desk, test_kinds  # noqa: F401
 
-from marey_schemas.jobs import BatchCompletion, JobCreate, Progress
+from marey_schemas.jobs import BatchCompletion, ClaimRequest, CompleteRequest, JobCreate, Progress
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import Forbidden, Invalid, LeaseLost, NotFound
 from marey_server.store import completion, queue
+from queue_desk import Desk
 
 
 def test_a_job_is_claimed_once_and_completed(desk: Desk) -> None:
@@ -295,8 +295,6 @@ def test_an_attempts_token_works_for_its_own_attempt_only(desk: Desk) -> None:
     mine, other = desk.claim_many()
     me = desk.attempt(mine)
     assert (me.kind, me.job_id, me.fence) == ("attempt", mine.job, mine.fence)
-    from marey_schemas.jobs import CompleteRequest
-
     with pytest.raises(NotFound):
         desk.database.write(me, completion.complete, other.job, other.fence, CompleteRequest(write_id="12345678"))
 
@@ -304,8 +302,6 @@ def test_an_attempts_token_works_for_its_own_attempt_only(desk: Desk) -> None:
 def test_only_a_token_with_the_scope_work_may_claim(desk: Desk) -> None:
     desk.submit()
     idle = Principal("user", desk.user.user_id, "ann", scopes=("read", "jobs"))
-    from marey_schemas.jobs import ClaimRequest
-
     with pytest.raises(Forbidden):
         desk.database.write(idle, queue.claim, ClaimRequest(worker="w", kinds=("errand",)))
     elsewhere = Principal("user", desk.user.user_id, "ann", scopes=("work!project=other",))

@@ -1,0 +1,430 @@
+"""Jobs that belong together: dependencies, fan-out, shared results, tries of the same."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from sqlalchemy import select, update
+
+from marey_schemas import job_kinds
+from marey_schemas.access import MemberChange, Role, UserCreate
+from marey_schemas.jobs import JobCreate
+from marey_schemas.kinds import Kind
+from marey_server.access.principal import SYSTEM, Principal
+from marey_server.errors import Conflict, Forbidden, Invalid, NotFound
+from marey_server.store import jobs, members, users
+from marey_server.store.database import Transaction
+from marey_server.store.items.drafts import Draft
+from marey_server.store.reaper import share_waiting
+from marey_server.store.tables import staged_output
+from queue_desk import SUM, Desk, document
+
+
+def fail_for_good(desk: Desk, job: str | None = None) -> None:
+    desk.fail(desk.claim(job=job), retryable=False, detail="no")
+
+
+# -- dependencies ------------------------------------------------------------------------------------------------------
+
+
+def test_a_job_waits_for_those_it_comes_after(desk: Desk) -> None:
+    first, second = desk.submit(), desk.submit()
+    third = desk.submit(after=[first, second])
+    assert desk.state(third) == "waiting"
+    one, two = desk.claim_many()
+    desk.complete(one)
+    assert desk.state(third) == "waiting"
+    desk.complete(two)
+    assert desk.state(third) == "queued"
+    assert desk.claim().job == third
+
+
+def test_a_job_after_one_that_has_succeeded_need_not_wait(desk: Desk) -> None:
+    first = desk.submit()
+    desk.complete(desk.claim())
+    assert desk.state(desk.submit(after=[first, first])) == "queued"
+
+
+def test_what_depends_on_a_failed_job_fails_down_the_chain(desk: Desk) -> None:
+    first = desk.submit()
+    second = desk.submit(after=[first])
+    third = desk.submit(after=[second])
+    skipped = desk.submit(after=[first], on_failure="skip")
+    fail_for_good(desk)
+    for job in (second, third):
+        failure = desk.job(job).failure
+        assert failure is not None
+        assert failure.reason == "dependency_failed"
+    assert desk.state(skipped) == "cancelled"
+    late = desk.submit(after=[first])
+    assert desk.state(late) == "failed"
+
+
+def test_what_depends_on_a_cancelled_job_fails(desk: Desk) -> None:
+    first = desk.submit()
+    second = desk.submit(after=[first])
+    desk.cancel(first)
+    assert desk.state(second) == "failed"
+
+
+def test_a_job_can_only_come_after_jobs_of_its_project(desk: Desk) -> None:
+    with pytest.raises(Invalid) as refused:
+        desk.submit(after=["job_nowhere"])
+    assert refused.value.errors[0].pointer == "/after/0"
+
+
+# -- inputs ------------------------------------------------------------------------------------------------------------
+
+
+def test_inputs_are_pinned_to_the_revisions_of_the_moment(desk: Desk) -> None:
+    (thing,) = desk.things(1)
+    job = desk.submit("square", inputs={"things": {"item": thing}})
+    desk.publish(Draft("again", Kind.PROCESSED, "thing0", {"motion": document(number=77)}, "raw"))
+    newer = desk.submit("square", inputs={"things": {"item": thing}})
+    older = desk.submit("square", inputs={"things": [{"item": thing, "revision": 1}]}, seed=5)
+    revisions = {lease.job: lease.inputs["things"][0].revision for lease in desk.claim_many()}
+    assert revisions == {job: 1, newer: 2, older: 1}
+
+
+def test_a_collection_stands_for_all_items_of_the_kind_in_it_and_below(desk: Desk) -> None:
+    desk.things(2, "raw")
+    desk.things(1, "raw/deep")
+    desk.things(1, "rawer")
+    desk.things(1, "RAW")
+    desk.submit("square", inputs={"things": {"collection": "raw"}})
+    leases = desk.claim_many()
+    places = sorted((pin.collection, pin.name) for lease in leases for pin in lease.inputs["things"])
+    assert places == [("raw", "thing0"), ("raw", "thing1"), ("raw/deep", "thing0")]
+
+
+@pytest.mark.parametrize(
+    ("inputs", "pointer", "code"),
+    [
+        ({}, "/inputs", "missing-input"),
+        ({"things": {"item": "processed_none"}}, "/inputs/things/item", "unknown-item"),
+        ({"things": [{"collection": "empty"}]}, "/inputs/things/0/collection", "empty-collection"),
+        ({"things": {"collection": "raw"}, "others": {"collection": "raw"}}, "/inputs/others", "unknown-input"),
+        ({"things": {"collection": "raw"}, "ruler": {"collection": "raw"}}, "/inputs/ruler", "one-item"),
+    ],
+)
+def test_inputs_that_make_no_sense_are_refused_with_their_place(
+    desk: Desk, inputs: dict[str, Any], pointer: str, code: str
+) -> None:
+    desk.things(3)
+    with pytest.raises(Invalid) as refused:
+        desk.submit("square", inputs=inputs)
+    assert [(error.pointer, error.code) for error in refused.value.errors] == [(pointer, code)]
+
+
+def test_a_revision_that_does_not_exist_is_refused(desk: Desk) -> None:
+    (thing,) = desk.things(1)
+    with pytest.raises(Invalid) as refused:
+        desk.submit("square", inputs={"things": [{"item": thing, "revision": 2}]})
+    assert refused.value.errors[0].pointer == "/inputs/things/0/revision"
+
+
+def test_one_bad_job_of_a_batch_lets_none_in(desk: Desk) -> None:
+    with pytest.raises(Invalid) as refused:
+        desk.submit_many(JobCreate(kind="errand"), JobCreate(kind="errand", params={"numbre": 3}))
+    assert refused.value.errors[0].pointer == "/jobs/1/params/numbre"
+    assert desk.database.read(desk.user, jobs.list_jobs, "lab").items == ()
+    with pytest.raises(Invalid) as refused:
+        desk.submit("unheard-of")
+    assert refused.value.errors[0].pointer == "/kind"
+
+
+def test_parameters_that_name_bytes_nobody_sent_are_refused(desk: Desk) -> None:
+    with pytest.raises(Conflict) as refused:
+        desk.submit("import", params={"files": [{"name": "walk.bvh", "blob": f"sha256:{'0' * 64}"}]})
+    assert refused.value.error_code == "missing-blobs"
+
+
+# -- fan-out -----------------------------------------------------------------------------------------------------------
+
+
+def test_many_inputs_are_spread_over_tasks_and_gathered_into_one_result(desk: Desk) -> None:
+    things = desk.things(5)
+    job = desk.submit("square", inputs={"things": {"collection": "raw"}}, into="made")
+    head = desk.job(job)
+    assert (head.size, head.state, head.children) == (3, "running", {"queued": 3})
+
+    seen = []
+    for lease in desk.claim_many():
+        names = [pin.name for pin in lease.inputs["things"]]
+        seen += [pin.item for pin in lease.inputs["things"]]
+        desk.stage(lease, *(f"{name}-squared" for name in names))
+        desk.complete(lease, result={"frames": 10, "seconds": 0.5, "refusals": [{"item": names[0]}]})
+    assert sorted(seen) == sorted(things)
+    head = desk.job(job)
+    assert head.state == "succeeded"
+    assert head.result is not None
+    assert head.result["outputs"] == 5
+    assert (head.result["tasks"], head.result["frames"], head.result["seconds"]) == (3, 30, 1.5)
+    assert len(head.result["refusals"]) == 3
+    assert len(desk.outputs(job)) == 5
+
+
+def test_a_few_inputs_make_no_tasks(desk: Desk) -> None:
+    desk.things(2)
+    job = desk.submit("square", inputs={"things": {"collection": "raw"}})
+    assert desk.job(job).size is None
+    assert desk.claim().job == job
+
+
+def test_a_failed_task_fails_the_whole_after_the_others_have_ended(desk: Desk) -> None:
+    desk.things(6)
+    job = desk.submit("square", inputs={"things": {"collection": "raw"}})
+    dependant = desk.submit(after=[job])
+    bad, *good = desk.claim_many()
+    desk.fail(bad, "bad-thing", retryable=False, detail="thing0 is crooked")
+    for lease in good:
+        assert desk.state(job) == "running"
+        desk.complete(lease)
+    head = desk.job(job)
+    assert head.failure is not None
+    assert (head.state, head.failure.code) == ("failed", "bad-thing")
+    assert "thing0 is crooked" in head.failure.detail
+    assert desk.state(dependant) == "failed"
+
+
+def test_cancelling_the_whole_cancels_its_tasks(desk: Desk) -> None:
+    desk.things(6)
+    job = desk.submit("square", inputs={"things": {"collection": "raw"}})
+    lease = desk.claim()
+    assert desk.cancel(job).cancel_requested
+    assert desk.job(job).children == {"cancelled": 2, "running": 1}
+    assert desk.heartbeat(lease).cancel_requested
+    desk.fail(lease, "cancelled")
+    assert desk.state(job) == "cancelled"
+    assert desk.claim_many() == []
+
+
+def test_tasks_wait_with_the_job_they_belong_to(desk: Desk) -> None:
+    desk.things(4)
+    first = desk.submit()
+    job = desk.submit("square", inputs={"things": {"collection": "raw"}}, after=[first])
+    assert desk.state(job) == "waiting"
+    claimed = desk.claim_many()
+    assert [lease.job for lease in claimed] == [first]
+    desk.complete(claimed[0])
+    assert desk.state(job) == "running"
+    for lease in desk.claim_many():
+        desk.complete(lease)
+    assert desk.state(job) == "succeeded"
+
+
+def test_tasks_of_a_job_whose_dependency_failed_are_never_done(desk: Desk) -> None:
+    desk.things(4)
+    first = desk.submit()
+    job = desk.submit("square", inputs={"things": {"collection": "raw"}}, after=[first])
+    cancelled = desk.submit("square", inputs={"things": {"collection": "raw"}}, after=[first], seed=1)
+    desk.cancel(cancelled)
+    fail_for_good(desk)
+    assert (desk.state(job), desk.job(job).children) == ("failed", {"cancelled": 2})
+    assert (desk.state(cancelled), desk.job(cancelled).children) == ("cancelled", {"cancelled": 2})
+    assert desk.claim_many() == []
+
+
+def test_a_task_cancelled_before_its_job_begins_is_not_waited_for(desk: Desk) -> None:
+    desk.things(4)
+    first = desk.submit()
+    job = desk.submit("square", inputs={"things": {"collection": "raw"}}, after=[first])
+    listed = desk.database.read(desk.user, jobs.list_jobs, "lab", jobs.JobFilters(parent=job))
+    for task in listed.items:
+        desk.cancel(task.id)
+    desk.complete(desk.claim())
+    assert desk.state(job) == "cancelled"
+
+
+# -- shared results ----------------------------------------------------------------------------------------------------
+
+
+def test_the_same_job_again_has_its_result_at_once(desk: Desk) -> None:
+    first = desk.submit("sum", params={"number": 3}, into="one")
+    lease = desk.claim()
+    desk.stage(lease, "total")
+    desk.complete(lease, result={"seconds": 2.0}, code_version="sum@1")
+
+    again = desk.submit("sum", params={"number": 3}, into="two")
+    job = desk.job(again)
+    assert (job.state, job.cached_from) == ("succeeded", first)
+    assert job.result == {"seconds": 2.0, "outputs": 1}
+    (there,), (here,) = desk.outputs(first), desk.outputs(again)
+    assert here.created
+    assert here.item != there.item
+    same_place = desk.submit("sum", params={"number": 3}, into="one")
+    (unchanged,) = desk.outputs(same_place)
+    assert (unchanged.item, unchanged.revision, unchanged.created) == (there.item, 1, False)
+
+
+def test_other_parameters_seeds_or_inputs_are_other_jobs(desk: Desk) -> None:
+    desk.submit("sum", params={"number": 3})
+    desk.complete(desk.claim())
+    assert desk.state(desk.submit("sum", params={"number": 4})) == "queued"
+    assert desk.state(desk.submit("sum", params={"number": 3}, seed=1)) == "queued"
+    assert desk.state(desk.submit("sum", params={"number": 3}, cache="off")) == "queued"
+    assert desk.state(desk.submit("sum", params={"number": 3}, cache="refresh")) == "queued"
+    assert desk.state(desk.submit("sum", params={"number": 3})) == "succeeded"
+
+
+def test_a_changed_input_or_a_new_version_of_the_kind_is_computed_again(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk.things(1)
+    inputs = {"things": {"collection": "raw"}}
+    desk.submit("square", inputs=inputs)
+    desk.complete(desk.claim())
+    assert desk.state(desk.submit("square", inputs=inputs)) == "succeeded"
+    desk.publish(Draft("again", Kind.PROCESSED, "thing0", {"motion": document(number=77)}, "raw"))
+    assert desk.state(desk.submit("square", inputs=inputs)) == "queued"
+
+    desk.submit("sum")
+    desk.complete(desk.claim(kinds=("sum",)))
+    newer = {**job_kinds.job_kinds(), "sum": replace(SUM, version=2)}
+    monkeypatch.setattr(job_kinds, "job_kinds", lambda: newer)
+    assert desk.state(desk.submit("sum")) == "queued"
+
+
+def test_jobs_identical_to_one_under_way_wait_for_it_and_share_its_result(desk: Desk) -> None:
+    first = desk.submit("sum")
+    joined = [desk.submit("sum", into=f"place{n}") for n in range(2)]
+    assert [desk.state(job) for job in joined] == ["waiting", "waiting"]
+    (lease,) = desk.claim_many()
+    joined.append(desk.submit("sum", into="place2"))
+    desk.stage(lease, "total")
+    desk.complete(lease)
+    for job in joined:
+        assert (desk.state(job), desk.job(job).cached_from) == ("succeeded", first)
+        assert len(desk.outputs(job)) == 1
+
+
+def test_identical_jobs_of_one_batch_are_computed_once(desk: Desk) -> None:
+    ids = desk.submit_many(*(JobCreate(kind="sum") for _ in range(5)))
+    desk.complete(desk.claim())
+    assert desk.claim_many() == []
+    assert {desk.state(job) for job in ids} == {"succeeded"}
+
+
+@pytest.mark.parametrize("end", ["fail", "cancel"])
+def test_if_the_one_under_way_brings_nothing_the_next_computes_for_the_rest(desk: Desk, end: str) -> None:
+    first = desk.submit("sum")
+    lease = desk.claim()
+    second, third = desk.submit("sum"), desk.submit("sum")
+    if end == "fail":
+        desk.fail(lease, retryable=False)
+    else:
+        desk.cancel(first)
+        desk.fail(lease)
+    assert sorted([desk.state(second), desk.state(third)]) == ["queued", "waiting"]
+    (again,) = desk.claim_many()
+    desk.complete(again)
+    assert (desk.state(second), desk.state(third)) == ("succeeded", "succeeded")
+
+
+def test_a_result_whose_documents_are_gone_is_computed_again(desk: Desk) -> None:
+    desk.submit("sum")
+    lease = desk.claim()
+    desk.stage(lease, "total")
+    desk.complete(lease)
+
+    def forget(tx: Transaction) -> None:
+        draft = tx.execute(select(staged_output.c.draft)).scalar_one()
+        tx.execute(update(staged_output).values(draft=draft | {"parts": {"motion": f"sha256:{'0' * 64}"}}))
+
+    desk.database.write(SYSTEM, forget)
+    assert desk.state(desk.submit("sum")) == "queued"
+
+
+def test_more_shared_results_than_fit_one_transaction_are_served_bit_by_bit(desk: Desk) -> None:
+    desk.submit("sum")
+    joined = desk.submit_many(*(JobCreate(kind="sum", into=f"place{n}") for n in range(100)))
+    desk.complete(desk.claim())
+    states = [desk.state(job) for job in joined]
+    assert 0 < states.count("succeeded") < 100
+    while desk.database.write(SYSTEM, share_waiting):
+        pass
+    assert {desk.state(job) for job in joined} == {"succeeded"}
+
+
+def test_tasks_find_the_results_of_earlier_tasks(desk: Desk) -> None:
+    desk.things(5)
+    inputs = {"things": {"collection": "raw"}}
+    first = desk.submit("square", inputs=inputs, into="one")
+    leases = desk.claim_many()
+    for lease in leases[:2]:
+        desk.stage(lease, *(f"{pin.name}-squared" for pin in lease.inputs["things"]))
+        desk.complete(lease)
+    desk.fail(leases[2], retryable=False)
+    assert desk.state(first) == "failed"
+
+    again = desk.database.write(desk.user, jobs.retry_job, first)
+    assert (again.retry_of, again.size, again.children) == (first, 3, {"succeeded": 2, "queued": 1})
+    lease = desk.claim()
+    desk.stage(lease, *(f"{pin.name}-squared" for pin in lease.inputs["things"]))
+    desk.complete(lease)
+    assert desk.state(again.id) == "succeeded"
+    assert len(desk.outputs(again.id)) == 5
+
+
+# -- trying again, and who may -----------------------------------------------------------------------------------------
+
+
+def test_only_what_failed_or_was_cancelled_can_be_tried_again(desk: Desk) -> None:
+    job = desk.submit(params={"number": 7}, priority=3, concurrency_key="k", labels={"gpu": "x"}, max_attempts=1)
+    with pytest.raises(Conflict):
+        desk.database.write(desk.user, jobs.retry_job, job)
+    desk.cancel(job)
+    again = desk.database.write(desk.user, jobs.retry_job, job)
+    assert (again.params, again.priority, again.max_attempts, again.retry_of) == ({"number": 7}, 3, 1, job)
+    assert desk.claim_many() == []
+    assert desk.claim(labels={"gpu": "x"}).job == again.id
+
+
+def test_others_jobs_are_cancelled_by_maintainers_only_and_hidden_from_strangers(desk: Desk) -> None:
+    job = desk.submit()
+    made = desk.database.write(SYSTEM, users.create_user, UserCreate(name="bob"))
+    bob = Principal("user", made.id, "bob", scopes=("read", "write", "jobs"))
+    with pytest.raises(NotFound):
+        desk.database.read(bob, jobs.read_job, job)
+    desk.database.write(SYSTEM, members.put_member, "lab", "bob", MemberChange(role=Role.CONTRIBUTOR))
+    assert desk.database.read(bob, jobs.read_job, job).id == job
+    with pytest.raises(Forbidden):
+        desk.database.write(bob, jobs.cancel_job, job)
+    desk.database.write(SYSTEM, members.put_member, "lab", "bob", MemberChange(role=Role.MAINTAINER))
+    assert desk.database.write(bob, jobs.cancel_job, job).state == "cancelled"
+
+
+def test_lists_show_jobs_newest_first_by_state_kind_and_author(desk: Desk) -> None:
+    first, second = desk.submit(), desk.submit("sum")
+    desk.complete(desk.claim(kinds=("errand",)))
+
+    def listed(filters: jobs.JobFilters, **more: Any) -> list[str]:
+        page = desk.database.read(desk.user, jobs.list_jobs, "lab", filters, **more)
+        return [one.id for one in page.items]
+
+    assert listed(jobs.JobFilters()) == [second, first]
+    assert listed(jobs.JobFilters(states=("succeeded",))) == [first]
+    assert listed(jobs.JobFilters(kinds=("sum",))) == [second]
+    assert listed(jobs.JobFilters(author="ann")) == [second, first]
+    assert listed(jobs.JobFilters(author="bob")) == []
+    page = desk.database.read(desk.user, jobs.list_jobs, "lab", limit=1, count=True)
+    assert (page.count, [one.id for one in page.items]) == (2, [second])
+    rest = desk.database.read(desk.user, jobs.list_jobs, "lab", limit=1, cursor=page.next_cursor)
+    assert [one.id for one in rest.items] == [first]
+
+
+def test_what_happened_to_a_job_can_be_told(desk: Desk) -> None:
+    job = desk.submit()
+    desk.fail(desk.claim())
+    desk.clock.advance(11)
+    desk.complete(desk.claim())
+    told = desk.database.read(desk.user, jobs.list_job_events, job).items
+    assert [one.kind for one in told] == [
+        "job.submitted",
+        "job.started",
+        "job.requeued",
+        "job.started",
+        "job.succeeded",
+    ]
+    attempts = desk.database.read(desk.user, jobs.list_attempts, job).items
+    assert [(one.fence, one.outcome) for one in attempts] == [(1, "failed"), (2, "succeeded")]
