@@ -32,7 +32,7 @@ from tornado.web import HTTPError, RequestHandler, stream_request_body
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.errors import BadRequest, MareyError, MethodNotAllowed, TooLarge
 from marey_server.handlers import negotiation, problem
-from marey_server.handlers.calls import Call, Caller, only_identify, run_call, run_plain
+from marey_server.handlers.calls import Call, Caller, only_identify, require_access, run_call, run_plain
 from marey_server.handlers.declarations import Bytes, Declared, Document, Operation
 from marey_server.handlers.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.handlers.reply import API, Form, Rendered, Reply, render
@@ -214,6 +214,8 @@ class Resource(RequestHandler):
         chosen_otherwise = operation.answer is Bytes  # by the address: bytes have the one type they have
         self.media = offers[0] if chosen_otherwise else negotiation.choose(headers.get("Accept"), offers)
         self.caller = Caller(negotiation.bearer_token(headers.get("Authorization")), operation)
+        if self.caller.token is None:
+            require_access(operation, ANONYMOUS)
         self.query = parse_query(operation.query, self.request.query_arguments)
         if operation.precondition == "required" or (
             operation.precondition != "none" and ("If-Match" in headers or "If-None-Match" in headers)
