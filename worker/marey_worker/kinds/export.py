@@ -1,0 +1,131 @@
+"""Clips as files of one format, in one archive."""
+
+from __future__ import annotations
+
+import zipfile
+from typing import Any, NamedTuple
+
+from pydantic import ValidationError
+
+from marey_motion import documents
+from marey_motion.errors import MotionError
+from marey_motion.exporting import write_clip_file
+from marey_motion.skeleton import Skeleton
+from marey_schemas import codecs
+from marey_schemas.documents import Motion, RevisionRef, SkeletonHierarchy
+from marey_schemas.jobs import ExportParams, PinnedInput
+from marey_schemas.kinds import Kind
+from marey_worker.context import Context, JobRefused, NoSuchThing
+
+EPOCH = (1980, 1, 1, 0, 0, 0)
+"""The earliest time a ZIP archive can tell; every file gets it, so that the same clips make the same bytes."""
+
+READABLE_BY_ALL = 0o644 << 16
+
+
+class _Unwritable(Exception):
+    """A clip has no file in this format."""
+
+    def __init__(self, code: str, detail: str) -> None:
+        super().__init__(detail)
+        self.code = code
+
+
+class _File(NamedTuple):
+    name: str
+    data: bytes
+
+
+def run(context: Context, params: ExportParams) -> dict[str, Any]:
+    """Write the archive; the result names its digest. A clip that cannot be written is a refusal in the result."""
+    exporting = _Exporting(context, params)
+    archive = context.scratch / "archive.zip"
+    refused: list[dict[str, Any]] = []
+    written: set[str] = set()
+    pins = sorted(context.inputs["clips"], key=lambda pin: (pin.collection, pin.name, pin.item))
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as target:
+        for done, pin in enumerate(pins):
+            context.progress(done, len(pins), f"writing {pin.name}")
+            try:
+                file = exporting.file_of(pin)
+            except (_Unwritable, MotionError) as error:
+                refused.append({"name": _place(pin), "item": pin.item, "code": error.code, "detail": str(error)})
+                continue
+            name = file.name if file.name not in written else f"{pin.item}-{file.name.rpartition('/')[2]}"
+            written.add(name)
+            target.writestr(_entry(name), file.data)
+    if not written:
+        raise JobRefused("nothing-to-export", f"none of {len(pins)} clips can be written as {params.format}")
+    size = archive.stat().st_size
+    return {"archive": context.put_file(archive), "clips": len(written), "bytes": size, "refused": refused}
+
+
+class _Exporting:
+    """One job's clips as files."""
+
+    def __init__(self, context: Context, params: ExportParams) -> None:
+        self._context = context
+        self._params = params
+        self._skeletons: dict[RevisionRef, tuple[Skeleton, dict[str, Any]]] = {}
+
+    def file_of(self, pin: PinnedInput) -> _File:
+        """The file of a clip. Raises `_Unwritable` or `MotionError` where there is none in this format."""
+        info = self._part(pin, "info") or {}
+        if self._params.format == "original":
+            return self._original(pin, info)
+        tree = self._context.document(pin.kind, pin.item, pin.revision, "motion")
+        try:
+            motion = Motion.model_validate(tree)
+        except ValidationError as error:
+            raise _Unwritable("bad-document", str(error)) from error
+        skeleton, hierarchy = self._skeleton(RevisionRef.model_validate(motion.skeleton.model_dump()))
+        if self._params.format == "json":
+            document = {
+                "schema": "marey/item@1",
+                "item": pin.item,
+                "kind": pin.kind.value,
+                "name": pin.name,
+                "collection": pin.collection,
+                "revision": pin.revision,
+                "parts": {"motion": tree, **({"info": info} if info else {})},
+                "skeleton": hierarchy,
+            }
+            return _File(f"{_place(pin)}.json", codecs.encode_tree(document, codecs.JSON))
+        clip = documents.clip_from_document(motion, skeleton)
+        written = write_clip_file(clip, self._params.format, unit=self._params.unit, info=info)
+        return _File(_place(pin) + written.suffix, written.data)
+
+    def _original(self, pin: PinnedInput, info: dict[str, Any]) -> _File:
+        source = info.get("source") or {}
+        if not source.get("file"):
+            raise _Unwritable("no-original", "it was not made from a file")
+        ending = str(source.get("file_name") or "").rpartition(".")[2]
+        return _File(f"{_place(pin)}.{ending}" if ending else _place(pin), self._context.blob(source["file"]))
+
+    def _skeleton(self, ref: RevisionRef) -> tuple[Skeleton, dict[str, Any]]:
+        if ref not in self._skeletons:
+            hierarchy = self._context.document(Kind.SKELETON, ref.item, ref.revision, "hierarchy")
+            skeleton = documents.skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
+            self._skeletons[ref] = skeleton, hierarchy
+        return self._skeletons[ref]
+
+    def _part(self, pin: PinnedInput, part: str) -> dict[str, Any] | None:
+        try:
+            document: dict[str, Any] = self._context.document(pin.kind, pin.item, pin.revision, part)
+        except NoSuchThing:
+            return None
+        return document
+
+
+def _place(pin: PinnedInput) -> str:
+    """A path inside the archive that leads nowhere else."""
+    parts = [part for part in (*pin.collection.split("/"), pin.name) if part not in ("", ".", "..")]
+    return "/".join(part.replace("\\", "_") for part in parts)
+
+
+def _entry(name: str) -> zipfile.ZipInfo:
+    entry = zipfile.ZipInfo(name, EPOCH)
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    entry.create_system = 3  # Unix, whatever this machine is
+    entry.external_attr = READABLE_BY_ALL
+    return entry
