@@ -314,6 +314,7 @@ def upgrade() -> None:
         sa.Column("collection_id", ID, nullable=False),
         sa.Column("kind", sa.String(length=16), nullable=False),
         sa.Column("name", NAME, nullable=False),
+        sa.Column("name_folded", sa.Text(), nullable=False),
         sa.Column("head", sa.Integer(), nullable=False),
         sa.Column("summary", DOCUMENT, nullable=False),
         sa.Column("frames", sa.Integer(), nullable=False),

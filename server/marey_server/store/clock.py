@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Protocol
 
 from sqlalchemy import Connection, insert, select, text, update
@@ -13,6 +13,7 @@ from marey_server.store.tables import server_state
 
 _HIGH_WATER = "clock_high_water_us"
 _SAVE_EVERY_US = 1_000_000
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class Clock(Protocol):
@@ -68,4 +69,4 @@ def save_high_water(connection: Connection, now_us: int) -> None:
 
 def datetime_of(us: int) -> datetime:
     """A stored time as documents show it."""
-    return datetime.fromtimestamp(us // 1_000_000, UTC).replace(microsecond=us % 1_000_000)
+    return _EPOCH + timedelta(microseconds=us)

@@ -219,7 +219,7 @@ class Database:
         return answer
 
     def _keep_wal_short(self, connection: Connection) -> None:
-        """Write a long log back to the file: under steady reads SQLite itself never finds the moment to start it anew."""
+        """Write a long log back to the file: under steady reads SQLite itself never finds a moment to start it anew."""
         now_s = time.monotonic()
         if now_s - self._wal_checked_s < WAL_CHECK_EVERY_S:
             return

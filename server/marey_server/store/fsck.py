@@ -78,9 +78,11 @@ def _check_file(tx: Transaction) -> list[Finding]:
         return []
     pages = [row[0] for row in tx.execute(text("PRAGMA integrity_check(100)")) if row[0] != "ok"]
     findings = [Finding("broken-database", "database", line) for line in pages]
-    for row in tx.execute(text("PRAGMA foreign_key_check")):
-        findings.append(Finding("dangling-reference", f"{row[0]}/{row[1]}", f"refers to what {row[2]} does not hold"))
-    return findings
+    dangling = tx.execute(text("PRAGMA foreign_key_check")).mappings()
+    return findings + [
+        Finding("dangling-reference", f"{row['table']}/{row['rowid']}", f"refers to what {row['parent']} does not hold")
+        for row in dangling
+    ]
 
 
 def _check_blob(tx: Transaction, row: Row[Any]) -> list[Finding]:

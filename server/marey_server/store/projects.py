@@ -74,8 +74,8 @@ def require(
     `Unauthenticated` where signing in could help.
     """
     alive = project.c.deleted_us.is_not(None) if deleted else project.c.deleted_us.is_(None)
-    found = _with_my_role(tx.principal).where(project.c.name == name, alive).order_by(project.c.deleted_us.desc())
-    row = tx.execute(found.limit(1)).first()
+    found = _with_my_role(tx.principal).where(project.c.name == name, alive)
+    row = tx.execute(found.order_by(project.c.deleted_us.desc()).limit(1) if deleted else found).first()
     seen = None if row is None else _as_seen(tx.principal, row)
     if seen is None or (seen.guest and deleted):
         raise NotFound(f"There is no project {name!r} that you may see.", code="no-project")

@@ -115,6 +115,7 @@ item = Table(
     Column("collection_id", ID, ForeignKey("collection.id"), nullable=False, index=True),
     Column("kind", String(16), nullable=False),
     Column("name", Name, nullable=False),
+    Column("name_folded", Text, nullable=False),  # for searches that do not see case, in any script
     Column("head", Integer, nullable=False),
     Column("summary", Document, nullable=False),
     Column("frames", Integer, nullable=False, default=0),

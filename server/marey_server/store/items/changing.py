@@ -98,7 +98,7 @@ def change_item(
     project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
     values: dict[str, Any] = {"updated_us": tx.now_us}
     if request.name is not None:
-        values["name"] = request.name
+        values |= {"name": request.name, "name_folded": request.name.casefold()}
     if request.collection is not None:
         values["collection_id"] = collections.ensure(tx, project_row, request.collection)
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_(None))

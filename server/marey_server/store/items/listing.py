@@ -103,7 +103,7 @@ def _conditions(project_id: str, kind: Kind, filters: ItemFilters) -> list[Colum
     if filters.frames_lte is not None:
         conditions.append(item.c.frames <= filters.frames_lte)
     if filters.q:
-        conditions.append(func.lower(item.c.name).contains(filters.q.lower(), autoescape=True))
+        conditions.append(item.c.name_folded.contains(filters.q.casefold(), autoescape=True))
     return conditions
 
 

@@ -171,7 +171,8 @@ class _Publication:
             "skeleton_id": summary.skeleton_id,
         }  # fmt: skip
         for name in _names(draft):
-            made = self.tx.execute(self.tx.insert_or_ignore(item, row | {"name": name}).returning(item.c.id)).scalar()
+            named = row | {"name": name, "name_folded": name.casefold()}
+            made = self.tx.execute(self.tx.insert_or_ignore(item, named).returning(item.c.id)).scalar()
             if made is not None:
                 self._write_revision(draft, made, 1, digests)
                 self._emit("item.created", draft, made, 1)

@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Row, Select, select, tuple_
+from sqlalchemy import Row, Select, select
 
 from marey_schemas.access import Role
 from marey_schemas.arrays import EncodedArray
@@ -81,7 +81,11 @@ def read_parts(
             document.c.digest, document.c.schema, document.c.size_bytes,
         )
         .join(document, document.c.digest == revision_part.c.document_digest)
-        .where(tuple_(revision_part.c.item_id, revision_part.c.number).in_(revisions))
+        .where(
+            # Not pairs: SQLite would scan the table for them. What this finds beyond them is one row here and there.
+            revision_part.c.item_id.in_({item_id for item_id, _ in revisions}),
+            revision_part.c.number.in_({number for _, number in revisions}),
+        )
     )  # fmt: skip
     found: dict[tuple[str, int], dict[str, PartSummary]] = {}
     for row in tx.execute(statement):
