@@ -130,7 +130,7 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
 
     Mapped joints take the source's orientation, all others rest (or keep theirs between copies of one rig). Bones keep
     the target's lengths, whatever the source's `translations` did to its own. The pelvis travels as in the source,
-    times the plan's scale.
+    times the plan's scale; a root of its own, above the pelvis, moves along without turning.
 
     Raises
     ------
@@ -169,19 +169,15 @@ def _paired(
 ) -> tuple[JointPair, ...]:
     """Joints of both skeletons that play the same standard joint, each target joint once.
 
-    A root is a joint of its own only where it is not another standard joint as well, such as the pelvis.
+    Not the root: where it is not the pelvis as well, it is a handle on the floor that no bone gives a direction to.
     """
-    joints = [dict(mapping.joints) for mapping in (source_mapping, target_mapping)]
-    for skeleton, names in zip((source, target), joints, strict=True):
-        root = names.pop("root", None)
-        if root is not None and root not in names.values():
-            names["root"] = root
-        for name in names.values():
+    for skeleton, mapping in ((source, source_mapping), (target, target_mapping)):
+        for name in mapping.joints.values():
             skeleton.index_of(name)
     pairs: dict[str, JointPair] = {}
     for standard in STANDARD_JOINTS:
-        if standard in joints[0] and standard in joints[1]:
-            pair = JointPair(standard, joints[0][standard], joints[1][standard])
+        if standard != "root" and standard in source_mapping.joints and standard in target_mapping.joints:
+            pair = JointPair(standard, source_mapping.joints[standard], target_mapping.joints[standard])
             pairs.setdefault(pair.target, pair)
     return tuple(pairs.values())
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +105,17 @@ class FootMotion:
     ball_planted: NDArray[np.bool_]
 
 
+class _Foot(NamedTuple):
+    """A foot at n moments, loaded or free: the ball over the floor as z + i·x and above its height at rest."""
+
+    ground: Complexes
+    heights: Floats
+    pitches: Floats
+    toe_pitches: Floats
+    yaws: Floats
+    freedom: Floats
+
+
 @dataclass(frozen=True)
 class Footfalls:
     """The stances of one foot over a stretch of time.
@@ -171,21 +182,17 @@ class Footfalls:
         """The foot at times within the span, shape (n,), seconds."""
         stance = np.searchsorted(self.strikes_s, times_s, side="right") - 1
         loaded = times_s < self.leaves_s[stance]
+        pairs = zip(self._standing(times_s, stance), self._swinging(times_s, stance), strict=True)
+        foot = _Foot(*(np.where(loaded, standing, swinging) for standing, swinging in pairs))
         planted = loaded | (self._lift(stance) < STILL_M)
-        standing, swinging = self._standing(times_s, stance), self._swinging(times_s, stance)
-
-        def chosen(field: str) -> Floats:
-            return np.where(loaded, standing[field], swinging[field])
-
-        ground, pitches = chosen("ground"), chosen("pitches").real
         return FootMotion(
-            balls=np.stack((ground.imag, self.shape.ball_height_m + chosen("heights"), ground.real), axis=-1),
-            yaws=chosen("yaws"),
-            pitches=pitches,
-            toe_pitches=chosen("toe_pitches"),
-            freedom=chosen("freedom"),
-            heel_planted=planted & (pitches >= 0.0),
-            ball_planted=planted & (pitches <= 0.0),
+            balls=np.stack((foot.ground.imag, self.shape.ball_height_m + foot.heights, foot.ground.real), axis=-1),
+            yaws=foot.yaws,
+            pitches=foot.pitches,
+            toe_pitches=foot.toe_pitches,
+            freedom=foot.freedom,
+            heel_planted=planted & (foot.pitches >= 0.0),
+            ball_planted=planted & (foot.pitches <= 0.0),
         )
 
     @cached_property
@@ -198,23 +205,23 @@ class Footfalls:
 
     @cached_property
     def _leaving_pitch_rates(self) -> Floats:
-        """Slope of `_push_off` at its end, in radians per second."""
+        """How fast each foot pitches at the end of its push-off, radians per second."""
         return np.asarray(self._leaving_pitches / ((1.0 - PUSH_OFF_START) * (self.leaves_s - self.strikes_s)))
 
-    def _standing(self, times_s: Floats, stance: NDArray[np.intp]) -> dict[str, Floats | Complexes]:
+    def _standing(self, times_s: Floats, stance: NDArray[np.intp]) -> _Foot:
         """The loaded foot: rolls about the heel, stands, rolls about the ball."""
         share = (times_s - self.strikes_s[stance]) / (self.leaves_s - self.strikes_s)[stance]
         landing = 1.0 - eased(share / LANDING_SHARE)
         pushing = np.clip((share - PUSH_OFF_START) / (1.0 - PUSH_OFF_START), 0.0, 1.0)
         pitches = self._landing_pitches[stance] * landing + self._leaving_pitches[stance] * pushing**2 * (2.0 - pushing)
-        return {
-            "ground": self._rolled(pitches, stance),
-            "heights": self.shape.heel_length_m * np.sin(np.maximum(pitches, 0.0)),
-            "pitches": pitches,
-            "toe_pitches": np.maximum(pitches, 0.0),
-            "freedom": np.zeros_like(pitches),
-            "yaws": self.middles.headings[stance],
-        }
+        return _Foot(
+            ground=self._rolled(pitches, stance),
+            heights=self.shape.heel_length_m * np.sin(np.maximum(pitches, 0.0)),
+            pitches=pitches,
+            toe_pitches=np.maximum(pitches, 0.0),
+            yaws=self.middles.headings[stance],
+            freedom=np.zeros_like(pitches),
+        )
 
     def _rolled(self, pitches: Floats, stance: NDArray[np.intp]) -> Complexes:
         """Where the ball is over the floor when the foot has rolled about its heel by positive `pitches`."""
@@ -224,7 +231,7 @@ class Footfalls:
     def _lift(self, stance: NDArray[np.intp]) -> Floats:
         return self.lifts_m[np.minimum(stance, len(self.lifts_m) - 1)]
 
-    def _swinging(self, times_s: Floats, stance: NDArray[np.intp]) -> dict[str, Floats | Complexes]:
+    def _swinging(self, times_s: Floats, stance: NDArray[np.intp]) -> _Foot:
         """The free foot, from the end of `stance` to the beginning of the next."""
         following = np.minimum(stance + 1, len(self.strikes_s) - 1)
         duration = self.strikes_s[following] - self.leaves_s[stance]
@@ -245,14 +252,14 @@ class Footfalls:
         heel_drop = smooth_positive_part(self.shape.heel_length_m * np.sin(pitches), rounding)
         toe_pitches = np.where(pitches > 0.0, pitches, pitches * bump)
         toe_drop = smooth_positive_part(-self.shape.toe_length_m * np.sin(toe_pitches), 0.4 * rounding)
-        return {
-            "ground": self._swing_ground(times_s, stance, following, share),
-            "heights": lifts * early + heel_drop + toe_drop,
-            "pitches": pitches,
-            "toe_pitches": toe_pitches,
-            "freedom": rounding / ROUNDING_M,
-            "yaws": self.middles.headings[stance] + turn * eased(share),
-        }
+        return _Foot(
+            ground=self._swing_ground(times_s, stance, following, share),
+            heights=lifts * early + heel_drop + toe_drop,
+            pitches=pitches,
+            toe_pitches=toe_pitches,
+            yaws=self.middles.headings[stance] + turn * eased(share),
+            freedom=rounding / ROUNDING_M,
+        )
 
     def _swing_ground(
         self, times_s: Floats, stance: NDArray[np.intp], following: NDArray[np.intp], share: Floats
