@@ -29,6 +29,7 @@ from marey_server.docs_page import render_page
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.handlers.resource import Resource
 from marey_server.handlers.routes import RouteTable
+from marey_server.housekeeping import keeping_house
 from marey_server.launchers.local import local_workers
 from marey_server.observe import access_log, configure_logging
 from marey_server.openapi import build_document
@@ -122,7 +123,8 @@ async def listening(app: Application) -> AsyncIterator[Running]:
     host, port = sockets[0].getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host
     try:
-        yield Running(app, f"http://{shown}:{port}", server)
+        async with keeping_house(app.services):
+            yield Running(app, f"http://{shown}:{port}", server)
     finally:
         await _drain(app.services, server)
 

@@ -77,7 +77,7 @@ def _complete(
         update(job)
         .where(held(*requests))
         .values(state="succeeded", finished_us=tx.now_us, lease_expires_us=None, rev=job.c.rev + 1)
-        .returning(*ENDED_COLUMNS, job.c.fence, job.c.into_path, job.c.author_id, job.c.message)
+        .returning(*ENDED_COLUMNS, job.c.fence, job.c.into_path, job.c.author_id, job.c.message, job.c.cache_key)
     ).all()
     staged = staging.staged_drafts(tx, [(row.id, row.fence) for row in won]) if won else {}
     done: dict[_Place, tuple[Ended, CompleteAnswer]] = {}
@@ -101,6 +101,9 @@ def _complete(
         done[row.id, row.fence] = (as_ended(row), answer)
     if done:
         _record(tx, records)
+        unshared = {(row.id, row.fence) for row in won if row.cache_key is None} & staged.keys()
+        if unshared:
+            staging.drop_staged(tx, unshared)
         end_attempts(
             tx,
             [

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, Table, delete, exists, select
 
+from marey_schemas.jobs import JobState
 from marey_server import faults
 from marey_server.access.principal import SYSTEM
 from marey_server.store import uploads
@@ -23,6 +24,7 @@ from marey_server.store.tables import (
     document,
     document_blob,
     idempotency_key,
+    job,
     job_blob,
     revision_part,
     staged_output,
@@ -95,8 +97,13 @@ def delete_documents(tx: Transaction, digests: Sequence[str], grace_us: int = GR
 
 
 def _staged_documents(tx: Transaction) -> set[str]:
-    """Documents that running attempts have staged. One staged after this was read is renewed, and so not garbage."""
-    drafts = tx.execute(select(staged_output.c.draft).execution_options(yield_per=1000)).scalars()
+    """Documents that running attempts have staged. One staged after this was read is renewed, and so not garbage.
+
+    What completed attempts staged is kept for identical jobs only as long as something else refers to it.
+    """
+    running = select(job.c.id).where(job.c.state == JobState.RUNNING.value)
+    staged = select(staged_output.c.draft).where(staged_output.c.job_id.in_(running))
+    drafts = tx.execute(staged.execution_options(yield_per=1000)).scalars()
     return {digest for draft in drafts for digest in draft["parts"].values()}
 
 

@@ -176,7 +176,7 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     ).one()
     place = (row.source_id, row.fence)
     drafts = staging.staged_drafts(tx, [place]).get(place, {})
-    if not staging.all_stored(tx, drafts):
+    if not staging.take_up_documents(tx, drafts):
         return _compute_again(tx, row)
     outputs = staging.publish_drafts(tx, row, staging.with_inputs(drafts, row.inputs))
     blobs.keep_for_job(tx, row.id, staging.named_blobs(row.result))

@@ -38,7 +38,6 @@ from marey_schemas.problems import FieldError
 from marey_server import faults
 from marey_server.access.secret_tokens import IssuedToken, issue_attempt_token
 from marey_server.errors import Forbidden, Invalid
-from marey_server.store.clock import save_high_water
 from marey_server.store.database import Transaction
 from marey_server.store.fencing import QUEUED, RUNNING, earlier, held, lease_lost, require_attempt
 from marey_server.store.job_events import emit_job_events
@@ -58,8 +57,6 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
     rows = _claim_rows(tx, request, policy)
     if not rows:
         return []
-    if not tx.is_postgres:
-        save_high_water(tx.connection, tx.now_us)
     tokens = [issue_attempt_token() for _ in rows]
     tx.execute(
         insert(attempt),
@@ -98,8 +95,6 @@ def heartbeat(
     row = tx.execute(update(job).where(held((job_id, fence))).values(**values).returning(*columns)).one_or_none()
     if row is None:
         raise lease_lost(job_id, fence)
-    if not tx.is_postgres:
-        save_high_water(tx.connection, tx.now_us)
     return HeartbeatAnswer(
         lease_ttl_s=max(0, row.lease_expires_us - tx.now_us) / SECOND_US,
         cancel_requested=row.cancel_requested_us is not None,

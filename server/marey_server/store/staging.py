@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import delete, func, insert, select, tuple_
+from sqlalchemy import delete, func, insert, select, tuple_, update
 
 from marey_schemas.jobs import StagedOutput
 from marey_schemas.kinds import PARTS, Kind
@@ -139,15 +139,19 @@ def staged_drafts(
     return drafts
 
 
-def all_stored(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> bool:
-    """Whether every document of the drafts is still there."""
+def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> bool:
+    """Keep the documents of an earlier job's drafts from being collected; whether all are still there."""
     wanted = sorted({digest for draft in drafts.values() for digest in draft["parts"].values()})
+    kept = 0
     for start in range(0, len(wanted), IN_LIST):
-        page = wanted[start : start + IN_LIST]
-        found = tx.execute(select(func.count()).select_from(document).where(document.c.digest.in_(page))).scalar_one()
-        if found != len(page):
-            return False
-    return True
+        page = document.c.digest.in_(wanted[start : start + IN_LIST])
+        kept += tx.execute(update(document).where(page).values(created_us=tx.now_us)).rowcount
+    return kept == len(wanted)
+
+
+def drop_staged(tx: Transaction, attempts: Collection[tuple[str, int]]) -> None:
+    """Forget what attempts (job id and fence) staged: they ended without success, or no identical job can use it."""
+    tx.execute(delete(staged_output).where(tuple_(staged_output.c.job_id, staged_output.c.fence).in_(list(attempts))))
 
 
 def with_inputs(drafts: Mapping[str, StagedDraft], pins: PinnedInputs) -> dict[str, StagedDraft]:

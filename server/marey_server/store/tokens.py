@@ -18,7 +18,7 @@ from marey_server.access.secret_tokens import (
     secret_matches,
     split_user_token,
 )
-from marey_server.errors import Forbidden, NotFound, Unauthenticated
+from marey_server.errors import Forbidden, LeaseLost, NotFound, Unauthenticated
 from marey_server.store import listing
 from marey_server.store.clock import datetime_of
 from marey_server.store.database import Transaction
@@ -61,16 +61,19 @@ def _resolve_user(tx: Transaction, prefix: str, secret: str) -> Principal:
 
 def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
     """An attempt lives while its fence is the job's. Once the job has ended, the token only serves to hear again what
-    `complete` or `fail` answered: it reads nothing any more.
+    `complete` or `fail` answered: it reads nothing any more. Raises `LeaseLost` once the fence has moved on.
     """
     statement = (
         select(job.c.id, job.c.project_id, job.c.author_id, job.c.state, attempt.c.fence, user.c.name)
+        .add_columns(job.c.fence.label("current_fence"))
         .select_from(attempt.join(job, job.c.id == attempt.c.job_id).outerjoin(user, user.c.id == job.c.author_id))
-        .where(attempt.c.token_hash == hash_secret(secret), job.c.fence == attempt.c.fence)
+        .where(attempt.c.token_hash == hash_secret(secret))
     )
     row = tx.execute(statement).first()
     if row is None:
         raise _unknown()
+    if row.fence != row.current_fence:
+        raise LeaseLost(f"Attempt {row.fence} does not hold {row.id} any more. Stop working on it.")
     running = row.state == JobState.RUNNING
     return Principal(
         "attempt",

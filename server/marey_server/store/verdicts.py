@@ -9,6 +9,7 @@ from sqlalchemy import ColumnElement, Row, update
 
 from marey_schemas.jobs import FailRequest, FailureReason
 from marey_server.errors import LeaseLost
+from marey_server.store import staging
 from marey_server.store.database import Transaction
 from marey_server.store.job_ends import AttemptEnd, end_attempts, end_jobs, failure_document
 from marey_server.store.job_events import emit_job_events, wake_workers
@@ -108,6 +109,7 @@ def carry_out(
     if not moved:
         raise LeaseLost(f"Attempt {end.fence} does not hold {end.job_id} any more.")
     end_attempts(tx, [end])
+    staging.drop_staged(tx, [(end.job_id, end.fence)])
     settle(tx, ended)
 
 

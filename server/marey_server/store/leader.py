@@ -1,0 +1,40 @@
+"""Which of several server processes does what only one should: a row that is held for a while, under a fence."""
+
+from __future__ import annotations
+
+from sqlalchemy import and_, case, or_, select, update
+
+from marey_server.store.database import Transaction
+from marey_server.store.tables import leader
+
+
+def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | None:
+    """Become or stay the leader in `name` for `ttl_us`; the fence of this leadership, None while another one leads."""
+    free = or_(leader.c.holder == holder, leader.c.expires_us <= tx.now_us)
+    renewed = tx.execute(
+        update(leader)
+        .where(leader.c.name == name, free)
+        .values(
+            holder=holder,
+            expires_us=tx.now_us + ttl_us,
+            fence=leader.c.fence + case((leader.c.holder == holder, 0), else_=1),
+        )
+        .returning(leader.c.fence)
+    ).scalar_one_or_none()
+    if renewed is not None:
+        return int(renewed)
+    first = {"name": name, "holder": holder, "fence": 1, "expires_us": tx.now_us + ttl_us}
+    made = tx.execute(tx.insert_or_ignore(leader, first).returning(leader.c.fence)).scalar_one_or_none()
+    return None if made is None else int(made)
+
+
+def still_leads(tx: Transaction, name: str, holder: str, fence: int) -> bool:
+    """Whether the leadership still stands; it cannot change hands before the transaction ends."""
+    mine = and_(leader.c.name == name, leader.c.holder == holder, leader.c.fence == fence)
+    statement = select(leader.c.fence).where(mine, leader.c.expires_us > tx.now_us).with_for_update(read=True)
+    return tx.execute(statement).scalar_one_or_none() is not None
+
+
+def give_up_lead(tx: Transaction, name: str, holder: str) -> None:
+    """Let another one lead at once."""
+    tx.execute(update(leader).where(leader.c.name == name, leader.c.holder == holder).values(expires_us=tx.now_us))
