@@ -270,7 +270,7 @@ def _gait(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
         return []
     soles = tracks.positions[:, np.concatenate(tracks.soles)]
     heights = soles[1:, :, 1] - tracks.floor_height()
-    weights = np.clip(2.0 - 2.0 ** (np.clip(heights, 0.0, None) / SKATE_HEIGHT_M), 0.0, 1.0)
+    weights = 2.0 - 2.0 ** (np.clip(heights, 0.0, SKATE_HEIGHT_M) / SKATE_HEIGHT_M)
     standing = float(weights.sum())
     if standing < 2:
         return []

@@ -124,9 +124,9 @@ class _AsfReader:
     def _root(self, words: list[bytes]) -> None:
         keyword = words[0].lower()
         if keyword == b"order":
-            self.root.channels = self._channels(words[1:])
+            self.root.channels = self._channels(words[1:], ROOT)
         elif keyword == b"axis":
-            self.root_axis = self._order(words[1:])
+            self.root_axis = self._order(words[1:], ROOT)
         elif keyword == b"position":
             self.root_position = self.lines.numbers(words[1:], 3, "position", ROOT)
         elif keyword == b"orientation":
@@ -147,9 +147,9 @@ class _AsfReader:
         elif keyword == b"length":
             bone.length = self.lines.numbers(words[1:], 1, "length", bone.name)[0]
         elif keyword == b"axis":
-            bone.frame = self._frame(self.lines.numbers(words[1:4], 3, "axis", bone.name), self._order(words[4:]))
+            bone.frame = self._frame(self.lines.numbers(words[1:4], 3, "axis", bone.name), self._order(words[4:], bone.name))
         elif keyword == b"dof":
-            bone.channels = self._channels(words[1:])
+            bone.channels = self._channels(words[1:], bone.name)
             if any(channel[0] != "r" for channel in bone.channels):
                 raise self.lines.error(
                     "only the root may have other degrees of freedom than rx, ry, rz", joint=bone.name
@@ -176,18 +176,19 @@ class _AsfReader:
                 raise self.lines.error("the hierarchy names a bone that :bonedata does not have", joint=name)
         self.children.setdefault(parent, []).extend(children)
 
-    def _channels(self, words: list[bytes]) -> tuple[str, ...]:
+    def _channels(self, words: list[bytes], joint: str) -> tuple[str, ...]:
         channels = tuple(word.lower().decode("latin-1") for word in words)
         if any(len(c) != 2 or c[0] not in "rt" or c[1] not in _AXES for c in channels) or len(set(channels)) < len(
             words
         ):
-            raise self.lines.error(f"{excerpt(b' '.join(words))!r} are no different ones of TX TY TZ RX RY RZ")
+            raise self.lines.error(f"{excerpt(b' '.join(words))!r} are no different ones of TX TY TZ RX RY RZ", joint=joint)
         return channels
 
-    def _order(self, words: list[bytes]) -> str:
+    def _order(self, words: list[bytes], joint: str) -> str:
         order = words[0].lower().decode("latin-1") if len(words) == 1 else ""
         if sorted(order) != list(_AXES):
-            raise self.lines.error(f"an order of axes such as XYZ is needed, not {excerpt(b' '.join(words))!r}")
+            message = f"an order of axes such as XYZ is needed, not {excerpt(b' '.join(words))!r}"
+            raise self.lines.error(message, joint=joint)
         return order
 
     def _frame(self, angles: list[float], order: str) -> NDArray[np.float64]:

@@ -1,0 +1,118 @@
+"""Motion files made up for tests, text by text, so that each can be broken in one place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+POSITIONS = "Xposition Yposition Zposition"
+ZXY = "Zrotation Xrotation Yrotation"
+
+ARM = f"""HIERARCHY
+ROOT Hips
+{{
+  OFFSET 0 90 0
+  CHANNELS 6 {POSITIONS} {ZXY}
+  JOINT Arm
+  {{
+    OFFSET 0 10 0
+    CHANNELS 3 {ZXY}
+    End Site
+    {{
+      OFFSET 0 5 0
+    }}
+  }}
+}}
+"""
+ARM_WIDTH = 9
+
+
+def rows_of(values: Sequence[Sequence[float]]) -> list[str]:
+    """Lines of numbers as files write them."""
+    return [" ".join(f"{value:.6f}" for value in row) for row in values]
+
+
+def bvh(
+    rows: Sequence[str] = ("0 0 0 0 0 0 0 0 0",),
+    *,
+    hierarchy: str = ARM,
+    frames: int | str | None = None,
+    frame_time: str = "0.01",
+) -> bytes:
+    """A BVH file of these lines of numbers; the header tells their count unless `frames` says otherwise."""
+    declared = len(rows) if frames is None else frames
+    return (hierarchy + f"MOTION\nFrames: {declared}\nFrame Time: {frame_time}\n" + "".join(f"{r}\n" for r in rows)).encode()
+
+
+def nested(names: Sequence[str], channels: Sequence[str], *, tip: bool = True) -> str:
+    """A HIERARCHY of joints one below the other, each 10 units above its parent."""
+    lines = ["HIERARCHY"]
+    for depth, (name, own) in enumerate(zip(names, channels, strict=True)):
+        words = own.split()
+        lines += [f"{'JOINT' if depth else 'ROOT'} {name}", "{", "OFFSET 0 10 0", f"CHANNELS {len(words)} {own}"]
+    if tip:
+        lines += ["End Site", "{", "OFFSET 0 10 0", "}"]
+    return "\n".join([*lines, *"}" * len(names)]) + "\n"
+
+
+ASF = """# made up
+:version 1.10
+:name made-up
+:units
+  mass 1.0
+  length 0.45
+  angle deg
+:documentation
+  two bones
+  bonedata is mentioned here, too
+:root
+  order TX TY TZ RX RY RZ
+  axis XYZ
+  position 0 0 0
+  orientation 0 0 0
+:bonedata
+  begin
+    id 1
+    name thigh
+    direction 0 -1 0
+    length 8
+    axis 0 0 20 XYZ
+    dof rx ry rz
+    limits (-160.0 20.0)
+           (-70.0 70.0)
+           (-60.0 70.0)
+  end
+  begin
+    id 2
+    name shin
+    direction 0 -1 0
+    length 7
+    axis 0 30 0 XYZ
+    dof rx
+  end
+  begin
+    id 3
+    name sole
+    direction 0 0 2
+    length 3
+    axis 0 0 0 XYZ
+  end
+:hierarchy
+  begin
+    root thigh
+    thigh shin
+    shin sole
+  end
+"""
+
+AMC = """#!OML:ASF made-up.asf
+:FULLY-SPECIFIED
+:DEGREES
+1
+root 1 2 3 10 20 30
+thigh 40 50 60
+shin 70
+2
+root 1 2 4 10 20 31
+shin 71
+thigh 40 50 61
+"""

@@ -1,0 +1,184 @@
+"""ASF/AMC against the definition of the format, written out with matrices, joint by joint."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from motion_files import AMC, ASF
+from scipy.spatial.transform import Rotation
+
+from marey_motion.errors import FormatError
+from marey_motion.formats import pair_companions, read_motion
+from marey_motion.formats.asf_amc import INCH_M, read_asf_amc
+from marey_motion.kinematics import global_positions
+from marey_motion.source import ImportOptions, SourceMotion
+
+CMU_UNIT_M = INCH_M / 0.45
+
+
+def read(amc: str = AMC, asf: str = ASF, **options: float) -> SourceMotion:
+    return read_asf_amc(amc.encode(), asf.encode(), "take.amc", asf_file="body.asf", **options)
+
+
+def refusal(amc: str = AMC, asf: str = ASF) -> FormatError:
+    with pytest.raises(FormatError) as refused:
+        read(amc, asf)
+    return refused.value
+
+
+def by_definition(root: list[float], thigh: list[float], shin: float) -> np.ndarray:
+    """Positions of root, thigh, shin, sole and the sole's tip: each bone turns by C M C⁻¹ against its parent."""
+
+    def fixed(order: str, angles: list[float]) -> np.ndarray:
+        return Rotation.from_euler(order.lower(), angles, degrees=True).as_matrix()
+
+    turned = fixed("XYZ", root[3:])
+    start = np.array(root[:3])
+    positions = [start, start]
+    bones = (
+        (fixed("XYZ", [0, 0, 20]), fixed("XYZ", thigh), np.array([0, -8, 0])),
+        (fixed("XYZ", [0, 30, 0]), fixed("X", [shin]), np.array([0, -7, 0])),
+        (np.eye(3), np.eye(3), np.array([0, 0, 3])),
+    )
+    for frame, motion, vector in bones:
+        turned = turned @ frame @ motion @ frame.T
+        positions.append(positions[-1] + turned @ vector)
+    return np.array(positions)
+
+
+def test_joints_are_where_the_definition_of_the_format_puts_them() -> None:
+    options = ImportOptions(unit_scale_m=1.0, up_axis="y")
+    clip = read_motion(AMC.encode(), "take.amc", companion=ASF.encode(), options=options).clip
+    assert clip is not None
+    placed = global_positions(clip)
+    expected = by_definition([1, 2, 3, 10, 20, 30], [40, 50, 60], 70)
+    np.testing.assert_allclose(placed[0], expected[:4], atol=1e-5)
+    np.testing.assert_allclose(placed[1], by_definition([1, 2, 4, 10, 20, 31], [40, 50, 61], 71)[:4], atol=1e-5)
+
+
+def test_the_last_bone_ends_in_an_end_site() -> None:
+    joint, tip = read().end_sites[0]
+    assert joint == 3
+    np.testing.assert_allclose(tip, [0, 0, 3])
+
+
+def test_degrees_of_freedom_turn_in_the_order_they_are_listed() -> None:
+    other = read(AMC.replace("thigh 40 50 60", "thigh 60 40 50"), ASF.replace("dof rx ry rz", "dof rz rx ry"))
+    in_that_order = Rotation.from_euler("zxy", [60, 40, 50], degrees=True)
+    frame = Rotation.from_euler("z", 20, degrees=True)
+    found = Rotation.from_quat(other.rotations[0, 1], scalar_first=True)  # type: ignore[index]
+    assert (found.inv() * frame * in_that_order * frame.inv()).magnitude() < 1e-6
+
+
+def test_the_root_may_list_its_channels_in_any_order() -> None:
+    other = read(
+        AMC.replace("root 1 2 3 10 20 30", "root 10 20 30 3 2 1").replace("root 1 2 4 10 20 31", "root 10 20 31 4 2 1"),
+        ASF.replace("TX TY TZ RX RY RZ", "RX RY RZ TZ TY TX"),
+    )
+    np.testing.assert_array_equal(other.root_positions, read().root_positions)
+    np.testing.assert_array_equal(other.rotations, read().rotations)
+
+
+def test_radians_are_read_as_radians() -> None:
+    in_radians = AMC.replace(":DEGREES", ":RADIANS").replace("shin 70", f"shin {float(np.radians(70))!r}")
+    found = read(in_radians).rotations[0, 2]  # type: ignore[index]
+    np.testing.assert_allclose(found, read().rotations[0, 2], atol=1e-6)  # type: ignore[index]
+
+
+def test_windows_line_ends_comments_and_tabs_change_nothing() -> None:
+    noisy = (AMC + "# the end\n").replace(" ", "\t").replace("\n", " \r\n")
+    np.testing.assert_array_equal(read(noisy, ASF.replace("\n", "\r\n")).rotations, read().rotations)
+
+
+def test_the_frame_rate_is_assumed_with_a_warning_unless_it_is_given() -> None:
+    assert read().frame_rate_hz == 120.0
+    assert [warning.code for warning in read().warnings] == ["frame-rate-assumed"]
+    assert read(frame_rate_hz=60.0).warnings == []
+    told = read(AMC.replace(":DEGREES", ":DEGREES\n:SAMPLES-PER-SECOND 30"))
+    assert (told.frame_rate_hz, told.warnings) == (30.0, [])
+
+
+def test_the_unit_is_the_inverse_inch_of_the_data_base() -> None:
+    assert read().unit_scale_m == pytest.approx(0.05644, abs=1e-5)
+
+
+def test_gaps_in_the_numbers_of_frames_are_told() -> None:
+    assert "frame-number-gap" in [warning.code for warning in read(AMC.replace("\n2\n", "\n7\n")).warnings]
+
+
+@pytest.mark.parametrize(
+    ("amc", "line", "joint", "words"),
+    [
+        (AMC.replace("shin 70", "shin 70 1"), 7, "shin", "2 values for 1"),
+        (AMC.replace("shin 70", "shin"), 7, "shin", "0 values for 1"),
+        (AMC.replace("shin 70", "shin nan"), 7, "shin", "not finite"),
+        (AMC.replace("shin 70", "shin 1e999"), 7, "shin", "too large"),
+        (AMC.replace("shin 70", "shin 7,0"), 7, "shin", "decimal comma"),
+        (AMC.replace("shin 70", "knee 70"), 7, None, "no bone 'knee'"),
+        (AMC.replace("shin 70", "thigh 1 2 3"), 7, "thigh", "twice"),
+        (AMC.replace("shin 70\n", ""), 7, "shin", "lacks"),
+        (AMC[: AMC.index("thigh 40 50 61")], 11, "thigh", "cut off"),
+        (AMC[: AMC.index(" 61")] + "\n", 11, "thigh", "cut off"),
+        (":FULLY-SPECIFIED\n:DEGREES\n", 2, None, "no frames"),
+        ("rubbish", 1, None, ":FULLY-SPECIFIED"),
+    ],
+)
+def test_what_is_wrong_in_an_amc_is_named_with_its_line(amc: str, line: int, joint: str | None, words: str) -> None:
+    error = refusal(amc)
+    assert words in str(error)
+    assert (error.file, error.line, error.joint) == ("take.amc", line, joint)
+
+
+@pytest.mark.parametrize(
+    ("found", "written", "joint", "words"),
+    [
+        ("direction 0 -1 0\n    length 8", "length 8", "thigh", "no direction"),
+        ("direction 0 -1 0\n    length 8", "direction 0 -1\n    length 8", "thigh", "3 are needed"),
+        ("length 8", "length long", "thigh", "not a number"),
+        ("axis 0 0 20 XYZ", "axis 0 0 20 XYX", "thigh", "order of axes"),
+        ("dof rx ry rz", "dof rx ry rw", "thigh", "RX RY RZ"),
+        ("dof rx ry rz", "dof rx ry l", "thigh", "RX RY RZ"),
+        ("dof rx ry rz", "dof tx rx", "thigh", "only the root"),
+        ("name shin", "name thigh", "thigh", "second bone"),
+        ("thigh shin\n", "thigh calf\n", "calf", ":bonedata does not have"),
+        ("shin sole\n", "", "sole", "does not connect"),
+        ("shin sole\n", "shin sole\n    root shin\n", "shin", "two parents"),
+        ("angle deg", "angle gon", None, "deg or rad"),
+        ("length 0.45", "length -1", None, "positive"),
+        (":hierarchy", ":nothing", None, "no :hierarchy"),
+    ],
+)
+def test_what_is_wrong_in_an_asf_is_named(found: str, written: str, joint: str | None, words: str) -> None:
+    error = refusal(asf=ASF.replace(found, written, 1))
+    assert words in str(error)
+    assert error.file == "body.asf"
+    assert error.line is not None
+    assert error.joint == joint
+
+
+def test_an_asf_alone_is_a_skeleton() -> None:
+    imported = read_motion(ASF.encode(), "body.asf", options=ImportOptions(up_axis="y"))
+    assert imported.clip is None
+    assert imported.skeleton.joint_names == ("root", "thigh", "shin", "sole")
+
+
+def test_an_amc_alone_is_refused_with_the_reason() -> None:
+    with pytest.raises(FormatError, match="together with its ASF"):
+        read_motion(AMC.encode(), "zeros.amc")
+
+
+class TestPairing:
+    def test_each_amc_finds_the_asf_of_its_subject_in_its_folder(self) -> None:
+        names = ["a/16/16.asf", "a/16/16_01.amc", "a/7/07.asf", "a/7/07_01-walk.amc", "b/1.asf", "b/10.asf", "b/10_2.amc"]
+        found = {pairing.motion: pairing.skeleton for pairing in pair_companions(names)}
+        assert found == {"a/16/16_01.amc": "a/16/16.asf", "a/7/07_01-walk.amc": "a/7/07.asf", "b/10_2.amc": "b/10.asf"}
+
+    def test_a_folders_only_asf_serves_any_name(self) -> None:
+        assert pair_companions(["x\\body.asf", "x\\take.AMC"])[0].skeleton == "x\\body.asf"
+
+    def test_without_an_asf_the_reason_is_given(self) -> None:
+        alone, unlike = pair_companions(["a/zeros.amc", "b/take.amc", "b/one.asf", "b/two.asf"])
+        assert alone.skeleton is None
+        assert "no ASF" in str(alone.reason)
+        assert unlike.skeleton is None
+        assert "2 ASF" in str(unlike.reason)

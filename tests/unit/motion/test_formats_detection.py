@@ -1,0 +1,61 @@
+"""The format of a file, by its bytes first."""
+
+from __future__ import annotations
+
+import bz2
+
+import pytest
+from motion_files import AMC, ASF, bvh
+
+from marey_motion.errors import FormatError, UnknownFormat
+from marey_motion.formats import detect_format, read_motion, write_motion
+from marey_motion.gait import generate_gait
+
+
+@pytest.mark.parametrize(
+    ("data", "name", "expected"),
+    [
+        (bvh(), "take.bvh", "bvh"),
+        (bvh(), "take.txt", "bvh"),
+        (b"\xef\xbb\xbf\r\n" + bvh(), "take", "bvh"),
+        (ASF.encode(), "body.asf", "asf"),
+        (AMC.encode(), "take.amc", "amc"),
+        (AMC.encode(), "take.bvh", "amc"),
+        (ASF.encode(), "skeleton", "asf"),
+        (b"PK\x03\x04", "take.npz", "npz"),
+        (b' {"poses": []}', "take", "predecessor"),
+        (bz2.compress(b"x"), "take", "predecessor"),
+        (b"\x02\x50" + bytes(510), "take", "c3d"),
+        (b"anything", "take.BVH", "bvh"),
+    ],
+)
+def test_bytes_count_more_than_names(data: bytes, name: str, expected: str) -> None:
+    assert detect_format(data, name) == expected
+
+
+@pytest.mark.parametrize(
+    ("data", "name", "code"),
+    [
+        (b"", "take.bvh", "file_empty"),
+        (b"\r\n \t", "take.bvh", "file_empty"),
+        (b"\x1f\x8b\x08", "take.bvh.gz", "format_archive"),
+        (b"PK\x03\x04", "takes.zip", "format_archive"),
+        (b"PK\x03\x04", "take.bvh", "format_archive"),
+        (b"rubbish", "take.xyz", "format_unknown"),
+    ],
+)
+def test_what_no_reader_knows_is_refused_with_a_reason(data: bytes, name: str, code: str) -> None:
+    with pytest.raises(UnknownFormat) as refused:
+        detect_format(data, name)
+    assert (refused.value.code, refused.value.file) == (code, name)
+
+
+def test_marker_files_are_refused_as_what_they_are() -> None:
+    with pytest.raises(FormatError, match="C3D") as refused:
+        read_motion(b"\x02\x50" + bytes(510), "take.c3d")
+    assert refused.value.code == "reader_absent"
+
+
+def test_an_unknown_format_to_write_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(UnknownFormat, match="bvh, npz, predecessor"):
+        write_motion(generate_gait(1.0, 0.0, 0.5), "fbx")

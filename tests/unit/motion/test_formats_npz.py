@@ -1,0 +1,128 @@
+"""The npz container: exact, deterministic, and closed to hostile archives."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from marey_motion import quaternions
+from marey_motion.clip import Clip
+from marey_motion.errors import FormatError, FormatLimit
+from marey_motion.formats import npz, read_motion, write_motion, write_npz
+from marey_motion.skeleton import Skeleton, same_hierarchy
+
+
+@pytest.fixture
+def archive(body: Skeleton, tumbling: Callable[..., Clip]) -> dict[str, bytes]:
+    with zipfile.ZipFile(io.BytesIO(write_npz(tumbling(body, translated=(3, 7))))) as members:
+        return {name: members.read(name) for name in members.namelist()}
+
+
+def unrolled(clip: Clip) -> Clip:
+    """The clip with rotations that are continuous in sign, as every clip of the house is."""
+    rotations = quaternions.unroll(clip.rotations).reshape(clip.frame_count, -1)
+    return replace(clip, poses=np.concatenate([clip.root_translations, rotations], axis=1).astype(np.float32))
+
+
+def packed(members: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", method) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return buffer.getvalue()
+
+
+def member(array: object) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, np.asarray(array), allow_pickle=True)
+    return buffer.getvalue()
+
+
+def test_a_clip_comes_back_to_the_bit(body: Skeleton, tumbling: Callable[..., Clip]) -> None:
+    clip = unrolled(tumbling(body, translated=(3, 7)))
+    back = read_motion(write_motion(clip, "npz"), "take.npz").clip
+    assert back is not None
+    assert back.poses.tobytes() == clip.poses.tobytes()
+    assert back.translations is not None
+    assert clip.translations is not None
+    assert back.translations.tobytes() == clip.translations.tobytes()
+    assert back.translated_joints == clip.translated_joints
+    assert back.frame_rate_hz == clip.frame_rate_hz
+    assert same_hierarchy(back.skeleton, clip.skeleton)
+
+
+def test_a_skeleton_alone_comes_back(body: Skeleton) -> None:
+    imported = read_motion(write_npz(body), "body.npz")
+    assert imported.clip is None
+    assert same_hierarchy(imported.skeleton, body)
+
+
+def test_the_same_clip_always_gives_the_same_bytes(body: Skeleton, tumbling: Callable[..., Clip]) -> None:
+    assert write_npz(tumbling(body)) == write_npz(tumbling(body))
+
+
+def test_numpy_reads_the_arrays_without_pickles(body: Skeleton, tumbling: Callable[..., Clip]) -> None:
+    clip = tumbling(body)
+    with np.load(io.BytesIO(write_npz(clip)), allow_pickle=False) as arrays:
+        np.testing.assert_array_equal(arrays["poses"], clip.poses)
+
+
+def test_a_compressed_archive_of_the_same_arrays_is_read(archive: dict[str, bytes]) -> None:
+    assert read_motion(packed(archive, zipfile.ZIP_DEFLATED), "take.npz").clip is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("format", member("other"), "must say"),
+        ("parents", None, "'parents'"),
+        ("offsets", member(np.zeros((3, 3))), "shape (22, 3)"),
+        ("offsets", member(np.full((22, 3), np.nan)), "not finite"),
+        ("parents", member(np.zeros(22)), "integers"),
+        ("parents", member(np.full(22, 40, np.int32)), "root"),
+        ("poses", member(np.zeros((70, 91), np.float32)), "no rotation"),
+        ("poses", member(np.zeros((70, 90), np.float32)), "shape (70, 91)"),
+        ("frame_rate_hz", member(-1.0), "positive"),
+        ("joint_names", member(np.array([object()], object)), "damaged"),
+        ("joint_names", member(np.array(["a"] * 22)), "unique"),
+        ("translated_joints", member(np.array([7, 3], np.int32)), "increase"),
+        ("poses", b"\x93NUMPY\x01\x00\xff\xff", "damaged"),
+        ("poses", b"", "damaged"),
+    ],
+)
+def test_a_wrong_member_is_named(archive: dict[str, bytes], name: str, content: bytes | None, words: str) -> None:
+    archive.pop(f"{name}.npy")
+    if content is not None:
+        archive[f"{name}.npy"] = content
+    with pytest.raises(FormatError) as refused:
+        read_motion(packed(archive), "take.npz")
+    assert words in str(refused.value)
+    assert refused.value.file == "take.npz"
+
+
+def test_an_archive_that_unpacks_to_too_much_is_refused_unopened(
+    archive: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(npz, "MAX_BYTES", 1 << 20)
+    archive["poses.npy"] = member(np.zeros(1 << 20))
+    bomb = packed(archive, zipfile.ZIP_DEFLATED)
+    assert len(bomb) < 1 << 16
+    with pytest.raises(FormatLimit, match="unpacks to"):
+        read_motion(bomb, "bomb.npz")
+
+
+def test_a_header_that_announces_more_than_there_is_is_refused(archive: dict[str, bytes]) -> None:
+    archive["poses.npy"] = archive["poses.npy"].replace(b"(70, 91)", b"(7000000, 91)", 1)
+    with pytest.raises(FormatError, match="announces"):
+        read_motion(packed(archive), "take.npz")
+
+
+@pytest.mark.parametrize("cut", [10, 100, 1000, 5000])
+def test_a_cut_off_archive_is_refused(archive: dict[str, bytes], cut: int) -> None:
+    with pytest.raises(FormatError):
+        read_motion(packed(archive)[:-cut], "take.npz")

@@ -1,0 +1,166 @@
+"""Units and axes from the body a file shows, asking where it does not say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from motion_files import bvh
+
+from marey_motion.clip import Clip
+from marey_motion.errors import AmbiguousUnits, MotionError
+from marey_motion.formats import ImportedMotion, ImportOptions, read_motion, write_bvh
+from marey_motion.formats.npz import write_npz
+from marey_motion.gait import game_skeleton, generate_gait
+from marey_motion.kinematics import global_positions
+from marey_motion.skeleton import EndSite, Skeleton
+from marey_motion.units import UNITS_M, unit_in_metres
+
+# Rows are the walker's x, y, z in the axes of a file whose upward axis is the key.
+FILE_AXES: dict[str, np.ndarray] = {
+    "y": np.eye(3),
+    "z": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "x": np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
+    "-y": np.diag([1, -1, -1]),
+    "-z": np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "-x": np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+}
+MIRROR = np.diag([-1.0, 1.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def walk() -> Clip:
+    return generate_gait(1.3, 0.2, 2.0, 30.0)
+
+
+def in_axes(clip: Clip, axes: np.ndarray) -> Clip:
+    """The same motion written down in other axes, which may be mirrored ones."""
+    skeleton, sense = clip.skeleton, round(np.linalg.det(axes))
+    turned = Skeleton(
+        skeleton.joint_names,
+        skeleton.parents,
+        skeleton.offsets @ axes.T,
+        skeleton.rest_rotations,
+        tuple(EndSite(site.joint, axes @ site.offset) for site in skeleton.end_sites),
+    )
+    rotations = clip.rotations.copy()
+    rotations[..., 1:] = sense * rotations[..., 1:] @ axes.T
+    poses = np.concatenate([clip.root_translations @ axes.T, rotations.reshape(clip.frame_count, -1)], axis=1)
+    return Clip(turned, clip.frame_rate_hz, poses.astype(np.float32))
+
+
+def imported(clip: Clip, unit: str | float = "cm", **options: Any) -> ImportedMotion:
+    return read_motion(write_bvh(clip, unit=unit), "walk.bvh", options=ImportOptions(**options))
+
+
+def codes(motion: ImportedMotion) -> set[str]:
+    return {warning.code for warning in motion.warnings}
+
+
+@pytest.mark.parametrize("unit", UNITS_M)
+def test_a_walkers_legs_tell_the_unit(walk: Clip, unit: str) -> None:
+    motion = imported(walk, unit)
+    assert motion.source.unit_scale_m == pytest.approx(UNITS_M[unit])
+    assert motion.clip is not None
+    np.testing.assert_allclose(global_positions(motion.clip), global_positions(walk), atol=2e-4)
+    assert any("legs of" in sentence and "hips" in sentence for sentence in motion.source.evidence)
+    assert ("unit-inferred" in codes(motion)) == (unit not in ("m", "cm", "mm"))
+
+
+@pytest.mark.parametrize("up_axis", FILE_AXES)
+def test_a_walker_tells_which_axis_points_up(walk: Clip, up_axis: str) -> None:
+    motion = imported(in_axes(walk, FILE_AXES[up_axis]))
+    assert motion.source.up_axis == up_axis
+    assert motion.clip is not None
+    np.testing.assert_allclose(global_positions(motion.clip), global_positions(walk), atol=2e-4)
+    assert ("up-axis-converted" in codes(motion)) == (up_axis != "y")
+
+
+def test_a_rest_pose_that_lies_does_not_mislead(walk: Clip) -> None:
+    """Exporters turn a Z-up rest pose upright with the root's rotation: the motion counts, not the rest pose."""
+    skeleton = game_skeleton()
+    poses = np.zeros((30, 3 + 4 * skeleton.joint_count), np.float32)
+    poses[:, 3:] = skeleton.rest_rotations.reshape(-1)
+    poses[:, :3] = skeleton.offsets[0]
+    motion = read_motion(write_bvh(Clip(skeleton, 30.0, poses)), "stand.bvh")
+    assert motion.source.up_axis == "y"
+
+
+def test_someone_lying_is_not_stood_up_silently(walk: Clip) -> None:
+    lying = in_axes(walk, FILE_AXES["z"])
+    upright_rest = Clip(walk.skeleton, 30.0, _fallen(walk))
+    assert imported(lying).source.up_axis == "z"
+    with pytest.raises(AmbiguousUnits, match="--up-axis") as refused:
+        imported(upright_rest)
+    assert refused.value.code == "up_axis_ambiguous"
+    assert imported(upright_rest, up_axis="y").source.up_axis == "y"
+
+
+def _fallen(walk: Clip) -> np.ndarray:
+    """One frame, held: the body lies along z, three metres up, far from any ground."""
+    poses = np.repeat(walk.poses[:1], 20, axis=0)
+    poses[:, :3] = [0.0, 3.0, 5.0]
+    poses[:, 3:7] = [np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]
+    return poses
+
+
+def test_a_mirrored_file_is_noticed_and_mirrored_back_on_request(walk: Clip) -> None:
+    mirrored = in_axes(walk, MIRROR)
+    assert "left-handed" in codes(imported(mirrored))
+    motion = imported(mirrored, handedness="left")
+    assert motion.source.handedness == "left"
+    assert motion.clip is not None
+    np.testing.assert_allclose(global_positions(motion.clip), global_positions(walk), atol=2e-4)
+    assert "left-handed" not in codes(imported(walk))
+
+
+@pytest.mark.parametrize("stature_m", [1.5, 1.75, 2.0])
+def test_adults_of_every_size_are_recognised(stature_m: float) -> None:
+    assert imported(generate_gait(1.0, 0.0, 1.0, 30.0, stature_m=stature_m)).source.unit_scale_m == 0.01
+
+
+def test_a_child_is_asked_about_with_the_candidates(walk: Clip) -> None:
+    child = generate_gait(0.6, 0.0, 1.0, 30.0, stature_m=1.1)
+    with pytest.raises(AmbiguousUnits) as refused:
+        imported(child)
+    assert "--unit" in str(refused.value)
+    assert "unit_scale_m" in str(refused.value)
+    assert "cm (legs 0.5" in str(refused.value)
+    assert refused.value.code == "units_ambiguous"
+    assert imported(child, unit_scale_m=0.01).source.unit_scale_m == 0.01
+
+
+def test_what_has_no_legs_is_asked_about() -> None:
+    with pytest.raises(AmbiguousUnits, match="--unit"):
+        read_motion(bvh(), "arm.bvh")
+    motion = read_motion(bvh(), "arm.bvh", options=ImportOptions(unit_scale_m=0.01))
+    assert motion.source.up_axis == "y"
+    assert "up-axis-assumed" in codes(motion)
+
+
+def test_the_users_word_counts_more_than_the_body(walk: Clip) -> None:
+    motion = imported(walk, unit_scale_m=0.02, up_axis="z")
+    assert (motion.source.unit_scale_m, motion.source.up_axis) == (0.02, "z")
+    assert any("given by the user" in sentence for sentence in motion.source.evidence)
+
+
+def test_a_format_that_fixes_its_unit_is_believed(walk: Clip) -> None:
+    assert read_motion(write_npz(walk), "walk.npz").source.unit_scale_m == 1.0
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("cm", 0.01), ("INCH", 0.0254), (0.5, 0.5)])
+def test_units_are_named_or_measured(unit: str | float, metres: float) -> None:
+    assert unit_in_metres(unit) == metres
+
+
+@pytest.mark.parametrize("unit", ["parsec", 0.0, -1.0, float("nan")])
+def test_what_is_no_unit_is_refused(unit: str | float) -> None:
+    with pytest.raises(MotionError):
+        unit_in_metres(unit)
+
+
+@pytest.mark.parametrize("options", [{"unit_scale_m": 0.0}, {"up_axis": "w"}, {"frame_rate_hz": -1.0}, {"handedness": "both"}])
+def test_impossible_options_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        ImportOptions(**options)
