@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
-pytest_plugins = ("database_fixtures", "queue_desk")
+pytest_plugins = ("database_fixtures", "store_fixtures", "queue_desk")
 
 MOCAP_VARIABLE = "MAREY_TEST_MOCAP"
 
