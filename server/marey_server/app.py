@@ -179,21 +179,30 @@ def make_first_administrator(tx: Transaction, token_file: Path) -> None:
 async def serve(settings: Settings) -> None:
     """Run a server until SIGTERM or SIGINT."""
     configure_logging(settings.log_form, settings.log_level)
-    database = open_database(settings)
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    async with listening(create_app(settings, database)) as running:
+    async with serving(settings) as running:
         log.info("listening on %s", running.address)
-        async with local_workers(
+        await stop.wait()
+        log.info("stopping")
+
+
+@asynccontextmanager
+async def serving(settings: Settings) -> AsyncIterator[Running]:
+    """A server with its database and its local workers; they stop first, then it drains."""
+    database = open_database(settings)
+    async with (
+        listening(create_app(settings, database)) as running,
+        local_workers(
             settings.local_workers,
             url=running.address,
             token=make_worker_token(database) if settings.local_workers else "",
             cache=settings.data / "worker-cache",
-        ):
-            await stop.wait()
-            log.info("stopping")
+        ),
+    ):
+        yield running
 
 
 def make_worker_token(database: Database) -> str:
