@@ -1,4 +1,4 @@
-"""Every route times every role, from the route table itself: who may do it, who is told what, and that nothing leaks."""
+"""Every route times every role, from the route table itself: who may do what, and that nothing private leaks."""
 
 import hashlib
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ ROLES = ("none", "stranger", "reader", "contributor", "maintainer", "owner", "ad
 RANK = {role: rank for rank, role in enumerate(("reader", "contributor", "maintainer", "owner"))}
 REFUSALS = {
     "unauthenticated", "bad-token", "no-project", "insufficient-role", "insufficient-scope", "scope-missing",
-    "administrators-only", "attempt-only", "not-for-attempts", "users-only", "forbidden", "no-user", "no-job", "no-blob",
-    "no-attempt", "not-yours",
+    "administrators-only", "attempt-only", "not-for-attempts", "users-only", "forbidden", "no-user", "no-job",
+    "no-blob", "no-attempt", "not-yours",
 }  # fmt: skip
 """Problem codes that say: you may not, or you may not know."""
 

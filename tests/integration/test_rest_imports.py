@@ -1,0 +1,231 @@
+"""Motion files in and out through the API."""
+
+import hashlib
+import io
+import zipfile
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from marey_motion.formats import read_motion
+from marey_motion.kinematics import forward_kinematics
+from marey_server.store.database import Database
+from rest_server import Server, running
+
+BVH = """HIERARCHY
+ROOT Hips
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  JOINT LeftUpLeg
+  {
+    OFFSET 9 -8 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    JOINT LeftLeg
+    {
+      OFFSET 0 -42 0
+      CHANNELS 3 Zrotation Xrotation Yrotation
+      JOINT LeftFoot
+      {
+        OFFSET 0 -43 0
+        CHANNELS 3 Zrotation Xrotation Yrotation
+        End Site
+        {
+          OFFSET 0 -6 14
+        }
+      }
+    }
+  }
+  JOINT RightUpLeg
+  {
+    OFFSET -9 -8 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    JOINT RightLeg
+    {
+      OFFSET 0 -42 0
+      CHANNELS 3 Zrotation Xrotation Yrotation
+      JOINT RightFoot
+      {
+        OFFSET 0 -43 0
+        CHANNELS 3 Zrotation Xrotation Yrotation
+        End Site
+        {
+          OFFSET 0 -6 14
+        }
+      }
+    }
+  }
+  JOINT Spine
+  {
+    OFFSET 0 20 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    JOINT Head
+    {
+      OFFSET 0 40 0
+      CHANNELS 3 Zrotation Xrotation Yrotation
+      End Site
+      {
+        OFFSET 0 20 0
+      }
+    }
+  }
+}
+MOTION
+Frames: 12
+Frame Time: 0.033333
+"""
+
+
+def bvh(seed: int = 0) -> bytes:
+    """A small body that sways."""
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(scale=5, size=(12, 3 + 3 * 9))
+    rows[:, 1] += 99
+    return (BVH + "\n".join(" ".join(f"{value:.4f}" for value in row) for row in rows) + "\n").encode()
+
+
+def send(client: httpx.Client, files: dict[str, bytes], **fields: str) -> httpx.Response:
+    parts = [("files", (name, data)) for name, data in files.items()]
+    return client.post("/projects/lab/imports", files=parts, data=fields)
+
+
+def statuses(answer: httpx.Response) -> dict[str, str]:
+    assert answer.status_code == 200, answer.text
+    return {entry["name"]: entry["status"] for entry in answer.json()["entries"]}
+
+
+def test_good_files_go_in_and_each_bad_one_is_refused_with_its_place(owner: httpx.Client):
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w") as packed:
+        packed.writestr("walk.bvh", bvh())
+    lines = bvh(1).splitlines()
+    lines[-3] = lines[-3].replace(b" ", b" oops ", 1)
+    files = {
+        "take/walk.bvh": bvh(),
+        "take/broken.bvh": b"\n".join(lines),
+        "take/all.zip": archive.getvalue(),
+        "empty.bvh": b"",
+        "lonely.amc": b":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 0 0 0 0 0\n",
+    }
+    answer = send(owner, files, collection="raw", tags="a,b", subject="S1")
+    assert statuses(answer) == {name: "created" if name == "take/walk.bvh" else "failed" for name in files}
+    entries = {entry["name"]: entry for entry in answer.json()["entries"]}
+    assert entries["take/broken.bvh"]["error"]["line"] == len(lines) - 2
+    assert "unpack" in entries["take/all.zip"]["error"]["detail"]
+    assert entries["lonely.amc"]["error"]["code"] == "asf_missing"
+    made = owner.get(f"/projects/lab/clips/{entries['take/walk.bvh']['item']}").json()
+    assert (made["name"], made["collection"], made["tags"]) == ("walk", "raw/take", ["a", "b"])
+    assert made["summary"]["frames"] == entries["take/walk.bvh"]["frames"] == 12
+    info = owner.get(f"/projects/lab/clips/{made['id']}/parts/info").json()
+    assert info["subject"] == "S1"
+    assert info["source"]["file_name"] == "take/walk.bvh"
+
+
+def test_the_same_file_again_changes_nothing_and_a_new_take_makes_a_revision(owner: httpx.Client):
+    first = send(owner, {"walk.bvh": bvh()}).json()["entries"][0]
+    again = send(owner, {"walk.bvh": bvh()}).json()["entries"][0]
+    assert (again["status"], again["item"], again["revision"]) == ("unchanged", first["item"], 1)
+    other = send(owner, {"walk.bvh": bvh(1)}).json()["entries"][0]
+    assert (other["item"], other["revision"]) == (first["item"], 2)
+    assert other["skeleton"] == first["skeleton"]
+    assert len(owner.get("/projects/lab/skeletons").json()["items"]) == 1
+
+
+def test_files_can_be_named_by_digest(owner: httpx.Client, server: Server):
+    data = bvh()
+    digest = f"sha256:{hashlib.sha256(data).hexdigest()}"
+    request = {"files": [{"name": "walk.bvh", "blob": digest}], "collection": "raw"}
+    assert owner.post("/projects/lab/imports", json=request).status_code == 404
+    assert owner.put(f"/blobs/{digest}", content=data).status_code == 204
+    assert statuses(owner.post("/projects/lab/imports", json=request)) == {"walk.bvh": "created"}
+    stranger = server.client(server.make_user("stranger"))
+    assert stranger.get(f"/blobs/{digest}").status_code == 404
+
+
+def test_the_original_comes_back_byte_for_byte_under_its_name(owner: httpx.Client):
+    item = send(owner, {"take/Gang é.bvh": bvh()}).json()["entries"][0]["item"]
+    original = owner.get(f"/projects/lab/clips/{item}/export")
+    assert original.content == bvh()
+    assert "filename*=UTF-8''Gang%20%C3%A9.bvh" in original.headers["Content-Disposition"]
+
+
+def test_an_exported_bvh_moves_as_the_imported_one(owner: httpx.Client):
+    item = send(owner, {"walk.bvh": bvh()}, unit="cm").json()["entries"][0]["item"]
+    exported = owner.get(f"/projects/lab/clips/{item}/export", params={"format": "bvh", "unit": "m"})
+    assert exported.headers["Content-Disposition"].startswith('attachment; filename="walk.bvh"')
+    ours = read_motion(exported.content, "walk.bvh").clip
+    theirs = read_motion(bvh(), "walk.bvh").clip
+    assert ours is not None
+    assert theirs is not None
+    there, here = (forward_kinematics(clip.skeleton, clip.poses)[0] for clip in (theirs, ours))
+    np.testing.assert_allclose(here, there, atol=1e-4)
+
+
+@pytest.mark.parametrize("file_format", ["npz", "predecessor", "json"])
+def test_clips_leave_in_other_formats(owner: httpx.Client, file_format: str):
+    item = send(owner, {"walk.bvh": bvh()}).json()["entries"][0]["item"]
+    exported = owner.get(f"/projects/lab/clips/{item}/export", params={"format": file_format})
+    assert exported.status_code == 200, exported.text
+    assert len(exported.content) > 1000
+
+
+def test_clips_can_be_made_to_use_a_given_skeleton(owner: httpx.Client):
+    skeleton = send(owner, {"walk.bvh": bvh()}).json()["entries"][0]["skeleton"]
+    other_body = bvh(1).replace(b"OFFSET 0 -42 0", b"OFFSET 0 -45 0")
+    answer = send(owner, {"run.bvh": bvh(1), "tall.bvh": other_body}, skeleton=skeleton)
+    assert statuses(answer) == {"run.bvh": "created", "tall.bvh": "failed"}
+    entries = answer.json()["entries"]
+    assert entries[1]["error"]["code"] == "skeleton_mismatch"
+    motion = owner.get(f"/projects/lab/clips/{entries[0]['item']}/parts/motion").json()
+    assert motion["skeleton"] == {"item": skeleton, "revision": 1}
+
+
+def test_unknown_options_and_empty_requests_are_refused(owner: httpx.Client):
+    assert send(owner, {"walk.bvh": bvh()}, colour="red").json()["errors"][0]["pointer"] == "/colour"
+    assert send(owner, {"walk.bvh": bvh()}, unit="mile").status_code == 422
+    multipart = {"Content-Type": "multipart/form-data; boundary=b"}
+    empty = owner.post("/projects/lab/imports", content=b"--b--\r\n", headers=multipart)
+    assert (empty.status_code, empty.json()["code"]) == (400, "no-files")
+    cut = owner.post("/projects/lab/imports", content=b"--b\r\n", headers=multipart)
+    assert (cut.status_code, cut.json()["code"]) == (400, "bad-multipart")
+
+
+def test_large_imports_become_a_job(database: Database, tmp_path: Path):
+    with running(database, tmp_path, import_files_now=2) as server:
+        owner = server.client(server.make_project())
+        files = {f"walk{number}.bvh": bvh(number) for number in range(3)}
+        answer = send(owner, files, collection="raw")
+        assert answer.status_code == 202
+        job = answer.json()
+        assert answer.headers["Location"] == f"/api/v1/jobs/{job['id']}"
+        assert job["kind"] == "import"
+        digests = [f"sha256:{hashlib.sha256(data).hexdigest()}" for data in files.values()]
+        assert [file["blob"] for file in job["params"]["files"]] == digests
+        assert owner.post("/blobs/missing", json={"digests": digests}).json()["missing"] == []
+
+
+def test_every_bvh_of_real_capture_comes_back_byte_for_byte(owner: httpx.Client, mocap: Path):
+    files = sorted(mocap.glob("*/*.bvh"))[:40]
+    assert files
+    answer = send(owner, {str(path.relative_to(mocap)): path.read_bytes() for path in files})
+    for path, entry in zip(files, answer.json()["entries"], strict=True):
+        if entry["status"] == "failed":
+            assert entry["error"]["code"] in ("units_ambiguous", "up_axis_ambiguous"), entry
+            continue
+        assert entry["status"] == "created", entry
+        assert owner.get(f"/projects/lab/clips/{entry['item']}/export").content == path.read_bytes()
+
+
+def test_events_tell_what_happened_and_can_be_followed(owner: httpx.Client):
+    send(owner, {"walk.bvh": bvh()})
+    told = owner.get("/projects/lab/events").json()["items"]
+    assert [event["kind"] for event in told if event["kind"].startswith("item.")] == ["item.created"] * 2
+    headers = {"Accept": "text/event-stream", "Last-Event-ID": str(told[-2]["seq"])}
+    with owner.stream("GET", "/projects/lab/events", headers=headers) as stream:
+        assert stream.headers["Content-Type"] == "text/event-stream"
+        lines = (line for line in stream.iter_lines() if line.startswith("id: "))
+        assert next(lines) == f"id: {told[-1]['seq']}"
+        owner.post("/projects/lab/collections", json={"path": "later"})
+        assert int(next(lines).removeprefix("id: ")) > told[-1]["seq"]

@@ -1,0 +1,184 @@
+"""Starting, watching and stopping a server."""
+
+import json
+import os
+import re
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from marey_schemas.access import UserCreate
+from marey_server.access.passwords import hash_password
+from marey_server.access.principal import SYSTEM
+from marey_server.store import users
+from marey_server.store.database import Database
+from rest_server import Server, running
+
+SERVE = "import asyncio; from marey_server.app import serve; from marey_server.settings import Settings; "
+
+
+class Process:
+    """A server in a process of its own, as an operator runs it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", SERVE + "asyncio.run(serve(Settings()))"],
+            env={**os.environ, "MAREY_DATA": str(folder), "MAREY_PORT": "0", "MAREY_LOG_FORM": "json"},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.lines: list[dict] = []
+        self._listening = threading.Event()
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+        assert self._listening.wait(30), self.lines
+        self.address = next(found[1] for line in self.lines if (found := re.search(r"(http://\S+)", line["message"])))
+
+    def _read(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self.lines.append(json.loads(line))
+            if "listening" in line:
+                self._listening.set()
+
+    @property
+    def token(self) -> str:
+        return (self.folder / "admin.token").read_text().strip()
+
+    def end(self) -> int:
+        """Ask it to stop; its exit status."""
+        self.process.send_signal(signal.SIGTERM)
+        status = self.process.wait(40)
+        self._reader.join(10)
+        return status
+
+
+@pytest.fixture
+def process(tmp_path: Path) -> Iterator[Process]:
+    started = Process(tmp_path / "data")
+    yield started
+    if started.process.poll() is None:
+        started.process.kill()
+        started.process.wait()
+
+
+def test_a_fresh_folder_gets_a_database_and_an_administrator_whose_token_only_the_owner_reads(process: Process):
+    file = process.folder / "admin.token"
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    me = httpx.get(f"{process.address}/api/v1/me", headers={"Authorization": f"Bearer {process.token}"}).json()
+    assert me["user"]["name"] == "admin"
+    assert me["user"]["administrator"]
+    first = process.token
+    assert process.end() == 0
+    again = Process(process.folder)
+    assert again.token == first
+    assert httpx.get(f"{again.address}/readyz").status_code == 200
+    assert again.end() == 0
+
+
+def test_requests_are_logged_as_json_with_who_what_and_how_long(process: Process):
+    headers = {"Authorization": f"Bearer {process.token}", "X-Request-Id": "trace-me-please"}
+    httpx.get(f"{process.address}/api/v1/projects/secret-name", headers=headers)
+    process.end()
+    (line,) = [line for line in process.lines if line.get("request_id") == "trace-me-please"]
+    assert line["principal"] == "admin"
+    assert line["route"] == "/api/v1/projects/{project}"
+    assert (line["method"], line["status"]) == ("GET", 404)
+    assert line["duration_ms"] > 0
+    assert not any("secret-name" in json.dumps(line) or process.token in json.dumps(line) for line in process.lines)
+
+
+def test_a_stopping_server_finishes_what_it_began_and_takes_nothing_new(process: Process):
+    host, port = process.address.removeprefix("http://").split(":")
+    body = json.dumps({"name": "slow"}).encode()
+    head = f"POST /api/v1/projects HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {process.token}\r\n"
+    with socket.create_connection((host, int(port)), timeout=20) as connection:
+        connection.sendall(head.encode() + f"Content-Length: {len(body)}\r\n\r\n".encode() + body[:5])
+        time.sleep(0.3)
+        process.process.send_signal(signal.SIGTERM)
+        deadline = time.monotonic() + 10
+        while time.monotonic() < deadline:
+            try:
+                httpx.get(f"{process.address}/healthz", timeout=1)
+            except httpx.TransportError:
+                break
+            time.sleep(0.05)
+        else:
+            pytest.fail("the server still takes connections")
+        assert process.process.poll() is None
+        connection.sendall(body[5:])
+        assert connection.recv(65536).startswith(b"HTTP/1.1 201")
+    assert process.process.wait(30) == 0
+
+
+def test_a_stopping_server_says_that_it_is_not_ready(database: Database, tmp_path: Path):
+    with running(database, tmp_path) as server:
+        client = httpx.Client(base_url=server.address)
+        assert client.get("/readyz").json() == {"status": "ready"}
+        server.app.services.draining.set()
+        refused = client.get("/readyz")
+        assert (refused.status_code, refused.json()["code"]) == (503, "draining")
+        assert "Retry-After" in refused.headers
+        assert client.get("/healthz").status_code == 200
+
+
+def test_a_database_of_another_version_is_not_ready(server: Server, monkeypatch):
+    monkeypatch.setattr("marey_server.store.readiness.schema_at_head", lambda _connection: False)
+    refused = httpx.get(f"{server.address}/readyz")
+    assert (refused.status_code, refused.json()["code"]) == (503, "not-ready")
+    assert "db upgrade" in refused.json()["detail"]
+
+
+def test_metrics_count_requests_by_route_template(server: Server, owner: httpx.Client):
+    for name in ("lab", "private-name"):
+        owner.get(f"/projects/{name}")
+    text = httpx.get(f"{server.address}/metrics").text
+    counted = 'marey_http_requests_total{method="GET",route="/api/v1/projects/{project}",status="%d"} 1.0'
+    assert counted % 200 in text
+    assert counted % 404 in text
+    assert "private-name" not in text
+
+
+def test_guessing_passwords_is_slowed_down(database: Database, tmp_path: Path):
+    stored = hash_password("correct horse battery")
+    database.write(SYSTEM, users.create_user, UserCreate(name="ann"), password_hash=stored)
+    with running(database, tmp_path, login_tries_per_minute=3) as server:
+        client = server.client()
+        wrong = [client.post("/login", json={"name": "ann", "password": "guess"}).status_code for _ in range(3)]
+        assert wrong == [401, 401, 401]
+        slowed = client.post("/login", json={"name": "ann", "password": "correct horse battery"})
+        assert slowed.status_code == 429
+        assert int(slowed.headers["Retry-After"]) >= 1
+        assert client.post("/login", json={"name": "ben", "password": "guess"}).status_code == 401
+
+
+def test_signing_in_gives_a_token_and_signing_out_ends_it(database: Database, tmp_path: Path):
+    database.write(SYSTEM, users.ensure_first_administrator)
+    stored = hash_password("correct horse battery")
+    database.write(SYSTEM, users.create_user, UserCreate(name="ann"), password_hash=stored)
+    with running(database, tmp_path) as server:
+        made = server.client().post("/login", json={"name": "ann", "password": "correct horse battery"})
+        assert made.status_code == 200
+        assert made.headers["Cache-Control"] == "no-store"
+        ann = server.client(made.json()["secret"])
+        user = ann.get("/users/ann")
+        change = {"password": "another long password", "current_password": "correct horse battery"}
+        wrong = ann.patch("/users/ann", json={**change, "current_password": "x"}, headers={"If-Match": "*"})
+        assert (wrong.status_code, wrong.json()["code"]) == (403, "wrong-password")
+        changed = ann.patch("/users/ann", json=change, headers={"If-Match": user.headers["ETag"]})
+        assert changed.status_code == 200, changed.text
+        assert "password" not in changed.text
+        assert ann.post("/logout").status_code == 204
+        assert ann.get("/me").status_code == 401
+        again = {"name": "ann", "password": "another long password"}
+        assert server.client().post("/login", json=again).status_code == 200

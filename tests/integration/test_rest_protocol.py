@@ -1,0 +1,383 @@
+"""How the server speaks HTTP: forms of answers, states and preconditions, pages, bytes, errors."""
+
+import gzip
+import hashlib
+import json
+import socket
+import time
+from urllib.parse import urlsplit
+
+import bson
+import httpx
+import msgpack
+import numpy as np
+import pytest
+
+from marey_schemas.arrays import EncodedArray
+from marey_schemas.codecs import MEDIA_TYPES, decode_tree
+from rest_server import Server
+
+JOINTS = ("hips", "knee", "foot")
+HIERARCHY = {
+    "schema": "marey/skeleton@1",
+    "joints": [{"name": name, "parent": index - 1, "offset": [0, -0.4, 0]} for index, name in enumerate(JOINTS)],
+}
+
+
+def motion(skeleton: str, frames: int = 40) -> dict:
+    rng = np.random.default_rng(7)
+    poses = rng.normal(size=(frames, 3 + 4 * len(JOINTS))).astype("<f4")
+    return {
+        "schema": "marey/motion@1",
+        "skeleton": {"item": skeleton, "revision": 1},
+        "frame_rate_hz": 30.0,
+        "joints": list(JOINTS),
+        "poses": {"dtype": "<f4", "shape": list(poses.shape), "data": poses.tobytes()},
+    }
+
+
+def make(client: httpx.Client, kind: str, name: str, **parts: dict) -> dict:
+    body = msgpack.packb({"name": name, "parts": parts})
+    made = client.post(f"/projects/lab/{kind}", content=body, headers={"Content-Type": "application/msgpack"})
+    assert made.status_code == 201, made.text
+    return made.json()
+
+
+@pytest.fixture
+def clip(owner: httpx.Client) -> str:
+    """The path of a clip."""
+    skeleton = make(owner, "skeletons", "three joints", hierarchy=HIERARCHY)
+    return f"/projects/lab/clips/{make(owner, 'clips', 'walk', motion=motion(skeleton['id']))['id']}"
+
+
+# -- forms ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_part_says_the_same_in_every_form(owner: httpx.Client, clip: str):
+    trees = {}
+    for name in (*MEDIA_TYPES, "application/msgpack; arrays=blocks", "application/bson; arrays=blocks"):
+        answer = owner.get(f"{clip}/parts/motion", headers={"Accept": name})
+        assert answer.headers["Content-Type"] == name
+        assert "Accept" in answer.headers["Vary"]
+        trees[name] = decode_tree(answer.content, name.partition(";")[0])
+    first = trees.pop("application/json")
+    for tree in trees.values():
+        np.testing.assert_array_equal(tree.pop("poses"), first["poses"])
+        assert tree == {key: value for key, value in first.items() if key != "poses"}
+
+
+def test_blocks_are_the_stored_bytes(owner: httpx.Client, clip: str):
+    answer = owner.get(f"{clip}/parts/motion", headers={"Accept": "application/msgpack; arrays=blocks"})
+    leaf = msgpack.unpackb(answer.content)["poses"]
+    assert leaf["encoding"] == "blocks"
+    stored = EncodedArray(leaf["dtype"], tuple(leaf["shape"]), leaf["data"])
+    whole = owner.get(f"{clip}/parts/motion", headers={"Accept": "application/bson"})
+    assert stored.decode().tobytes() == bson.decode(whole.content)["poses"]["data"]
+
+
+@pytest.mark.parametrize("accept", MEDIA_TYPES)
+def test_frames_and_joints_cut_as_slicing_does(owner: httpx.Client, clip: str, accept: str):
+    def read(query: str) -> dict:
+        answer = owner.get(f"{clip}/parts/motion{query}", headers={"Accept": accept})
+        assert answer.status_code == 200, answer.text
+        return decode_tree(answer.content, accept)
+
+    whole = read("")["poses"]
+    np.testing.assert_array_equal(read("?frames=10:15")["poses"], whole[10:15])
+    np.testing.assert_array_equal(read("?frames=:3")["poses"], whole[:3])
+    cut = read("?joints=hips,foot&frames=5:")
+    assert cut["joints"] == ["hips", "foot"]
+    np.testing.assert_array_equal(cut["poses"], np.delete(whole, slice(7, 11), axis=1)[5:])
+
+
+def test_models_come_in_every_form(owner: httpx.Client, clip: str):
+    shown = owner.get(clip).json()
+    assert msgpack.unpackb(owner.get(clip, headers={"Accept": "application/msgpack"}).content) == shown
+    assert bson.decode(owner.get(clip, headers={"Accept": "application/bson"}).content) == shown
+
+
+def test_a_form_nobody_offers_is_refused_with_a_list(owner: httpx.Client, clip: str):
+    refused = owner.get(clip, headers={"Accept": "image/png"})
+    assert refused.status_code == 406
+    assert refused.json()["context"]["offered"] == list(MEDIA_TYPES)
+
+
+def test_bodies_of_unknown_form_or_compressed_are_refused(owner: httpx.Client):
+    assert owner.post("/projects", content=b"x", headers={"Content-Type": "text/csv"}).status_code == 415
+    body = gzip.compress(json.dumps({"name": "zipped"}).encode())
+    headers = {"Content-Type": "application/json", "Content-Encoding": "gzip"}
+    assert owner.post("/projects", content=body, headers=headers).status_code == 415
+
+
+# -- states and preconditions ---------------------------------------------------------------------------------------
+
+
+def test_what_the_caller_holds_already_is_not_sent_again(owner: httpx.Client, clip: str):
+    for path in (clip, f"{clip}/parts/motion"):
+        etag = owner.get(path).headers["ETag"]
+        again = owner.get(path, headers={"If-None-Match": etag})
+        assert (again.status_code, again.content, again.headers["ETag"]) == (304, b"", etag)
+        other_form = owner.get(path, headers={"If-None-Match": etag, "Accept": "application/msgpack"})
+        assert other_form.status_code == 200
+
+
+def test_a_change_says_which_state_it_changes(owner: httpx.Client, clip: str):
+    etag = owner.get(clip).headers["ETag"]
+    change = {"name": "run"}
+    assert owner.patch(clip, json=change).status_code == 428
+    changed = owner.patch(clip, json=change, headers={"If-Match": etag})
+    assert changed.status_code == 200
+    assert changed.headers["ETag"] != etag
+    late = owner.patch(clip, json={"name": "jump"}, headers={"If-Match": etag})
+    assert late.status_code == 412
+    assert late.headers["ETag"] == changed.headers["ETag"]
+    assert owner.get(clip).json()["name"] == "run"
+    assert owner.patch(clip, json={"name": "jump"}, headers={"If-Match": "*"}).status_code == 200
+
+
+def test_a_part_read_as_msgpack_can_be_replaced_with_json(owner: httpx.Client, clip: str):
+    etag = owner.get(f"{clip}/parts/motion", headers={"Accept": "application/msgpack"}).headers["ETag"]
+    info = {"schema": "marey/clip-info@1", "subject": "somebody"}
+    put = owner.put(f"{clip}/parts/info", json=info, headers={"If-Match": etag}, params={"message": "who it is"})
+    assert put.json()["revision"] == 2
+    history = owner.get(f"{clip}/revisions").json()["items"]
+    assert [(entry["revision"], entry["message"]) for entry in history] == [(2, "who it is"), (1, "")]
+    assert history[0]["parts"]["motion"] == history[1]["parts"]["motion"]
+
+
+def test_a_pinned_revision_never_changes_and_says_so(owner: httpx.Client, clip: str):
+    before = owner.get(f"{clip}/parts/motion", params={"revision": 1})
+    owner.put(f"{clip}/parts/info", json={"schema": "marey/clip-info@1"}, headers={"If-Match": "*"})
+    after = owner.get(f"{clip}/parts/motion", params={"revision": 1})
+    assert (before.content, before.headers["ETag"]) == (after.content, after.headers["ETag"])
+    assert "immutable" in after.headers["Cache-Control"]
+
+
+def test_members_can_be_made_only_where_there_is_none(server: Server, owner: httpx.Client):
+    server.make_user("ben")
+    put = {"json": {"role": "reader"}, "headers": {"If-None-Match": "*"}}
+    assert owner.put("/projects/lab/members/ben", **put).status_code == 200
+    assert owner.put("/projects/lab/members/ben", **put).status_code == 412
+
+
+# -- idempotency ----------------------------------------------------------------------------------------------------
+
+
+def test_the_same_request_with_the_same_key_is_done_once(owner: httpx.Client):
+    key = {"Idempotency-Key": "make-walks"}
+    first = owner.post("/projects/lab/collections", json={"path": "walks"}, headers=key)
+    again = owner.post("/projects/lab/collections", json={"path": "walks"}, headers=key)
+    assert first.status_code == 201
+    for name in ("ETag", "Location"):
+        assert again.headers[name] == first.headers[name]
+    assert (again.status_code, again.content) == (201, first.content)
+    assert again.headers["Idempotent-Replayed"] == "true"
+    other = owner.post("/projects/lab/collections", json={"path": "runs"}, headers=key)
+    assert (other.status_code, other.json()["code"]) == (422, "idempotency-key-reused")
+    assert owner.post("/projects/lab/collections", json={"path": "walks"}).status_code == 409
+
+
+# -- lists ----------------------------------------------------------------------------------------------------------
+
+
+def test_pages_follow_each_other_and_lose_nothing_while_things_are_added(owner: httpx.Client):
+    for number in range(7):
+        make(owner, "skeletons", f"s{number}", hierarchy=HIERARCHY)
+    seen = []
+    answer = owner.get("/projects/lab/skeletons", params={"limit": 3, "sort": "name", "count": "exact"})
+    assert answer.json()["count"] == 7
+    while True:
+        seen += [item["name"] for item in answer.json()["items"]]
+        if "next" not in answer.links:
+            break
+        make(owner, "skeletons", f"added after {seen[-1]}", hierarchy=HIERARCHY)
+        address = httpx.URL(str(owner.base_url)).join(answer.links["next"]["url"])
+        answer = owner.get(str(address))
+    assert [name for name in seen if name.startswith("s")] == [f"s{number}" for number in range(7)]
+    assert len(set(seen)) == len(seen)
+
+
+def test_lists_are_filtered_and_show_the_fields_asked_for(owner: httpx.Client, clip: str):
+    owner.patch(clip, json={"tags": ["raw", "checked"], "collection": "a/b"}, headers={"If-Match": "*"})
+    for query in ("tag.in=raw,other", "collection=a", "path=a/b/walk", "name=wa*", "frames.gte=40", "q=ALK"):
+        found = owner.get(f"/projects/lab/clips?{query}&fields=name,tags").json()["items"]
+        assert found == [{"name": "walk", "tags": ["checked", "raw"]}], query
+    for query in ("tag.in=other", "collection=b", "path=a/walk", "name=wal", "frames.gte=41", "frames.lte=39"):
+        assert owner.get(f"/projects/lab/clips?{query}").json()["items"] == [], query
+
+
+def test_an_unknown_or_unfit_query_parameter_is_named(owner: httpx.Client):
+    refused = owner.get("/projects/lab/clips", params={"limit": "many", "colour": "red"})
+    assert refused.status_code == 400
+    assert [error["pointer"] for error in refused.json()["errors"]] == ["colour"]
+    refused = owner.get("/projects/lab/clips", params={"limit": "many", "frames.gte": "-1"})
+    assert {error["pointer"] for error in refused.json()["errors"]} == {"limit", "frames.gte"}
+
+
+def test_a_cursor_of_another_list_or_made_up_is_refused(owner: httpx.Client):
+    for number in range(3):
+        make(owner, "skeletons", f"s{number}", hierarchy=HIERARCHY)
+    cursor = owner.get("/projects/lab/skeletons", params={"limit": 1}).json()["next_cursor"]
+    for params in ({"cursor": cursor, "q": "x"}, {"cursor": cursor[:-2] + "AA"}, {"cursor": "x"}):
+        refused = owner.get("/projects/lab/skeletons", params=params)
+        assert (refused.status_code, refused.json()["code"]) == (400, "bad-cursor")
+
+
+# -- errors ---------------------------------------------------------------------------------------------------------
+
+
+def test_every_error_is_a_problem_document_with_the_request_id(owner: httpx.Client, server: Server):
+    answers = [
+        owner.get("/nowhere"),
+        owner.get("/projects/none"),
+        owner.put("/projects"),
+        owner.request("OPTIONS", "/projects"),
+        owner.post("/projects", content=b"{"),
+        server.client("marey_000000000000_wrong").get("/me"),
+        owner.post("/projects", content=b"x" * 2_000_000),
+    ]
+    assert [answer.status_code for answer in answers] == [404, 404, 405, 405, 400, 401, 413]
+    for answer in answers:
+        problem = answer.json()
+        assert answer.headers["Content-Type"] == "application/problem+json"
+        assert problem["status"] == answer.status_code
+        assert problem["instance"] == answer.headers["X-Request-Id"]
+    assert answers[2].headers["Allow"] == "GET, HEAD, POST"
+    assert "Bearer" in answers[5].headers["WWW-Authenticate"]
+
+
+def test_what_is_wrong_with_a_body_is_pointed_at(owner: httpx.Client):
+    body = {"name": "UPPER", "visibility": "secret", "colour": "red", "title": 5}
+    refused = owner.post("/projects", json=body)
+    assert refused.status_code == 422
+    assert {error["pointer"] for error in refused.json()["errors"]} == {"/name", "/visibility", "/colour", "/title"}
+
+
+def test_numbers_are_not_guessed_from_texts(owner: httpx.Client):
+    assert owner.post("/uploads", json={"length": "5"}).status_code == 422
+    assert owner.post("/uploads", json={"length": True}).status_code == 422
+
+
+@pytest.mark.parametrize("text", ["a\0b", "\0"])
+def test_a_nul_is_refused_wherever_it_stands(owner: httpx.Client, text: str):
+    refused = owner.patch("/projects/lab", json={"title": text}, headers={"If-Match": "*"})
+    assert (refused.status_code, refused.json()["errors"][0]["pointer"]) == (422, "/title")
+    assert owner.get("/projects/lab/clips", params={"q": text}).status_code == 400
+    assert owner.get("/projects/%00").status_code == 404
+
+
+def test_a_sane_request_id_is_kept_and_another_replaced(owner: httpx.Client):
+    assert owner.get("/me", headers={"X-Request-Id": "trace-0123.abc"}).headers["X-Request-Id"] == "trace-0123.abc"
+    assert owner.get("/me", headers={"X-Request-Id": "<b>"}).headers["X-Request-Id"] != "<b>"
+
+
+def test_a_body_sent_in_chunks_is_stopped_at_its_limit(owner: httpx.Client):
+    refused = owner.post("/projects", content=(b"x" * 65536 for _ in range(40)))
+    assert (refused.status_code, refused.json()["code"]) == (413, "too-large")
+    assert owner.get("/me").status_code == 200
+
+
+def test_a_fault_of_ours_shows_nothing_of_its_inside(server: Server, owner: httpx.Client, monkeypatch, caplog):
+    def fail(*_args, **_kwargs):
+        raise RuntimeError("the secret inside")
+
+    monkeypatch.setattr("marey_server.handlers.projects.projects.read_project", fail)
+    failed = owner.get("/projects/lab")
+    assert failed.status_code == 500
+    assert "secret" not in failed.text
+    assert failed.json()["instance"] == failed.headers["X-Request-Id"]
+    assert "the secret inside" in caplog.text
+
+
+# -- a connection ---------------------------------------------------------------------------------------------------
+
+
+def talk(server: Server, data: bytes) -> bytes:
+    """What the server says to raw bytes until it closes the connection or a second passes."""
+    address = urlsplit(server.address)
+    with socket.create_connection((address.hostname, address.port), timeout=1) as connection:
+        connection.sendall(data)
+        said = b""
+        while True:
+            try:
+                chunk = connection.recv(65536)
+            except TimeoutError:
+                return said
+            if not chunk:
+                return said
+            said += chunk
+
+
+def test_a_refused_sender_who_waits_for_a_go_is_told_at_once(server: Server):
+    head = b"POST /api/v1/projects HTTP/1.1\r\nHost: x\r\nContent-Length: 99999999\r\nExpect: 100-continue\r\n\r\n"
+    said = talk(server, head)
+    assert said.startswith(b"HTTP/1.1 401")
+    assert b"100 (Continue)" not in said
+
+
+def test_a_head_without_end_is_cut_off(server: Server):
+    said = talk(server, b"GET /healthz HTTP/1.1\r\n" + b"X-Filler: " + b"y" * 100_000)
+    assert b"200 OK" not in said
+
+
+def test_security_headers_are_on_every_answer(owner: httpx.Client):
+    for answer in (owner.get("/me"), owner.get("/nowhere"), owner.get("/docs")):
+        assert answer.headers["X-Content-Type-Options"] == "nosniff"
+        assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
+        assert "Access-Control-Allow-Origin" not in answer.headers
+
+
+# -- bytes ----------------------------------------------------------------------------------------------------------
+
+
+def put_bytes(client: httpx.Client, data: bytes) -> str:
+    path = f"/blobs/sha256:{hashlib.sha256(data).hexdigest()}"
+    assert client.put(path, content=data).status_code == 204
+    return path
+
+
+@pytest.mark.parametrize("size", [0, 1, 70_000, 3_500_000])
+def test_bytes_come_back_whole_and_in_ranges(owner: httpx.Client, size: int):
+    data = np.random.default_rng(size).bytes(size)
+    path = put_bytes(owner, data)
+    whole = owner.get(path)
+    assert whole.content == data
+    assert whole.headers["Repr-Digest"].startswith("sha-256=:")
+    assert "immutable" in whole.headers["Cache-Control"]
+    head = owner.head(path)
+    assert (head.status_code, head.content, head.headers["Content-Length"]) == (200, b"", str(size))
+    assert owner.get(path, headers={"If-None-Match": whole.headers["ETag"]}).status_code == 304
+    if size > 1000:
+        part = owner.get(path, headers={"Range": "bytes=500-", "If-Range": whole.headers["ETag"]})
+        assert (part.status_code, part.content) == (206, data[500:])
+        assert part.headers["Content-Range"] == f"bytes 500-{size - 1}/{size}"
+        assert owner.get(path, headers={"Range": "bytes=0-9", "If-Range": '"other"'}).content == data
+    beyond = owner.get(path, headers={"Range": f"bytes={size}-"})
+    assert (beyond.status_code, beyond.headers["Content-Range"]) == (416, f"bytes */{size}")
+
+
+def test_bytes_under_a_wrong_name_are_refused_and_not_kept(owner: httpx.Client):
+    path = f"/blobs/sha256:{'0' * 64}"
+    assert owner.put(path, content=b"other bytes").json()["code"] == "digest-mismatch"
+    assert owner.get(path).status_code == 404
+
+
+def test_an_upload_goes_on_where_it_broke_off(owner: httpx.Client, server: Server):
+    data = np.random.default_rng(1).bytes(2_500_000)
+    made = owner.post("/uploads", json={"length": len(data)})
+    path = made.headers["Location"].removeprefix("/api/v1")
+    address = urlsplit(server.address)
+    token = owner.headers["Authorization"]
+    with socket.create_connection((address.hostname, address.port)) as connection:
+        head = f"PATCH /api/v1{path} HTTP/1.1\r\nHost: x\r\nAuthorization: {token}\r\nUpload-Offset: 0\r\n"
+        connection.sendall(head.encode() + f"Content-Length: {len(data)}\r\n\r\n".encode() + data[:1_500_000])
+        deadline = time.monotonic() + 10
+        while owner.get(path).json()["offset"] == 0 and time.monotonic() < deadline:
+            time.sleep(0.02)
+    offset = int(owner.head(path).headers["Upload-Offset"])
+    assert 0 < offset < len(data)
+    wrong = owner.patch(path, content=data, headers={"Upload-Offset": "7"})
+    assert (wrong.status_code, wrong.headers["Upload-Offset"]) == (409, str(offset))
+    done = owner.patch(path, content=data[offset:], headers={"Upload-Offset": str(offset)}).json()
+    assert done["offset"] == len(data)
+    assert owner.get(f"/blobs/{done['digest']}").content == data
