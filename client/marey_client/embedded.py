@@ -6,8 +6,11 @@ runs: a machine with the client alone stays a client.
 
 from __future__ import annotations
 
+import asyncio
 import importlib
+import threading
 from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -23,26 +26,51 @@ class NotInstalled(MareyError):
 
 def serve(**settings: Any) -> None:
     """Run a server until it is stopped; settings that are None come from the environment or `marey.toml`."""
-    commands = _room("marey_server.commands", "server")
+    commands = room("marey_server.commands", "server")
     with _refusals_of(commands):
         commands.serve(**_given(settings))
 
 
 def database(action: str, *, data: Path | None, database_url: str | None, **options: Any) -> None:
     """Run one of the database commands."""
-    commands = _room("marey_server.commands", "server")
+    commands = room("marey_server.commands", "server")
     with _refusals_of(commands):
         getattr(commands, action)(**_given({"data": data, "database_url": database_url}), **options)
 
 
 def work(credential: Credential, **options: Any) -> None:
     """Run jobs until stopped."""
-    _room("marey_worker.commands", "worker").work(credential, **options)
+    room("marey_worker.commands", "worker").work(credential, **options)
 
 
-def demo(motion: Path | None, **options: Any) -> None:
-    """Run the demonstration."""
-    _room("marey_worker.demo", "all").demonstrate(motion, **options)
+@contextmanager
+def server_in_thread(data: Path, *, workers: int) -> Iterator[str]:
+    """A server with workers on a free port of this machine while the block runs; its address."""
+    app = room("marey_server.app", "all")
+    settings = room("marey_server.settings", "all").Settings(data=data, host="127.0.0.1", port=0, local_workers=workers)
+    started: Future[str] = Future()
+    stop = threading.Event()
+
+    async def run() -> None:
+        async with app.serving(settings) as running:
+            started.set_result(running.address)
+            await asyncio.get_running_loop().run_in_executor(None, stop.wait)
+
+    def main() -> None:
+        try:
+            asyncio.run(run())
+        except BaseException as error:
+            if started.done():
+                raise
+            started.set_exception(error)
+
+    thread = threading.Thread(target=main, name="marey-server")
+    thread.start()
+    try:
+        yield started.result()
+    finally:
+        stop.set()
+        thread.join()
 
 
 @contextmanager
@@ -58,7 +86,8 @@ def _given(settings: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if value is not None}
 
 
-def _room(module: str, extra: str) -> ModuleType:
+def room(module: str, extra: str) -> ModuleType:
+    """A module of another part of Marey. Raises `NotInstalled`, naming the extra that brings it."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:

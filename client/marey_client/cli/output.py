@@ -35,6 +35,14 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
     Console(width=width, highlight=False).print(table)
 
 
+def print_rows(rows: Iterable[tuple[str, str, str]]) -> None:
+    """Print names, figures aligned to the right, and what they count."""
+    rows = list(rows)
+    widths = [max(len(row[place]) for row in rows) for place in range(2)]
+    for name, figure, meaning in rows:
+        typer.echo(f"{name:<{widths[0]}}  {figure:>{widths[1]}}  {meaning}".rstrip())
+
+
 def print_pairs(pairs: Iterable[tuple[str, object]]) -> None:
     """Print names and values, one pair a line."""
     shown = [(name, value) for name, value in pairs if value not in (None, "", ())]

@@ -71,9 +71,9 @@ def demo(
     as_json: AsJson = False,
 ) -> None:
     """From takes to retargeted clips on this machine: import, retarget, table, picture."""
-    from marey_client import embedded
+    from marey_client.demo import demonstrate
 
-    embedded.demo(motion, data=data, keep_serving=serve_on, as_json=as_json)
+    demonstrate(motion, data=data, keep_serving=serve_on, as_json=as_json)
 
 
 # -- the database --

@@ -1,0 +1,5 @@
+"""`python -m marey_client.cli`: the `marey` command where its script is not on the path."""
+
+from marey_client.cli import main
+
+main()

@@ -1,0 +1,201 @@
+"""The demonstration: takes go in, are retargeted to a second skeleton by a worker, and come out as files and a picture.
+
+Everything goes through a server of its own on this machine, by the same requests that any other program would send.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from marey_client import embedded
+from marey_client.cli.output import Advance, print_json, progress, tell
+from marey_client.credentials import ADMIN_TOKEN, read_secret
+from marey_client.demo_report import Report, print_report
+from marey_client.errors import NotFound
+from marey_client.imports import FoundFiles, LocalFile, find_files
+from marey_client.jobs import Jobs
+from marey_client.marey import Marey
+from marey_client.motions import ClipHandle, SkeletonHandle
+from marey_client.project import ProjectHandle
+from marey_schemas.access import ProjectCreate
+from marey_schemas.documents import SkeletonHierarchy
+from marey_schemas.imports import ImportEntry, ImportOptions
+from marey_schemas.jobs import CollectionInput, ItemInput, Job, JobCreate
+
+PROJECT = "demo"
+TAKES, RESULTS, SKELETON = "takes", "retargeted", "game"
+SHEET_TAKES = 8
+
+
+def demonstrate(motion: Path | None, *, data: Path, keep_serving: bool, as_json: bool) -> None:
+    """Tell the whole story, once; with the same `data` again, nothing is done twice."""
+    os.environ.setdefault("MAREY_LOG_LEVEL", "warning")
+    with embedded.server_in_thread(data, workers=1) as url, Marey(url, read_secret(data / ADMIN_TOKEN)) as marey:
+        files = find_files([motion]) if motion else _generated_takes(data / "generated")
+        with progress() as advance:
+            report = Story(_demo_project(marey), files, data, advance).tell()
+        report.server = url
+        if as_json:
+            print_json(report.as_dict())
+        else:
+            print_report(report)
+        if keep_serving:
+            _serve_on(url, data)
+
+
+@dataclass
+class Story:
+    """The steps of the demonstration in one project."""
+
+    project: ProjectHandle
+    files: FoundFiles
+    data: Path
+    advance: Advance
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def tell(self) -> Report:
+        """All steps; what came of them."""
+        with self._timed("import"):
+            entries = self._import()
+        with self._timed("retarget"):
+            job = self._retarget(self._target())
+        sources = {clip.path: clip for clip in self.project.clips.list(collection=TAKES)}
+        results = sorted(self.project.clips.list(collection=RESULTS), key=lambda clip: clip.path)
+        with self._timed("files"):
+            shown = _evenly(results, SHEET_TAKES)
+            exported = [self._export(clip) for clip in shown]
+            sheet = self._contact_sheet([(sources[_source_path(clip)], clip) for clip in shown])
+        return Report(
+            entries=entries,
+            left_out=len(self.files.left_out),
+            job=job,
+            sources=[clip.item for clip in sources.values()],
+            results=[clip.item for clip in results],
+            seconds=self.seconds,
+            data=self.data,
+            exported=exported,
+            sheet=sheet,
+        )
+
+    @contextmanager
+    def _timed(self, step: str) -> Iterator[None]:
+        started = time.monotonic()
+        yield
+        self.seconds[step] = time.monotonic() - started
+
+    def _import(self) -> Sequence[ImportEntry]:
+        options = ImportOptions(collection=TAKES)
+        return self.project.imports.upload(self.files.files, options, notice=self.advance)
+
+    def _target(self) -> SkeletonHandle:
+        """The second skeleton: made on the first run, found on later ones."""
+        found = next(self.project.skeletons.list(path=f"{TAKES}/{SKELETON}"), None)
+        return found or self.project.skeletons.create(SKELETON, _game_skeleton_parts(), collection=TAKES)
+
+    def _retarget(self, target: SkeletonHandle) -> Job | None:
+        """Every take onto the second skeleton; None where no take was imported."""
+        if next(self.project.clips.list(collection=TAKES, page_size=1), None) is None:
+            return None
+        inputs: dict[str, Any] = {
+            "clips": CollectionInput(collection=TAKES),
+            "skeleton": ItemInput(item=target.id),
+        }
+        job = self.project.submit(JobCreate(kind="retarget", inputs=inputs, into=RESULTS))
+        return Jobs(self.project.transport).wait(job.id, on_progress=self._show)
+
+    def _show(self, job: Job) -> None:
+        self.advance("retargeting", job.children.get("succeeded", 0), job.size)
+
+    def _export(self, clip: ClipHandle) -> Path:
+        return clip.export(self.data / "files", format="bvh")
+
+    def _contact_sheet(self, pairs: Sequence[tuple[ClipHandle, ClipHandle]]) -> Path | None:
+        """Source and result figures side by side, as a picture."""
+        if not pairs:
+            return None
+        figures = embedded.room("marey_motion.figures", "all")
+        load = _clip_loader(self.project)
+        takes = [figures.TakePair(source.name, load(source), load(result)) for source, result in pairs]
+        path = self.data / "contact-sheet.png"
+        path.write_bytes(figures.contact_sheet(takes, heading="Takes and what became of them"))
+        return path
+
+
+# -- material --
+
+
+def _generated_takes(folder: Path) -> FoundFiles:
+    """Walks, runs and turns as BVH files; the same on every machine."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_bvh = embedded.room("marey_motion.formats", "all").write_bvh
+    files = []
+    for take in embedded.room("marey_motion.gait", "all").generate_dataset():
+        path = folder / f"{take.name}.bvh"
+        path.write_bytes(write_bvh(take.clip))
+        files.append(LocalFile(path.name, path, path.stat().st_size))
+    return FoundFiles(tuple(files), ())
+
+
+def _game_skeleton_parts() -> dict[str, Any]:
+    """Another rig than the takes have: other names, proportions, rest pose and axes."""
+    documents = embedded.room("marey_motion.documents", "all")
+    rigs = embedded.room("marey_motion.rigs", "all")
+    skeleton = embedded.room("marey_motion.gait", "all").game_skeleton()
+    mapping = rigs.map_joints(skeleton)
+    parts = {
+        "hierarchy": documents.skeleton_to_document(skeleton),
+        "mapping": documents.mapping_to_document(mapping, rigs.guess_axes(skeleton, mapping)),
+    }
+    return {name: part.model_dump(by_alias=True, exclude_none=True) for name, part in parts.items()}
+
+
+def _clip_loader(project: ProjectHandle) -> Callable[[ClipHandle], Any]:
+    """A function from clips of the server to clips of `marey_motion`; reads each skeleton once."""
+    documents = embedded.room("marey_motion.documents", "all")
+    skeletons: dict[tuple[str, int], Any] = {}
+
+    def load(clip: ClipHandle) -> Any:
+        motion = clip.motion()
+        ref = motion.skeleton.model_dump()
+        key = (ref["item"], ref["revision"])
+        if key not in skeletons:
+            hierarchy = project.skeletons.get(ref["item"]).part("hierarchy", revision=ref["revision"])
+            skeletons[key] = documents.skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
+        return documents.clip_from_document(motion, skeletons[key])
+
+    return load
+
+
+def _demo_project(marey: Marey) -> ProjectHandle:
+    try:
+        marey.project(PROJECT).read()
+    except NotFound:
+        return marey.create_project(ProjectCreate(name=PROJECT, title="Demonstration"))
+    return marey.project(PROJECT)
+
+
+def _source_path(result: ClipHandle) -> str:
+    """Results keep the path of their source below the folder they go to."""
+    return result.path.removeprefix(f"{RESULTS}/")
+
+
+def _evenly(clips: Sequence[ClipHandle], most: int) -> list[ClipHandle]:
+    """At most so many, spread over all of them."""
+    if len(clips) <= most:
+        return list(clips)
+    return [clips[index * (len(clips) - 1) // (most - 1)] for index in range(most)]
+
+
+def _serve_on(url: str, data: Path) -> None:
+    tell(f"serving at {url}; the administrator's token is in {data / ADMIN_TOKEN}; stop with Ctrl-C")
+    try:
+        while True:
+            time.sleep(3600)
+    except KeyboardInterrupt:
+        tell("stopping")

@@ -1,0 +1,127 @@
+"""What the demonstration found, for people and for programs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from marey_client.cli.output import print_rows, tell
+from marey_schemas.imports import ImportEntry
+from marey_schemas.items import Item
+from marey_schemas.jobs import Job
+
+REASONS_SHOWN = 12
+
+
+@dataclass
+class Report:
+    """Figures and places. `seconds` is by step: import, retarget, files."""
+
+    entries: Sequence[ImportEntry]
+    left_out: int
+    job: Job | None
+    sources: Sequence[Item]
+    results: Sequence[Item]
+    seconds: dict[str, float]
+    data: Path
+    exported: Sequence[Path]
+    sheet: Path | None
+    server: str = ""
+
+    @property
+    def refused(self) -> list[tuple[str, str, str]]:
+        """(step, name, reason) of everything that was not taken or not made."""
+        imports = [
+            ("import", entry.name, f"{entry.error.detail} ({entry.error.code})")
+            for entry in self.entries
+            if entry.error is not None
+        ]
+        retargets = [
+            ("retarget", str(one.get("name")), f"{one.get('detail')} ({one.get('code')})")
+            for one in (self.job.result or {} if self.job else {}).get("refused", ())
+        ]
+        return imports + retargets
+
+    @property
+    def warnings(self) -> Counter[str]:
+        """How many files had a warning, by its code."""
+        return Counter(code for entry in self.entries for code in {warning.code for warning in entry.warnings})
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything, for programs."""
+        return {
+            "server": self.server,
+            "data": str(self.data.absolute()),
+            "files": len(self.entries),
+            "left_out": self.left_out,
+            "statuses": dict(Counter(entry.status for entry in self.entries)),
+            "warnings": dict(self.warnings),
+            "refused": [{"step": step, "name": name, "reason": reason} for step, name, reason in self.refused],
+            "frames": _frames(self.sources),
+            "retargeted_clips": len(self.results),
+            "retargeted_frames": _frames(self.results),
+            "seconds": self.seconds,
+            "poses_per_second": self._rates(),
+            "bytes_per_pose": {"takes": _bytes_per_pose(self.sources), "retargeted": _bytes_per_pose(self.results)},
+            "job": self.job.id if self.job else None,
+            "contact_sheet": str(self.sheet.absolute()) if self.sheet else None,
+            "exported": [str(path.absolute()) for path in self.exported],
+        }
+
+    def _rates(self) -> dict[str, float]:
+        frames = {"import": sum(entry.frames or 0 for entry in self.entries), "retarget": _frames(self.results)}
+        return {step: count / self.seconds[step] for step, count in frames.items()}
+
+
+def print_report(report: Report) -> None:
+    """A table of figures, the reasons of refusals, and where everything is."""
+    print_rows(_rows(report))
+    for step, name, reason in report.refused[:REASONS_SHOWN]:
+        tell(f"refused at {step}: {name}: {reason}")
+    if len(report.refused) > REASONS_SHOWN:
+        tell(f"... and {len(report.refused) - REASONS_SHOWN} more")
+    tell(f"\nserver data       {report.data.absolute()}")
+    if report.exported:
+        tell(f"retargeted files  {report.exported[0].parent.absolute()}")
+    if report.sheet:
+        tell(f"contact sheet     {report.sheet.absolute()}")
+    tell(f"look around       marey serve --data {report.data}   and then   marey ls demo")
+
+
+def _rows(report: Report) -> Iterator[tuple[str, str, str]]:
+    figures = report.as_dict()
+    rates, seconds, sizes = figures["poses_per_second"], figures["seconds"], figures["bytes_per_pose"]
+    taken = {status: count for status, count in figures["statuses"].items() if status != "failed"}
+    refusals = Counter(step for step, _, _ in report.refused)
+    yield "files", f"{figures['files']}", _counted(taken)
+    if report.left_out:
+        yield "left out", f"{report.left_out}", "no motion files"
+    yield "warnings", f"{sum(report.warnings.values())}", _counted(dict(report.warnings.most_common()))
+    yield "refused", f"{len(report.refused)}", _counted({f"at {step}": count for step, count in refusals.items()})
+    yield "frames in", f"{figures['frames']:,}", "sent, read, checked, stored"
+    yield "", f"{seconds['import']:.2f}", "seconds"
+    yield "", f"{rates['import']:,.0f}", "poses per second"
+    yield "", f"{sizes['takes']:.0f}", "bytes per pose"
+    yield (
+        "frames out",
+        f"{figures['retargeted_frames']:,}",
+        f"in {figures['retargeted_clips']} clips on another skeleton",
+    )
+    yield "", f"{seconds['retarget']:.2f}", "seconds, through queue and worker"
+    yield "", f"{rates['retarget']:,.0f}", "poses per second"
+    yield "", f"{sizes['retargeted']:.0f}", "bytes per pose"
+
+
+def _counted(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count} {what}" for what, count in counts.items())
+
+
+def _frames(items: Sequence[Item]) -> int:
+    return sum(int(item.summary.get("frames", 0)) for item in items)
+
+
+def _bytes_per_pose(items: Sequence[Item]) -> float:
+    return sum(item.parts["motion"].size_bytes for item in items) / max(1, _frames(items))
