@@ -39,6 +39,7 @@ from marey_server.store import tokens, users
 from marey_server.store.blob_backings import DirectoryBlobs
 from marey_server.store.database import Database, Transaction
 from marey_server.store.schema import upgrade_schema
+from marey_server.store.wakeups import wakeups
 
 log = logging.getLogger(__name__)
 
@@ -132,6 +133,7 @@ async def listening(app: Application) -> AsyncIterator[Running]:
 async def _drain(services: Services, server: HTTPServer) -> None:
     services.draining.set()
     services.metrics.draining.set(1)
+    wakeups.wake_everybody()
     server.stop()
     deadline = time.monotonic() + services.settings.drain_s
     while services.in_flight and time.monotonic() < deadline:

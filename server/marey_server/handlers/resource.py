@@ -92,7 +92,7 @@ class Resource(RequestHandler):
         self.set_header("X-Request-Id", self.request_id)
         self._received = bytearray()
         self.received_bytes = 0
-        self._refused = False
+        self._refused = self._performing = self._gone = False
 
     @property
     def services(self) -> Services:
@@ -156,7 +156,7 @@ class Resource(RequestHandler):
 
     def is_awaited(self) -> bool:
         """Whether an answer still has somebody to go to, and the server time to make one."""
-        return self in self.services.in_flight and not self.services.draining.is_set()
+        return not self._gone and not self.services.draining.is_set()
 
     @property
     def answer_form(self) -> Form:
@@ -290,6 +290,7 @@ class Resource(RequestHandler):
         """Run a declared method and send what it answers."""
         if self._refused:
             return
+        self._performing = True
         arguments = self.path_variables
         if self.query is not None:
             arguments["query"] = self.query
@@ -390,7 +391,9 @@ class Resource(RequestHandler):
     def on_connection_close(self) -> None:
         """The caller has gone."""
         super().on_connection_close()
-        self.services.in_flight.discard(self)
+        self._gone = True
+        if not self._performing:  # a method that runs ends by itself, and a draining server waits for it
+            self.services.in_flight.discard(self)
 
 
 def _decode(data: bytes, media_type: str, content: Any) -> Any:

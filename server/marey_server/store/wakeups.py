@@ -45,6 +45,13 @@ class Wakeups:
             listener.wake()
 
 
+    def wake_everybody(self) -> None:
+        """Wake every listener: the server is about to stop."""
+        with self._lock:
+            topics = list(self._listeners)
+        self.announce(topics)
+
+
 class Listener:
     """One coroutine's ear."""
 
