@@ -40,7 +40,9 @@ def bvh(
 ) -> bytes:
     """A BVH file of these lines of numbers; the header tells their count unless `frames` says otherwise."""
     declared = len(rows) if frames is None else frames
-    return (hierarchy + f"MOTION\nFrames: {declared}\nFrame Time: {frame_time}\n" + "".join(f"{r}\n" for r in rows)).encode()
+    return (
+        hierarchy + f"MOTION\nFrames: {declared}\nFrame Time: {frame_time}\n" + "".join(f"{r}\n" for r in rows)
+    ).encode()
 
 
 def nested(names: Sequence[str], channels: Sequence[str], *, tip: bool = True) -> str:

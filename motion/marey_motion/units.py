@@ -282,10 +282,10 @@ def _is_leg(length_m: float) -> bool:
 
 
 def _hip_height(body: _Body, up_axis: UpAxis) -> float:
-    """How high the hips come above the ground when they are high, in the file's unit; 0 without feet."""
+    """How high the hips mostly are above the ground, in the file's unit; 0 without feet."""
     if body.leg is None:
         return 0.0
-    return float(np.quantile(hip_heights(body.positions, body.landmarks, up_axis), 0.9))
+    return float(np.median(hip_heights(body.positions, body.landmarks, up_axis)))
 
 
 def hip_heights(positions: NDArray[np.float64], landmarks: Landmarks, up_axis: UpAxis = "y") -> NDArray[np.float64]:

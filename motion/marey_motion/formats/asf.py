@@ -147,7 +147,9 @@ class _AsfReader:
         elif keyword == b"length":
             bone.length = self.lines.numbers(words[1:], 1, "length", bone.name)[0]
         elif keyword == b"axis":
-            bone.frame = self._frame(self.lines.numbers(words[1:4], 3, "axis", bone.name), self._order(words[4:], bone.name))
+            bone.frame = self._frame(
+                self.lines.numbers(words[1:4], 3, "axis", bone.name), self._order(words[4:], bone.name)
+            )
         elif keyword == b"dof":
             bone.channels = self._channels(words[1:], bone.name)
             if any(channel[0] != "r" for channel in bone.channels):
@@ -181,7 +183,9 @@ class _AsfReader:
         if any(len(c) != 2 or c[0] not in "rt" or c[1] not in _AXES for c in channels) or len(set(channels)) < len(
             words
         ):
-            raise self.lines.error(f"{excerpt(b' '.join(words))!r} are no different ones of TX TY TZ RX RY RZ", joint=joint)
+            raise self.lines.error(
+                f"{excerpt(b' '.join(words))!r} are no different ones of TX TY TZ RX RY RZ", joint=joint
+            )
         return channels
 
     def _order(self, words: list[bytes], joint: str) -> str:

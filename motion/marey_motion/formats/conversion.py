@@ -18,6 +18,8 @@ from marey_motion.units import infer_conversion
 
 Real = TypeVar("Real", np.float32, np.float64)
 
+_LARGEST_LENGTH = 1e12
+
 # Rows are the file's axes that become x, y, z; each matrix is a rotation.
 _TO_Y_UP: dict[UpAxis, list[list[int]]] = {
     "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -36,6 +38,7 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
     ------
     AmbiguousUnits    when neither the file, its body nor the options tell the unit or the upward axis
     """
+    _check_range(source, file)
     try:
         landmarks = find_landmarks(source.skeleton)
         found = infer_conversion(source, landmarks, file, options)
@@ -68,6 +71,15 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
         evidence=found.evidence,
     )
     return ImportedMotion(clip, skeleton, info, tuple(warnings))
+
+
+def _check_range(source: SourceMotion, file: str) -> None:
+    """Refuse lengths whose squares or float32 forms would overflow; no body or path is that long in any unit."""
+    tips = np.array([offset for _, offset in source.end_sites])
+    for values in (source.offsets, tips, source.root_positions, source.translations):
+        if values is not None and np.abs(values).max(initial=0.0) > _LARGEST_LENGTH:
+            message = f"a length of {np.abs(values).max():.3g} units; {_LARGEST_LENGTH:.0e} are the most"
+            raise FormatError(message, code="value_range", file=file)
 
 
 def _converted_skeleton(source: SourceMotion, axes: NDArray[np.float64], scale: float) -> Skeleton:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from motion_files import AMC, ASF
 from scipy.spatial.transform import Rotation
 
 from marey_motion.errors import FormatError
@@ -12,6 +11,7 @@ from marey_motion.formats import pair_companions, read_motion
 from marey_motion.formats.asf_amc import INCH_M, read_asf_amc
 from marey_motion.kinematics import global_positions
 from marey_motion.source import ImportOptions, SourceMotion
+from motion_files import AMC, ASF
 
 CMU_UNIT_M = INCH_M / 0.45
 
@@ -169,7 +169,15 @@ def test_an_amc_alone_is_refused_with_the_reason() -> None:
 
 class TestPairing:
     def test_each_amc_finds_the_asf_of_its_subject_in_its_folder(self) -> None:
-        names = ["a/16/16.asf", "a/16/16_01.amc", "a/7/07.asf", "a/7/07_01-walk.amc", "b/1.asf", "b/10.asf", "b/10_2.amc"]
+        names = [
+            "a/16/16.asf",
+            "a/16/16_01.amc",
+            "a/7/07.asf",
+            "a/7/07_01-walk.amc",
+            "b/1.asf",
+            "b/10.asf",
+            "b/10_2.amc",
+        ]
         found = {pairing.motion: pairing.skeleton for pairing in pair_companions(names)}
         assert found == {"a/16/16_01.amc": "a/16/16.asf", "a/7/07_01-walk.amc": "a/7/07.asf", "b/10_2.amc": "b/10.asf"}
 

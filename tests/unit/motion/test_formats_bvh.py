@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from motion_files import ARM, POSITIONS, ZXY, bvh, nested, rows_of
 from scipy.spatial.transform import Rotation
 
 from marey_motion.errors import FormatError, FormatLimit
 from marey_motion.formats.bvh import read_bvh
 from marey_motion.source import SourceMotion
+from motion_files import ARM, POSITIONS, ZXY, bvh, nested, rows_of
 
 
 def read(data: bytes, **options: float) -> SourceMotion:

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from motion_files import bvh
 
 from marey_motion.clip import Clip
 from marey_motion.errors import AmbiguousUnits, MotionError
@@ -16,6 +15,7 @@ from marey_motion.gait import game_skeleton, generate_gait
 from marey_motion.kinematics import global_positions
 from marey_motion.skeleton import EndSite, Skeleton
 from marey_motion.units import UNITS_M, unit_in_metres
+from motion_files import bvh
 
 # Rows are the walker's x, y, z in the axes of a file whose upward axis is the key.
 FILE_AXES: dict[str, np.ndarray] = {
@@ -160,7 +160,9 @@ def test_what_is_no_unit_is_refused(unit: str | float) -> None:
         unit_in_metres(unit)
 
 
-@pytest.mark.parametrize("options", [{"unit_scale_m": 0.0}, {"up_axis": "w"}, {"frame_rate_hz": -1.0}, {"handedness": "both"}])
+@pytest.mark.parametrize(
+    "options", [{"unit_scale_m": 0.0}, {"up_axis": "w"}, {"frame_rate_hz": -1.0}, {"handedness": "both"}]
+)
 def test_impossible_options_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
         ImportOptions(**options)
