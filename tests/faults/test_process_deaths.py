@@ -1,0 +1,391 @@
+"""Processes die in the middle of things; nothing is lost, nothing is there twice, and what is stored is sound."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+import sqlalchemy
+
+from marey_client import Marey
+from marey_client.blobs import digest_of
+from marey_client.errors import MareyError
+from marey_client.imports import LocalFile, find_files
+from marey_client.project import ProjectHandle
+from marey_motion.clip import Clip
+from marey_motion.formats import write_motion
+from marey_motion.gait import game_skeleton, generate_gait
+from marey_schemas.access import ProjectCreate
+from marey_schemas.imports import ImportEntry
+from marey_schemas.jobs import Job, JobCreate, JobState
+from server_process import QUICK_LEASES, ServerProcess, WorkerProcess
+from tcp_proxy import TcpProxy
+
+pytestmark = pytest.mark.timeout(240)
+
+
+@pytest.fixture(scope="session")
+def takes(tmp_path_factory: pytest.TempPathFactory) -> list[LocalFile]:
+    """200 different short walks as BVH files."""
+    folder = tmp_path_factory.mktemp("takes")
+    for number in range(200):
+        clip = generate_gait(1.0 + number / 200, 0.0, 0.5, 30)
+        (folder / f"walk-{number:03d}.bvh").write_bytes(write_motion(clip, "bvh"))
+    return list(find_files([folder]).files)
+
+
+@pytest.fixture
+def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
+    process = ServerProcess(tmp_path, database_url, **QUICK_LEASES)
+    yield process
+    process.stop()
+
+
+@pytest.fixture
+def start_worker(tmp_path: Path, server: ServerProcess) -> Iterator[Callable[..., WorkerProcess]]:
+    workers: list[WorkerProcess] = []
+
+    def start(name: str, *, fault: str | None = None, port: int | None = None) -> WorkerProcess:
+        url = f"http://127.0.0.1:{port}" if port else server.url
+        worker = WorkerProcess(tmp_path / f"{name}.log")
+        workers.append(worker)
+        return worker.start(url, server.token, tmp_path, name=name, fault=fault)
+
+    yield start
+    for worker in workers:
+        worker.stop()
+
+
+def make_lab(marey: Marey) -> ProjectHandle:
+    return marey.create_project(ProjectCreate(name="lab"))
+
+
+def import_game_skeleton(lab: ProjectHandle, folder: Path) -> str:
+    """Id of a second skeleton, which came with a clip."""
+    skeleton = game_skeleton()
+    at_rest = np.concatenate([skeleton.offsets[0], skeleton.rest_rotations.ravel()]).astype(np.float32)
+    file = folder / "game.bvh"
+    file.write_bytes(write_motion(Clip(skeleton, 30.0, np.tile(at_rest, (5, 1)), None, ()), "bvh"))
+    [entry] = lab.imports.upload(list(find_files([file]).files))
+    assert entry.skeleton is not None, entry
+    return entry.skeleton
+
+
+def clips_by_name(lab: ProjectHandle) -> dict[str, tuple[str, int]]:
+    """Id and newest revision of every clip; fails when a name is there twice in a folder."""
+    found: dict[str, tuple[str, int]] = {}
+    for clip in lab.clips.list():
+        assert clip.path not in found, f"{clip.path} is there twice"
+        found[clip.path] = (clip.id, clip.item.revision)
+    return found
+
+
+def submit_retargets(lab: ProjectHandle, entries: list[ImportEntry], skeleton: str, *, into: str) -> list[Job]:
+    return [
+        lab.submit(
+            JobCreate.model_validate(
+                {
+                    "kind": "retarget",
+                    "inputs": {"clips": [{"item": entry.item}], "skeleton": {"item": skeleton}},
+                    "into": into,
+                }
+            )
+        )
+        for entry in entries
+    ]
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 60) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.1)
+
+
+def ended(marey: Marey, jobs: list[Job], seconds: float = 120) -> list[Job]:
+    deadline = time.monotonic() + seconds
+    found = []
+    for each in jobs:
+        job = marey.jobs.get(each.id)
+        while not job.state.terminal:
+            assert time.monotonic() < deadline, f"{job.id} is still {job.state}"
+            time.sleep(0.1)
+            job = marey.jobs.get(each.id)
+        found.append(job)
+    return found
+
+
+# -- the server dies ---------------------------------------------------------------------------------------------------
+
+
+def test_a_server_killed_among_200_uploads_keeps_what_it_acknowledged(
+    server: ServerProcess, takes: list[LocalFile]
+) -> None:
+    acknowledged: dict[str, str] = {}
+
+    def upload_until_the_server_dies() -> None:
+        with server.client(patient=False) as marey:
+            for take in takes:
+                try:
+                    [entry] = marey.project("lab").imports.upload([take])
+                except MareyError:
+                    return
+                acknowledged[take.name] = entry.item or ""
+
+    server.start()
+    with server.client() as marey:
+        make_lab(marey)
+    uploading = threading.Thread(target=upload_until_the_server_dies)
+    uploading.start()
+    wait_until(lambda: len(acknowledged) >= 70)
+    server.kill()
+    uploading.join(60)
+    assert 70 <= len(acknowledged) < 200
+
+    server.start()
+    with server.client() as marey:
+        lab = marey.project("lab")
+        before = clips_by_name(lab)
+        assert set(acknowledged.values()) <= {item for item, _ in before.values()}
+        entries = lab.imports.upload(takes)
+        assert {
+            entry.name: entry.item for entry in entries if entry.status == "unchanged"
+        }.items() >= acknowledged.items()
+        after = clips_by_name(lab)
+        assert len(after) == 200
+        assert {revision for _, revision in after.values()} == {1}
+    server.check_database()
+
+
+@pytest.mark.parametrize("place", ["publish.before_commit", "publish.after_commit", "blob.put.before_commit"])
+def test_a_server_killed_at_a_write_leaves_it_whole_or_not_at_all(
+    server: ServerProcess, takes: list[LocalFile], place: str
+) -> None:
+    server.start()
+    with server.client() as marey:
+        make_lab(marey)
+    server.stop()
+    server.start(fault=f"{place}@3:kill")
+    with server.client(patient=False) as marey, pytest.raises(MareyError):
+        _upload_one_by_one(marey, takes[:8])
+    assert server.wait_until_dead() == -signal.SIGKILL
+
+    server.start()
+    with server.client() as marey:
+        lab = marey.project("lab")
+        entries = lab.imports.upload(takes[:8])
+        assert {entry.status for entry in entries} <= {"created", "unchanged"}
+        assert sorted(revision for _, revision in clips_by_name(lab).values()) == [1] * 8
+    server.check_database()
+
+
+@pytest.mark.parametrize("place", ["complete.before_commit@11", "complete.after_commit@17"])
+def test_a_server_killed_among_50_completes_publishes_each_result_once(
+    server: ServerProcess,
+    takes: list[LocalFile],
+    tmp_path: Path,
+    start_worker: Callable[..., WorkerProcess],
+    place: str,
+) -> None:
+    server.start()
+    with server.client() as marey:
+        lab = make_lab(marey)
+        entries = lab.imports.upload(takes[:50])
+        skeleton = import_game_skeleton(lab, tmp_path)
+    server.stop()
+    server.start(fault=f"{place}:kill")
+    with server.client() as marey:
+        jobs = submit_retargets(marey.project("lab"), entries, skeleton, into="game")
+    start_worker("steady")
+    assert server.wait_until_dead() == -signal.SIGKILL
+
+    server.start()
+    with server.client() as marey:
+        finished = ended(marey, jobs)
+        assert {job.state for job in finished} == {JobState.SUCCEEDED}, [job.failure for job in finished]
+        results = {
+            path: place for path, place in clips_by_name(marey.project("lab")).items() if path.startswith("game/")
+        }
+        assert len(results) == 50
+        assert {revision for _, revision in results.values()} == {1}
+        for job in finished:
+            outputs = list(marey.jobs.outputs(job.id))
+            assert len(outputs) == 1
+            made = marey.project("lab").clips.get(outputs[0].item)
+            assert {edge.item for edge in made.lineage().inputs} >= {skeleton}
+    server.check_database()
+
+
+# -- the worker dies, sleeps, or is cut off ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("place", ["after_claim", "after_blob", "before_complete", "after_complete"])
+def test_a_job_of_a_killed_worker_is_finished_by_another_with_one_result(
+    server: ServerProcess,
+    takes: list[LocalFile],
+    tmp_path: Path,
+    start_worker: Callable[..., WorkerProcess],
+    place: str,
+) -> None:
+    server.start()
+    with server.client() as marey:
+        lab = make_lab(marey)
+        entries = lab.imports.upload(takes[:1])
+        skeleton = import_game_skeleton(lab, tmp_path)
+        dying = start_worker("dying", fault=f"worker.{place}:kill")
+        [job] = submit_retargets(lab, entries, skeleton, into="game")
+        assert dying.wait_until_dead() == -signal.SIGKILL
+        start_worker("healthy")
+        [job] = ended(marey, [job])
+        assert job.state is JobState.SUCCEEDED, job.failure
+        outcomes = [attempt.outcome for attempt in marey.jobs.attempts(job.id)]
+        assert sorted(filter(None, outcomes)) == (["succeeded"] if place == "after_complete" else ["lost", "succeeded"])
+        assert [revision for path, (_, revision) in clips_by_name(lab).items() if path.startswith("game/")] == [1]
+    server.check_database()
+
+
+def test_a_worker_that_slept_through_its_lease_is_refused_and_the_second_result_stays(
+    server: ServerProcess, takes: list[LocalFile], tmp_path: Path, start_worker: Callable[..., WorkerProcess]
+) -> None:
+    server.start()
+    with server.client() as marey:
+        lab = make_lab(marey)
+        entries = lab.imports.upload(takes[:1])
+        skeleton = import_game_skeleton(lab, tmp_path)
+        sleeper = start_worker("sleeper", fault="worker.before_complete:stop")
+        [job] = submit_retargets(lab, entries, skeleton, into="game")
+        wait_until(lambda: sleeper.process is not None and _is_stopped(sleeper.process.pid))
+        start_worker("awake")
+        [job] = ended(marey, [job])
+        assert job.state is JobState.SUCCEEDED
+        assert job.fence >= 2
+        before = clips_by_name(lab)
+        sleeper.send(signal.SIGCONT)
+        wait_until(lambda: "given up" in sleeper.log.read_text())
+        assert clips_by_name(lab) == before
+        assert marey.jobs.get(job.id).fence == job.fence
+    server.check_database()
+
+
+def test_a_lost_answer_to_complete_is_asked_for_again(
+    server: ServerProcess, takes: list[LocalFile], tmp_path: Path, start_worker: Callable[..., WorkerProcess]
+) -> None:
+    server.start()
+    with server.client() as marey, TcpProxy(server.port) as proxy:
+        lab = make_lab(marey)
+        entries = lab.imports.upload(takes[:10])
+        skeleton = import_game_skeleton(lab, tmp_path)
+        start_worker("behind-proxy", port=proxy.port)
+        jobs = submit_retargets(lab, entries, skeleton, into="game")
+        cutting = threading.Thread(target=_cut_some, args=(proxy, 8))
+        cutting.start()
+        finished = ended(marey, jobs)
+        cutting.join(60)
+        assert proxy.cuts >= 1
+        assert {job.state for job in finished} == {JobState.SUCCEEDED}
+        results = [revision for path, (_, revision) in clips_by_name(lab).items() if path.startswith("game/")]
+        assert results == [1] * 10
+    server.check_database()
+
+
+def test_a_worker_cut_off_from_the_server_loses_its_job_to_another(
+    server: ServerProcess, takes: list[LocalFile], tmp_path: Path, start_worker: Callable[..., WorkerProcess]
+) -> None:
+    server.start()
+    with server.client() as marey, TcpProxy(server.port) as proxy:
+        lab = make_lab(marey)
+        entries = lab.imports.upload(takes[:3])
+        skeleton = import_game_skeleton(lab, tmp_path)
+        start_worker("cut-off", port=proxy.port)
+        jobs = submit_retargets(lab, entries, skeleton, into="game")
+        wait_until(lambda: any(marey.jobs.get(job.id).state is not JobState.QUEUED for job in jobs))
+        proxy.drop_answers.set()
+        start_worker("connected")
+        finished = ended(marey, jobs)
+        proxy.drop_answers.clear()
+        assert {job.state for job in finished} == {JobState.SUCCEEDED}
+        results = [revision for path, (_, revision) in clips_by_name(lab).items() if path.startswith("game/")]
+        assert results == [1] * 3
+    server.check_database()
+
+
+# -- the store fails ---------------------------------------------------------------------------------------------------
+
+
+def test_a_full_disk_is_a_507_and_leaves_nothing_behind(server: ServerProcess, takes: list[LocalFile]) -> None:
+    server.start()
+    with server.client() as marey:
+        make_lab(marey)
+    server.stop()
+    server.start(fault="blob.put.before_commit:error")
+    with server.client(patient=False) as marey:
+        content = takes[0].path.read_bytes()
+        answer = httpx.put(
+            f"{server.url}/api/v1/blobs/{digest_of(content)}",
+            content=content,
+            headers={"Authorization": f"Bearer {server.token}"},
+        )
+        assert answer.status_code == 507
+        assert answer.json()["code"] == "storage-full"
+    server.stop()
+    server.start()
+    with server.client() as marey:
+        [entry] = marey.project("lab").imports.upload(takes[:1])
+        assert entry.status == "created"
+    server.check_database()
+
+
+def test_a_database_that_is_away_for_a_while_delays_work_and_loses_none(
+    server: ServerProcess, database_url: str, takes: list[LocalFile]
+) -> None:
+    server.start()
+    with server.client() as marey:
+        lab = make_lab(marey)
+        uploaded: list[ImportEntry] = []
+        uploading = threading.Thread(target=lambda: uploaded.extend(lab.imports.upload(takes[:40])))
+        uploading.start()
+        _disturb(database_url, seconds=5)
+        uploading.join(120)
+        assert [entry.status for entry in uploaded] == ["created"] * 40
+        assert sorted(revision for _, revision in clips_by_name(lab).values()) == [1] * 40
+    server.check_database()
+
+
+def _disturb(database_url: str, seconds: float) -> None:
+    """Hold SQLite's write lock, or end every connection to the Postgres database again and again."""
+    engine = sqlalchemy.create_engine(database_url, isolation_level="AUTOCOMMIT", poolclass=sqlalchemy.NullPool)
+    deadline = time.monotonic() + seconds
+    with engine.connect() as connection:
+        if engine.dialect.name == "sqlite":
+            connection.exec_driver_sql("BEGIN EXCLUSIVE")
+            time.sleep(seconds)
+            connection.exec_driver_sql("ROLLBACK")
+            return
+        while time.monotonic() < deadline:
+            connection.exec_driver_sql(
+                "SELECT pg_terminate_backend(pid) FROM pg_stat_activity"
+                " WHERE datname = current_database() AND pid <> pg_backend_pid()"
+            )
+            time.sleep(0.3)
+
+
+def _upload_one_by_one(marey: Marey, takes: list[LocalFile]) -> None:
+    for take in takes:
+        marey.project("lab").imports.upload([take])
+
+
+def _cut_some(proxy: TcpProxy, count: int) -> None:
+    for _ in range(count):
+        proxy.cut_after_request.set()
+        time.sleep(0.4)
+    proxy.cut_after_request.clear()
+
+
+def _is_stopped(pid: int) -> bool:
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
