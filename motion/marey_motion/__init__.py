@@ -21,6 +21,13 @@ if TYPE_CHECKING:
     from marey_motion.errors import SkeletonError as SkeletonError
     from marey_motion.errors import UnknownFormat as UnknownFormat
     from marey_motion.errors import UnknownJoint as UnknownJoint
+    from marey_motion.figures import contact_sheet as contact_sheet
+    from marey_motion.formats import read_motion as read_motion
+    from marey_motion.formats import write_motion as write_motion
+    from marey_motion.gait import game_skeleton as game_skeleton
+    from marey_motion.gait import generate_dataset as generate_dataset
+    from marey_motion.gait import generate_gait as generate_gait
+    from marey_motion.gait import studio_skeleton as studio_skeleton
     from marey_motion.kinematics import foot_contacts as foot_contacts
     from marey_motion.kinematics import forward_directions as forward_directions
     from marey_motion.kinematics import forward_kinematics as forward_kinematics
@@ -29,6 +36,9 @@ if TYPE_CHECKING:
     from marey_motion.kinematics import headings as headings
     from marey_motion.kinematics import turn_rates as turn_rates
     from marey_motion.kinematics import velocities as velocities
+    from marey_motion.retargeting import RetargetPlan as RetargetPlan
+    from marey_motion.retargeting import plan_retarget as plan_retarget
+    from marey_motion.retargeting import retarget as retarget
     from marey_motion.rigs import JointAxes as JointAxes
     from marey_motion.rigs import JointMapping as JointMapping
     from marey_motion.rigs import guess_axes as guess_axes
@@ -36,6 +46,8 @@ if TYPE_CHECKING:
     from marey_motion.skeleton import EndSite as EndSite
     from marey_motion.skeleton import Skeleton as Skeleton
     from marey_motion.skeleton import same_hierarchy as same_hierarchy
+    from marey_motion.source import ImportedMotion as ImportedMotion
+    from marey_motion.source import ImportOptions as ImportOptions
 
 _HOMES = {
     "clip": ("Clip",),
@@ -51,6 +63,9 @@ _HOMES = {
         "UnknownFormat",
         "UnknownJoint",
     ),
+    "figures": ("contact_sheet",),
+    "formats": ("read_motion", "write_motion"),
+    "gait": ("game_skeleton", "generate_dataset", "generate_gait", "studio_skeleton"),
     "kinematics": (
         "foot_contacts",
         "forward_directions",
@@ -61,8 +76,10 @@ _HOMES = {
         "turn_rates",
         "velocities",
     ),
+    "retargeting": ("RetargetPlan", "plan_retarget", "retarget"),
     "rigs": ("JointAxes", "JointMapping", "guess_axes", "map_joints"),
     "skeleton": ("EndSite", "Skeleton", "same_hierarchy"),
+    "source": ("ImportOptions", "ImportedMotion"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
