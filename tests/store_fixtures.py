@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marey_schemas.access import MemberChange, ProjectCreate, Role, User, UserCreate, Visibility
+from marey_schemas.access import MemberChange, ProjectChange, ProjectCreate, Role, UserCreate, Visibility
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
 from marey_server.store import items, members, projects, users
-from marey_server.store.database import Database
+from marey_server.store.database import Database, Transaction
 
 ALL_SCOPES = ("read", "write", "jobs", "work", "admin")
 
@@ -34,29 +34,33 @@ def motion_tree(skeleton: Any, *, frames: int = 5, joints: int = 3, seed: int = 
     }
 
 
+def _new_user(tx: Transaction, name: str, *, administrator: bool = False) -> Principal:
+    made = users.create_user(tx, UserCreate(name=name, administrator=administrator))
+    return Principal("user", made.id, made.name, administrator, ALL_SCOPES)
+
+
 class Lab:
     """The project `lab` in a database, and who is who in it."""
 
     def __init__(self, database: Database, name: str = "lab") -> None:
         self.database = database
         self.name = name
-        self.root = Principal("user", None, "root", administrator=True, scopes=ALL_SCOPES)
+        database.write(SYSTEM, self._furnish)
+
+    def _furnish(self, tx: Transaction) -> None:
         self.owner, self.maintainer, self.contributor, self.reader, self.stranger = (
-            self.sign_up(f"{who}-{name}") for who in ("owner", "maintainer", "contributor", "reader", "stranger")
+            _new_user(tx, f"{who}-{self.name}") for who in ("owner", "maintainer", "contributor", "reader", "stranger")
         )
         self.anonymous = ANONYMOUS
-        self.write(projects.create_project, ProjectCreate(name=name), who=self.owner)
-        for who, role in (
-            (self.maintainer, Role.MAINTAINER),
-            (self.contributor, Role.CONTRIBUTOR),
-            (self.reader, Role.READER),
-        ):
-            self.write(members.put_member, name, who.user_name, MemberChange(role=role), who=self.owner)
+        tx.principal = self.owner
+        projects.create_project(tx, ProjectCreate(name=self.name))
+        for who in (self.maintainer, self.contributor, self.reader):
+            role = Role(str(who.user_name).partition("-")[0])
+            members.put_member(tx, self.name, str(who.user_name), MemberChange(role=role))
 
     def sign_up(self, name: str, *, administrator: bool = False) -> Principal:
         """A new user, as a principal with every scope."""
-        made: User = self.database.write(SYSTEM, users.create_user, UserCreate(name=name, administrator=administrator))
-        return Principal("user", made.id, made.name, administrator, ALL_SCOPES)
+        return self.database.write(SYSTEM, _new_user, name, administrator=administrator)
 
     def read(self, function: Any, *args: Any, who: Principal | None = None, **kwargs: Any) -> Any:
         """Run a read, as the owner unless told otherwise."""
@@ -68,8 +72,6 @@ class Lab:
 
     def make_public(self) -> None:
         """Let everybody read the project."""
-        from marey_schemas.access import ProjectChange
-
         change = ProjectChange(visibility=Visibility.PUBLIC)
         self.write(projects.change_project, self.name, change, expected_rev=None)
 

@@ -1,0 +1,68 @@
+"""Scopes, roles, passwords and tokens, without a database."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from marey_schemas.access import Role
+from marey_server.access import passwords, roles, scopes
+from marey_server.access.secret_tokens import attempt_secret, issue_attempt_token, issue_user_token, split_user_token
+
+
+@pytest.fixture
+def cheap_hashes(monkeypatch):
+    monkeypatch.setattr(passwords, "LOG2_N", 4)
+
+
+def test_roles_are_ordered():
+    order = [Role.READER, Role.CONTRIBUTOR, Role.MAINTAINER, Role.OWNER]
+    for i, role in enumerate(order):
+        assert [roles.includes(role, need) for need in order] == [j <= i for j in range(4)]
+
+
+def test_a_bound_scope_reaches_its_project_only():
+    assert scopes.allows(["write!project=walk"], "write", "walk")
+    assert not scopes.allows(["write!project=walk"], "write", "run")
+    assert not scopes.allows(["write!project=walk"], "write")
+    assert not scopes.allows(["write!project=walk"], "read", "walk")
+    assert scopes.allows(["write"], "write", "walk")
+
+
+scope_texts = st.sampled_from(["read", "write", "jobs", "read!project=a", "write!project=a", "write!project=b"])
+
+
+@given(st.lists(scope_texts), st.lists(scope_texts))
+def test_what_does_not_exceed_allows_nothing_more(wanted, held):
+    if not scopes.exceeding(wanted, held):
+        for need in ("read", "write", "jobs"):
+            for project in ("a", "b", None):
+                assert scopes.allows(held, need, project) or not scopes.allows(wanted, need, project)
+
+
+def test_a_password_matches_its_own_hash_only(cheap_hashes):
+    stored = passwords.hash_password("pässwörd 1\ud800")
+    assert passwords.password_matches("pässwörd 1\ud800", stored)
+    assert not passwords.password_matches("pässwörd 2", stored)
+    assert not passwords.password_matches("", None)
+    assert passwords.hash_password("same") != passwords.hash_password("same")
+
+
+def test_a_hash_keeps_working_when_new_ones_cost_more(cheap_hashes, monkeypatch):
+    stored = passwords.hash_password("correct horse")
+    monkeypatch.setattr(passwords, "LOG2_N", 5)
+    assert passwords.password_matches("correct horse", stored)
+
+
+def test_hashing_really_costs_32_mib():
+    assert (1 << passwords.LOG2_N) * 128 * 8 == 32 * 2**20
+    assert passwords.password_matches("correct horse", passwords.hash_password("correct horse"))
+
+
+def test_tokens_of_users_and_attempts_are_told_apart():
+    user, attempt = issue_user_token(), issue_attempt_token()
+    prefix, secret = split_user_token(user.text)
+    assert prefix == user.prefix
+    assert secret not in (user.secret_hash, prefix)
+    assert split_user_token(attempt.text) is None
+    assert attempt_secret(attempt.text)
+    assert attempt_secret(user.text) is None

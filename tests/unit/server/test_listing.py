@@ -1,0 +1,175 @@
+"""Lists of items: filters, order, cursors."""
+
+from contextlib import suppress
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from marey_schemas.kinds import Kind
+from marey_server.errors import BadRequest, Invalid
+from marey_server.store import items, listing
+from marey_server.store.items import ItemFilters
+
+CLIPS = (  # name, collection, tags, frames
+    ("walk 1", "raw/a", ("walk",), 10),
+    ("walk 2", "raw/b", ("walk", "slow"), 20),
+    ("Walk 10", "raw", ("fast",), 30),
+    ("run_100%", "rawer", (), 20),
+    ("Übung", "", ("slow",), 5),
+    ("zoë", "raw/a/x", (), 5),
+)
+
+
+@pytest.fixture
+def filled(lab):
+    rig = lab.add_skeleton()
+    for seed, (name, collection, tags, frames) in enumerate(CLIPS):
+        lab.add_clip(rig, name, collection=collection, tags=tags, frames=frames, seed=seed)
+    lab.rig = rig
+    return lab
+
+
+def names(lab, sort="name", **filters):
+    return [one.name for one in lab.read(items.list_items, "lab", Kind.CLIP, ItemFilters(**filters), sort=sort).items]
+
+
+FILTERS = (
+    ({}, {name for name, *_ in CLIPS}),
+    ({"collection": "raw"}, {"walk 1", "walk 2", "Walk 10", "zoë"}),
+    ({"collection": "raw/a"}, {"walk 1", "zoë"}),
+    ({"collection": "ra"}, set()),
+    ({"collection": ""}, {name for name, *_ in CLIPS}),
+    ({"path": "raw/walk 1"}, set()),
+    ({"path": "raw/a/walk 1"}, {"walk 1"}),
+    ({"path": "Übung"}, {"Übung"}),
+    ({"name": "walk 1"}, {"walk 1"}),
+    ({"name": "walk*"}, {"walk 1", "walk 2"}),
+    ({"name": "*"}, {name for name, *_ in CLIPS}),
+    ({"name": "run_100%*"}, {"run_100%"}),
+    ({"name": "%*"}, set()),
+    ({"tags": ("walk",)}, {"walk 1", "walk 2"}),
+    ({"tags": ("fast", "slow")}, {"walk 2", "Walk 10", "Übung"}),
+    ({"frames_gte": 20}, {"walk 2", "Walk 10", "run_100%"}),
+    ({"frames_gte": 10, "frames_lte": 20}, {"walk 1", "walk 2", "run_100%"}),
+    ({"q": "WALK"}, {"walk 1", "walk 2", "Walk 10"}),
+    ({"q": "übung"}, {"Übung"}),
+    ({"q": "ZOË"}, {"zoë"}),
+    ({"q": "0%"}, {"run_100%"}),
+    ({"q": "_"}, {"run_100%"}),
+    ({"skeleton": "skeleton_x"}, set()),
+    ({"q": "walk", "tags": ("slow",), "collection": "raw/b"}, {"walk 2"}),
+)
+
+
+def test_filters_choose(filled):
+    for filters, expected in FILTERS:
+        found = names(filled, **filters)
+        assert set(found) == expected, filters
+        assert len(found) == len(expected), filters
+        counted = filled.read(items.list_items, "lab", Kind.CLIP, ItemFilters(**filters), limit=1, count=True)
+        assert counted.count == len(expected), filters
+
+
+def test_clips_are_found_by_their_skeleton(filled):
+    assert len(names(filled, skeleton=filled.rig.id)) == len(CLIPS)
+
+
+def test_order_is_that_of_code_points_on_every_database(filled):
+    assert names(filled, sort="name") == sorted(name for name, *_ in CLIPS)
+    assert names(filled, sort="-name") == sorted((name for name, *_ in CLIPS), reverse=True)
+
+
+def test_keys_of_an_order_have_directions_of_their_own(filled):
+    by_frames = sorted(((frames, name) for name, _, _, frames in CLIPS), key=lambda pair: (-pair[0], pair[1]))
+    assert names(filled, sort="-frames,name") == [name for _, name in by_frames]
+
+
+@pytest.mark.parametrize("sort", ["nose", "name,nose", "name,-name", "-", ",,nose"])
+def test_unknown_orders_are_refused(filled, sort):
+    with pytest.raises(BadRequest):
+        names(filled, sort=sort)
+
+
+@pytest.mark.parametrize("limit", [0, -1, 1001])
+def test_limits_out_of_range_are_refused(filled, limit):
+    with pytest.raises(BadRequest):
+        filled.read(items.list_items, "lab", Kind.CLIP, limit=limit)
+
+
+def test_fields_choose_what_is_shown(filled):
+    page = filled.read(items.list_items, "lab", Kind.CLIP, ItemFilters(name="walk 2"), fields=("id", "name", "tags"))
+    assert page.items[0].keys() == {"id", "name", "tags"}
+    assert page.items[0]["tags"] == ["slow", "walk"]
+    with pytest.raises(BadRequest):
+        filled.read(items.list_items, "lab", Kind.CLIP, fields=("nose",))
+
+
+def pages(lab, limit, **kwargs):
+    cursor = None
+    while True:
+        page = lab.read(items.list_items, "lab", Kind.CLIP, cursor=cursor, limit=limit, **kwargs)
+        yield [one.name for one in page.items]
+        cursor = page.next_cursor
+        if cursor is None:
+            return
+
+
+def test_pages_put_together_are_the_list(filled):
+    for sort in ("id", "name", "-name", "frames", "-frames,name", "frames,-name", "-created_at", "updated_at"):
+        whole = names(filled, sort=sort)
+        for limit in (1, 2, 4, 6, 7):
+            assert [name for page in pages(filled, limit, sort=sort) for name in page] == whole, (sort, limit)
+
+
+def test_what_is_inserted_meanwhile_neither_repeats_nor_hides_anything(filled):
+    seen = []
+    for number, page in enumerate(pages(filled, 2, sort="name")):
+        seen += page
+        filled.add_clip(filled.rig, f"A {number}", seed=50 + number)
+        filled.add_clip(filled.rig, f"zz {number}", seed=70 + number)
+        if number > 5:
+            break
+    assert len(seen) == len(set(seen))
+    assert [name for name in seen if not name.startswith("zz")] == sorted(name for name, *_ in CLIPS)
+
+
+def test_a_cursor_serves_only_the_list_it_came_from(filled):
+    def ask(cursor, **kwargs):
+        return filled.read(items.list_items, "lab", Kind.CLIP, cursor=cursor, **kwargs)
+
+    cursor = filled.read(items.list_items, "lab", Kind.CLIP, limit=2, sort="name").next_cursor
+    assert ask(cursor, sort="name").items
+    for wrong in (
+        lambda: ask(cursor, sort="-name"),
+        lambda: ask(cursor, sort="name", filters=ItemFilters(q="w")),
+        lambda: filled.read(items.list_items, "lab", Kind.STUDY, cursor=cursor, sort="name"),
+        lambda: ask(cursor[:-2] + "AA", sort="name"),
+        lambda: ask("", sort="name"),
+        lambda: ask("é€", sort="name"),
+        lambda: ask("A" * 300, sort="name"),
+    ):
+        with pytest.raises(BadRequest):
+            wrong()
+
+
+def test_cursors_of_one_server_are_worth_nothing_on_another(filled):
+    cursor = filled.read(items.list_items, "lab", Kind.CLIP, limit=2).next_cursor
+
+    def forget(tx):
+        tx.connection.exec_driver_sql("DELETE FROM server_state WHERE key = 'cursor_key'")
+        listing.make_cursor_key(tx)
+
+    filled.write(forget)
+    with pytest.raises(BadRequest):
+        filled.read(items.list_items, "lab", Kind.CLIP, limit=2, cursor=cursor)
+
+
+@given(text=st.text(max_size=8), number=st.integers(-(2**70), 2**70))
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_no_filter_value_breaks_a_list(filled, text, number):
+    texts = [{"q": text}, {"name": text}, {"name": f"{text}*"}, {"path": text}, {"tags": (text,)}]
+    numbers = [{"frames_gte": number}, {"frames_lte": number}]
+    for filters in (*texts, {"collection": text}, {"skeleton": text}, *numbers):
+        with suppress(Invalid):
+            assert set(names(filled, **filters)) <= {name for name, *_ in CLIPS}

@@ -1,0 +1,180 @@
+"""Results of imports and jobs become items: together, once, and with references between them."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from marey_schemas.kinds import Kind
+from marey_server.errors import Conflict, Invalid
+from marey_server.store import documents, items, projects
+from marey_server.store.items import Draft, StoredDocument, references
+from store_fixtures import motion_tree, skeleton_tree
+
+
+def publish(lab, *drafts, **kwargs):
+    def run(tx):
+        project_row = projects.require(tx, "lab", scope="write")
+        return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id, **kwargs)
+
+    return lab.write(run)
+
+
+def rig_draft(name="rig", reuse="by_content", **kwargs):
+    return Draft(name, Kind.SKELETON, name, {"hierarchy": skeleton_tree(**kwargs)}, reuse=reuse)
+
+
+def clip_draft(name="walk", rig="rig", **kwargs):
+    motion = motion_tree({"output": rig}, **kwargs)
+    return Draft(name, Kind.CLIP, name, {"motion": motion}, collection="raw", tags=("new",))
+
+
+def listed(lab, kind):
+    return lab.read(items.list_items, "lab", kind, sort="name").items
+
+
+def test_drafts_refer_to_each_other_whatever_their_order(lab):
+    clip, rig = publish(lab, clip_draft(), rig_draft())
+    part = lab.read(items.read_part, "lab", Kind.CLIP, clip.item, "motion")
+    assert part.tree["skeleton"] == {"item": rig.item, "revision": 1}
+    assert (clip.name, clip.created, rig.created) == ("walk", True, True)
+
+
+def test_publishing_the_same_again_makes_nothing_new(lab):
+    first = publish(lab, clip_draft(), rig_draft())
+    again = publish(lab, clip_draft(), rig_draft())
+    assert [(one.item, one.revision) for one in again] == [(one.item, one.revision) for one in first]
+    assert not any(one.created for one in again)
+    assert len(listed(lab, Kind.CLIP)) == len(listed(lab, Kind.SKELETON)) == 1
+
+
+def test_other_content_under_a_name_is_its_next_revision(lab):
+    publish(lab, clip_draft(), rig_draft())
+    clip, _ = publish(lab, clip_draft(seed=1, frames=9), rig_draft())
+    assert (clip.revision, clip.created) == (2, True)
+    assert listed(lab, Kind.CLIP)[0].summary["frames"] == 9
+
+
+def test_equal_content_is_found_under_any_name_even_after_its_other_parts_were_edited(lab):
+    (rig,) = publish(lab, rig_draft("rig"))
+    mapping = {"joints": {"hips": "j0"}}
+    lab.write(items.put_part, "lab", Kind.SKELETON, rig.item, "mapping", mapping, expected_rev=None)
+    (found,) = publish(lab, rig_draft("other name"))
+    assert (found.item, found.revision, found.created) == (rig.item, 2, False)
+
+
+def test_other_content_under_a_taken_name_is_numbered(lab):
+    publish(
+        lab,
+        rig_draft(bone_m=0.5),
+    )
+    publish(lab, rig_draft(bone_m=0.6))
+    publish(lab, rig_draft(bone_m=0.7))
+    assert [one.name for one in listed(lab, Kind.SKELETON)] == ["rig", "rig (2)", "rig (3)"]
+
+
+def test_a_new_item_refuses_a_taken_name_and_nothing_is_published(lab):
+    publish(lab, rig_draft())
+    with pytest.raises(Conflict):
+        publish(lab, clip_draft(), rig_draft(reuse="new"))
+    assert listed(lab, Kind.CLIP) == ()
+
+
+def test_one_bad_draft_and_nothing_is_published(lab):
+    with pytest.raises(Invalid):
+        publish(lab, rig_draft(), clip_draft("good"), clip_draft("bad", joints=2))
+    assert listed(lab, Kind.SKELETON) == listed(lab, Kind.CLIP) == ()
+    with lab.database.engine.connect() as connection:
+        for table in ("document", "blob", "blob_chunk", "collection", "revision"):
+            assert connection.exec_driver_sql(f"SELECT count(*) FROM {table}").scalar() == 0
+
+
+def test_names_within_a_batch_are_unique(lab):
+    with pytest.raises(Invalid):
+        publish(lab, rig_draft(), rig_draft())
+
+
+def test_drafts_with_one_target_become_its_revisions_in_order(lab):
+    drafts = [Draft(f"d{i}", Kind.SKELETON, "rig", {"hierarchy": skeleton_tree(bone_m=i + 1)}) for i in range(3)]
+    assert [(one.revision, one.created) for one in publish(lab, *drafts)] == [(1, True), (2, True), (3, True)]
+
+
+def test_staged_documents_with_references_keep_their_arrays(lab):
+    motion = motion_tree({"output": "rig"}, frames=6)
+    staged = lab.write(documents.store_document, motion)
+    draft = Draft("walk", Kind.CLIP, "walk", {"motion": StoredDocument(staged)})
+    clip, rig = publish(lab, draft, rig_draft())
+    part = lab.read(items.read_part, "lab", Kind.CLIP, clip.item, "motion", arrays="decoded")
+    assert part.tree["poses"].tobytes() == motion["poses"].tobytes()
+    assert part.tree["skeleton"] == {"item": rig.item, "revision": 1}
+
+
+def test_sources_become_lineage_in_both_directions(lab):
+    clip, rig = publish(lab, clip_draft(), rig_draft())
+    sources = {"clip": [(clip.item, 1)], "skeleton": [(rig.item, 1)]}
+    (made,) = publish(lab, Draft("out", Kind.STUDY, "out", {"study": {"n": 1}}, sources=sources))
+    lineage = lab.read(items.read_lineage, "lab", Kind.STUDY, made.item)
+    assert {(edge.role, edge.item, edge.revision, edge.kind) for edge in lineage.inputs} == {
+        ("clip", clip.item, 1, Kind.CLIP), ("skeleton", rig.item, 1, Kind.SKELETON),
+    }  # fmt: skip
+    back = lab.read(items.read_lineage, "lab", Kind.CLIP, clip.item)
+    assert [(edge.item, edge.revision, edge.role) for edge in back.outputs] == [(made.item, 1, "clip")]
+
+
+def test_what_was_made_from_something_that_changed_is_stale_through_any_number_of_steps(lab):
+    clip, _ = publish(lab, clip_draft(), rig_draft())
+    steps = [clip]
+    for step in range(3):
+        draft = Draft("o", Kind.STUDY, f"s{step}", {"study": {"step": step}}, sources={"in": [(steps[-1].item, 1)]})
+        steps += publish(lab, draft)
+
+    def staleness():
+        return lab.read(items.read_staleness, "lab", Kind.STUDY, steps[-1].item)
+
+    assert not staleness().stale
+    lab.write(items.put_part, "lab", Kind.CLIP, clip.item, "info", {"subject": "x"}, expected_rev=None)
+    assert staleness().stale
+    assert [(edge.item, edge.revision) for edge in staleness().because] == [(clip.item, 1)]
+
+
+def test_many_publishers_of_one_skeleton_make_one(lab):
+    def run(tx, number):
+        project_row = projects.require(tx, "lab", scope="write")
+        drafts = [rig_draft(), clip_draft(f"walk {number}", seed=number)]
+        return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id)
+
+    futures = [lab.database.submit_write(lab.owner, run, number) for number in range(8)]
+    assert len({future.result(60)[0].item for future in futures}) == 1
+    assert len(listed(lab, Kind.CLIP)) == 8
+    assert len(listed(lab, Kind.SKELETON)) == 1
+
+
+def test_many_publishers_of_one_name_make_its_revisions(lab):
+    publish(lab, rig_draft())
+
+    def run(tx, number):
+        project_row = projects.require(tx, "lab", scope="write")
+        return items.publish(tx, project_row, [rig_draft(), clip_draft(seed=number)], author_id=tx.principal.user_id)[1]
+
+    futures = [lab.database.submit_write(lab.owner, run, number) for number in range(8)]
+    assert sorted(future.result(60).revision for future in futures) == list(range(1, 9))
+    assert listed(lab, Kind.CLIP)[0].revision == 8
+
+
+names = st.sampled_from("abcdef")
+
+
+@given(st.dictionaries(names, st.lists(names, max_size=3)))
+@settings(max_examples=300)
+def test_references_are_followed_before_what_refers(refers):
+    try:
+        order = references.in_order(refers)
+    except Invalid:
+        # There is a cycle: walking backwards over members of `refers` never ends.
+        left = {name: {one for one in refers[name] if one in refers} for name in refers}
+        while done := [name for name, others in left.items() if not others]:
+            left = {name: others - set(done) for name, others in left.items() if name not in done}
+        assert left
+        return
+    assert sorted(order) == sorted(refers)
+    for name, others in refers.items():
+        assert all(order.index(other) < order.index(name) for other in others if other in refers)

@@ -1,0 +1,239 @@
+"""Users, passwords, tokens."""
+
+import pytest
+import sqlalchemy
+
+from marey_schemas.access import TokenCreate, UserChange, UserCreate
+from marey_schemas.jobs import JobState
+from marey_server.access import passwords
+from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
+from marey_server.access.secret_tokens import issue_attempt_token
+from marey_server.errors import Conflict, Forbidden, LeaseLost, NotFound, PreconditionFailed, Unauthenticated
+from marey_server.store import projects, tokens, users
+from marey_server.store.tables import attempt, job
+
+
+@pytest.fixture(autouse=True)
+def cheap_hashes(monkeypatch):
+    monkeypatch.setattr(passwords, "LOG2_N", 4)
+
+
+@pytest.fixture
+def chief(database):
+    made = database.write(SYSTEM, users.ensure_first_administrator)
+    assert made is not None
+    return database.read(SYSTEM, users.administrator_principal)
+
+
+def sign_up(database, chief, name, password=None):
+    hashed = passwords.hash_password(password) if password else None
+    made = database.write(chief, users.create_user, UserCreate(name=name), password_hash=hashed)
+    return Principal("user", made.id, name, scopes=("read", "write", "jobs"))
+
+
+def test_the_first_administrator_is_made_once(database, chief):
+    assert chief.administrator
+    assert database.write(SYSTEM, users.ensure_first_administrator) is None
+
+
+def test_only_administrators_make_and_list_users(database, chief):
+    ann = sign_up(database, chief, "ann")
+    weak_chief = Principal("user", chief.user_id, "admin", administrator=True, scopes=("read", "write"))
+    for who in (ann, weak_chief):
+        with pytest.raises(Forbidden):
+            database.write(who, users.create_user, UserCreate(name="ben"))
+        with pytest.raises(Forbidden):
+            database.read(who, users.list_users)
+    with pytest.raises(Unauthenticated):
+        database.read(ANONYMOUS, users.list_users)
+    assert [found.name for found in database.read(chief, users.list_users).items] == ["admin", "ann"]
+
+
+def test_names_of_users_are_unique(database, chief):
+    sign_up(database, chief, "ann")
+    with pytest.raises(Conflict):
+        sign_up(database, chief, "ann")
+
+
+def test_users_see_themselves_and_nobody_else(database, chief):
+    ann, ben = sign_up(database, chief, "ann"), sign_up(database, chief, "ben")
+    assert database.read(ann, users.find_user, "ann").name == "ann"
+    with pytest.raises(NotFound):
+        database.read(ben, users.find_user, "ann")
+
+
+def test_signing_in_needs_the_password(database, chief):
+    sign_up(database, chief, "ann", "correct horse")
+    sign_up(database, chief, "silent")
+    principal = database.read(ANONYMOUS, users.verify_password, "ann", "correct horse")
+    assert (principal.user_name, principal.administrator) == ("ann", False)
+    assert "admin" not in principal.scopes
+    for name, password in (("ann", "wrong horse"), ("nobody", "correct horse"), ("silent", ""), ("admin", "")):
+        with pytest.raises(Unauthenticated) as refused:
+            database.read(ANONYMOUS, users.verify_password, name, password)
+        assert refused.value.detail == "Name or password is wrong."
+
+
+def test_a_user_changes_the_password_with_the_current_one(database, chief):
+    ann = sign_up(database, chief, "ann", "correct horse")
+    change = UserChange(password="battery staple", current_password="correct horse")
+    new = passwords.hash_password("battery staple")
+    with pytest.raises(Forbidden):
+        database.write(ann, users.change_user, "ann", change, expected_rev=None, password_hash=new)
+    old = database.read(ann, users.stored_hash, "ann")
+    database.write(ann, users.change_user, "ann", change, expected_rev=None, password_hash=new, verified_hash=old)
+    assert database.read(ANONYMOUS, users.verify_password, "ann", "battery staple").user_name == "ann"
+    with pytest.raises(PreconditionFailed):
+        database.write(ann, users.change_user, "ann", change, expected_rev=None, password_hash=new, verified_hash=old)
+
+
+def test_users_cannot_raise_themselves(database, chief):
+    ann = sign_up(database, chief, "ann")
+    with pytest.raises(Forbidden):
+        database.write(ann, users.change_user, "ann", UserChange(administrator=True), expected_rev=None)
+    assert not database.read(ann, users.find_user, "ann").administrator
+
+
+def test_somebody_stays_administrator(database, chief):
+    with pytest.raises(Conflict):
+        database.write(chief, users.delete_user, "admin", expected_rev=None)
+    with pytest.raises(Conflict):
+        database.write(chief, users.change_user, "admin", UserChange(administrator=False), expected_rev=None)
+    assert database.read(chief, users.find_user, "admin").administrator
+
+
+def make_token(database, who, **kwargs):
+    return database.write(who, tokens.create_token, TokenCreate(name="mine", **kwargs))
+
+
+def test_a_token_stands_for_its_user_until_it_is_revoked(database, chief):
+    ann, ben = sign_up(database, chief, "ann"), sign_up(database, chief, "ben")
+    made = make_token(database, ann, scopes=("read",))
+    found = database.read(ANONYMOUS, tokens.resolve_token, made.secret)
+    assert (found.user_id, found.scopes, found.token_id) == (ann.user_id, ("read",), made.id)
+    assert [one.id for one in database.read(ann, tokens.list_tokens).items] == [made.id]
+    with pytest.raises(NotFound):
+        database.write(ben, tokens.revoke_token, made.id)
+    database.write(ann, tokens.revoke_token, made.id)
+    with pytest.raises(Unauthenticated):
+        database.read(ANONYMOUS, tokens.resolve_token, made.secret)
+
+
+def test_a_token_expires(database, chief, clock):
+    made = make_token(database, chief, expires_in_s=60)
+    clock.advance(59)
+    assert database.read(ANONYMOUS, tokens.resolve_token, made.secret).user_name == "admin"
+    clock.advance(2)
+    with pytest.raises(Unauthenticated):
+        database.read(ANONYMOUS, tokens.resolve_token, made.secret)
+
+
+def test_tokens_of_a_disabled_user_are_worth_nothing(database, chief):
+    ann = sign_up(database, chief, "ann", "correct horse")
+    made = make_token(database, ann)
+    database.write(chief, users.delete_user, "ann", expected_rev=None)
+    with pytest.raises(Unauthenticated):
+        database.read(ANONYMOUS, tokens.resolve_token, made.secret)
+    with pytest.raises(Unauthenticated):
+        database.read(ANONYMOUS, users.verify_password, "ann", "correct horse")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "marey_", "marey_abc", "marey__x", "mareyjob_", "mareyjob_0", "Bearer x", "marey_\ud800_\x00", "x" * 5000],
+)
+def test_what_is_no_token_is_refused(database, text):
+    with pytest.raises(Unauthenticated):
+        database.read(ANONYMOUS, tokens.resolve_token, text)
+
+
+def test_a_wrong_secret_behind_a_right_prefix_is_refused(database, chief):
+    made = make_token(database, chief)
+    with pytest.raises(Unauthenticated):
+        database.read(ANONYMOUS, tokens.resolve_token, made.secret[:-1] + ("0" if made.secret[-1] != "0" else "1"))
+
+
+def test_no_secret_is_stored(database, chief):
+    made = make_token(database, chief)
+    secret = made.secret.rpartition("_")[2]
+    with database.engine.connect() as connection:
+        for table in ("token", "event"):
+            rows = connection.exec_driver_sql(f'SELECT * FROM "{table}"').all()
+            assert rows
+            assert secret not in str(rows)
+
+
+def test_a_token_never_makes_a_stronger_one(database, chief):
+    ann = sign_up(database, chief, "ann")
+    weak = Principal("user", ann.user_id, "ann", scopes=("read", "write", "jobs!project=walk"))
+    for scope in ("admin", "work", "jobs", "jobs!project=run"):
+        with pytest.raises(Forbidden):
+            make_token(database, weak, scopes=(scope,))
+    assert make_token(database, weak, scopes=("write!project=run", "jobs!project=walk")).scopes
+    with pytest.raises(Forbidden):
+        make_token(database, Principal("user", ann.user_id, "ann", scopes=("read",)), scopes=("read",))
+
+
+def test_use_of_a_token_is_noted_once_an_hour(database, chief, clock):
+    made = make_token(database, chief)
+
+    def last_used():
+        return database.read(chief, tokens.list_tokens).items[0].last_used_at
+
+    database.write(SYSTEM, tokens.note_use, made.id)
+    first = last_used()
+    clock.advance(600)
+    database.write(SYSTEM, tokens.note_use, made.id)
+    assert last_used() == first
+    clock.advance(3600)
+    database.write(SYSTEM, tokens.note_use, made.id)
+    assert last_used() > first
+
+
+@pytest.fixture
+def running(lab):
+    """A job of the lab's contributor with a running attempt, and the attempt's token."""
+    project_id = lab.read(projects.read_project, "lab").id
+    issued = issue_attempt_token()
+
+    def insert(tx):
+        row = {
+            "kind": "retarget",
+            "params": {},
+            "inputs": {},
+            "time_limit_s": 60,
+            "memory_limit_mb": 64,
+            "run_at_us": 0,
+            "fence": 3,
+        }
+        row |= {"id": "job_1", "project_id": project_id, "author_id": lab.contributor.user_id, "created_us": 0}
+        tx.execute(sqlalchemy.insert(job).values(state=JobState.RUNNING, **row))
+        row = {"job_id": "job_1", "fence": 3, "worker": "w", "token_hash": issued.secret_hash, "started_us": 0}
+        tx.execute(sqlalchemy.insert(attempt).values(**row))
+
+    lab.write(insert)
+    return issued.text
+
+
+def change_job(lab, **values):
+    lab.write(lambda tx: tx.execute(sqlalchemy.update(job).values(**values)))
+
+
+def test_the_token_of_an_attempt_reads_its_project(lab, running):
+    found = lab.read(tokens.resolve_token, running)
+    assert (found.kind, found.job_id, found.fence, found.scopes) == ("attempt", "job_1", 3, ("read",))
+    assert lab.read(projects.read_project, "lab", who=found).name == "lab"
+
+
+def test_the_token_of_an_attempt_dies_when_the_fence_moves(lab, running):
+    change_job(lab, fence=4)
+    with pytest.raises(LeaseLost):
+        lab.read(tokens.resolve_token, running)
+
+
+@pytest.mark.parametrize("state", [state for state in JobState if state is not JobState.RUNNING])
+def test_the_token_of_an_attempt_that_is_over_reads_nothing(lab, running, state):
+    change_job(lab, state=state)
+    found = lab.read(tokens.resolve_token, running)
+    with pytest.raises(NotFound):
+        lab.read(projects.read_project, "lab", who=found)
