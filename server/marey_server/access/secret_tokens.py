@@ -50,7 +50,7 @@ def split_user_token(text: str) -> tuple[str, str] | None:
     if not text.startswith(_USER):
         return None
     prefix, _, secret = text[len(_USER) :].partition("_")
-    return (prefix, secret) if prefix and secret else None
+    return (prefix, secret) if prefix.isalnum() and prefix.isascii() and secret else None
 
 
 def attempt_secret(text: str) -> str | None:

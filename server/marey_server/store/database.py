@@ -24,7 +24,7 @@ from sqlalchemy import URL, Connection, CursorResult, Engine, Executable, Table,
 from sqlalchemy.dialects import postgresql, sqlite
 
 from marey_server.access.principal import Principal
-from marey_server.errors import StorageFull, Unavailable
+from marey_server.errors import Invalid, StorageFull, Unavailable
 from marey_server.store import tables
 from marey_server.store.blob_backings import BlobBacking, DatabaseBlobs
 from marey_server.store.clock import Clock, DatabaseClock, save_high_water
@@ -313,7 +313,7 @@ def _postgres_engine(url: URL, connections: int, echo: bool) -> Engine:
 
 # -- failures ---------------------------------------------------------------------------------------------------------
 
-_FAILURES = (exc.DBAPIError, exc.TimeoutError, OSError)
+_FAILURES = (exc.DBAPIError, exc.TimeoutError, OSError, OverflowError, UnicodeEncodeError)
 
 
 def _worth_retrying(error: Exception) -> bool:
@@ -333,6 +333,8 @@ def _translated(error: Exception) -> Exception:
         return StorageFull("The disk has no room left; nothing was written.") if full else error
     if isinstance(error, exc.TimeoutError):
         return _no_answer("All connections to the database are in use; nothing was written.")
+    if isinstance(error, OverflowError | UnicodeEncodeError | exc.DataError):
+        return Invalid("A number or text of the request is beyond what can be stored.", code="bad-value")
     if not isinstance(error, exc.DBAPIError):
         return error
     message = str(error.orig)

@@ -89,8 +89,11 @@ def _conditions(project_id: str, kind: Kind, filters: ItemFilters) -> list[Colum
         conditions.append(item.c.collection_id.in_(_below(project_id, filters.collection)))
     if filters.path is not None:
         folder, _, name = filters.path.rpartition("/")
-        at = select(collection.c.id).where(collection.c.project_id == project_id, collection.c.path == folder)
-        conditions += [item.c.collection_id.in_(at), item.c.name == name]
+        at = select(collection.c.id).where(
+            collection.c.project_id == project_id, collection.c.path == folder, collection.c.deleted_us.is_(None)
+        )
+        # Equal to one id, not in a set of ids: so SQLite sees that the unique index gives one row.
+        conditions += [item.c.collection_id == at.scalar_subquery(), item.c.name == name]
     if filters.name is not None:
         conditions += _named(filters.name)
     if filters.tags:
