@@ -68,7 +68,7 @@ async def _tend_queue(services: Services, holder: str) -> None:
     leads, may_reap = await _write(services, _look_round, holder, services.start_grace)
     if leads and may_reap:
         await _reap(services)
-    while leads and await _write(services, reaper.share_waiting):
+    while leads and await _write(services, reaper.share_waiting) > 0:
         pass
 
 

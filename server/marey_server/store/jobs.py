@@ -160,18 +160,20 @@ def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLIC
 def _cancel(tx: Transaction, condition: ColumnElement[bool], policy: QueuePolicy) -> list[Ended]:
     """Cancel the jobs that meet the condition, in one statement whatever their state; those that ended by it.
 
-    A running job's time is over with the cancellation, so that its lease cannot outlive the grace.
+    A running job's time is over with the cancellation, so that its lease cannot outlive the grace. A gathering job has
+    no lease, and ends with its tasks.
     """
     running = job.c.state == RUNNING
+    leased = and_(running, job.c.size.is_(None))
     rows = tx.execute(
         update(job)
         .where(condition)
         .values(
             state=case((running, "running"), else_="cancelled"),
             cancel_requested_us=func.coalesce(job.c.cancel_requested_us, tx.now_us),
-            deadline_us=case((running, earlier(job.c.deadline_us, tx.now_us)), else_=None),
+            deadline_us=case((leased, earlier(job.c.deadline_us, tx.now_us)), else_=None),
             lease_expires_us=case(
-                (running, earlier(job.c.lease_expires_us, tx.now_us + policy.end_grace_us)), else_=None
+                (leased, earlier(job.c.lease_expires_us, tx.now_us + policy.end_grace_us)), else_=None
             ),
             finished_us=case((running, None), else_=tx.now_us),
             rev=job.c.rev + 1,

@@ -1,0 +1,330 @@
+"""The queue against a model of itself, under any order of what submitters, workers and the reaper may do."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, Phase, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
+from sqlalchemy import Connection, delete, func, select
+
+from marey_schemas.jobs import Lease
+from marey_server.access.principal import SYSTEM
+from marey_server.errors import Conflict, LeaseLost
+from marey_server.store import submission, tables
+from marey_server.store.database import Transaction
+from marey_server.store.reaper import share_waiting
+from queue_desk import Desk
+from queue_model import TERMINAL, ModelJob, ModelQueue
+
+ERRANDS = ("errand",)
+CHAINED = ("sum", "square")
+
+
+class StillClock:
+    """A clock that stands until it is set forward."""
+
+    def __init__(self) -> None:
+        self.us = 1_800_000_000_000_000
+
+    def now_us(self, _connection: Connection) -> int:
+        return self.us
+
+
+def _forget_jobs(tx: Transaction) -> None:
+    for table in (
+        tables.staged_output,
+        tables.job_log,
+        tables.attempt,
+        tables.job_dependency,
+        tables.lineage,
+        tables.job,
+    ):
+        tx.execute(delete(table) if table is not tables.job else delete(table).where(table.c.parent_id.is_not(None)))
+    tx.execute(delete(tables.job))
+    tx.execute(delete(tables.event))
+
+
+class QueueMachine(RuleBasedStateMachine):
+    """Errands are compared with the model exactly; chained jobs are held to what must always be so."""
+
+    def __init__(self, desk: Desk, clock: StillClock) -> None:
+        super().__init__()
+        self.desk = desk
+        self.clock = clock
+        self.model = ModelQueue()
+        self.leases: list[Lease] = []
+        self.said: list[tuple[str, Lease, str]] = []
+        self.ended: dict[str, tuple[str, int]] = {}
+        desk.database.write(SYSTEM, _forget_jobs)
+
+    # -- submitting ----------------------------------------------------------------------------------------------------
+
+    @rule(
+        priority=st.integers(-1, 1),
+        key=st.sampled_from([None, None, "a", "b"]),
+        max_attempts=st.integers(1, 3),
+        time_limit_s=st.sampled_from([40, 3600]),
+        on_failure=st.sampled_from(["fail", "skip"]),
+        data=st.data(),
+    )
+    def submit(
+        self, priority: int, key: str | None, max_attempts: int, time_limit_s: int, on_failure: str, data: st.DataObject
+    ) -> None:
+        self._tick()
+        known = sorted(self.model.jobs)
+        after = data.draw(st.lists(st.sampled_from(known), max_size=2, unique=True)) if known else []
+        job_id = self.desk.submit(
+            priority=priority,
+            concurrency_key=key,
+            max_attempts=max_attempts,
+            resources={"time_limit_s": time_limit_s},
+            on_failure=on_failure,
+            after=after,
+        )
+        self.model.submit(
+            ModelJob(
+                job_id,
+                priority,
+                self.clock.us,
+                max_attempts,
+                key,
+                time_limit_s * 1_000_000,
+                on_failure,
+                frozenset(after),
+            )
+        )
+
+    @rule(number=st.integers(0, 1), into=st.sampled_from(["x", "y"]), cache=st.sampled_from(["use", "use", "refresh"]))
+    def submit_sum(self, number: int, into: str, cache: str) -> None:
+        self._tick()
+        self.desk.submit("sum", params={"number": number}, into=into, cache=cache)
+
+    @rule(seed=st.integers(0, 1), wait=st.booleans())
+    def submit_squares(self, seed: int, wait: bool) -> None:
+        self._tick()
+        unfinished = [job.id for job in self.model.jobs.values() if job.state not in TERMINAL]
+        after = unfinished[:1] if wait else []
+        self.desk.submit("square", inputs={"things": {"collection": "raw"}}, seed=seed, after=after)
+
+    # -- working -------------------------------------------------------------------------------------------------------
+
+    @rule(most=st.integers(1, 4))
+    def claim(self, most: int) -> None:
+        self._tick()
+        leases = self.desk.claim_many(most, ERRANDS)
+        assert [lease.job for lease in leases] == self.model.claim(self.clock.us, most)
+        self.leases += leases
+
+    @rule(most=st.integers(1, 4))
+    def claim_chained(self, most: int) -> None:
+        self._tick()
+        self.leases += self.desk.claim_many(most, CHAINED)
+
+    @precondition(lambda self: self.leases)
+    @rule(data=st.data())
+    def heartbeat(self, data: st.DataObject) -> None:
+        lease = self._some_lease(data)
+        if self._holds(lease):
+            self.desk.heartbeat(lease)
+            if lease.kind in ERRANDS:
+                self.model.heartbeat(lease.job, self.clock.us)
+        else:
+            with pytest.raises(LeaseLost):
+                self.desk.heartbeat(lease)
+
+    @precondition(lambda self: self.leases)
+    @rule(data=st.data(), name=st.sampled_from(["p", "q"]))
+    def stage(self, data: st.DataObject, name: str) -> None:
+        lease = self._some_lease(data)
+        if self._holds(lease):
+            self.desk.stage(lease, name)
+        else:
+            with pytest.raises(LeaseLost):
+                self.desk.stage(lease, name)
+
+    @precondition(lambda self: self.leases)
+    @rule(data=st.data())
+    def complete(self, data: st.DataObject) -> None:
+        lease, write_id = self._some_lease(data), self.desk.write_id()
+        if self._holds(lease):
+            assert self.desk.complete(lease, write_id=write_id).state == "succeeded"
+            self.said.append(("complete", lease, write_id))
+            if lease.kind in ERRANDS:
+                self.model.complete(lease.job, lease.fence, write_id)
+        else:
+            with pytest.raises(LeaseLost):
+                self.desk.complete(lease, write_id=write_id)
+
+    @precondition(lambda self: self.leases)
+    @rule(
+        data=st.data(),
+        retryable=st.booleans(),
+        interrupted=st.booleans(),
+        signature=st.sampled_from([None, "exit:9"]),
+    )
+    def fail(self, data: st.DataObject, retryable: bool, interrupted: bool, signature: str | None) -> None:
+        lease, write_id = self._some_lease(data), self.desk.write_id()
+        how: dict[str, Any] = {"retryable": retryable, "interrupted": interrupted, "signature": signature}
+        if self._holds(lease):
+            answer = self.desk.fail(lease, write_id=write_id, **how)
+            self.said.append(("fail", lease, write_id))
+            if lease.kind in ERRANDS:
+                self.model.fail(lease.job, lease.fence, write_id, self.clock.us, **how)
+                assert answer.state == self.model.jobs[lease.job].answers[lease.fence, write_id]
+        else:
+            with pytest.raises(LeaseLost):
+                self.desk.fail(lease, write_id=write_id, **how)
+
+    @precondition(lambda self: self.said)
+    @rule(data=st.data())
+    def say_again(self, data: st.DataObject) -> None:
+        """A request that was answered arrives a second time, perhaps much later: it changes nothing."""
+        what, lease, write_id = data.draw(st.sampled_from(self.said))
+        before = self._rows()
+        answer = (
+            self.desk.complete(lease, write_id=write_id)
+            if what == "complete"
+            else self.desk.fail(lease, write_id=write_id)
+        )
+        if lease.kind in ERRANDS:
+            assert answer.state == self.model.jobs[lease.job].answers[lease.fence, write_id]
+        assert self._rows() == before
+
+    # -- time, reaper, cancellation ------------------------------------------------------------------------------------
+
+    @rule(seconds=st.sampled_from([1, 11, 45, 61, 200]))
+    def time_passes(self, seconds: int) -> None:
+        self.clock.us += seconds * 1_000_000
+
+    @rule()
+    def reap(self) -> None:
+        self.desk.reap()
+        self.model.reap(self.clock.us)
+
+    @precondition(lambda self: self.model.jobs)
+    @rule(data=st.data())
+    def cancel(self, data: st.DataObject) -> None:
+        job_id = data.draw(st.sampled_from(sorted(self.model.jobs)))
+        if self.model.jobs[job_id].state in ("succeeded", "failed"):
+            with pytest.raises(Conflict):
+                self.desk.cancel(job_id)
+        else:
+            self.desk.cancel(job_id)
+            self.model.cancel(job_id, self.clock.us)
+
+    @rule(data=st.data())
+    def cancel_chained(self, data: st.DataObject) -> None:
+        chained = [row.id for row in self._rows() if row.kind in CHAINED and row.state not in TERMINAL]
+        if chained:
+            self.desk.cancel(data.draw(st.sampled_from(sorted(chained))))
+
+    # -- what must always be so ----------------------------------------------------------------------------------------
+
+    @invariant()
+    def errands_stand_as_the_model_says(self) -> None:
+        errands = {
+            row.id: (row.state, row.fence, row.attempt, row.interruptions)
+            for row in self._rows()
+            if row.kind in ERRANDS
+        }
+        assert errands == self.model.states()
+
+    @invariant()
+    def nothing_that_ended_changes(self) -> None:
+        for row in self._rows():
+            if row.state in TERMINAL:
+                now = (row.state, row.fence)
+                assert self.ended.setdefault(row.id, now) == now
+
+    @invariant()
+    def gathering_jobs_count_their_tasks(self) -> None:
+        rows = self._rows()
+        for head in rows:
+            if head.size is not None:
+                tasks = [row for row in rows if row.parent_id == head.id]
+                assert len(tasks) == head.size
+                left = sum(task.state not in TERMINAL for task in tasks)
+                if head.state == "running":
+                    assert head.dependencies_left == left > 0
+                elif head.state in TERMINAL:
+                    assert left == 0
+
+    @invariant()
+    def only_leased_jobs_run(self) -> None:
+        for row in self._rows():
+            assert (row.lease_expires_us is not None) == (row.state == "running" and row.size is None)
+
+    def teardown(self) -> None:
+        """Whatever has happened, the queue can be worked off to the end, and every result is there once."""
+        for _ in range(200):
+            self.clock.us += 1000 * 1_000_000
+            self.desk.reap()
+            while self.desk.database.write(SYSTEM, share_waiting):
+                pass
+            leases = self.desk.claim_many()
+            for lease in leases:
+                self.desk.complete(lease)
+            if not leases and all(row.state in TERMINAL for row in self._rows()):
+                break
+        stuck = [(row.kind, row.state) for row in self._rows() if row.state not in TERMINAL]
+        assert stuck == []
+        assert self.desk.database.read(SYSTEM, _successes_told_twice) == []
+
+    # -- helpers of the rules ------------------------------------------------------------------------------------------
+
+    def _tick(self) -> None:
+        self.clock.us += 1000
+
+    def _some_lease(self, data: st.DataObject) -> Lease:
+        return data.draw(st.sampled_from(self.leases))
+
+    def _holds(self, lease: Lease) -> bool:
+        if lease.kind in ERRANDS:
+            return self.model.holds(lease.job, lease.fence)
+        return any(row.id == lease.job and row.state == "running" and row.fence == lease.fence for row in self._rows())
+
+    def _rows(self) -> list[Any]:
+        return self.desk.database.read(SYSTEM, _all_jobs)
+
+
+def _all_jobs(tx: Transaction) -> list[Any]:
+    return list(tx.execute(select(tables.job).order_by(tables.job.c.id)).all())
+
+
+def _successes_told_twice(tx: Transaction) -> list[Any]:
+    statement = (
+        select(tables.event.c.subject)
+        .where(tables.event.c.kind.in_([f"job.{state}" for state in TERMINAL]))
+        .group_by(tables.event.c.subject)
+        .having(func.count() > 1)
+    )
+    return list(tx.execute(statement).scalars())
+
+
+def run_machine(desk: Desk, monkeypatch: pytest.MonkeyPatch, *, examples: int = 30, steps: int = 40) -> None:
+    """Run the machine on a desk whose clock stands still and whose ids are numbers, so that runs can be repeated."""
+    clock = StillClock()
+    numbers = itertools.count(1)
+    monkeypatch.setattr(submission, "new_id", lambda prefix: f"{prefix}_{next(numbers):08}")
+    desk.database.clock = clock
+    desk.things(4)
+    run_state_machine_as_test(
+        lambda: QueueMachine(desk, clock),
+        settings=settings(
+            max_examples=examples,
+            stateful_step_count=steps,
+            deadline=None,
+            suppress_health_check=list(HealthCheck),
+            print_blob=True,
+            phases=(Phase.explicit, Phase.reuse, Phase.generate),
+        ),
+    )
+
+
+@pytest.mark.timeout(600)
+def test_the_queue_behaves_as_its_model(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_machine(desk, monkeypatch)
