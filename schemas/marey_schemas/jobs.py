@@ -47,7 +47,7 @@ class FailureReason(StrEnum):
 class ImportParams(ImportOptions):
     """Parameters of `import`."""
 
-    files: tuple[ImportFile, ...] = Field(min_length=1, max_length=10_000)
+    files: tuple[ImportFile, ...] = Field(min_length=1, max_length=10_000, description="Names and digests.")
 
 
 class RetargetParams(Request):
@@ -55,14 +55,14 @@ class RetargetParams(Request):
 
     scale: float | None = Field(None, gt=0, lt=1000, description="Root scale; absent: ratio of the hip heights.")
     suffix: str = Field("", max_length=64, description="Appended to the names of the results.")
-    tags: tuple[Tag, ...] = Field((), max_length=64)
+    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the results.")
 
 
 class ExportParams(Request):
     """Parameters of `export`: one archive of files."""
 
-    format: Literal["bvh", "npz", "predecessor", "json", "original"] = "bvh"
-    unit: Literal["m", "cm"] = "cm"
+    format: Literal["bvh", "npz", "predecessor", "json", "original"] = Field("bvh", description="Format of the files.")
+    unit: Literal["m", "cm"] = Field("cm", description="Unit of length where the format leaves it open.")
 
 
 class InputSpec(Answer):

@@ -1,0 +1,187 @@
+"""Writes the reference pages that come from the code: `python -m docs.generate`, or `--check` to compare only."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer
+from pydantic_core import PydanticUndefined
+
+from marey_client.cli.app import app
+from marey_motion import checks
+from marey_schemas.job_kinds import job_kinds
+from marey_server import errors
+from marey_server.settings import Settings
+
+ROOT = Path(__file__).parents[1]
+REFERENCE = Path(__file__).parent / "reference"
+NOTE = "<!-- Written by `make docs` from the code; change it there. -->\n\n"
+
+
+def pages() -> dict[str, str]:
+    """Every generated page by file name."""
+    return {
+        "command-line.md": command_line_page(),
+        "settings.md": settings_page(),
+        "job-kinds.md": job_kinds_page(),
+        "checks.md": checks_page(),
+        "errors.md": errors_page(),
+    }
+
+
+def command_line_page() -> str:
+    """Every command with its arguments and options."""
+    text = "# Command line\n\nExit status: 0 success, 1 refused or failed, 2 wrong usage.\n\n"
+    root = typer.main.get_command(app)
+    text += "## marey\n\n" + _parameters(root)
+    for name, command in _commands(root, "marey"):
+        text += f"## {name}\n\n{(command.help or '').strip()}\n\n" + _parameters(command)
+    return NOTE + text.rstrip() + "\n"
+
+
+def _commands(group: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+    for name, command in sorted(group.commands.items()):
+        if hasattr(command, "commands"):
+            yield from _commands(command, f"{prefix} {name}")
+        else:
+            yield f"{prefix} {name}", command
+
+
+def _parameters(command: Any) -> str:
+    rows = [
+        (
+            f"`{', '.join(one.opts + one.secondary_opts)}`" if one.param_type_name == "option" else f"`{one.name}`",
+            one.help,
+        )
+        for one in command.params
+        if one.name not in ("help", "install_completion", "show_completion", "version")
+    ]
+    return _table(("option or argument", "meaning"), rows)
+
+
+def _spelled(parameter: Any) -> str:
+    if parameter.param_type_name == "argument":
+        return f"`{parameter.name}`"
+    return f"`{', '.join(parameter.opts + parameter.secondary_opts)}`"
+
+
+def settings_page() -> str:
+    """Every setting of a server."""
+    rows = []
+    for name, field in Settings.model_fields.items():
+        default = "" if field.default in (None, PydanticUndefined) else f"`{field.default}`"
+        rows.append((f"`{name}`", f"`MAREY_{name.upper()}`", default, field.description or ""))
+    return (
+        NOTE + "# Settings\n\nFlags of `marey serve` come first, then variables, then `marey.toml`, then the default.\n\n"
+        + _table(("setting", "variable", "default", "meaning"), rows)
+    )  # fmt: skip
+
+
+def job_kinds_page() -> str:
+    """Every built-in kind of job."""
+    text = "# Job kinds\n\nA running server answers the same, with full JSON Schemas, at `/api/v1/job-kinds`.\n\n"
+    for kind in job_kinds().values():
+        text += f"## {kind.name}\n\n{kind.description}\n\n"
+        inputs = [(f"`{name}`", _input(spec), spec.description) for name, spec in kind.inputs.items()]
+        text += _table(("input", "takes", "meaning"), inputs) if inputs else ""
+        schema = kind.params.model_json_schema()
+        rows = [(f"`{name}`", _type(each), each.get("description", "")) for name, each in schema["properties"].items()]
+        text += _table(("parameter", "type", "meaning"), rows)
+    return NOTE + text.rstrip() + "\n"
+
+
+def _input(spec: Any) -> str:
+    return f"{'many ' if spec.many else 'one '}{spec.kind.plural if spec.many else spec.kind.value}"
+
+
+def _type(schema: dict[str, Any]) -> str:
+    if "anyOf" in schema:
+        return " or ".join(_type(each) for each in schema["anyOf"] if each.get("type") != "null")
+    if "enum" in schema:
+        return ", ".join(f"`{value}`" for value in schema["enum"])
+    return str(schema.get("type", schema.get("$ref", "").rpartition("/")[2]))
+
+
+def checks_page() -> str:
+    """Every warning an import may give."""
+    text = "# Import checks\n\nWarnings never keep a file out. `marey show` lists a clip's with joints and frames.\n\n"
+    return NOTE + text + _table(("code", "meaning"), [(f"`{code}`", meaning) for code, meaning in checks.CODES.items()])
+
+
+def errors_page() -> str:
+    """Every code of a problem answer."""
+    text = (
+        "# Errors\n\nErrors are `application/problem+json` (RFC 9457). `code` is stable; `instance` is the request id to quote"
+        " when asking for help; `errors` points at single fields.\n\n"
+    )
+    classes = {one.__name__: one for one in _subclasses(errors.MareyError)}
+    found = {(one.code, one.status): one.__doc__.strip().splitlines()[0] for one in classes.values() if one.__doc__}
+    for code, name, detail in _raised(classes):
+        found.setdefault((code, classes[name].status), detail)
+    rows = [
+        (f"`{code}`", str(status), says)
+        for (code, status), says in sorted(found.items(), key=lambda each: each[0][::-1])
+    ]
+    return NOTE + text + _table(("code", "status", "says"), rows)
+
+
+def _subclasses(base: type[errors.MareyError]) -> Iterator[type[errors.MareyError]]:
+    yield base
+    for each in base.__subclasses__():
+        yield from _subclasses(each)
+
+
+def _raised(classes: dict[str, type[errors.MareyError]]) -> Iterator[tuple[str, str, str]]:
+    """Code, class and text of every error that is made with a code of its own."""
+    for file in sorted((ROOT / "server").rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in classes):
+                continue
+            codes = [each.value for each in node.keywords if each.arg == "code"]
+            if codes and isinstance(codes[0], ast.Constant) and node.args:
+                yield str(codes[0].value), node.func.id, _spoken(node.args[0])
+
+
+def _spoken(node: ast.expr) -> str:
+    """A message as it reads, with … for what differs from case to case."""
+    if isinstance(node, ast.Constant):
+        return str(node.value)
+    if isinstance(node, ast.JoinedStr):
+        return "".join(str(each.value) if isinstance(each, ast.Constant) else "…" for each in node.values)
+    return "…"
+
+
+def _table(heads: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
+    if not rows:
+        return ""
+    lines = [heads, tuple("---" for _ in heads), *rows]
+    return "".join(f"| {' | '.join(_cell(cell) for cell in line)} |\n" for line in lines) + "\n"
+
+
+def _cell(text: object) -> str:
+    return " ".join(str(text or "").split()).replace("|", "\\|")
+
+
+def main() -> int:
+    """Write the pages, or with `--check` fail where one is out of date."""
+    stale = [name for name, text in pages().items() if not _is(REFERENCE / name, text)]
+    if "--check" in sys.argv[1:]:
+        for name in stale:
+            sys.stderr.write(f"docs/reference/{name} is out of date; run `make docs`\n")
+        return int(bool(stale))
+    for name in stale:
+        (REFERENCE / name).write_text(pages()[name], encoding="utf-8")
+        sys.stdout.write(f"wrote docs/reference/{name}\n")
+    return 0
+
+
+def _is(file: Path, text: str) -> bool:
+    return file.is_file() and file.read_text(encoding="utf-8") == text
+
+
+if __name__ == "__main__":
+    sys.exit(main())
