@@ -26,7 +26,6 @@ SKELETON_OUTPUT = "skeleton"
 """What a clip calls the skeleton of its own file until both are stored."""
 SAME_OFFSET_M = 1e-3
 _LONGEST_SEGMENT, _LONGEST_PATH = 255, 1024
-_UNIT_NAMES = {"ft": "foot"}
 
 Tree = dict[str, Any]
 
@@ -99,7 +98,7 @@ def import_options(
 ) -> ImportOptions:
     """Options of the readers, with the unit by name or by its size in metres."""
     if unit is not None and unit_scale_m is None:
-        unit_scale_m = unit_in_metres(_UNIT_NAMES.get(unit, unit))
+        unit_scale_m = unit_in_metres(unit)
     return ImportOptions(
         unit_scale_m=unit_scale_m, up_axis=up_axis, frame_rate_hz=frame_rate_hz, trim_rest_pose=trim_rest_pose
     )

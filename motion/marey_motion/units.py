@@ -26,7 +26,7 @@ UNITS_M = {
     "inch": 0.0254,
     "cmu": 0.0254 / 0.45,
     "dm": 0.1,
-    "foot": 0.3048,
+    "ft": 0.3048,
     "m": 1.0,
 }
 CONVENTIONAL_UNITS = ("m", "cm", "mm")
@@ -332,7 +332,7 @@ def _look_for_mirroring(source: SourceMotion, body: _Body, options: ImportOption
             CheckWarning(
                 "left-handed",
                 f"left is on the right (mean cosine {cosine:.2f}): the file may be left-handed; "
-                "if so, import it with --handedness left (handedness)",
+                "if so, import it with the option handedness=left",
                 values={"cosine": cosine},
             )
         )

@@ -195,38 +195,15 @@ def _nested_document(skeleton: Skeleton, tips: list[tuple[str, int, NDArray[np.f
     nodes: list[Document] = []
     for joint, name in enumerate(skeleton.joint_names):
         parent = int(skeleton.parents[joint])
-        node = {
-            "name": name,
-            "parent": None if parent < 0 else skeleton.joint_names[parent],
-            "quaternion_frame_index": joint,
-            "index": joint,
-            "offset": offsets[joint].tolist(),
-            "channels": (_POSITIONS + _ROTATIONS) if parent < 0 else _ROTATIONS,
-            "rotation": skeleton.rest_rotations[joint].tolist(),
-            "fixed": False,
-            "level": 0 if parent < 0 else nodes[parent]["level"] + 1,
-            "node_type": _ROOT_NODE if parent < 0 else _JOINT_NODE,
-            "children": [],
-        }
+        above = nodes[parent] if parent >= 0 else None
+        node = _nested_node(name, joint, above, offsets[joint], skeleton.rest_rotations[joint])
+        node["quaternion_frame_index"] = joint
+        node["channels"] = _ROTATIONS if above else _POSITIONS + _ROTATIONS
+        node["node_type"] = _JOINT_NODE if above else _ROOT_NODE
         nodes.append(node)
-        if parent >= 0:
-            nodes[parent]["children"].append(node)
     for number, (name, joint, offset) in enumerate(tips, len(nodes)):
-        nodes[joint]["children"].append(
-            {
-                "name": name,
-                "parent": skeleton.joint_names[joint],
-                "quaternion_frame_index": -1,
-                "index": number,
-                "offset": (offset / CENTIMETRE_M).tolist(),
-                "channels": [],
-                "rotation": [1.0, 0.0, 0.0, 0.0],
-                "fixed": True,
-                "level": nodes[joint]["level"] + 1,
-                "node_type": _TIP_NODE,
-                "children": [],
-            }
-        )
+        node = _nested_node(name, number, nodes[joint], offset / CENTIMETRE_M, np.array([1.0, 0.0, 0.0, 0.0]))
+        node |= {"quaternion_frame_index": -1, "channels": [], "fixed": True, "node_type": _TIP_NODE}
     return {
         "animated_joints": list(skeleton.joint_names),
         "free_joints_map": {},
@@ -236,3 +213,22 @@ def _nested_document(skeleton: Skeleton, tips: list[tuple[str, int, NDArray[np.f
         "tool_nodes": [],
         "aligning_root_node": skeleton.joint_names[0],
     }
+
+
+def _nested_node(
+    name: str, index: int, above: Document | None, offset: NDArray[np.float64], rotation: NDArray[np.float64]
+) -> Document:
+    """A node, put below the one above it."""
+    node: Document = {
+        "name": name,
+        "parent": above["name"] if above else None,
+        "index": index,
+        "offset": offset.tolist(),
+        "rotation": rotation.tolist(),
+        "fixed": False,
+        "level": above["level"] + 1 if above else 0,
+        "children": [],
+    }
+    if above:
+        above["children"].append(node)
+    return node

@@ -226,7 +226,7 @@ class TestRefusals:
 
     @pytest.mark.parametrize("frame_time", ["0", "-0.01", "1e-9"])
     def test_frame_times_that_give_no_rate_name_the_option(self, frame_time: str) -> None:
-        assert "--frame-rate" in str(refusal(bvh(frame_time=frame_time)))
+        assert "--fps" in str(refusal(bvh(frame_time=frame_time)))
 
     def test_more_joints_than_any_body_has_are_refused_early(self) -> None:
         hierarchy = "HIERARCHY\nROOT a\n{\nOFFSET 0 0 0\n" + "JOINT b\n{\nOFFSET 0 0 0\n" * 100_000
