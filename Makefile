@@ -24,10 +24,6 @@ $(VENV)/.installed-dev: pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) install -c constraints.txt -e '.[dev]'
 	@touch $@ $(VENV)/.installed-all
 
-$(VENV)/.installed-bench: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) install -c constraints.txt -e '.[dev,bench]'
-	@touch $@ $(VENV)/.installed-dev $(VENV)/.installed-all
-
 demo: $(VENV)/.installed-all ## From takes to retargeted clips; DATA=folder for your own motion
 	$(BIN)/marey demo $(if $(DATA),"$(DATA)")
 
@@ -47,7 +43,7 @@ format: $(VENV)/.installed-dev ## Put the code in house style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(VENV)/.installed-bench ## Speed against peers, as ratios
+bench: $(VENV)/.installed-dev ## Speed against peers, as ratios
 	$(BIN)/python -m benchmarks
 
 fuzz: $(VENV)/.installed-dev ## An hour of malformed motion files and twenty minutes of malformed requests

@@ -76,7 +76,8 @@ def settings_page() -> str:
         default = "" if field.default in (None, PydanticUndefined) else f"`{field.default}`"
         rows.append((f"`{name}`", f"`MAREY_{name.upper()}`", default, field.description or ""))
     return (
-        NOTE + "# Settings\n\nFlags of `marey serve` come first, then variables, then `marey.toml`, then the default.\n\n"
+        NOTE
+        + "# Settings\n\nFlags of `marey serve` come first, then variables, then `marey.toml`, then the default.\n\n"
         + _table(("setting", "variable", "default", "meaning"), rows)
     )  # fmt: skip
 
@@ -115,8 +116,8 @@ def checks_page() -> str:
 def errors_page() -> str:
     """Every code of a problem answer."""
     text = (
-        "# Errors\n\nErrors are `application/problem+json` (RFC 9457). `code` is stable; `instance` is the request id to quote"
-        " when asking for help; `errors` points at single fields.\n\n"
+        "# Errors\n\nErrors are `application/problem+json` (RFC 9457). `code` is stable; `instance` is the request id"
+        " to quote when asking for help; `errors` points at single fields.\n\n"
     )
     classes = {one.__name__: one for one in _subclasses(errors.MareyError)}
     found = {(one.code, one.status): one.__doc__.strip().splitlines()[0] for one in classes.values() if one.__doc__}

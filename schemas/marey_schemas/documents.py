@@ -54,9 +54,8 @@ class SkeletonHierarchy(Request):
                 raise ValueError(f"joints[{index}]: the name {joint.name!r} stands twice")
             seen.add(joint.name)
             if (joint.parent == -1) != (index == 0) or joint.parent >= index:
-                raise ValueError(
-                    f"joints[{index}] ({joint.name}): parent {joint.parent} must come before it; only joint 0 is the root"
-                )
+                place = f"joints[{index}] ({joint.name})"
+                raise ValueError(f"{place}: parent {joint.parent} must come before it; only joint 0 is the root")
         for index, site in enumerate(self.end_sites):
             if site.joint >= len(self.joints):
                 raise ValueError(f"end_sites[{index}]: joint {site.joint} does not exist")
