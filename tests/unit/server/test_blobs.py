@@ -1,0 +1,115 @@
+"""Possession: who may read and refer to which bytes."""
+
+import pytest
+
+from marey_schemas.items import ItemCreate
+from marey_schemas.kinds import Kind
+from marey_server.access.principal import Principal
+from marey_server.errors import Conflict, Forbidden, NotFound, Unauthenticated
+from marey_server.store import blobs, items, projects
+from marey_server.store.blobs import GRACE_US, digest_of
+
+FILE = b"HIERARCHY ROOT hips"
+DIGEST = digest_of(FILE)
+
+
+def study(lab, who, name="s", **body):
+    request = ItemCreate(name=name, parts={"study": {"schema": "marey/document@1", **body}})
+    return lab.write(items.create_item, "lab", Kind.STUDY, request, who=who)
+
+
+def readers(lab):
+    everybody = (lab.owner, lab.contributor, lab.reader, lab.stranger, lab.anonymous)
+    return {who.user_name for who in everybody if lab.read(blobs.readable, [DIGEST], who=who)}
+
+
+def test_who_sent_the_bytes_may_read_them_and_nobody_else(lab):
+    lab.write(blobs.put_blob, FILE, who=lab.contributor)
+    assert readers(lab) == {lab.contributor.user_name}
+    with pytest.raises(NotFound):
+        lab.read(blobs.read_range, DIGEST, 0, 5, who=lab.owner)
+    assert lab.read(blobs.read_range, DIGEST, 0, 5, who=lab.contributor) == b"HIERA"
+
+
+def test_a_document_shares_what_it_names_with_the_readers_of_its_project(lab):
+    lab.write(blobs.put_blob, FILE, who=lab.contributor)
+    made = study(lab, lab.contributor, figures=[{"blob": DIGEST}])
+    everybody_inside = {lab.owner.user_name, lab.contributor.user_name, lab.reader.user_name}
+    assert readers(lab) == everybody_inside
+    lab.make_public()
+    assert readers(lab) == everybody_inside | {lab.stranger.user_name, None}
+    lab.write(items.delete_item, "lab", Kind.STUDY, made.id, expected_rev=None)
+    assert readers(lab) == {lab.contributor.user_name}
+
+
+def test_nobody_gets_bytes_by_naming_their_digest(lab):
+    lab.write(blobs.put_blob, FILE, who=lab.contributor)
+    for body in ({"figures": [{"blob": DIGEST}]}, {"blob": DIGEST}):
+        with pytest.raises(Conflict) as refused:
+            study(lab, lab.owner, **body)
+        assert refused.value.context == {"missing": [DIGEST]}
+        assert refused.value.errors[0].pointer.endswith("/blob")
+    rig = lab.add_skeleton()
+    with pytest.raises(Conflict):
+        lab.add_clip(rig, info={"source": {"file": DIGEST}})
+    assert readers(lab) == {lab.contributor.user_name}
+
+
+def test_naming_a_digest_in_words_shares_nothing(lab):
+    lab.write(blobs.put_blob, FILE, who=lab.contributor)
+    study(lab, lab.owner, "before", image=DIGEST)
+    study(lab, lab.contributor, "after", image=DIGEST)
+    assert readers(lab) == {lab.contributor.user_name}
+
+
+def test_a_stored_document_gives_no_access_to_who_stores_it_again_without_the_bytes(lab):
+    lab.write(blobs.put_blob, FILE, who=lab.contributor)
+    made = study(lab, lab.contributor, "mine", blob=DIGEST)
+    lab.write(items.delete_item, "lab", Kind.STUDY, made.id, expected_rev=None)
+    with pytest.raises(Conflict):
+        study(lab, lab.owner, "theirs", blob=DIGEST)
+
+
+def test_missing_answers_by_the_same_rule_in_the_order_asked(lab):
+    lab.write(blobs.put_blob, FILE, who=lab.contributor)
+    other = digest_of(b"other")
+    asked = [other, DIGEST, other, "sha256:nonsense"]
+    assert lab.read(blobs.missing, asked, who=lab.contributor) == [other, "sha256:nonsense"]
+    assert lab.read(blobs.missing, asked, who=lab.owner) == [other, DIGEST, "sha256:nonsense"]
+    assert lab.read(blobs.missing, asked, who=lab.anonymous) == [other, DIGEST, "sha256:nonsense"]
+
+
+def test_thousands_of_digests_are_asked_for_at_once(lab):
+    digests = [digest_of(str(number).encode()) for number in range(10_000)]
+    lab.write(blobs.put_blob, b"9999")
+    assert lab.read(blobs.missing, digests) == digests[:-1]
+
+
+def test_what_may_soon_be_collected_must_be_sent_again(lab, clock):
+    lab.write(blobs.put_blob, FILE)
+    clock.advance(GRACE_US / 1e6 * 0.6)
+    assert lab.read(blobs.missing, [DIGEST]) == [DIGEST]
+    lab.write(blobs.put_blob, FILE)
+    assert lab.read(blobs.missing, [DIGEST]) == []
+    study(lab, lab.owner, blob=DIGEST)
+    clock.advance(GRACE_US / 1e6 * 10)
+    assert lab.read(blobs.missing, [DIGEST]) == []
+
+
+def test_sending_bytes_needs_a_credential_that_writes(lab):
+    with pytest.raises(Unauthenticated):
+        lab.write(blobs.put_blob, FILE, who=lab.anonymous)
+    with pytest.raises(Forbidden):
+        lab.write(blobs.put_blob, FILE, who=Principal("user", lab.owner.user_id, "o", scopes=("read", "jobs")))
+    bound = Principal("user", lab.owner.user_id, "o", scopes=("write!project=lab",))
+    assert lab.write(blobs.put_blob, FILE, who=bound) == DIGEST
+
+
+def test_what_an_attempt_sends_belongs_to_the_author_of_its_job(lab):
+    project_id = lab.read(projects.read_project, "lab").id
+    attempt = Principal(
+        "attempt", lab.contributor.user_id, scopes=("read",), job_id="job_1", fence=1, project_id=project_id
+    )
+    lab.write(blobs.put_blob, FILE, who=attempt)
+    assert readers(lab) == {lab.contributor.user_name}
+    assert lab.read(blobs.readable, [DIGEST], who=attempt) == {DIGEST}

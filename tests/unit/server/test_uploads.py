@@ -1,0 +1,94 @@
+"""Uploads that come in pieces."""
+
+import os
+
+import pytest
+
+from marey_server.errors import Conflict, Invalid, NotFound, TooLarge, Unauthenticated
+from marey_server.store import blobs, garbage, uploads
+from marey_server.store.blobs import digest_of
+
+DATA = os.urandom(3_000_001)
+
+
+def send(lab, upload_id, pieces, data=DATA):
+    offset = 0
+    for size in pieces:
+        lab.write(uploads.append, upload_id, offset, data[offset : offset + size])
+        offset += size
+    return offset
+
+
+@pytest.mark.parametrize(
+    "pieces", [(3_000_001,), (1, 2_999_999, 1), (1_048_576, 1_048_576, 902_849), (700_000,) * 4 + (200_001,)]
+)
+def test_pieces_of_any_size_become_the_bytes(lab, pieces):
+    upload = lab.write(uploads.create_upload, len(DATA), digest=digest_of(DATA))
+    send(lab, upload.id, pieces)
+    assert lab.write(uploads.finish, upload.id) == digest_of(DATA)
+    assert lab.read(blobs.read_blob, digest_of(DATA)) == DATA
+    assert lab.read(blobs.read_range, digest_of(DATA), 1_048_570, 1_048_580) == DATA[1_048_570:1_048_580]
+    assert lab.write(uploads.finish, upload.id) == digest_of(DATA)
+    assert lab.read(uploads.read_upload, upload.id).digest == digest_of(DATA)
+
+
+def test_a_piece_at_the_wrong_place_is_told_the_right_one(lab):
+    upload = lab.write(uploads.create_upload, len(DATA))
+    send(lab, upload.id, (1000,))
+    for offset in (0, 999, 1001):
+        with pytest.raises(Conflict) as refused:
+            lab.write(uploads.append, upload.id, offset, b"x")
+        assert refused.value.context == {"offset": 1000}
+    with pytest.raises(Conflict):
+        lab.write(uploads.finish, upload.id)
+
+
+def test_the_same_piece_sent_twice_at_once_counts_once(lab):
+    upload = lab.write(uploads.create_upload, len(DATA))
+    futures = [lab.database.submit_write(lab.owner, uploads.append, upload.id, 0, DATA) for _ in range(4)]
+    outcomes = [future.exception(60) for future in futures]
+    assert sum(outcome is None for outcome in outcomes) == 1
+    assert all(outcome is None or outcome.context == {"offset": len(DATA)} for outcome in outcomes)
+    assert lab.write(uploads.finish, upload.id) == digest_of(DATA)
+
+
+def test_more_than_was_announced_is_refused(lab):
+    upload = lab.write(uploads.create_upload, 10)
+    with pytest.raises(TooLarge):
+        lab.write(uploads.append, upload.id, 0, b"x" * 11)
+    for length in (0, -1, uploads.MAX_UPLOAD_BYTES + 1):
+        with pytest.raises(TooLarge):
+            lab.write(uploads.create_upload, length)
+
+
+def test_other_bytes_than_announced_become_no_blob(lab):
+    upload = lab.write(uploads.create_upload, 5, digest=digest_of(b"right"))
+    lab.write(uploads.append, upload.id, 0, b"wrong")
+    with pytest.raises(Invalid):
+        lab.write(uploads.finish, upload.id)
+    assert lab.read(blobs.readable, [digest_of(b"wrong"), digest_of(b"right")]) == set()
+
+
+def test_an_upload_is_its_senders_alone(lab):
+    upload = lab.write(uploads.create_upload, 5)
+    with pytest.raises(NotFound):
+        lab.read(uploads.read_upload, upload.id, who=lab.reader)
+    with pytest.raises(NotFound):
+        lab.write(uploads.append, upload.id, 0, b"x", who=lab.reader)
+    with pytest.raises(Unauthenticated):
+        lab.read(uploads.read_upload, upload.id, who=lab.anonymous)
+
+
+def test_uploads_that_nobody_continues_are_dropped(lab, clock):
+    forgotten = lab.write(uploads.create_upload, len(DATA))
+    send(lab, forgotten.id, (1000,))
+    clock.advance(uploads.LIFETIME_US / 1e6 - 10)
+    alive = lab.write(uploads.create_upload, 5)
+    clock.advance(20)
+    assert garbage.collect_garbage(lab.database).uploads == 1
+    with pytest.raises(NotFound):
+        lab.read(uploads.read_upload, forgotten.id)
+    assert lab.read(uploads.read_upload, alive.id).offset == 0
+    lab.write(uploads.abandon, alive.id)
+    with pytest.raises(NotFound):
+        lab.read(uploads.read_upload, alive.id)
