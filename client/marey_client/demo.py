@@ -65,6 +65,8 @@ class Story:
             entries = self._import()
         with self._timed("retarget"):
             job = self._retarget(self._target())
+        tasks = [job, *self.project.jobs(filters={"parent": job.id})] if job else []
+        tasks = [task for task in tasks if task.size is None]
         sources = {clip.path: clip for clip in self.project.clips.list(collection=TAKES)}
         results = sorted(self.project.clips.list(collection=RESULTS), key=lambda clip: clip.path)
         with self._timed("files"):
@@ -80,6 +82,8 @@ class Story:
             seconds=self.seconds,
             data=self.data,
             exported=exported,
+            tasks=len(tasks),
+            shared_tasks=sum(task.cached_from is not None for task in tasks),
             sheet=sheet,
         )
 

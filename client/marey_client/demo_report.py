@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from marey_client.cli.output import print_rows, tell
+from marey_client.imports import refusal_text
 from marey_schemas.imports import ImportEntry
 from marey_schemas.items import Item
 from marey_schemas.jobs import Job
@@ -28,20 +29,19 @@ class Report:
     seconds: dict[str, float]
     data: Path
     exported: Sequence[Path]
+    tasks: int
+    shared_tasks: int
     sheet: Path | None
     server: str = ""
 
     @property
-    def refused(self) -> list[tuple[str, str, str]]:
-        """(step, name, reason) of everything that was not taken or not made."""
-        imports = [
-            ("import", entry.name, f"{entry.error.detail} ({entry.error.code})")
-            for entry in self.entries
-            if entry.error is not None
-        ]
+    def refused(self) -> list[tuple[str, str]]:
+        """(step, name and reason) of everything that was not taken or not made."""
+        imports = [("import", refusal_text(entry)) for entry in self.entries if entry.error is not None]
+        result = (self.job.result if self.job else None) or {}
         retargets = [
-            ("retarget", str(one.get("name")), f"{one.get('detail')} ({one.get('code')})")
-            for one in (self.job.result or {} if self.job else {}).get("refused", ())
+            ("retarget", f"{one.get('name')}: {one.get('detail')} ({one.get('code')})")
+            for one in result.get("refused", ())
         ]
         return imports + retargets
 
@@ -59,13 +59,15 @@ class Report:
             "left_out": self.left_out,
             "statuses": dict(Counter(entry.status for entry in self.entries)),
             "warnings": dict(self.warnings),
-            "refused": [{"step": step, "name": name, "reason": reason} for step, name, reason in self.refused],
+            "refused": [{"step": step, "reason": reason} for step, reason in self.refused],
             "frames": _frames(self.sources),
             "retargeted_clips": len(self.results),
             "retargeted_frames": _frames(self.results),
             "seconds": self.seconds,
             "poses_per_second": self._rates(),
             "bytes_per_pose": {"takes": _bytes_per_pose(self.sources), "retargeted": _bytes_per_pose(self.results)},
+            "tasks": self.tasks,
+            "shared_tasks": self.shared_tasks,
             "job": self.job.id if self.job else None,
             "contact_sheet": str(self.sheet.absolute()) if self.sheet else None,
             "exported": [str(path.absolute()) for path in self.exported],
@@ -79,8 +81,8 @@ class Report:
 def print_report(report: Report) -> None:
     """A table of figures, the reasons of refusals, and where everything is."""
     print_rows(_rows(report))
-    for step, name, reason in report.refused[:REASONS_SHOWN]:
-        tell(f"refused at {step}: {name}: {reason}")
+    for step, reason in report.refused[:REASONS_SHOWN]:
+        tell(f"refused at {step}: {reason}")
     if len(report.refused) > REASONS_SHOWN:
         tell(f"... and {len(report.refused) - REASONS_SHOWN} more")
     tell(f"\nserver data       {report.data.absolute()}")
@@ -95,7 +97,7 @@ def _rows(report: Report) -> Iterator[tuple[str, str, str]]:
     figures = report.as_dict()
     rates, seconds, sizes = figures["poses_per_second"], figures["seconds"], figures["bytes_per_pose"]
     taken = {status: count for status, count in figures["statuses"].items() if status != "failed"}
-    refusals = Counter(step for step, _, _ in report.refused)
+    refusals = Counter(step for step, _ in report.refused)
     yield "files", f"{figures['files']}", _counted(taken)
     if report.left_out:
         yield "left out", f"{report.left_out}", "no motion files"
@@ -110,7 +112,10 @@ def _rows(report: Report) -> Iterator[tuple[str, str, str]]:
         f"{figures['retargeted_frames']:,}",
         f"in {figures['retargeted_clips']} clips on another skeleton",
     )
-    yield "", f"{seconds['retarget']:.2f}", "seconds, through queue and worker"
+    shared = (
+        f"; {report.shared_tasks} of {report.tasks} tasks share results of earlier ones" if report.shared_tasks else ""
+    )
+    yield "", f"{seconds['retarget']:.2f}", f"seconds, through queue and worker{shared}"
     yield "", f"{rates['retarget']:,.0f}", "poses per second"
     yield "", f"{sizes['retargeted']:.0f}", "bytes per pose"
 

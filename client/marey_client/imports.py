@@ -148,6 +148,17 @@ class Imports:
         return digests
 
 
+def refusal_text(entry: ImportEntry) -> str:
+    """Why a file was refused, in a line that begins with its name."""
+    assert entry.error is not None
+    detail = entry.error.detail
+    if detail.startswith(entry.name):
+        return f"{detail} ({entry.error.code})"
+    line = f", line {entry.error.line}" if entry.error.line else ""
+    joint = f", joint {entry.error.joint}" if entry.error.joint else ""
+    return f"{entry.name}{line}{joint}: {detail} ({entry.error.code})"
+
+
 def _say_nothing(_stage: str, _done: int, _total: int) -> None:
     pass
 

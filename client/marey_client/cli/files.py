@@ -74,11 +74,11 @@ def upload(
 
 
 def _print_entries(entries: Sequence[ImportEntry]) -> None:
+    from marey_client.imports import refusal_text
+
     for entry in entries:
         if entry.error is not None:
-            line = f", line {entry.error.line}" if entry.error.line else ""
-            joint = f", joint {entry.error.joint}" if entry.error.joint else ""
-            tell(f"{entry.name}{line}{joint}: {entry.error.detail} ({entry.error.code})")
+            tell(refusal_text(entry))
         for warning in entry.warnings:
             tell(f"{entry.name}: warning: {warning.message} ({warning.code})")
     counts = Counter(entry.status for entry in entries)
@@ -207,17 +207,9 @@ def download(
     as_json: AsJson = False,
 ) -> None:
     """Write clips to files. A folder comes with the folders below it."""
-    from marey_schemas.kinds import Kind
-
     address = Address.parse(place)
     with connect(context) as marey:
-        single = find_item(marey, address, [Kind.CLIP, Kind.SKELETON])
-        if single is not None:
-            clips, base = [single], single.item.collection
-        else:
-            clips, base = list(marey.project(address.project).clips.list(collection=address.path)), address.path
-        if not clips:
-            raise WrongUsage(f"there is no clip at {address}; marey ls {address.project} shows what there is")
+        clips, base = _clips_at(marey, address)
         written, refused = _download_all(clips, base, output, format, unit)
     if as_json:
         print_json({"files": [str(path) for path in written], "refused": refused})
@@ -227,6 +219,20 @@ def download(
             tell(f"{name}: {reason}")
     if refused:
         raise Refused
+
+
+def _clips_at(marey: Marey, address: Address) -> tuple[list[ItemHandle], str]:
+    """What an address means to a download, and the folder that paths are told from: a clip, a folder, or a skeleton."""
+    from marey_schemas.kinds import Kind
+
+    clip = find_item(marey, address, [Kind.CLIP])
+    below = [] if clip else list(marey.project(address.project).clips.list(collection=address.path))
+    single = clip or (None if below else find_item(marey, address, [Kind.SKELETON]))
+    if single is not None:
+        return [single], single.item.collection
+    if not below:
+        raise WrongUsage(f"there is no clip at {address}; marey ls {address.project} shows what there is")
+    return list(below), address.path
 
 
 def _download_all(

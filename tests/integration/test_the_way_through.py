@@ -1,0 +1,288 @@
+"""The way through the house, as its users walk it: command line and SDK, a real server, a real worker."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+
+from marey_client import errors
+from marey_client.imports import FILES_PER_IMPORT, find_files
+from marey_motion.formats import read_motion, write_bvh
+from marey_motion.gait import game_skeleton, generate_gait
+from marey_schemas.access import ProjectCreate
+from marey_schemas.documents import SkeletonMapping
+from marey_schemas.imports import ImportOptions
+from marey_schemas.items import ItemChange
+from marey_schemas.jobs import CollectionInput, ImportParams, ItemInput, JobCreate
+from server_process import ServerProcess
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    process = ServerProcess(tmp_path_factory.mktemp("server"))
+    process.start(workers=1)
+    yield process
+    assert process.stop() == 0
+
+
+@pytest.fixture(scope="module")
+def takes(tmp_path_factory):
+    """Two walks and a broken file, in folders."""
+    folder = tmp_path_factory.mktemp("takes")
+    (folder / "turns").mkdir()
+    (folder / "walk.bvh").write_bytes(write_bvh(generate_gait(1.3, 0.0, 2.0)))
+    (folder / "turns" / "left.bvh").write_bytes(write_bvh(generate_gait(1.2, 0.8, 1.5)))
+    (folder / "broken.bvh").write_bytes(b"HIERARCHY\nROOT Hips\n{\n  OFFSET 0 0 nonsense\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def marey(server):
+    with server.client() as client:
+        yield client
+
+
+@pytest.fixture
+def project(marey, request):
+    name = hashlib.sha1(request.node.name.encode()).hexdigest()[:12]
+    return marey.create_project(ProjectCreate(name=name))
+
+
+@pytest.fixture(scope="module")
+def run(server, tmp_path_factory):
+    """Runs the command line against the server, in a folder of its own."""
+    folder = tmp_path_factory.mktemp("shell")
+
+    def run(*arguments, status=0, **environment):
+        surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
+        known = {
+            "MAREY_URL": server.url,
+            "MAREY_DATA": str(server.data),
+            "XDG_CONFIG_HOME": str(folder),
+            "HOME": str(folder),
+        }
+        done = subprocess.run(
+            [sys.executable, "-m", "marey_client.cli", *map(str, arguments)],
+            env={**surroundings, **known, **environment}, capture_output=True, text=True, cwd=folder, timeout=120,
+        )  # fmt: skip
+        assert done.returncode == status, done.stdout + done.stderr
+        return done
+
+    return run
+
+
+def target_skeleton(project):
+    """A skeleton of another rig, by way of a file that holds a pose of it."""
+    from marey_motion.documents import mapping_to_document, skeleton_to_document
+    from marey_motion.rigs import guess_axes, map_joints
+
+    skeleton = game_skeleton()
+    mapping = map_joints(skeleton)
+    parts = {
+        "hierarchy": skeleton_to_document(skeleton),
+        "mapping": mapping_to_document(mapping, guess_axes(skeleton, mapping)),
+    }
+    trees = {name: part.model_dump(by_alias=True, exclude_none=True) for name, part in parts.items()}
+    return project.skeletons.create("studio", trees)
+
+
+def test_the_readme_told_in_a_shell(run, takes, tmp_path, marey):
+    run("project", "create", "lab")
+    upload = run("upload", takes, "--project", "lab", "--collection", "raw", "--json", status=1)
+    entries = {entry["name"]: entry for entry in json.loads(upload.stdout)}
+    assert entries["walk.bvh"]["status"] == entries["turns/left.bvh"]["status"] == "created"
+    assert entries["broken.bvh"]["error"]["line"] == 4
+    assert "walk" in run("ls", "lab/raw").stdout
+    assert "left" not in run("ls", "lab/raw").stdout
+    assert "raw/turns/left" in run("ls", "lab/raw", "-r").stdout
+
+    studio = target_skeleton(marey.project("lab"))
+    told = run("retarget", "lab/raw", "--to", f"lab/{studio.id}", "--into", "studio").stdout
+    assert "2 clips" in told
+    assert "0 refused" in told
+    run("download", "lab/studio", "--format", "bvh", "-o", tmp_path / "out")
+    files = sorted(path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.bvh"))
+    assert files == ["raw/turns/left.bvh", "raw/walk.bvh"]
+    back = read_motion((tmp_path / "out/raw/walk.bvh").read_bytes(), "walk.bvh").clip
+    assert back.frame_count == 120
+    assert back.skeleton.joint_names == game_skeleton().joint_names
+
+    history = json.loads(run("show", "lab/studio/raw/walk", "--history", "--json").stdout)
+    assert {edge["kind"] for edge in history["lineage"]["inputs"]} == {"clip", "skeleton"}
+    jobs = json.loads(run("job", "ls", "lab", "--json").stdout)
+    assert "succeeded" in run("why", jobs[0]["id"]).stdout
+    assert json.loads(run("job", "show", jobs[0]["id"], "--json").stdout)["result"]["clips"] == 2
+
+
+def test_the_original_comes_back_byte_for_byte(run, takes, tmp_path):
+    run("project", "create", "originals")
+    run("upload", takes / "walk.bvh", "--project", "originals")
+    run("download", "originals/walk", "-o", tmp_path)
+    assert (tmp_path / "walk.bvh").read_bytes() == (takes / "walk.bvh").read_bytes()
+
+
+def test_refusals_are_one_line_with_a_request_id_and_exit_status_1(run):
+    done = run("project", "show", "absent", status=1)
+    assert done.stderr.count("\n") == 1
+    assert "request " in done.stderr
+    assert done.stdout == ""
+
+
+def test_a_token_can_be_made_used_and_revoked(run, tmp_path):
+    run("project", "create", "tokens")
+    run("token", "create", "reader", "--scope", "read", "--output", tmp_path / "token")
+    assert (tmp_path / "token").stat().st_mode & 0o777 == 0o600
+    assert "tokens" in run("--token-file", tmp_path / "token", "project", "ls").stdout
+    refused = run("project", "create", "more", "--token-file", tmp_path / "token", status=1)
+    assert "write" in refused.stderr
+    (made,) = [one for one in json.loads(run("token", "ls", "--json").stdout) if one["name"] == "reader"]
+    run("token", "revoke", made["id"])
+    assert "bad-token" in run("project", "ls", "--token-file", tmp_path / "token", status=1).stderr
+
+
+def test_poses_come_whole_and_in_slices(project, takes):
+    project.imports.upload(find_files([takes / "walk.bvh"]).files, ImportOptions(collection="raw"))
+    (clip,) = project.clips.list()
+    whole = clip.motion()
+    expected = read_motion((takes / "walk.bvh").read_bytes(), "walk.bvh").clip
+    assert np.array_equal(whole.poses, expected.poses)
+    some = clip.motion(frames=slice(10, 20), joints=whole.joints[3:5])
+    assert np.array_equal(some.root_translations, whole.root_translations[10:20])
+    assert np.array_equal(some.rotations, whole.rotations[10:20, 3:5])
+
+
+def test_items_are_changed_only_as_they_were_read(project, takes):
+    project.imports.upload(find_files([takes / "walk.bvh"]).files)
+    (clip,) = project.clips.list()
+    stale = project.clips.get(clip.id)
+    assert clip.change(ItemChange(name="stroll")).name == "stroll"
+    with pytest.raises(errors.PreconditionFailed):
+        stale.change(ItemChange(name="march"))
+    clip.delete()
+    assert list(project.clips.list()) == []
+    clip.restore()
+    assert [one.name for one in project.clips.list()] == ["stroll"]
+
+
+def test_a_mapping_that_was_edited_is_a_new_revision(project):
+    studio = target_skeleton(project)
+    mapping = studio.mapping()
+    joints = {standard: joint for standard, joint in mapping.joints.items() if standard != "head"}
+    assert studio.put_mapping(SkeletonMapping(joints=joints, axes=mapping.axes)).revision == 2
+    assert "head" not in studio.mapping().joints
+    assert [revision.revision for revision in studio.revisions()] == [2, 1]
+
+
+def test_files_beyond_one_request_are_imported_and_sent_but_once(project, tmp_path):
+    count = FILES_PER_IMPORT + 20
+    for number in range(count):
+        (tmp_path / f"take-{number:03d}.bvh").write_bytes(write_bvh(generate_gait(1.0 + number / 100, 0.0, 0.1)))
+    found = find_files([tmp_path]).files
+    first = project.imports.upload(found)
+    assert [entry.status for entry in first] == ["created"] * count
+    told = []
+    again = project.imports.upload(found, notice=lambda *news: told.append(news))
+    assert [entry.status for entry in again] == ["unchanged"] * count
+    assert not [stage for stage, *_ in told if stage == "sending"]
+
+
+def test_a_job_imports_what_a_request_would(project, marey, takes):
+    files = find_files([takes]).files
+    blobs = [{"name": file.name, "blob": marey.blobs.put_file(file.path)} for file in files]
+    params = ImportParams.model_validate({"files": blobs, "collection": "raw", "subject": "ada"})
+    job = project.submit(JobCreate(kind="import", params=params.model_dump(mode="json", exclude_defaults=True)))
+    ended = marey.jobs.wait(job.id, timeout_s=60)
+    entries = {entry["name"]: entry for entry in ended.result["entries"]}
+    assert entries["broken.bvh"]["error"]["line"] == 4
+    assert entries["walk.bvh"]["frames"] == 120
+    by_job = {clip.path: clip for clip in project.clips.list()}
+    assert sorted(by_job) == ["raw/turns/left", "raw/walk"]
+    assert by_job["raw/walk"].info().subject == "ada"
+    assert len(list(project.skeletons.list())) == 1
+    now = {entry.name: entry for entry in project.imports.upload(files, ImportOptions(collection="raw", subject="ada"))}
+    assert now["walk.bvh"].status == "unchanged"
+    assert now["walk.bvh"].item == by_job["raw/walk"].id
+
+
+@pytest.mark.parametrize("file_format", ["bvh", "original", "npz", "json"])
+def test_an_archive_holds_every_clip_and_is_the_same_each_time(project, marey, takes, tmp_path, file_format):
+    project.imports.upload(find_files([takes]).files, ImportOptions(collection="raw"))
+    digests = []
+    for _ in range(2):
+        wanted = JobCreate(
+            kind="export",
+            inputs={"clips": CollectionInput(collection="raw")},
+            params={"format": file_format},
+            cache="off",
+        )
+        ended = marey.jobs.wait(project.submit(wanted).id, timeout_s=60)
+        digests.append(ended.result["archive"])
+    assert digests[0] == digests[1]
+    archive = marey.blobs.fetch_to(digests[0], tmp_path / "clips.zip")
+    with zipfile.ZipFile(archive) as held:
+        names = {name.rpartition(".")[0]: name for name in held.namelist()}
+        assert set(names) == {"raw/walk", "raw/turns/left"}
+        if file_format == "original":
+            assert held.read(names["raw/walk"]) == (takes / "walk.bvh").read_bytes()
+
+
+def test_a_clip_that_cannot_be_retargeted_is_a_refusal_and_the_others_are_made(project, marey, takes, tmp_path):
+    project.imports.upload(find_files([takes]).files, ImportOptions(collection="raw"))
+    studio = target_skeleton(project)
+    lonely = project.skeletons.create(
+        "box",
+        {"hierarchy": {"schema": "marey/skeleton@1", "joints": [{"name": "Box", "parent": -1, "offset": [0, 0, 0]}]}},
+    )
+    poses = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], dtype="<f4"), (10, 1))
+    motion = {
+        "schema": "marey/motion@1", "skeleton": {"item": lonely.id, "revision": 1}, "frame_rate_hz": 30.0,
+        "joints": ["Box"], "poses": poses,
+    }  # fmt: skip
+    project.clips.create("tumbling", {"motion": motion}, collection="raw")
+    inputs = {"clips": CollectionInput(collection="raw"), "skeleton": ItemInput(item=studio.id)}
+    ended = marey.jobs.wait(project.submit(JobCreate(kind="retarget", inputs=inputs, into="out")).id, timeout_s=60)
+    assert ended.result["clips"] == 2
+    (refusal,) = ended.result["refused"]
+    assert refusal["name"] == "raw/tumbling"
+    assert refusal["code"]
+    assert sorted(clip.path for clip in project.clips.list(collection="out")) == ["out/raw/turns/left", "out/raw/walk"]
+
+
+def test_retargeting_to_a_skeleton_without_a_body_fails_once_and_says_why(project, marey, takes):
+    project.imports.upload(find_files([takes / "walk.bvh"]).files, ImportOptions(collection="raw"))
+    box = project.skeletons.create(
+        "box",
+        {
+            "hierarchy": {"schema": "marey/skeleton@1", "joints": [{"name": "Box", "parent": -1, "offset": [0, 0, 0]}]},
+            "mapping": {"schema": "marey/skeleton-mapping@1", "joints": {"pelvis": "Sphere"}},
+        },
+    )
+    inputs = {"clips": CollectionInput(collection="raw"), "skeleton": ItemInput(item=box.id)}
+    with pytest.raises(errors.JobUnsuccessful, match="Sphere") as caught:
+        marey.jobs.wait(project.submit(JobCreate(kind="retarget", inputs=inputs, into="out")).id, timeout_s=60)
+    assert len(list(marey.jobs.attempts(caught.value.job.id))) == 1
+
+
+def test_results_keep_the_licence_and_say_what_was_done(project, marey, takes):
+    options = ImportOptions(collection="raw", licence="CC BY-NC 4.0", subject="ada")
+    project.imports.upload(find_files([takes / "walk.bvh"]).files, options)
+    inputs = {"clips": CollectionInput(collection="raw"), "skeleton": ItemInput(item=target_skeleton(project).id)}
+    marey.jobs.wait(project.submit(JobCreate(kind="retarget", inputs=inputs, into="out")).id, timeout_s=60)
+    (result,) = project.clips.list(collection="out")
+    info = result.info()
+    assert (info.licence, info.subject) == ("CC BY-NC 4.0", "ada")
+    assert info.source.details["scale"] > 0
+
+
+def test_a_large_file_arrives_whole(marey, tmp_path):
+    data = np.random.default_rng(1).bytes(70 << 20)
+    (tmp_path / "large.bin").write_bytes(data)
+    digest = marey.blobs.put_file(tmp_path / "large.bin")
+    assert digest == f"sha256:{hashlib.sha256(data).hexdigest()}"
+    assert marey.blobs.missing([digest]) == set()
+    assert marey.blobs.fetch_to(digest, tmp_path / "back.bin").read_bytes() == data
