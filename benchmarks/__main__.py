@@ -16,6 +16,8 @@ from rich.table import Table
 import benchmarks
 from benchmarks.timing import Row
 
+_VERDICTS = {True: "met", False: "[bold]missed[/bold]", None: ""}
+
 
 def main() -> int:
     """Print a table of ratios; exit status 1 if a goal was missed and `--strict` was given."""
@@ -44,11 +46,11 @@ def main() -> int:
     if arguments.json:
         with open(arguments.json, "w", encoding="utf-8") as file:
             json.dump([asdict(row) for row in rows], file, indent=2)
-    return int(arguments.strict and not all(row.met for row in rows))
+    return int(arguments.strict and any(row.met is False for row in rows))
 
 
 def _table(rows: list[Row]) -> Table:
-    table = Table(title="Marey beside its peers", title_justify="left")
+    table = Table(title="Marey beside its peers: medians (best), ratios of medians", title_justify="left")
     for heading, justify in (
         ("job", "left"),
         ("size", "left"),
@@ -61,9 +63,7 @@ def _table(rows: list[Row]) -> Table:
         table.add_column(heading, justify=justify)  # type: ignore[arg-type]
     for row in rows:
         ratio = f"{row.ratio:.1f}x" if row.ratio is not None else ""
-        table.add_row(
-            row.job, row.size, row.ours, row.peer, ratio, row.goal, "met" if row.met else "[bold]missed[/bold]"
-        )
+        table.add_row(row.job, row.size, row.ours, row.peer, ratio, row.goal, _VERDICTS[row.met])
     return table
 
 

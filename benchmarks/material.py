@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,10 @@ from numpy.typing import NDArray
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
+from marey_motion.gait import generate_gait
 from marey_motion.skeleton import Skeleton
+
+_FINGER_BONE_M = (0.0, -0.025, 0.005)
 
 
 def real_folder() -> Path | None:
@@ -48,4 +52,38 @@ def chain_skeleton(joints: int, rng: np.random.Generator) -> Skeleton:
     identity = np.tile([1.0, 0.0, 0.0, 0.0], (joints, 1))
     return Skeleton(
         tuple(f"joint{j:02d}" for j in range(joints)), parents, rng.normal(scale=0.1, size=(joints, 3)), identity
+    )
+
+
+def captured_walk(frames: int, joints: int, seed: int = 0) -> Clip:
+    """A generated walk at 120 Hz as a capture system would deliver it: with fingers, and with noise on every channel.
+
+    The fingers make up for the joints that the generated body lacks of `joints`; they move like everything else.
+    """
+    walk = generate_gait(1.3, 0.2, frames / 120.0, 120.0)
+    skeleton = with_fingers(walk.skeleton, joints, "LeftHand")
+    rng = np.random.default_rng(seed)
+    seconds = np.arange(frames) / 120.0
+    fingers = _harmonics(seconds, (joints - walk.skeleton.joint_count, 3), 0.1, rng)
+    curled = quaternions.from_euler("zxy", fingers)
+    shaken = quaternions.from_euler("zxy", rng.normal(scale=2e-4, size=(frames, joints, 3)))
+    still = np.concatenate([walk.rotations.astype(np.float64), curled], axis=1)
+    rotations = quaternions.unroll(quaternions.multiply(still, shaken))
+    root = walk.root_translations + rng.normal(scale=5e-5, size=(frames, 3))
+    poses = np.concatenate([root, rotations.reshape(frames, 4 * joints)], axis=1).astype(np.float32)
+    return Clip(skeleton, 120.0, poses)
+
+
+def with_fingers(skeleton: Skeleton, joints: int, hand: str) -> Skeleton:
+    """The skeleton with finger joints, three to a finger, at one hand, so that it has `joints`."""
+    old, new = skeleton.joint_count, joints - skeleton.joint_count
+    names = tuple(f"{hand}Finger{index // 3 + 1}_{index % 3 + 1}" for index in range(new))
+    parents = [old + index - 1 if index % 3 else skeleton.index_of(hand) for index in range(new)]
+    return replace(
+        skeleton,
+        joint_names=skeleton.joint_names + names,
+        display_names=skeleton.display_names + names,
+        parents=np.concatenate([skeleton.parents, np.array(parents, np.int32)]),
+        offsets=np.concatenate([skeleton.offsets, np.tile(_FINGER_BONE_M, (new, 1))]),
+        rest_rotations=np.concatenate([skeleton.rest_rotations, np.tile([1.0, 0.0, 0.0, 0.0], (new, 1))]),
     )
