@@ -1,0 +1,164 @@
+"""The feed of events, and keys that make requests safe to repeat."""
+
+import threading
+
+import pytest
+
+from marey_schemas.access import ProjectChange
+from marey_schemas.kinds import Kind
+from marey_server.access.principal import Principal
+from marey_server.errors import Conflict, Forbidden, Invalid, NotFound, Unauthenticated
+from marey_server.store import events, idempotency, items, projects
+from marey_server.store.idempotency import IN_FLIGHT_US, LIFETIME_US, StoredAnswer
+
+
+def feed(lab, after=0, **kwargs):
+    return lab.read(events.list_events, "lab", after=after, **kwargs)
+
+
+def test_what_happens_is_told_in_order_with_who_did_it(lab):
+    rig = lab.add_skeleton()
+    clip = lab.add_clip(rig, who=lab.contributor)
+    lab.write(items.delete_item, "lab", Kind.CLIP, clip.id, expected_rev=None)
+    told = [(event.kind, event.subject, event.actor) for event in feed(lab) if event.kind.startswith("item.")]
+    assert told == [
+        ("item.created", rig.id, lab.owner.user_name),
+        ("item.created", clip.id, lab.contributor.user_name),
+        ("item.deleted", clip.id, lab.owner.user_name),
+    ]
+    assert {event.project for event in feed(lab)} == {"lab"}
+
+
+def test_the_feed_goes_on_after_the_last_event_received(lab):
+    for number in range(5):
+        lab.add_skeleton(f"rig {number}", bone_m=number + 1)
+    whole = [event.seq for event in feed(lab)]
+    seen, after = [], 0
+    while page := feed(lab, after, limit=2):
+        seen += [event.seq for event in page]
+        after = page[-1].seq
+    assert seen == whole
+    assert feed(lab, after=whole[-1]) == []
+    assert lab.read(events.newest_seq) == whole[-1]
+
+
+def test_what_failed_did_not_happen(lab):
+    before = feed(lab)
+    with pytest.raises(Conflict):
+        lab.write(projects.create_project, projects.ProjectCreate(name="lab"))
+    assert feed(lab) == before
+
+
+def test_no_event_is_missed_however_transactions_overlap(lab, open_database):
+    """A transaction that began first and commits last: a reader in between does not step over its event."""
+    other = open_database()
+    started, go_on = threading.Event(), threading.Event()
+
+    def slow(tx):
+        tx.emit("slow", "s", project_id=project_id)
+        started.set()
+        go_on.wait(10)
+
+    project_id = lab.read(projects.read_project, "lab").id
+    last = feed(lab)[-1].seq
+    thread = threading.Thread(target=lambda: other.write(lab.owner, slow))
+    thread.start()
+    started.wait(10)
+    if not lab.database.is_sqlite:
+        lab.write(lambda tx: tx.emit("quick", "q", project_id=project_id))
+    between = feed(lab, last)
+    go_on.set()
+    thread.join(30)
+    after = between[-1].seq if between else last
+    rest = feed(lab, after)
+    told = [event.kind for event in (*between, *rest)]
+    assert sorted(told) == (["slow"] if lab.database.is_sqlite else ["quick", "slow"])
+
+
+def test_events_are_for_members_and_administrators(lab):
+    lab.make_public()
+    with pytest.raises(Unauthenticated):
+        lab.read(events.list_events, "lab", who=lab.anonymous)
+    with pytest.raises(Forbidden):
+        lab.read(events.list_events, "lab", who=lab.stranger)
+    assert lab.read(events.list_events, "lab", who=lab.reader)
+    with pytest.raises(Forbidden):
+        lab.read(events.list_events, who=lab.owner)
+    chief = lab.sign_up("chief", administrator=True)
+    kinds = {event.kind for event in lab.read(events.list_events, who=chief)}
+    assert {"user.created", "project.created", "project.changed"} <= kinds
+
+
+# -- idempotency ------------------------------------------------------------------------------------------------------
+
+
+def once(tx, key="k", fingerprint="f", *, fail=False):
+    """A request that counts up the project's title, once per key."""
+    stored = idempotency.begin(tx, key, fingerprint)
+    if stored is not None:
+        return stored
+    before = projects.read_project(tx, "lab").title or ""
+    projects.change_project(tx, "lab", ProjectChange(title=before + "I"), expected_rev=None)
+    if fail:
+        raise Invalid("no")
+    idempotency.finish(tx, key, 201, {"Location": "/x"}, b"body")
+    return None
+
+
+def count(lab):
+    return len(lab.read(projects.read_project, "lab").title or "")
+
+
+def test_a_request_sent_again_is_done_once_and_answered_the_same(lab):
+    assert lab.write(once) is None
+    assert lab.write(once) == StoredAnswer(201, {"Location": "/x"}, b"body")
+    assert count(lab) == 1
+
+
+def test_a_request_sent_by_many_connections_at_once_is_done_once(lab):
+    futures = [lab.database.submit_write(lab.owner, once) for _ in range(8)]
+    answers = [future.result(60) for future in futures]
+    assert answers.count(None) == 1
+    assert count(lab) == 1
+
+
+def test_a_key_stands_for_one_request_of_one_caller(lab):
+    lab.write(once)
+    with pytest.raises(Invalid) as refused:
+        lab.write(once, fingerprint="other")
+    assert refused.value.error_code == "idempotency-key-reused"
+    admin = Principal("user", lab.owner.user_id + "x", "o", administrator=True, scopes=lab.owner.scopes)
+    assert lab.write(once, who=admin) is None
+    assert count(lab) == 2
+
+
+def test_a_request_that_failed_may_be_sent_again(lab):
+    with pytest.raises(Invalid):
+        lab.write(once, fail=True)
+    assert lab.write(once) is None
+    assert count(lab) == 1
+
+
+def test_a_key_expires(lab, clock):
+    lab.write(once)
+    clock.advance(LIFETIME_US / 1e6 + 1)
+    assert lab.write(once, fingerprint="other") is None
+    assert count(lab) == 2
+
+
+def test_a_long_request_blocks_its_key_until_it_ends_or_has_died(lab, clock):
+    lab.write(idempotency.begin, "long", "f")
+    with pytest.raises(Conflict) as refused:
+        lab.write(idempotency.begin, "long", "f")
+    assert refused.value.error_code == "idempotency-in-flight"
+    lab.write(idempotency.release, "long")
+    assert lab.write(idempotency.begin, "long", "f") is None
+    clock.advance(IN_FLIGHT_US / 1e6 + 1)
+    assert lab.write(idempotency.begin, "long", "f") is None
+    with pytest.raises(Conflict):
+        lab.write(idempotency.begin, "long", "f")
+
+
+def test_hidden_projects_have_no_feed(lab):
+    with pytest.raises(NotFound):
+        lab.read(events.list_events, "lab", who=lab.stranger)

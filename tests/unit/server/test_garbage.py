@@ -1,0 +1,170 @@
+"""Garbage collection beside everything else: nothing that is referred to is ever deleted."""
+
+import threading
+
+import pytest
+import sqlalchemy
+
+from marey_schemas.items import ItemCreate
+from marey_schemas.kinds import Kind
+from marey_server.access.principal import SYSTEM
+from marey_server.errors import Conflict
+from marey_server.store import blobs, documents, fsck, garbage, items
+from marey_server.store.blobs import GRACE_US, digest_of
+from marey_server.store.tables import attempt, blob, document, job, staged_output
+
+LONG_S = GRACE_US / 1e6 + 1
+FILE = b"a file"
+TREE = {"schema": "marey/document@1", "blob": digest_of(FILE)}
+
+
+def rows(lab, table):
+    return set(lab.read(lambda tx: tx.execute(sqlalchemy.select(table.c.digest)).scalars().all()))
+
+
+def publish_study(tx, name="s"):
+    return items.create_item(tx, "lab", Kind.STUDY, ItemCreate(name=name, parts={"study": TREE}))
+
+
+def test_what_nothing_refers_to_goes_after_a_day_and_what_something_refers_to_stays(lab, clock):
+    rig = lab.add_skeleton()
+    clip = lab.add_clip(rig)
+    lab.write(blobs.put_blob, FILE)
+    lab.write(documents.store_document, {"schema": "marey/document@1", "n": 1})
+    before = rows(lab, document), rows(lab, blob)
+    assert garbage.collect_garbage(lab.database) == garbage.Collected(0, 0, 0, 0, 0)
+    clock.advance(LONG_S)
+    collected = garbage.collect_garbage(lab.database)
+    assert (collected.documents, collected.blobs) == (1, 1)
+    assert len(before[0] - rows(lab, document)) == 1
+    assert before[1] - rows(lab, blob) == {digest_of(FILE)}
+    lab.write(items.delete_item, "lab", Kind.CLIP, clip.id, expected_rev=None)
+    clock.advance(LONG_S)
+    assert garbage.collect_garbage(lab.database).documents == 0
+    assert lab.write(items.restore_item, "lab", Kind.CLIP, clip.id).id == clip.id
+    assert list(fsck.check_store(lab.database)) == []
+
+
+def test_arrays_go_with_the_document_that_held_them_unless_another_holds_them_too(lab, clock):
+    import numpy as np
+
+    shared, own = np.arange(10.0), np.arange(20.0)
+    kept = {"schema": "marey/document@1", "x": shared}
+    lab.write(items.create_item, "lab", Kind.STUDY, ItemCreate(name="kept", parts={"study": kept}))
+    lab.write(documents.store_document, {"schema": "marey/document@1", "x": shared, "y": own})
+    clock.advance(LONG_S)
+    collected = garbage.collect_garbage(lab.database)
+    assert (collected.documents, collected.blobs) == (1, 1)
+    assert list(fsck.check_store(lab.database)) == []
+
+
+def test_what_a_running_attempt_has_staged_stays_for_as_long_as_it_runs(lab, clock):
+    staged = lab.write(documents.store_document, {"schema": "marey/document@1", "n": 1})
+
+    def stage(tx):
+        project_id = tx.execute(sqlalchemy.text("SELECT id FROM project")).scalar_one()
+        given = {"kind": "x", "params": {}, "inputs": {}, "time_limit_s": 60, "memory_limit_mb": 64, "run_at_us": 0}
+        given |= {"id": "job_1", "project_id": project_id, "created_us": 0, "state": "running"}
+        tx.execute(sqlalchemy.insert(job).values(**given))
+        given = {"job_id": "job_1", "fence": 1, "worker": "w", "token_hash": "h", "started_us": 0}
+        tx.execute(sqlalchemy.insert(attempt).values(**given))
+        draft = {"parts": {"study": staged}}
+        given = {"job_id": "job_1", "fence": 1, "name": "o", "position": 0, "draft": draft}
+        tx.execute(sqlalchemy.insert(staged_output).values(**given))
+        blobs.put_blob(tx, FILE)
+        blobs.keep_for_job(tx, "job_1", [digest_of(FILE)])
+
+    lab.write(stage)
+    clock.advance(7 * LONG_S)
+    assert garbage.collect_garbage(lab.database) == garbage.Collected(0, 0, 0, 0, 0)
+    lab.write(lambda tx: tx.execute(sqlalchemy.delete(staged_output)))
+    assert garbage.collect_garbage(lab.database).documents == 1
+    assert rows(lab, blob) == {digest_of(FILE)}
+
+
+def test_a_job_cannot_keep_what_its_author_may_not_refer_to(lab):
+    lab.write(blobs.put_blob, FILE, who=lab.reader)
+    with pytest.raises(Conflict):
+        lab.write(blobs.keep_for_job, "job_1", [digest_of(FILE)])
+
+
+@pytest.mark.parametrize("taker", ["publish", "put"])
+@pytest.mark.parametrize("first", ["taker", "collector"])
+def test_whoever_takes_something_up_while_it_is_collected_gets_it_or_is_told(lab, clock, open_database, taker, first):
+    """Two connections: one acts and waits before it commits, the other starts meanwhile."""
+    lab.write(blobs.put_blob, FILE)
+    lab.write(documents.store_document, TREE)
+    clock.advance(LONG_S)
+    acted, outcome = threading.Event(), []
+
+    def take(tx):
+        return publish_study(tx) if taker == "publish" else blobs.put_blob(tx, FILE)
+
+    def collect(tx):
+        garbage.delete_documents(tx, sorted(rows_of_document))
+        return garbage.delete_blobs(tx, [digest_of(FILE)])
+
+    rows_of_document = rows(lab, document)
+    leads, follows = (take, collect) if first == "taker" else (collect, take)
+    other = open_database()
+
+    def lead(tx):
+        answer = leads(tx)
+        acted.set()
+        thread.join(0.3)
+        return answer
+
+    def follow():
+        acted.wait(10)
+        try:
+            outcome.append(other.write(lab.owner if follows is take else SYSTEM, follows))
+        except Conflict as error:
+            outcome.append(error.error_code)
+
+    thread = threading.Thread(target=follow)
+    thread.start()
+    lab.write(lead, who=lab.owner if leads is take else SYSTEM)
+    thread.join(30)
+    assert list(fsck.check_store(lab.database)) == []
+    there = digest_of(FILE) in rows(lab, blob)
+    if taker == "put" or first == "taker":
+        assert there
+        assert lab.read(blobs.read_blob, digest_of(FILE)) == FILE
+    else:
+        assert outcome == ["missing-blobs"]
+        assert not there
+
+
+def test_nothing_is_lost_while_everybody_is_busy(lab, clock):
+    """Publishers, senders and collectors at once, with a grace of nothing: what was published is whole."""
+    errors = []
+
+    def publisher(number):
+        for turn in range(6):
+            try:
+                lab.write(blobs.put_blob, FILE)
+                lab.write(publish_study, f"{number}-{turn}")
+            except Conflict as error:
+                if error.error_code != "missing-blobs":
+                    errors.append(error)
+
+    def collector():
+        for _ in range(10):
+            garbage.collect_garbage(lab.database, grace_us=0)
+
+    threads = [threading.Thread(target=publisher, args=(number,)) for number in range(3)]
+    threads += [threading.Thread(target=collector) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+    assert errors == []
+    assert list(fsck.check_store(lab.database)) == []
+
+
+def test_expired_keys_go(lab, clock):
+    from marey_server.store import idempotency
+
+    lab.write(idempotency.begin, "k", "f")
+    clock.advance(idempotency.LIFETIME_US / 1e6 + 1)
+    assert garbage.collect_garbage(lab.database).keys == 1
