@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -12,8 +12,8 @@ from marey_client.blobs import Blobs, digest_of_file
 from marey_client.errors import NothingToUpload
 from marey_client.jobs import Jobs
 from marey_client.transport import Transport, as_json, read_model
-from marey_schemas.imports import ImportAnswer, ImportEntry, ImportFile, ImportOptions, ImportRequest
-from marey_schemas.jobs import Job
+from marey_schemas.imports import ImportAnswer, ImportEntry, ImportFile, ImportOptions, ImportRequest, skeleton_output
+from marey_schemas.jobs import Job, JobOutput
 
 MOTION_SUFFIXES = frozenset({".bvh", ".asf", ".amc", ".c3d", ".npz", ".json"})
 COMPANION_SUFFIX = ".asf"
@@ -84,8 +84,11 @@ def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
             companions[path.parent.as_posix()].append(file)
     portion: dict[str, LocalFile] = {}
     size = 0
+    accompanied = {folder for (folder, _), group in groups.items() if any(map(_needs_companion, group))}
     for (folder, _), group in groups.items():
-        needs_companion = any(file.name.lower().endswith(NEEDS_COMPANION_SUFFIX) for file in group)
+        needs_companion = any(map(_needs_companion, group))
+        if folder in accompanied and not needs_companion and all(file in companions[folder] for file in group):
+            continue  # goes with the files that need it, never on its own as a skeleton
         together = {file.name: file for file in [*(companions[folder] if needs_companion else []), *group]}
         together_bytes = sum(file.size_bytes for file in together.values())
         if portion and (len(portion) + len(together) > FILES_PER_IMPORT or size + together_bytes > BYTES_PER_IMPORT):
@@ -95,6 +98,10 @@ def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
         portion |= together
     if portion:
         yield list(portion.values())
+
+
+def _needs_companion(file: LocalFile) -> bool:
+    return file.name.lower().endswith(NEEDS_COMPANION_SUFFIX)
 
 
 @dataclass(frozen=True)
@@ -130,7 +137,8 @@ class Imports:
         if response.status_code != 202:
             return read_model(ImportAnswer, response).entries
         job = self.jobs.wait(read_model(Job, response).id)
-        return ImportAnswer.model_validate(job.result or {}).entries
+        outputs = {output.name: output for output in self.jobs.outputs(job.id)}
+        return tuple(_with_item(entry, outputs) for entry in ImportAnswer.model_validate(job.result).entries)
 
     def _send_missing(self, files: Sequence[LocalFile], tell: Notice) -> dict[str, str]:
         """Digest by name, once the server has all the bytes."""
@@ -146,6 +154,16 @@ class Imports:
                 upload.result()
                 tell("sending", done, len(by_digest))
         return digests
+
+
+def _with_item(entry: ImportEntry, outputs: Mapping[str, JobOutput]) -> ImportEntry:
+    """A job's entry with the items that were made of its file when the job was published."""
+    skeleton = outputs.get(skeleton_output(entry.name))
+    made = outputs.get(entry.name) or skeleton
+    if made is None:
+        return entry
+    known = {"status": "created" if made.created else "unchanged", "item": made.item, "revision": made.revision}
+    return entry.model_copy(update={**known, "skeleton": skeleton.item if skeleton else None})
 
 
 def refusal_text(entry: ImportEntry) -> str:

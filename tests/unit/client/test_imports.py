@@ -99,3 +99,11 @@ def test_only_bytes_the_server_lacks_are_sent_and_each_file_gets_its_entry(scrip
     assert imported[0]["unit"] == "cm"
     assert "up_axis" not in imported[0]
     assert told[-1] == ("importing", 4, 4)
+
+
+def test_an_asf_never_travels_without_the_amc_files_that_need_it():
+    others = [f"a/{number:03d}.bvh" for number in range(FILES_PER_IMPORT - 1)]
+    names = [*others, "b/b.asf", "b/b_01.amc", "b/b_02.amc", "c/c.asf"]
+    portions = names_of(batches(named(names)))
+    assert sorted({name for portion in portions for name in portion}) == names
+    assert all(any(name.endswith(".amc") for name in portion) for portion in portions if "b/b.asf" in portion)
