@@ -23,7 +23,7 @@ class Wakeups:
     def listen(self, topics: Iterable[str]) -> Iterator[Listener]:
         """Hear of `topics` from now on. Listen first and look second, so that nothing falls between."""
         listener = Listener(asyncio.get_running_loop())
-        topics = tuple(topics)
+        topics = frozenset(topics)
         with self._lock:
             for topic in topics:
                 self._listeners.setdefault(topic, set()).add(listener)
