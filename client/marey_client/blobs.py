@@ -11,12 +11,13 @@ import httpx
 
 from marey_client.downloads import saved_atomically
 from marey_client.errors import DigestMismatch
-from marey_client.transport import Transport
+from marey_client.transport import OCTETS, Transport
+from marey_client.uploads import send_in_pieces
 from marey_schemas.items import BlobsMissing, BlobsQuery
 
 CHUNK_BYTES = 1 << 20
 DIGESTS_PER_QUESTION = 10_000
-OCTETS = "application/octet-stream"
+RESUMABLE_FROM_BYTES = 64 << 20
 
 
 def digest_of(data: bytes) -> str:
@@ -53,8 +54,10 @@ class Blobs:
         return name
 
     def put_file(self, path: Path, *, digest: str | None = None) -> str:
-        """Stream a file to the server; its digest."""
+        """Stream a file to the server; its digest. A large one goes in pieces, and no piece twice."""
         name = digest or digest_of_file(path)
+        if path.stat().st_size > RESUMABLE_FROM_BYTES:
+            return send_in_pieces(self.transport, path, name)
         size = {"Content-Length": str(path.stat().st_size)}
         self.transport.send("PUT", f"/blobs/{name}", content=lambda: _chunks(path), media_type=OCTETS, headers=size)
         return name

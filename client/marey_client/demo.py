@@ -26,7 +26,7 @@ from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate
 from marey_schemas.documents import SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, ImportOptions
-from marey_schemas.jobs import CollectionInput, ItemInput, Job, JobCreate
+from marey_schemas.jobs import CollectionInput, Job
 
 PROJECT = "demo"
 TAKES, RESULTS, SKELETON = "takes", "retargeted", "game"
@@ -106,11 +106,7 @@ class Story:
         """Every take onto the second skeleton; None where no take was imported."""
         if next(self.project.clips.list(collection=TAKES, page_size=1), None) is None:
             return None
-        inputs: dict[str, Any] = {
-            "clips": CollectionInput(collection=TAKES),
-            "skeleton": ItemInput(item=target.id),
-        }
-        job = self.project.submit(JobCreate(kind="retarget", inputs=inputs, into=RESULTS))
+        job = self.project.retarget([CollectionInput(collection=TAKES)], target.id, into=RESULTS)
         return Jobs(self.project.transport).wait(job.id, on_progress=self._show)
 
     def _show(self, job: Job) -> None:

@@ -37,6 +37,10 @@ class DigestMismatch(MareyError):
     """The bytes that arrived are not those that were asked for."""
 
 
+class FileChanged(MareyError):
+    """A file became another one while it was being sent."""
+
+
 class NothingToUpload(MareyError):
     """There are no motion files where some were expected."""
 

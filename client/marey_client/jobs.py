@@ -15,6 +15,7 @@ LONGEST_WAIT_S = 20.0
 """How long one question may stay open at the server."""
 
 SHORTEST_PAUSE_S = 0.05
+FOLLOW_EVERY_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -89,12 +90,20 @@ class Jobs:
         """The revisions a job made."""
         return pages(self.transport, JobOutput, f"/jobs/{job_id}/outputs")
 
-    def log(self, job_id: str, *, offset: int = 0) -> str:
-        """What the newest attempt wrote, from byte `offset` on."""
-        response = self.transport.send(
-            "GET", f"/jobs/{job_id}/log", params={"offset": offset or None}, headers={"Accept": "text/plain"}
-        )
-        return response.content.decode(errors="replace")
+    def log(self, job_id: str, *, follow: bool = False) -> Iterator[bytes]:
+        """What the job's attempts wrote, piece by piece; with `follow` until there will be no more."""
+        offset = 0
+        while True:
+            response = self.transport.send(
+                "GET", f"/jobs/{job_id}/log", params={"offset": offset}, headers={"Accept": "text/plain"}
+            )
+            offset = int(response.headers["Log-Offset"])
+            if response.content:
+                yield response.content
+            elif not follow or response.headers["Log-Sealed"] == "true":
+                return
+            else:
+                time.sleep(FOLLOW_EVERY_S)
 
     def _ended(self, job: Job, require_success: bool) -> Job:
         if not require_success or job.state is JobState.SUCCEEDED:

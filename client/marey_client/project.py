@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -17,7 +17,7 @@ from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.access import Project, ProjectChange
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate
-from marey_schemas.jobs import Job, JobCreate
+from marey_schemas.jobs import CollectionInput, ItemInput, Job, JobCreate, RetargetParams
 from marey_schemas.kinds import Kind
 
 
@@ -92,6 +92,38 @@ class ProjectHandle:
     def submit(self, job: JobCreate) -> Job:
         """Hand in a job."""
         return Jobs(self.transport).submit(self.name, job)
+
+    def retarget(
+        self,
+        clips: Sequence[ItemInput | CollectionInput],
+        skeleton: str,
+        *,
+        into: str,
+        params: RetargetParams | None = None,
+        priority: int = 0,
+    ) -> Job:
+        """Hand in the retargeting of clips and folders of clips to the skeleton with this id.
+
+        Mappings of the clips' skeletons that were edited since the clips were imported are gone by.
+        """
+        inputs: dict[str, Any] = {"clips": tuple(clips), "skeleton": ItemInput(item=skeleton)}
+        if edited := self._edited_rigs(clips):
+            inputs["rigs"] = edited
+        given = (params or RetargetParams()).model_dump(exclude_unset=True)
+        return self.submit(JobCreate(kind="retarget", inputs=inputs, params=given, into=into, priority=priority))
+
+    def _edited_rigs(self, clips: Sequence[ItemInput | CollectionInput]) -> tuple[ItemInput, ...]:
+        """The skeletons of clips that have more than their first revision."""
+        used: set[str] = set()
+        for place in clips:
+            found = (
+                self.clips.list(collection=place.collection)
+                if isinstance(place, CollectionInput)
+                else [self.clips.get(place.item)]
+            )
+            used.update(clip.item.summary["skeleton"] for clip in found)
+        skeletons = map(self.skeletons.get, sorted(used))
+        return tuple(ItemInput(item=one.id) for one in skeletons if one.item.revision > 1)
 
     def jobs(self, *, filters: Params | None = None) -> Iterator[Job]:
         """Its jobs, newest first."""

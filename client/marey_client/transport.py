@@ -25,6 +25,7 @@ T = TypeVar("T")
 Params = Mapping[str, str | int | float | bool | None]
 
 JSON = "application/json"
+OCTETS = "application/octet-stream"
 BLOCKS = "application/msgpack; arrays=blocks"
 API = "/api/v1"
 MAX_ANSWER_BYTES = 1 << 28

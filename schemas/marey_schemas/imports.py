@@ -69,6 +69,11 @@ class ImportEntry(Answer):
     error: Refusal | None = None
 
 
+def skeleton_output(file_name: str) -> str:
+    """What an import job calls the skeleton of a file among its outputs; the clip has the file's own name."""
+    return f"{file_name}#skeleton"
+
+
 class ImportAnswer(Answer):
     """One entry per file, in the order sent."""
 

@@ -86,6 +86,12 @@ RETARGET = KindDeclaration(
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to carry over."),
         "skeleton": InputSpec(kind=Kind.SKELETON, description="The skeleton that shall move."),
+        "rigs": InputSpec(
+            kind=Kind.SKELETON,
+            many=True,
+            required=False,
+            description="Skeletons of the clips whose mapping was edited since, at the revision to go by.",
+        ),
     },
     outputs={"clips": Kind.CLIP},
     fan_out="clips",

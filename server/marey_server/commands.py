@@ -26,7 +26,10 @@ def serve(**settings: Any) -> None:
     """Run a server, and the workers it is told to start, until SIGTERM or SIGINT."""
     from marey_server.app import serve as serve_until_stopped
 
-    asyncio.run(serve_until_stopped(read_settings(**settings)))
+    chosen = read_settings(**settings)
+    comfort = {"local_workers": 1, "log_form": "text" if sys.stderr.isatty() else "json"}
+    unset = {name: value for name, value in comfort.items() if name not in chosen.model_fields_set}
+    asyncio.run(serve_until_stopped(read_settings(**settings, **unset)))
 
 
 def read_settings(**given: Any) -> Settings:

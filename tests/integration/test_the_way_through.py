@@ -14,9 +14,9 @@ from marey_client import errors
 from marey_client.imports import FILES_PER_IMPORT, find_files
 from marey_motion.formats import read_motion, write_bvh
 from marey_motion.gait import game_skeleton, generate_gait
-from marey_schemas.access import ProjectCreate
+from marey_schemas.access import Login, ProjectCreate, UserCreate
 from marey_schemas.documents import SkeletonMapping
-from marey_schemas.imports import ImportOptions
+from marey_schemas.imports import ImportFile, ImportOptions
 from marey_schemas.items import ItemChange
 from marey_schemas.jobs import CollectionInput, ImportParams, ItemInput, JobCreate
 from server_process import ServerProcess
@@ -286,3 +286,71 @@ def test_a_large_file_arrives_whole(marey, tmp_path):
     assert digest == f"sha256:{hashlib.sha256(data).hexdigest()}"
     assert marey.blobs.missing([digest]) == set()
     assert marey.blobs.fetch_to(digest, tmp_path / "back.bin").read_bytes() == data
+
+
+def test_an_import_that_becomes_a_job_answers_like_one_that_does_not(project, marey, tmp_path):
+    content = write_bvh(generate_gait(1.0, 0.0, 0.1))
+    (tmp_path / "take.bvh").write_bytes(content)
+    blob = marey.blobs.put_file(tmp_path / "take.bvh")
+    files = tuple(ImportFile(name=f"{number:03d}/take.bvh", blob=blob) for number in range(80))
+    first, again = project.imports.run(files), project.imports.run(files)
+    assert [entry.name for entry in first] == [file.name for file in files]
+    assert {entry.status for entry in first} == {"created"}
+    assert {entry.status for entry in again} == {"unchanged"}
+    assert [entry.item for entry in first] == [entry.item for entry in again]
+    assert len({entry.skeleton for entry in first}) == 1
+    assert project.clips.get(first[0].item).path == "000/take"
+
+
+def test_the_log_of_a_job_can_be_read_and_followed(project, marey, takes, run):
+    (takes_file,) = find_files([takes / "broken.bvh"]).files
+    blob = marey.blobs.put_file(takes_file.path)
+    job = project.submit(JobCreate(kind="import", params={"files": [{"name": "broken.bvh", "blob": blob}]}))
+    followed = b"".join(marey.jobs.log(job.id, follow=True))
+    assert b"broken.bvh" in followed
+    assert run("job", "log", job.id).stdout.encode() == followed
+
+
+def test_logging_in_stores_a_token_for_its_owner_alone(marey, server, tmp_path):
+    marey.users.create(UserCreate(name="ada", password="correct horse battery"))
+    surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
+    environment = {**surroundings, "XDG_CONFIG_HOME": str(tmp_path), "HOME": str(tmp_path)}
+
+    def command(*arguments, stdin=None):
+        whole = [sys.executable, "-m", "marey_client.cli", *arguments]
+        return subprocess.run(
+            whole, env=environment, input=stdin, capture_output=True, text=True, cwd=tmp_path, timeout=60
+        )
+
+    with server.client() as other:
+        token = other.sign_in(Login(name="ada", password="correct horse battery")).secret
+    done = command("login", "--server", server.url, "--with-token", stdin=f"{token}\n")
+    assert done.returncode == 0, done.stderr
+    assert token not in done.stdout + done.stderr
+    (stored,) = tmp_path.rglob("credentials.json")
+    assert stored.stat().st_mode & 0o777 == 0o600
+    assert json.loads(command("user", "show", "--json").stdout)["user"]["name"] == "ada"
+    assert command("logout").returncode == 0
+    assert command("user", "show", "--server", server.url).returncode == 1
+
+
+def test_an_edited_mapping_of_the_clips_own_skeleton_is_gone_by(project, marey, takes):
+    project.imports.upload(find_files([takes / "walk.bvh"]).files, ImportOptions(collection="raw"))
+    studio = target_skeleton(project)
+
+    def retargeted(into):
+        job = project.retarget([CollectionInput(collection="raw")], studio.id, into=into)
+        marey.jobs.wait(job.id, timeout_s=60)
+        (clip,) = project.clips.list(collection=into)
+        return clip
+
+    before = retargeted("before")
+    (source,) = [skeleton for skeleton in project.skeletons.list() if skeleton.id != studio.id]
+    mapping = source.mapping()
+    joints = {standard: joint for standard, joint in mapping.joints.items() if standard != "left_elbow"}
+    source.put_mapping(SkeletonMapping(joints=joints, axes=mapping.axes))
+    after = retargeted("after")
+    assert before.info().source.details["mapped"] == after.info().source.details["mapped"] + 1
+    assert "left_elbow" in after.info().source.details["missing"]
+    used = {(edge.role, edge.revision) for edge in after.lineage().inputs}
+    assert ("rigs", 2) in used

@@ -36,7 +36,8 @@ def work(
     """
     if credential.token is None:
         raise NoCredential(f"a worker needs a token with the scope `work` for {credential.url}; see --token-file")
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
+    level = os.environ.get("MAREY_LOG_LEVEL", "info").upper()
+    logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
     logging.getLogger("httpx").setLevel(logging.WARNING)
     given = {} if name is None else {"name": name}
     options = WorkerOptions(

@@ -38,7 +38,9 @@ def upload(
     collection: Annotated[str, typer.Option(help="The folder in the project.")] = "",
     unit: Annotated[str | None, typer.Option(help="m, dm, cm, mm, inch, ft or cmu; default: found out.")] = None,
     unit_scale_m: Annotated[float | None, typer.Option(help="Metres per unit, where no named unit fits.")] = None,
-    up_axis: Annotated[str | None, typer.Option(help="x, y or z; default: found out.")] = None,
+    up_axis: Annotated[str | None, typer.Option(help="x, y, z, -x, -y or -z; default: found out.")] = None,
+    left_handed: Annotated[bool, typer.Option("--left-handed", help="The files are left-handed; mirror them.")] = False,
+    align_floor: Annotated[bool, typer.Option("--align-floor", help="Put the feet on height 0.")] = False,
     frame_rate_hz: Annotated[
         float | None, typer.Option("--fps", help="Frames per second; default: the file's.")
     ] = None,
@@ -57,6 +59,7 @@ def upload(
     given = {
         "collection": collection, "unit": unit, "unit_scale_m": unit_scale_m, "up_axis": up_axis,
         "frame_rate_hz": frame_rate_hz, "skeleton": skeleton, "trim_rest_pose": trim_rest_pose or None,
+        "handedness": "left" if left_handed else None, "align_floor": align_floor or None,
         "tags": tuple(tag) if tag else None, "subject": subject, "licence": licence, "capture_system": capture_system,
     }  # fmt: skip
     options = ImportOptions.model_validate({key: value for key, value in given.items() if value is not None})

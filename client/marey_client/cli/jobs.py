@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -17,8 +16,6 @@ if TYPE_CHECKING:
     from marey_schemas.jobs import CollectionInput, ItemInput, Job
 
 job = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Jobs.")
-
-FOLLOW_EVERY_S = 0.5
 
 
 def add_to(app: typer.Typer) -> None:
@@ -41,25 +38,22 @@ def retarget(
     as_json: AsJson = False,
 ) -> None:
     """Move clips to another skeleton, as a job."""
-    from marey_schemas.jobs import ItemInput, JobCreate, RetargetParams
+    from marey_schemas.jobs import RetargetParams
     from marey_schemas.kinds import Kind
 
     addresses = [Address.parse(source) for source in sources]
     target_address = Address.parse(to)
     if len({address.project for address in [*addresses, target_address]}) > 1:
         raise WrongUsage("the clips and the skeleton must be in one project")
-    params = RetargetParams(scale=scale, suffix=suffix, tags=tuple(tag or ()))
+    given = {"scale": scale, "suffix": suffix, "tags": tuple(tag or ())}
+    params = RetargetParams.model_validate(
+        {name: value for name, value in given.items() if value not in (None, "", ())}
+    )
     with connect(context) as marey:
         clips = tuple(_clips_at(marey, address) for address in addresses)
         target = require_item(marey, target_address, [Kind.SKELETON])
-        wanted = JobCreate(
-            kind="retarget",
-            inputs={"clips": clips, "skeleton": ItemInput(item=target.id)},
-            params=params.model_dump(exclude_defaults=True),
-            into=into.strip("/"),
-            priority=priority,
-        )
-        submitted = marey.project(target_address.project).submit(wanted)
+        project = marey.project(target_address.project)
+        submitted = project.retarget(clips, target.id, into=into.strip("/"), params=params, priority=priority)
         if not wait:
             return print_json(submitted) if as_json else typer.echo(submitted.id)
         ended = _follow(marey, submitted)
@@ -145,15 +139,8 @@ def show_log(
 ) -> None:
     """Print what a job wrote."""
     with connect(context) as marey:
-        offset = 0
-        while True:
-            ended = marey.jobs.get(job_id).state.terminal
-            text = marey.jobs.log(job_id, offset=offset)
-            typer.echo(text, nl=False)
-            offset += len(text.encode())
-            if ended or not follow:
-                return
-            time.sleep(FOLLOW_EVERY_S)
+        for piece in marey.jobs.log(job_id, follow=follow):
+            typer.echo(piece, nl=False)
 
 
 @job.command("cancel")

@@ -27,9 +27,9 @@ def serve(
     data: DataFolder = None,
     host: Annotated[str | None, typer.Option(help="Address to listen on; default 127.0.0.1.")] = None,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="0 for any free one; default 8460.")] = None,
-    workers: Annotated[int, typer.Option(min=0, help="Worker processes beside the server.")] = 1,
+    workers: Annotated[int | None, typer.Option(min=0, help="Worker processes beside it; default 1.")] = None,
     database_url: DatabaseUrl = None,
-    log_form: Annotated[str, typer.Option(help="text for people, json for programs.")] = "text",
+    log_form: Annotated[str | None, typer.Option(help="text, the default at a terminal, or json.")] = None,
 ) -> None:
     """Run a server, its database file and a local worker until stopped."""
     from marey_client import embedded

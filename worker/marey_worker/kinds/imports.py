@@ -9,7 +9,7 @@ from marey_motion.documents import skeleton_from_document
 from marey_motion.errors import MotionError
 from marey_motion.importing import FileDigests, ImportedDocuments, ImportRequest, PlannedFile
 from marey_schemas.documents import Check, OutputRef, SkeletonHierarchy
-from marey_schemas.imports import ImportEntry, Refusal
+from marey_schemas.imports import ImportEntry, Refusal, skeleton_output
 from marey_schemas.jobs import ImportParams, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused, NoSuchThing
@@ -85,13 +85,7 @@ class _Importing:
     def _read_request(self) -> ImportRequest:
         """The options in the words of the readers, with the skeleton the clips must use."""
         params = self._params
-        options = importing.import_options(
-            unit=params.unit,
-            unit_scale_m=params.unit_scale_m,
-            up_axis=params.up_axis,
-            frame_rate_hz=params.frame_rate_hz,
-            trim_rest_pose=params.trim_rest_pose,
-        )
+        options = importing.import_options(params.model_dump())
         if params.skeleton is None:
             return ImportRequest(options, params.subject, params.licence, params.capture_system)
         try:
@@ -107,11 +101,11 @@ class _Importing:
 
     def _stage(self, planned: PlannedFile, found: ImportedDocuments) -> None:
         """The clip under the file's name, its skeleton beside it; an equal skeleton of the project is used instead."""
-        skeleton_output = f"{planned.name}#skeleton"
+        skeleton_name = skeleton_output(planned.name)
         if found.hierarchy is not None and found.mapping is not None:
             self._ready.append(
                 StagedOutput(
-                    name=skeleton_output,
+                    name=skeleton_name,
                     kind=Kind.SKELETON,
                     item_name=found.skeleton_name,
                     collection=SKELETON_COLLECTION,
@@ -122,7 +116,7 @@ class _Importing:
         if found.motion is not None and found.info is not None:
             motion = found.motion
             if found.hierarchy is not None:
-                motion = {**motion, "skeleton": OutputRef(output=skeleton_output).model_dump()}
+                motion = {**motion, "skeleton": OutputRef(output=skeleton_name).model_dump()}
             self._ready.append(
                 StagedOutput(
                     name=planned.name,

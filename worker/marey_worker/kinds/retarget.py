@@ -9,14 +9,14 @@ from pydantic import ValidationError
 
 from marey_motion import documents
 from marey_motion.errors import MotionError
-from marey_motion.retargeting import RetargetPlan, plan_retarget, retarget
+from marey_motion.retargeting import RetargetPlan, retarget
 from marey_schemas.documents import ClipInfo, Motion, RevisionRef, Source
 from marey_schemas.jobs import ItemInput, PinnedInput, RetargetParams, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused, NoSuchThing
-from marey_worker.kinds.rigged import Rigged, RiggedSkeletons
+from marey_worker.kinds.rigged import Rig, plan_between, read_rigged
 
-BYTES_PER_STAGE = 8 << 20
+BYTES_PER_STAGE = 2 << 20  # small enough for the server to take results in while the next are computed
 OUTPUTS_PER_STAGE = 64
 
 
@@ -34,8 +34,6 @@ class _Retargeting:
     def __init__(self, context: Context, params: RetargetParams) -> None:
         self._context = context
         self._params = params
-        self._skeletons = RiggedSkeletons(context, {})
-        self._plans: dict[RevisionRef, RetargetPlan] = {}
         self._refused: list[dict[str, Any]] = []
         self._ready: list[StagedOutput] = []
         self._ready_bytes = 0
@@ -43,9 +41,10 @@ class _Retargeting:
         self._made = 0
 
         (self._target_pin,) = context.inputs["skeleton"]
-        self._target_ref = RevisionRef(item=self._target_pin.item, revision=self._target_pin.revision)
+        self._target = Rig.as_stored(_ref(self._target_pin))
+        self._rigs = {pin.item: pin for pin in context.inputs.get("rigs", ())}
         try:
-            self._target: Rigged = self._skeletons.get(self._target_ref)
+            read_rigged(context, self._target)
         except MotionError as error:
             raise JobRefused(error.code, f"skeleton {self._target_pin.name}: {error}") from error
 
@@ -68,8 +67,10 @@ class _Retargeting:
         }
 
     def _retargeted(self, pin: PinnedInput, motion: Motion) -> StagedOutput:
-        source = RevisionRef.model_validate(motion.skeleton.model_dump())
-        plan = self._plan(source)
+        used = RevisionRef.model_validate(motion.skeleton.model_dump())
+        edited = self._rigs.get(used.item)
+        source = Rig(used, _ref(edited) if edited else used)
+        plan = plan_between(self._context, source, self._target, self._params.scale)
         clip = retarget(documents.clip_from_document(motion, plan.source), plan)
         self._frames += clip.frame_count
         return StagedOutput(
@@ -79,20 +80,15 @@ class _Retargeting:
             collection=pin.collection,
             tags=self._params.tags,
             parts={
-                "motion": documents.clip_to_document(clip, self._target_ref).model_dump(by_alias=True),
+                "motion": documents.clip_to_document(clip, self._target.skeleton).model_dump(by_alias=True),
                 "info": self._info(pin, plan).model_dump(mode="json", by_alias=True, exclude_none=True),
             },
             sources={
-                "clips": (ItemInput(item=pin.item, revision=pin.revision),),
-                "skeleton": (ItemInput(item=self._target_pin.item, revision=self._target_pin.revision),),
+                "clips": (_input(pin),),
+                "skeleton": (_input(self._target_pin),),
+                **({"rigs": (_input(edited),)} if edited else {}),
             },
         )
-
-    def _plan(self, source: RevisionRef) -> RetargetPlan:
-        if source not in self._plans:
-            rigged = self._skeletons.get(source)
-            self._plans[source] = plan_retarget(*rigged, *self._target, scale=self._params.scale)
-        return self._plans[source]
 
     def _info(self, pin: PinnedInput, plan: RetargetPlan) -> ClipInfo:
         """What was known of the source and holds for the result, and how it was made."""
@@ -130,3 +126,11 @@ class _Retargeting:
         if self._ready:
             self._context.stage(self._ready)
         self._ready, self._ready_bytes = [], 0
+
+
+def _ref(pin: PinnedInput) -> RevisionRef:
+    return RevisionRef(item=pin.item, revision=pin.revision)
+
+
+def _input(pin: PinnedInput) -> ItemInput:
+    return ItemInput(item=pin.item, revision=pin.revision)

@@ -1,17 +1,23 @@
-"""Skeletons as retargeting needs them, read once per job."""
+"""Skeletons as retargeting needs them, kept from job to job: a revision never changes, and one process stays warm."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from typing import Generic, NamedTuple, TypeVar
 
 from marey_motion import documents
+from marey_motion.retargeting import RetargetPlan, plan_retarget
 from marey_motion.rigs import JointAxes, JointMapping, guess_axes, map_joints
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents import RevisionRef, SkeletonHierarchy, SkeletonMapping
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, NoSuchThing
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
+
+MOST_KEPT = 512
 
 
 class Rigged(NamedTuple):
@@ -22,29 +28,62 @@ class Rigged(NamedTuple):
     axes: Mapping[str, JointAxes]
 
 
-@dataclass(frozen=True)
-class RiggedSkeletons:
-    """The skeletons that the clips of a job use, by item and revision."""
+class _Kept(Generic[Key, Value]):
+    """The values used last."""
 
-    context: Context
-    known: dict[RevisionRef, Rigged]
+    def __init__(self) -> None:
+        self._values: OrderedDict[Key, Value] = OrderedDict()
 
-    def get(self, ref: RevisionRef) -> Rigged:
-        """The skeleton with the mapping stored with it, or a guessed one where it has none.
+    def get(self, key: Key, make: Callable[[], Value]) -> Value:
+        """The value of `key`, made if it is not kept."""
+        if key not in self._values:
+            self._values[key] = make()
+        self._values.move_to_end(key)
+        if len(self._values) > MOST_KEPT:
+            self._values.popitem(last=False)
+        return self._values[key]
 
-        Raises `MotionError` where the stored mapping contradicts the skeleton.
-        """
-        if ref not in self.known:
-            self.known[ref] = self._read(ref)
-        return self.known[ref]
 
-    def _read(self, ref: RevisionRef) -> Rigged:
-        hierarchy = self.context.document(Kind.SKELETON, ref.item, ref.revision, "hierarchy")
-        skeleton = documents.skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
-        try:
-            stored = self.context.document(Kind.SKELETON, ref.item, ref.revision, "mapping")
-        except NoSuchThing:
-            mapping = map_joints(skeleton)
-            return Rigged(skeleton, mapping, guess_axes(skeleton, mapping))
-        mapping, axes = documents.mapping_from_document(SkeletonMapping.model_validate(stored), skeleton)
-        return Rigged(skeleton, mapping, axes)
+class Rig(NamedTuple):
+    """A revision of a skeleton, and the revision whose mapping to go by."""
+
+    skeleton: RevisionRef
+    mapping: RevisionRef
+
+    @classmethod
+    def as_stored(cls, ref: RevisionRef) -> Rig:
+        """A skeleton with its own mapping."""
+        return cls(ref, ref)
+
+
+_skeletons: _Kept[Rig, Rigged] = _Kept()
+_plans: _Kept[tuple[Rig, Rig, float | None], RetargetPlan] = _Kept()
+
+
+def read_rigged(context: Context, rig: Rig) -> Rigged:
+    """A skeleton with its mapping, or a guessed one where it has none.
+
+    Raises `MotionError` where the mapping contradicts the skeleton.
+    """
+    return _skeletons.get(rig, lambda: _read(context, rig))
+
+
+def plan_between(context: Context, source: Rig, target: Rig, scale: float | None) -> RetargetPlan:
+    """How clips of one skeleton get onto the other. Raises `MotionError`."""
+
+    def plan() -> RetargetPlan:
+        return plan_retarget(*read_rigged(context, source), *read_rigged(context, target), scale=scale)
+
+    return _plans.get((source, target, scale), plan)
+
+
+def _read(context: Context, rig: Rig) -> Rigged:
+    hierarchy = context.document(Kind.SKELETON, rig.skeleton.item, rig.skeleton.revision, "hierarchy")
+    skeleton = documents.skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
+    try:
+        stored = context.document(Kind.SKELETON, rig.mapping.item, rig.mapping.revision, "mapping")
+    except NoSuchThing:
+        mapping = map_joints(skeleton)
+        return Rigged(skeleton, mapping, guess_axes(skeleton, mapping))
+    mapping, axes = documents.mapping_from_document(SkeletonMapping.model_validate(stored), skeleton)
+    return Rigged(skeleton, mapping, axes)

@@ -1,0 +1,95 @@
+"""Large files in pieces."""
+
+import hashlib
+import json
+
+import httpx
+import pytest
+
+from marey_client import blobs, errors, uploads
+
+DATA = bytes(range(251)) * 100
+
+
+class UploadServer:
+    """Keeps the bytes of one upload; `faults` are raised instead of answers, after keeping so many bytes of a piece."""
+
+    def __init__(self, make_problem):
+        self.kept = bytearray()
+        self.faults = []
+        self.sent = 0
+        self.announced = None
+        self.finished = False
+        self.make_problem = make_problem
+
+    def __call__(self, request):
+        request.read()
+        if request.method == "POST":
+            self.announced = json.loads(request.content)
+        if request.method == "PATCH":
+            if int(request.headers["Upload-Offset"]) != len(self.kept):
+                return self.make_problem(409, "wrong-offset", context={"offset": len(self.kept)})
+            self.sent += len(request.content)
+            keep = self.faults.pop(0) if self.faults else None
+            self.kept += request.content[:keep]
+            if keep is not None:
+                raise httpx.ReadError("connection reset")
+            self.finished = len(self.kept) == len(DATA)
+        digest = f"sha256:{hashlib.sha256(self.kept).hexdigest()}" if self.finished else None
+        shown = {"id": "up1", "length": len(DATA), "offset": len(self.kept), "digest": digest}
+        return httpx.Response(200, json=shown)
+
+
+@pytest.fixture
+def upload_server(make_problem, monkeypatch):
+    monkeypatch.setattr(uploads, "PIECE_BYTES", 4096)
+    monkeypatch.setattr(blobs, "RESUMABLE_FROM_BYTES", 1000)
+    return UploadServer(make_problem)
+
+
+@pytest.fixture
+def send(script, upload_server, tmp_path):
+    path = tmp_path / "large.bvh"
+    path.write_bytes(DATA)
+    script.answers = [upload_server] * 100
+    return lambda: script.marey().blobs.put_file(path)
+
+
+def test_a_large_file_goes_in_pieces_under_its_digest(send, upload_server):
+    assert send() == f"sha256:{hashlib.sha256(DATA).hexdigest()}"
+    assert bytes(upload_server.kept) == DATA
+    assert upload_server.announced["length"] == len(DATA)
+
+
+@pytest.mark.parametrize("kept", [0, 1000, 4096])
+def test_after_a_lost_connection_it_goes_on_where_the_server_is(send, upload_server, kept):
+    upload_server.faults = [4096, kept]
+    send()
+    assert bytes(upload_server.kept) == DATA
+    assert upload_server.sent <= len(DATA) + 4096
+
+
+def test_a_last_piece_whose_answer_was_lost_still_becomes_a_blob(send, upload_server):
+    upload_server.faults = [4096] * 6 + [len(DATA)]
+    assert send().startswith("sha256:")
+    assert upload_server.finished
+
+
+def test_a_connection_that_never_lets_a_piece_through_is_given_up(send, upload_server):
+    upload_server.faults = [0] * 100
+    with pytest.raises(errors.Unreachable):
+        send()
+    assert upload_server.sent == uploads.TRIES_PER_PIECE * 4096
+
+
+def test_a_file_that_shrinks_is_noticed(script, upload_server, tmp_path):
+    path = tmp_path / "large.bvh"
+    path.write_bytes(DATA)
+
+    def shrink(request):
+        path.write_bytes(b"")
+        return upload_server(request)
+
+    script.answers = [upload_server, shrink, upload_server]
+    with pytest.raises(errors.FileChanged, match="shorter"):
+        script.marey().blobs.put_file(path)

@@ -1,0 +1,111 @@
+"""When a lease is renewed, and what is believed about it."""
+
+import threading
+import time
+
+import pytest
+
+from marey_client.errors import LeaseLost, Unreachable
+from marey_schemas.jobs import HeartbeatAnswer, Lease, Progress, Resources
+from marey_schemas.problems import Problem
+from marey_worker import keeper
+from marey_worker.keeper import LeaseKeeper
+
+LOST = LeaseLost(Problem(type="", title="", status=409, detail="lost", instance="r", code="lease-lost"))
+
+
+class Api:
+    """Answers heartbeats; `answers` says with what."""
+
+    def __init__(self):
+        self.heard = []
+        self.error = None
+        self.cancel = False
+        self.beat = threading.Event()
+
+    def heartbeat(self, progress):
+        self.heard.append(progress)
+        self.beat.set()
+        if self.error is not None:
+            raise self.error
+        return HeartbeatAnswer(lease_ttl_s=60.0, cancel_requested=self.cancel)
+
+
+def lease(*, heartbeat_s=0.01, ttl_s=60.0):
+    return Lease(
+        job="job_1", project="lab", kind="add", params={}, inputs={}, into="", seed=0, resources=Resources(), fence=1,
+        attempt=1, attempt_token="t", lease_ttl_s=ttl_s, heartbeat_s=heartbeat_s,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def api(monkeypatch):
+    monkeypatch.setattr(keeper, "TICK_S", 0.005)
+    monkeypatch.setattr(keeper, "RETRY_S", 0.01)
+    return Api()
+
+
+@pytest.fixture
+def keep(api):
+    started = []
+
+    def keep(**figures):
+        started.append(LeaseKeeper(api, lease(**figures)))
+        return started[-1]
+
+    yield keep
+    for one in started:
+        one.stop()
+
+
+def test_heartbeats_go_on_until_stopped(api, keep):
+    one = keep()
+    while len(api.heard) < 5:
+        assert api.beat.wait(5)
+    one.stop()
+    time.sleep(0.05)
+    heard = len(api.heard)
+    time.sleep(0.1)
+    assert len(api.heard) == heard
+
+
+def test_progress_is_told_before_the_next_heartbeat_is_due(api, keep, monkeypatch):
+    monkeypatch.setattr(keeper, "PROGRESS_EVERY_S", 0.02)
+    keep(heartbeat_s=1000).tell(Progress(done=1, total=2))
+    assert api.beat.wait(5)
+    assert api.heard[0].done == 1
+
+
+def test_a_lost_lease_ends_the_heartbeats(api, keep):
+    api.error = LOST
+    one = keep()
+    assert one.lost.wait(5)
+    heard = len(api.heard)
+    time.sleep(0.1)
+    assert len(api.heard) == heard
+    with pytest.raises(LeaseLost):
+        one.confirm()
+
+
+def test_a_request_to_cancel_is_heard(api, keep):
+    api.cancel = True
+    assert keep().cancelled.wait(5)
+
+
+def test_a_server_that_is_away_is_asked_again_and_the_lease_is_not_given_up(api, keep):
+    api.error = Unreachable("away")
+    one = keep()
+    while len(api.heard) < 3:
+        time.sleep(0.005)
+    assert not one.lost.is_set()
+    api.error = None
+    one.confirm()
+
+
+def test_nothing_is_confirmed_after_a_long_silence_without_asking(api, keep):
+    one = keep(heartbeat_s=1000, ttl_s=0.03)
+    time.sleep(0.05)
+    one.confirm()
+    assert len(api.heard) == 1
+    one.confirm()
+    assert len(api.heard) == 1
