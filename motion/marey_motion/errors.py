@@ -49,31 +49,31 @@ def _restore(error_type: type[MotionError], message: str, state: dict[str, objec
 class SkeletonError(MotionError):
     """The skeleton is not a valid joint hierarchy."""
 
-    default_code = "skeleton_invalid"
+    default_code = "skeleton-invalid"
 
 
 class UnknownJoint(SkeletonError):
     """The skeleton has no joint of this name."""
 
-    default_code = "unknown_joint"
+    default_code = "unknown-joint"
 
 
 class ClipError(MotionError):
     """The clip's arrays do not describe a motion of its skeleton."""
 
-    default_code = "clip_invalid"
+    default_code = "clip-invalid"
 
 
 class RotationError(MotionError):
     """The numbers do not describe rotations."""
 
-    default_code = "rotation_invalid"
+    default_code = "rotation-invalid"
 
 
 class MappingError(MotionError):
     """The skeleton's joints could not be given the standard names that the operation needs."""
 
-    default_code = "mapping_invalid"
+    default_code = "mapping-invalid"
 
 
 # Files
@@ -89,7 +89,7 @@ class FormatError(MotionError):
     joint : name of the joint that was being read
     """
 
-    default_code = "format_invalid"
+    default_code = "format-invalid"
 
     def __init__(
         self,
@@ -111,16 +111,16 @@ class FormatError(MotionError):
 class UnknownFormat(FormatError):
     """No reader recognises the file."""
 
-    default_code = "format_unknown"
+    default_code = "format-unknown"
 
 
 class AmbiguousUnits(FormatError):
     """The file does not say its unit of length and its sizes fit more than one."""
 
-    default_code = "units_ambiguous"
+    default_code = "units-ambiguous"
 
 
 class FormatLimit(FormatError):
     """The file asks for more joints, frames or bytes than a reader accepts."""
 
-    default_code = "format_limit"
+    default_code = "format-limit"

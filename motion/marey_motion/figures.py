@@ -74,7 +74,7 @@ def contact_sheet(takes: Sequence[TakePair], *, heading: str = "Retargeting", mo
     if not (1 <= len(takes) <= MAX_TAKES and 1 <= moments <= MAX_MOMENTS):
         raise MotionError(
             f"a sheet shows 1 to {MAX_TAKES} takes at 1 to {MAX_MOMENTS} moments, not {len(takes)} at {moments}",
-            code="figure_size",
+            code="figure-size",
         )
     rows = [_staged(take, moments) for take in takes]
     height = HEADER + ROW * len(rows)

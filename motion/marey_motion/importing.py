@@ -7,7 +7,7 @@ so that one bad file harms no other and memory holds one at a time.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import PurePosixPath
 from typing import Any, Literal
 
@@ -67,6 +67,9 @@ class ImportRequest:
     skeleton_ref: Mapping[str, Any] | None = None
 
 
+_READER_OPTIONS = tuple(option.name for option in fields(ImportOptions))
+
+
 @dataclass(frozen=True)
 class FileDigests:
     """The names of a file's bytes and of its companion's, for the record of where a clip comes from."""
@@ -88,20 +91,12 @@ class ImportedDocuments:
     checks: tuple[Tree, ...]
 
 
-def import_options(
-    *,
-    unit: str | None = None,
-    unit_scale_m: float | None = None,
-    up_axis: Any = None,
-    frame_rate_hz: float | None = None,
-    trim_rest_pose: bool = False,
-) -> ImportOptions:
-    """Options of the readers, with the unit by name or by its size in metres."""
-    if unit is not None and unit_scale_m is None:
-        unit_scale_m = unit_in_metres(unit)
-    return ImportOptions(
-        unit_scale_m=unit_scale_m, up_axis=up_axis, frame_rate_hz=frame_rate_hz, trim_rest_pose=trim_rest_pose
-    )
+def import_options(given: Mapping[str, Any]) -> ImportOptions:
+    """Options of the readers out of those of an import, with the unit by name or by its size in metres."""
+    chosen = {name: given[name] for name in _READER_OPTIONS if given.get(name) is not None}
+    if given.get("unit") is not None:
+        chosen.setdefault("unit_scale_m", unit_in_metres(given["unit"]))
+    return ImportOptions(**chosen)
 
 
 def plan_imports(names: Sequence[str]) -> list[PlannedFile]:
@@ -115,11 +110,11 @@ def plan_imports(names: Sequence[str]) -> list[PlannedFile]:
         one = _place(name, taken)
         pairing = companions.get(name)
         if name in seen:
-            one = replace(one, role="refused", code="name_repeated", reason="another file of the upload has this name")
+            one = replace(one, role="refused", code="name-repeated", reason="another file of the upload has this name")
         elif one.role == "motion" and name in needed:
             one = replace(one, role="companion")
         elif one.role == "motion" and pairing is not None and pairing.skeleton is None:
-            one = replace(one, role="refused", code="asf_missing", reason=pairing.reason or "")
+            one = replace(one, role="refused", code="asf-missing", reason=pairing.reason or "")
         elif one.role == "motion" and pairing is not None:
             one = replace(one, companion=pairing.skeleton)
         if one.role == "motion":
@@ -134,7 +129,7 @@ def _place(name: str, taken: set[tuple[str, str]]) -> PlannedFile:
     segments = [part for part in path.parts if part not in ("/", ".", "..")]
     if not segments or any(len(part) > _LONGEST_SEGMENT for part in segments) or len(name) > _LONGEST_PATH:
         reason = f"a name has 1 to {_LONGEST_SEGMENT} characters, with its folders {_LONGEST_PATH}"
-        return PlannedFile(name, "refused", code="name_invalid", reason=reason)
+        return PlannedFile(name, "refused", code="name-invalid", reason=reason)
     folder, stem = "/".join(segments[:-1]), PurePosixPath(segments[-1]).stem
     return PlannedFile(name, "motion", folder, segments[-1] if (folder, stem) in taken else stem)
 
@@ -231,7 +226,7 @@ def _on_skeleton(clip: Clip, skeleton: Skeleton, file: str) -> Clip:
         odd = ", ".join(sorted(set(own.joint_names) ^ set(skeleton.joint_names))[:5])
         raise FormatError(
             f"its joints are not those of the skeleton asked for ({odd}); leave the skeleton out and retarget instead",
-            code="skeleton_mismatch",
+            code="skeleton-mismatch",
             file=file,
         )
     order = np.array([own.index_of(name) for name in skeleton.joint_names])
@@ -242,7 +237,7 @@ def _on_skeleton(clip: Clip, skeleton: Skeleton, file: str) -> Clip:
         raise FormatError(
             f"its bones are not those of the skeleton asked for (offsets differ by up to {apart:.4f} m); "
             "leave the skeleton out and retarget instead",
-            code="skeleton_mismatch",
+            code="skeleton-mismatch",
             file=file,
         )
     rotations = clip.rotations[:, order].reshape(clip.frame_count, -1)

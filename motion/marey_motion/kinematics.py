@@ -136,13 +136,13 @@ def forward_directions(positions: Floats, left: Sequence[int], right: Sequence[i
     the frame before them (the first ones, of the first frame that has one); `MotionError` when no frame has one.
     """
     if not left or len(left) != len(right):
-        raise MotionError("a heading needs at least one pair of left and right joints", code="heading_undefined")
+        raise MotionError("a heading needs at least one pair of left and right joints", code="heading-undefined")
     lateral = np.sum(positions[:, list(left)].astype(np.float64) - positions[:, list(right)], axis=1)
     forward = np.stack((-lateral[:, 2], lateral[:, 0]), axis=1)
     length = np.linalg.norm(forward, axis=1)
     known = length >= SHORTEST_LATERAL_M
     if not known.any():
-        raise MotionError("left and right joints are never apart on the ground", code="heading_undefined")
+        raise MotionError("left and right joints are never apart on the ground", code="heading-undefined")
     last_known = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
     frames = np.where(last_known < 0, int(np.argmax(known)), last_known)
     directions: NDArray[np.float64] = forward[frames] / length[frames, None]

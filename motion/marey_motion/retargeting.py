@@ -107,7 +107,7 @@ def plan_retarget(
     if scale is None:
         scale = _hip_height_ratio(pairs, source, source_axes, target, target_axes)
     if not (np.isfinite(scale) and scale > 0):
-        raise MappingError(f"a scale of {scale} must be a positive number", code="scale_invalid", where="scale")
+        raise MappingError(f"a scale of {scale} must be a positive number", code="scale-invalid", where="scale")
     followed = {pair.target for pair in pairs}
     others = tuple(name for name in target.joint_names if name not in followed)
     same_rig = _are_same_rig(source, target)
@@ -194,7 +194,7 @@ def _check_enough(pairs: tuple[JointPair, ...], source_mapping: JointMapping, ta
     raise MappingError(
         f"too few joints to retarget: {'; '.join(lacks)}. Set them in the mapping as standard name: joint name; "
         f"the pelvis and at least {FEWEST_ESSENTIAL - 1} others of the essential joints are needed on both sides",
-        code="mapping_too_small",
+        code="mapping-too-small",
         where="mapping",
     )
 

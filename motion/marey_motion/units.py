@@ -46,7 +46,7 @@ def unit_in_metres(unit: str | float) -> float:
     metres = UNITS_M.get(unit.lower()) if isinstance(unit, str) else float(unit)
     if metres is None or not (np.isfinite(metres) and metres > 0):
         raise MotionError(
-            f"the unit {unit!r} is none of {', '.join(UNITS_M)} nor a size in metres", code="unit_unknown"
+            f"the unit {unit!r} is none of {', '.join(UNITS_M)} nor a size in metres", code="unit-unknown"
         )
     return metres
 
@@ -162,7 +162,7 @@ def _settle_up_axis(body: _Body, axis: UpAxis, cosine: float) -> UpAxis:
     raise AmbiguousUnits(
         f"which axis points up is not clear: {standing}; {resting}; name it with --up-axis (up_axis), "
         f"one of {axis}" + (f" or {rest_axis}" if rest_axis != axis else ""),
-        code="up_axis_ambiguous",
+        code="up-axis-ambiguous",
         file=body.file,
     )
 

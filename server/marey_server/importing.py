@@ -84,13 +84,7 @@ def motion_request(options: ImportOptions, skeleton: GivenSkeleton | None) -> Im
     """The options in the words of the readers."""
     from marey_motion import documents, importing
 
-    readers = importing.import_options(
-        unit=options.unit,
-        unit_scale_m=options.unit_scale_m,
-        up_axis=options.up_axis,
-        frame_rate_hz=options.frame_rate_hz,
-        trim_rest_pose=options.trim_rest_pose,
-    )
+    readers = importing.import_options(options.model_dump())
     own = None
     if skeleton is not None:
         own = documents.skeleton_from_document(SkeletonHierarchy.model_validate(skeleton.hierarchy))

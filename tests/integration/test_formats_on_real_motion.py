@@ -24,12 +24,12 @@ Outcome = ImportedMotion | MotionError
 
 # Files of too few joints to show a body, of markers, or without the skeleton they need.
 REFUSED: dict[str, tuple[type[MotionError], str]] = {
-    "c3d/135_02.c3d": (FormatError, "reader_absent"),
-    "c3d/squat.c3d": (FormatError, "reader_absent"),
-    "torture/zeros.amc": (FormatError, "asf_missing"),
-    "torture/sinusoidal.bvh": (AmbiguousUnits, "units_ambiguous"),
-    "torture/pybvh-rotation_first_root.bvh": (AmbiguousUnits, "units_ambiguous"),
-    "torture/pybvh-full_precision_frame_time.bvh": (AmbiguousUnits, "units_ambiguous"),
+    "c3d/135_02.c3d": (FormatError, "reader-absent"),
+    "c3d/squat.c3d": (FormatError, "reader-absent"),
+    "torture/zeros.amc": (FormatError, "asf-missing"),
+    "torture/sinusoidal.bvh": (AmbiguousUnits, "units-ambiguous"),
+    "torture/pybvh-rotation_first_root.bvh": (AmbiguousUnits, "units-ambiguous"),
+    "torture/pybvh-full_precision_frame_time.bvh": (AmbiguousUnits, "units-ambiguous"),
 }
 # Position channels that are displacements, which loaders without that distinction fold to a point.
 DISPLACED = ("rigs/makehuman/benchmark.bvh", "rigs/makehuman/tpose.bvh")

@@ -114,7 +114,7 @@ def test_good_files_go_in_and_each_bad_one_is_refused_with_its_place(owner: http
     entries = {entry["name"]: entry for entry in answer.json()["entries"]}
     assert entries["take/broken.bvh"]["error"]["line"] == len(lines) - 2
     assert "unpack" in entries["take/all.zip"]["error"]["detail"]
-    assert entries["lonely.amc"]["error"]["code"] == "asf_missing"
+    assert entries["lonely.amc"]["error"]["code"] == "asf-missing"
     made = owner.get(f"/projects/lab/clips/{entries['take/walk.bvh']['item']}").json()
     assert (made["name"], made["collection"], made["tags"]) == ("walk", "raw/take", ["a", "b"])
     assert made["summary"]["frames"] == entries["take/walk.bvh"]["frames"] == 12
@@ -177,7 +177,7 @@ def test_clips_can_be_made_to_use_a_given_skeleton(owner: httpx.Client):
     answer = send(owner, {"run.bvh": bvh(1), "tall.bvh": other_body}, skeleton=skeleton)
     assert statuses(answer) == {"run.bvh": "created", "tall.bvh": "failed"}
     entries = answer.json()["entries"]
-    assert entries[1]["error"]["code"] == "skeleton_mismatch"
+    assert entries[1]["error"]["code"] == "skeleton-mismatch"
     motion = owner.get(f"/projects/lab/clips/{entries[0]['item']}/parts/motion").json()
     assert motion["skeleton"] == {"item": skeleton, "revision": 1}
 
@@ -212,7 +212,7 @@ def test_every_bvh_of_real_capture_comes_back_byte_for_byte(owner: httpx.Client,
     answer = send(owner, {str(path.relative_to(mocap)): path.read_bytes() for path in files})
     for path, entry in zip(files, answer.json()["entries"], strict=True):
         if entry["status"] == "failed":
-            assert entry["error"]["code"] in ("units_ambiguous", "up_axis_ambiguous"), entry
+            assert entry["error"]["code"] in ("units-ambiguous", "up-axis-ambiguous"), entry
             continue
         assert entry["status"] == "created", entry
         assert owner.get(f"/projects/lab/clips/{entry['item']}/export").content == path.read_bytes()

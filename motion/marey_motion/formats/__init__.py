@@ -79,14 +79,14 @@ def _read_source(
     if found == detection.AMC:
         if companion is None:
             message = "an AMC holds angles alone; import it together with its ASF"
-            raise FormatError(message, code="asf_missing", file=name)
+            raise FormatError(message, code="asf-missing", file=name)
         return read_asf_amc(data, companion, name, asf_file=companion_name, frame_rate_hz=rate_hz)
     if found == detection.NPZ:
         return read_npz(data, name, frame_rate_hz=rate_hz)
     if found == detection.PREDECESSOR:
         return read_predecessor(data, name, skeleton=companion, skeleton_file=companion_name, frame_rate_hz=rate_hz)
     message = f"there is no reader for {found.upper()} files; they hold markers, not a skeleton's motion"
-    raise FormatError(message, code="reader_absent", file=name)
+    raise FormatError(message, code="reader-absent", file=name)
 
 
 def write_motion(clip: Clip, file_format: str, **options: Any) -> bytes:

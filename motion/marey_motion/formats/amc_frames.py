@@ -207,7 +207,7 @@ def _read_long_tokens(
             bone = int(np.searchsorted(ends, column, side="right"))
             lines.number = line
             problem = number_problem(excerpt(text[start:stop].tobytes()))
-            raise lines.error(problem, code="bad_number", joint=skeleton.bones[bone].name)
+            raise lines.error(problem, code="bad-number", joint=skeleton.bones[bone].name)
         values[frame, column] = value
 
 
@@ -218,10 +218,10 @@ def _fail(
     bone = skeleton.bones[state[_BONE]]
     word = lines.data[state[_POSITION] : state[_POSITION] + 64].split(maxsplit=1)[:1] or [b""]
     if stopped == _BAD_NUMBER:
-        raise lines.error(number_problem(excerpt(word[0])), code="bad_number", joint=bone.name)
+        raise lines.error(number_problem(excerpt(word[0])), code="bad-number", joint=bone.name)
     if stopped == _UNKNOWN_BONE:
         raise lines.error(
-            f"the skeleton has no bone {excerpt(word[0])!r}; is this the AMC's own ASF?", code="unknown_bone"
+            f"the skeleton has no bone {excerpt(word[0])!r}; is this the AMC's own ASF?", code="unknown-bone"
         )
     if stopped == _REPEATED_BONE:
         raise lines.error(f"the bone stands twice in frame {state[_NUMBER]}", joint=bone.name)
@@ -230,7 +230,7 @@ def _fail(
         raise lines.error(
             f"{state[_FOUND]} values for {len(bone.channels)} degrees of freedom"
             + ("; the file is cut off" if cut else ""),
-            code="file_truncated" if cut else "frame_width",
+            code="file-truncated" if cut else "frame_width",
             joint=bone.name,
         )
     moving = np.array([len(bone.channels) > 0 for bone in skeleton.bones])
@@ -238,6 +238,6 @@ def _fail(
     at_end = not lines.data[state[_POSITION] :].strip()
     raise lines.error(
         f"frame {state[_NUMBER]} lacks this bone" + ("; the file is cut off" if at_end else ""),
-        code="file_truncated" if at_end else "frame_width",
+        code="file-truncated" if at_end else "frame_width",
         joint=missing.name,
     )

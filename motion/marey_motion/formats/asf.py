@@ -104,11 +104,11 @@ class _AsfReader:
                 known = known or keyword in (b"version", b"name", *sections)
                 section = sections.get(keyword)
             elif not known:
-                raise self.lines.error(f"an ASF file begins with :version, not {excerpt(text)!r}", code="not_asf")
+                raise self.lines.error(f"an ASF file begins with :version, not {excerpt(text)!r}", code="not-asf")
             elif section:
                 section(text.split())
         if not self.children:
-            raise self.lines.error("the file has no :hierarchy", code="file_truncated")
+            raise self.lines.error("the file has no :hierarchy", code="file-truncated")
         return self._assembled()
 
     def _units(self, words: list[bytes]) -> None:

@@ -135,7 +135,7 @@ def _read_amc_header(lines: TextLines) -> tuple[bool, float | None]:
         position, number = lines.position, lines.number
         line = next(iter(lines), None)
         if line is None:
-            raise lines.error("the file holds no frames", code="file_truncated")
+            raise lines.error("the file holds no frames", code="file-truncated")
         words = line.lower().split()
         if words[0] == b":degrees" or words[0] == b":radians":
             degrees = words[0] == b":degrees"
@@ -147,7 +147,7 @@ def _read_amc_header(lines: TextLines) -> tuple[bool, float | None]:
             lines.position, lines.number = position, number
             return degrees, rate_hz
         elif not words[0].startswith((b"#", b":")):
-            raise lines.error(f"an AMC file begins with :FULLY-SPECIFIED, not {excerpt(line)!r}", code="not_amc")
+            raise lines.error(f"an AMC file begins with :FULLY-SPECIFIED, not {excerpt(line)!r}", code="not-amc")
 
 
 def _fill_motion(source: SourceMotion, skeleton: AsfSkeleton, values: NDArray[np.float64], degrees: bool) -> None:

@@ -106,7 +106,7 @@ def _read_frames(
         lines.number = bad.line
         joint, channel = columns.labels[bad.index % width] if width else (0, "value")
         raise lines.error(
-            f"{channel}: {number_problem(bad.token)}", code="bad_number", joint=header.names[joint]
+            f"{channel}: {number_problem(bad.token)}", code="bad-number", joint=header.names[joint]
         ) from None
     frames, rest = divmod(table.values.size, width) if width else (0, table.values.size)
     wrapped = table.ragged_line > 0
@@ -116,11 +116,11 @@ def _read_frames(
         raise lines.error(
             f"{table.ragged_count} values where the channels need {width}"
             + ("; the file is cut off in its last line" if cut else ""),
-            code="file_truncated" if cut else "frame_width",
+            code="file-truncated" if cut else "frame_width",
         )
     if frames == 0 and header.declared_frames:
         lines.number = header.data_line
-        raise lines.error(f"{header.declared_frames} frames are declared and none follows", code="file_truncated")
+        raise lines.error(f"{header.declared_frames} frames are declared and none follows", code="file-truncated")
     _warn_of_layout(header, frames, wrapped, warnings)
     return table.values.reshape(frames, width) if frames else np.empty((0, width))
 

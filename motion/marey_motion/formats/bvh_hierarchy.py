@@ -46,7 +46,7 @@ def read_header(lines: TextLines) -> BvhHeader:
     first = next(iter(lines), b"")
     if first.upper() != b"HIERARCHY":
         shown = f"the file begins with {excerpt(first)!r}" if first else "the file is empty"
-        raise lines.error(f"a BVH file begins with HIERARCHY; {shown}", code="not_bvh")
+        raise lines.error(f"a BVH file begins with HIERARCHY; {shown}", code="not-bvh")
     header = _HierarchyReader(lines).read()
     _read_motion_header(lines, header)
     return header
@@ -67,7 +67,7 @@ class _HierarchyReader:
                 return self._checked()
             for piece in filter(None, map(bytes.strip, _BRACES.split(line))):
                 self._read_piece(piece)
-        raise self.lines.error("the file ends inside its HIERARCHY", code="file_truncated")
+        raise self.lines.error("the file ends inside its HIERARCHY", code="file-truncated")
 
     def _read_piece(self, piece: bytes) -> None:
         if piece == b"{":
@@ -104,7 +104,7 @@ class _HierarchyReader:
         if keyword == b"ROOT" and header.names:
             raise self.lines.error(
                 "a second ROOT; a file holds one skeleton here, so split it into one file per ROOT",
-                code="several_roots",
+                code="several-roots",
             )
         if not self.open and keyword == b"JOINT":
             raise self.lines.error("a JOINT outside of any joint; the first one must be ROOT")
@@ -170,7 +170,7 @@ def _read_motion_header(lines: TextLines, header: BvhHeader) -> None:
     while frames is None or frame_time is None:
         line = next(iter(lines), None)
         if line is None:
-            raise lines.error("the file ends before 'Frames:' and 'Frame Time:'", code="file_truncated")
+            raise lines.error("the file ends before 'Frames:' and 'Frame Time:'", code="file-truncated")
         if match := _FRAME_TIME.fullmatch(line):
             frame_time = lines.number_in(match[1], "Frame Time")
         elif match := _FRAMES.fullmatch(line):

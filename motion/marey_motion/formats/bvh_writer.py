@@ -51,7 +51,7 @@ def _axes_of(skeleton: Skeleton, joint: int, rotation_order: str, source: Source
         if len(turns) == 3:
             rotation_order = "".join(turns)
     if sorted(rotation_order.lower()) != ["x", "y", "z"]:
-        raise FormatError(f"the rotation order {rotation_order!r} is no order of x, y and z", code="rotation_order")
+        raise FormatError(f"the rotation order {rotation_order!r} is no order of x, y and z", code="rotation-order")
     return ["xyz".index(axis) for axis in rotation_order.lower()]
 
 
@@ -121,7 +121,7 @@ def format_table(values: NDArray[np.float64]) -> bytes:
     """Lines of numbers with six decimals, separated by blanks."""
     largest = float(np.abs(values).max(initial=0.0))
     if not largest < _LARGEST:
-        raise FormatError(f"a value of {largest:.3g} does not fit a BVH file", code="value_range")
+        raise FormatError(f"a value of {largest:.3g} does not fit a BVH file", code="value-range")
     widest = len(str(int(largest))) + _DECIMALS + 3
     text = np.empty(values.size * widest, np.uint8)
     return text[: _format(values, text)].tobytes()

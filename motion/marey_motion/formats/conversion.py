@@ -79,7 +79,7 @@ def _check_range(source: SourceMotion, file: str) -> None:
     for values in (source.offsets, tips, source.root_positions, source.translations):
         if values is not None and np.abs(values).max(initial=0.0) > _LARGEST_LENGTH:
             message = f"a length of {np.abs(values).max():.3g} units; {_LARGEST_LENGTH:.0e} are the most"
-            raise FormatError(message, code="value_range", file=file)
+            raise FormatError(message, code="value-range", file=file)
 
 
 def _converted_skeleton(source: SourceMotion, axes: NDArray[np.float64], scale: float) -> Skeleton:

@@ -37,7 +37,7 @@ def detect_format(data: bytes, name: str) -> str:
     UnknownFormat    for empty files, archives and anything no reader knows
     """
     if not data.strip(b"\0\r\n\t "):
-        raise UnknownFormat("the file is empty", code="file_empty", file=name)
+        raise UnknownFormat("the file is empty", code="file-empty", file=name)
     suffix = _SUFFIXES.get(PurePosixPath(name.replace("\\", "/")).suffix.lower())
     archive = next((kind for mark, kind in _ARCHIVES.items() if data.startswith(mark)), None)
     if data.startswith(_ZIP):
@@ -46,7 +46,7 @@ def detect_format(data: bytes, name: str) -> str:
         archive = "zip"
     if archive:
         raise UnknownFormat(
-            f"a {archive} archive; unpack it and import the files inside", code="format_archive", file=name
+            f"a {archive} archive; unpack it and import the files inside", code="format-archive", file=name
         )
     found = _by_content(data) or suffix
     if found is None:

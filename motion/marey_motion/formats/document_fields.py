@@ -49,9 +49,9 @@ def number_array(values: Any, file: str, name: str, joint: str | None = None) ->
         numbers = array.astype(np.float64)
     except (ValueError, TypeError, OverflowError) as error:
         message = f"field {name!r} must hold numbers in rows of equal length"
-        raise FormatError(message, code="bad_number", file=file, joint=joint) from error
+        raise FormatError(message, code="bad-number", file=file, joint=joint) from error
     if not np.isfinite(numbers).all():
         raise FormatError(
-            f"field {name!r} holds numbers that are not finite", code="bad_number", file=file, joint=joint
+            f"field {name!r} holds numbers that are not finite", code="bad-number", file=file, joint=joint
         )
     return numbers

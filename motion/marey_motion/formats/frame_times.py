@@ -25,7 +25,7 @@ def frame_rate_of(frame_time_s: float, file: str, warnings: list[CheckWarning]) 
     if not 1.0 / HIGHEST_RATE_HZ <= frame_time_s < float("inf"):
         raise FormatError(
             f"a Frame Time of {frame_time_s} s gives no frame rate; set it with --fps (frame_rate_hz)",
-            code="frame_time",
+            code="frame-time",
             file=file,
         )
     declared_hz = 1.0 / frame_time_s

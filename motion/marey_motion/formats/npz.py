@@ -94,7 +94,7 @@ def read_npz(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
     """
     arrays = _read_members(data, file)
     if "format" not in arrays or str(arrays["format"]) != MARK:
-        raise FormatError(f"member 'format' must say {MARK}", code="not_npz", file=file)
+        raise FormatError(f"member 'format' must say {MARK}", code="not-npz", file=file)
     needed = _SKELETON_MEMBERS + (_MOTION_MEMBERS if "poses" in arrays else ())
     missing = [name for name in needed if name not in arrays]
     if missing:
@@ -144,7 +144,7 @@ def _array(arrays: dict[str, NDArray[Any]], name: str, kind: str, shape: tuple[i
             file=file,
         )
     if kind == "f" and not np.isfinite(array).all():
-        raise FormatError(f"member {name!r} holds numbers that are not finite", code="bad_number", file=file)
+        raise FormatError(f"member {name!r} holds numbers that are not finite", code="bad-number", file=file)
     return array
 
 
@@ -160,7 +160,7 @@ def _read_members(data: bytes, file: str) -> dict[str, NDArray[Any]]:
     except _ARCHIVE_ERRORS as error:
         if isinstance(error, FormatError):
             raise
-        raise FormatError(f"the archive is damaged: {error}", code="not_npz", file=file) from error
+        raise FormatError(f"the archive is damaged: {error}", code="not-npz", file=file) from error
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:

@@ -52,7 +52,7 @@ def read_predecessor(
     if skeleton is None:
         raise FormatError(
             "a clip document names its joints but not their hierarchy; import it together with its skeleton document",
-            code="skeleton_missing",
+            code="skeleton-missing",
             file=file,
         )
     source = read_skeleton_document(decode_document(skeleton, skeleton_file), skeleton_file)
@@ -74,7 +74,7 @@ def write_predecessor_clip(clip: Clip, *, form: ClipForm = "poses", encoding: En
     if clip.translated_joints:
         raise FormatError(
             "the predecessor's clips hold rotations alone; this joint also moves against its parent",
-            code="translations_unsupported",
+            code="translations-unsupported",
             joint=skeleton.joint_names[clip.translated_joints[0]],
         )
     root = (clip.root_translations.astype(np.float64) - skeleton.offsets[0]) / CENTIMETRE_M * MIRROR_VECTOR

@@ -38,9 +38,9 @@ def decode_document(data: bytes, file: str) -> dict[str, Any]:
         else:
             document = bson.decode(data)
     except (ValueError, RecursionError, OverflowError, bson.errors.BSONError) as error:
-        raise FormatError(f"the document cannot be read: {error}", code="document_damaged", file=file) from error
+        raise FormatError(f"the document cannot be read: {error}", code="document-damaged", file=file) from error
     if not isinstance(document, dict):
-        raise FormatError("the file holds no document", code="document_damaged", file=file)
+        raise FormatError("the file holds no document", code="document-damaged", file=file)
     return document
 
 
@@ -53,9 +53,9 @@ def _decompressed(data: bytes, file: str) -> bytes:
     try:
         document = decompressor.decompress(data, MAX_BYTES + 1)
     except (OSError, ValueError, EOFError) as error:
-        raise FormatError(f"the bz2 data is damaged: {error}", code="document_damaged", file=file) from error
+        raise FormatError(f"the bz2 data is damaged: {error}", code="document-damaged", file=file) from error
     if len(document) > MAX_BYTES:
         raise FormatLimit(f"the document unpacks to more than {MAX_BYTES} bytes", file=file)
     if not decompressor.eof:
-        raise FormatError("the bz2 data is cut off", code="file_truncated", file=file)
+        raise FormatError("the bz2 data is cut off", code="file-truncated", file=file)
     return document

@@ -42,7 +42,7 @@ def read_skeleton_document(document: Document, file: str) -> SourceMotion:
     else:
         raise FormatError(
             "the document has neither 'poses' nor 'frames' of a clip, nor 'jointDescs' or a 'root' node of a skeleton",
-            code="document_unknown",
+            code="document-unknown",
             file=file,
         )
     return _source(nodes, mirrored, file)

@@ -29,7 +29,7 @@ def as_rotations(
         frame, joint = (int(index) for index in np.argwhere(wrong)[0])
         raise FormatError(
             f"frame {frame} holds no rotation but {values[frame, joint].tolist()}",
-            code="bad_number",
+            code="bad-number",
             file=file,
             joint=joint_names[joint],
         )

@@ -24,7 +24,7 @@ class TextLines:
 
     def __init__(self, data: bytes, file: str) -> None:
         if data.startswith(_WIDE_MARKS):
-            raise FormatError("the text is UTF-16; save it as UTF-8", code="text_encoding", file=file, line=1)
+            raise FormatError("the text is UTF-16; save it as UTF-8", code="text-encoding", file=file, line=1)
         self.data = data
         self.file = file
         self.number = 0
@@ -59,7 +59,7 @@ class TextLines:
         """One finite decimal number."""
         value = read_number(word)
         if value is None:
-            raise self.error(f"{what}: {number_problem(excerpt(word))}", code="bad_number", joint=joint)
+            raise self.error(f"{what}: {number_problem(excerpt(word))}", code="bad-number", joint=joint)
         return value
 
 

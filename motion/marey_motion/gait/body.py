@@ -142,7 +142,7 @@ def _pelvis_heights(
             moment = moments.times_s[np.argmin(squared)]
             raise MotionError(
                 f"at {moment:.2f} s a step is longer than the leg of {leg:.2f} m; go slower or turn less",
-                code="gait_out_of_reach",
+                code="gait-out-of-reach",
                 where="speed_m_s",
             )
         heights = np.minimum(heights, ankle[:, 1] + np.sqrt(squared) - hip[:, 1])

@@ -42,13 +42,13 @@ class PathSegment:
         for field in ("duration_s", "speed_m_s", "turn_rate_rad_s", "final_speed_m_s", "travel_angle_rad"):
             value = getattr(self, field)
             if not np.isfinite(value):
-                raise MotionError(f"{value} is not a finite number", code="gait_invalid", where=field)
+                raise MotionError(f"{value} is not a finite number", code="gait-invalid", where=field)
         if self.duration_s <= 0:
-            raise MotionError(f"{self.duration_s} s must be positive", code="gait_invalid", where="duration_s")
+            raise MotionError(f"{self.duration_s} s must be positive", code="gait-invalid", where="duration_s")
         if min(self.speed_m_s, self.final_speed_m_s) < 0:
             raise MotionError(
                 "a speed cannot be negative; set travel_angle_rad to π to go backward",
-                code="gait_invalid",
+                code="gait-invalid",
                 where="speed_m_s",
             )
 
@@ -100,7 +100,7 @@ class RootPath:
     def __post_init__(self) -> None:
         object.__setattr__(self, "segments", tuple(self.segments))
         if not self.segments:
-            raise MotionError("a path needs at least one segment", code="gait_invalid", where="segments")
+            raise MotionError("a path needs at least one segment", code="gait-invalid", where="segments")
 
     @property
     def duration_s(self) -> float:

@@ -36,12 +36,12 @@ def test_bytes_count_more_than_names(data: bytes, name: str, expected: str) -> N
 @pytest.mark.parametrize(
     ("data", "name", "code"),
     [
-        (b"", "take.bvh", "file_empty"),
-        (b"\r\n \t", "take.bvh", "file_empty"),
-        (b"\x1f\x8b\x08", "take.bvh.gz", "format_archive"),
-        (b"PK\x03\x04", "takes.zip", "format_archive"),
-        (b"PK\x03\x04", "take.bvh", "format_archive"),
-        (b"rubbish", "take.xyz", "format_unknown"),
+        (b"", "take.bvh", "file-empty"),
+        (b"\r\n \t", "take.bvh", "file-empty"),
+        (b"\x1f\x8b\x08", "take.bvh.gz", "format-archive"),
+        (b"PK\x03\x04", "takes.zip", "format-archive"),
+        (b"PK\x03\x04", "take.bvh", "format-archive"),
+        (b"rubbish", "take.xyz", "format-unknown"),
     ],
 )
 def test_what_no_reader_knows_is_refused_with_a_reason(data: bytes, name: str, code: str) -> None:
@@ -53,7 +53,7 @@ def test_what_no_reader_knows_is_refused_with_a_reason(data: bytes, name: str, c
 def test_marker_files_are_refused_as_what_they_are() -> None:
     with pytest.raises(FormatError, match="C3D") as refused:
         read_motion(b"\x02\x50" + bytes(510), "take.c3d")
-    assert refused.value.code == "reader_absent"
+    assert refused.value.code == "reader-absent"
 
 
 def test_an_unknown_format_to_write_is_refused_with_the_known_ones() -> None:

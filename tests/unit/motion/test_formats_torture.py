@@ -30,9 +30,9 @@ CENTIMETRES = ImportOptions(unit_scale_m=0.01, up_axis="y")
     [
         (big.short_lines, f"read {big.SIZE // 18}"),
         (big.long_numbers, f"read {big.SIZE // 207}"),
-        (big.endless_hierarchy, "format_limit"),
+        (big.endless_hierarchy, "format-limit"),
         (big.one_line, "frame_width"),
-        (big.rubbish, "not_bvh"),
+        (big.rubbish, "not-bvh"),
     ],
 )
 def test_fifty_megabytes_need_less_than_a_gigabyte(make: Callable[[], bytes], outcome: str, tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def test_a_wrong_skeleton_is_refused_with_the_place_of_the_fault(changes, where,
     with pytest.raises(SkeletonError, match=words) as caught:
         chain(**changes)
     assert caught.value.where == where
-    assert caught.value.code == "skeleton_invalid"
+    assert caught.value.code == "skeleton-invalid"
 
 
 def test_an_unknown_joint_is_answered_with_the_nearest_names(body):

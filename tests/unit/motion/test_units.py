@@ -93,7 +93,7 @@ def test_someone_lying_is_not_stood_up_silently(walk: Clip) -> None:
     assert imported(lying).source.up_axis == "z"
     with pytest.raises(AmbiguousUnits, match="--up-axis") as refused:
         imported(upright_rest)
-    assert refused.value.code == "up_axis_ambiguous"
+    assert refused.value.code == "up-axis-ambiguous"
     assert imported(upright_rest, up_axis="y").source.up_axis == "y"
 
 
@@ -127,7 +127,7 @@ def test_a_child_is_asked_about_with_the_candidates(walk: Clip) -> None:
     assert "--unit" in str(refused.value)
     assert "unit_scale_m" in str(refused.value)
     assert "cm (legs 0.5" in str(refused.value)
-    assert refused.value.code == "units_ambiguous"
+    assert refused.value.code == "units-ambiguous"
     assert imported(child, unit_scale_m=0.01).source.unit_scale_m == 0.01
 
 
