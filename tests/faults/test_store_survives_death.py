@@ -1,0 +1,138 @@
+"""A process that dies while it writes leaves all of the write or nothing; run again, it ends the same."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from marey_schemas.kinds import Kind
+from marey_server.access.principal import Principal
+from marey_server.store import blobs, fsck, garbage, items
+from marey_server.store.blobs import digest_of
+
+FILES = [f"file {number}".encode() * 1000 for number in range(3)]
+
+WRITER = """
+import sys
+from marey_server.access.principal import Principal
+from marey_server.store import blobs, garbage, items, projects
+from marey_server.store.blob_backings import DirectoryBlobs
+from marey_server.store.database import Database
+from marey_schemas.kinds import Kind
+from pathlib import Path
+
+url, user_id, user_name, work, folder = sys.argv[1:]
+database = Database(url, blobs=DirectoryBlobs(Path(folder)) if folder else None)
+who = Principal("user", user_id, user_name, scopes=("read", "write"))
+FILES = [f"file {number}".encode() * 1000 for number in range(3)]
+
+def publish(tx):
+    row = projects.require(tx, "lab", scope="write")
+    trees = [{"n": n, "blob": blobs.digest_of(data)} for n, data in enumerate(FILES)]
+    drafts = [
+        items.Draft(f"d{n}", Kind.STUDY, f"study {n}", {"study": tree}, collection="a/b") for n, tree in enumerate(trees)
+    ]
+    return items.publish(tx, row, drafts, author_id=user_id)
+
+if work == "send":
+    for data in FILES:
+        database.write(who, blobs.put_blob, data)
+elif work == "publish":
+    database.write(who, publish)
+else:
+    garbage.collect_garbage(database, grace_us=-1)
+database.close()
+"""
+
+
+class Writer:
+    """Runs one kind of work in a process of its own, with a fault or without."""
+
+    def __init__(self, lab, url, folder):
+        self._args = [sys.executable, "-c", WRITER, url, lab.owner.user_id, lab.owner.user_name]
+        self._folder = folder
+
+    def run(self, work, fault=""):
+        """Exit status: 0, or minus the signal that ended it."""
+        environment = {**os.environ, "MAREY_FAULT": fault}
+        done = subprocess.run([*self._args, work, self._folder], env=environment, capture_output=True, timeout=60)
+        assert done.returncode in (0, -signal.SIGKILL), done.stderr.decode()
+        return done.returncode
+
+
+@pytest.fixture(params=["rows", "files"])
+def folder(request, tmp_path):
+    return "" if request.param == "rows" else str(tmp_path / "blobs")
+
+
+@pytest.fixture
+def writer(lab, database_url, folder):
+    from marey_server.store.blob_backings import DirectoryBlobs
+
+    if folder:
+        lab.database.blobs = DirectoryBlobs(Path(folder))
+    return Writer(lab, database_url, folder)
+
+
+def stored(lab):
+    there = lab.read(blobs.readable, [digest_of(data) for data in FILES])
+    return [digest_of(data) in there for data in FILES]
+
+
+def published(lab):
+    return [one.name for one in lab.read(items.list_items, "lab", Kind.STUDY, sort="name").items]
+
+
+def assert_sound(lab):
+    assert list(fsck.check_store(lab.database)) == []
+
+
+@pytest.mark.parametrize(
+    ("fault", "left"),
+    [
+        ("blob.put.before_commit@2:kill", [True, False, False]),
+        ("blob.put.after_commit@2:kill", [True, True, False]),
+    ],
+)
+def test_a_sender_that_dies_leaves_whole_blobs(lab, writer, fault, left):
+    assert writer.run("send", fault) == -signal.SIGKILL
+    assert stored(lab) == left
+    assert_sound(lab)
+    assert writer.run("send") == 0
+    assert stored(lab) == [True, True, True]
+    assert_sound(lab)
+
+
+@pytest.mark.parametrize(("fault", "left"), [("publish.before_commit:kill", 0), ("publish.after_commit:kill", 3)])
+def test_a_publisher_that_dies_leaves_everything_or_nothing(lab, writer, fault, left):
+    writer.run("send")
+    assert writer.run("publish", fault) == -signal.SIGKILL
+    assert len(published(lab)) == left
+    assert_sound(lab)
+    assert writer.run("publish") == 0
+    assert published(lab) == ["study 0", "study 1", "study 2"]
+    assert all(one.revision == 1 for one in lab.read(items.list_items, "lab", Kind.STUDY).items)
+    assert_sound(lab)
+
+
+def test_a_collector_that_dies_deletes_nothing_it_did_not_finish(lab, writer):
+    writer.run("send")
+    assert writer.run("collect", "garbage.before_commit:kill") == -signal.SIGKILL
+    assert stored(lab) == [True, True, True]
+    assert_sound(lab)
+    assert writer.run("collect") == 0
+    assert stored(lab) == [False, False, False]
+    assert_sound(lab)
+
+
+def test_without_a_fault_nobody_dies(lab, writer):
+    assert [writer.run(work) for work in ("send", "publish", "collect")] == [0, 0, 0]
+    assert len(published(lab)) == 3
+    assert stored(lab) == [True, True, True]
+    garbage.collect_garbage(lab.database, grace_us=-1)
+    assert_sound(lab)
+    stranger = Principal("user", lab.stranger.user_id, "stranger", scopes=("read",))
+    assert not lab.read(blobs.readable, [digest_of(FILES[0])], who=stranger)

@@ -1,0 +1,283 @@
+"""Transactions: what is retried, what is translated, what the clock says."""
+
+import threading
+import time
+
+import psycopg
+import pytest
+import sqlalchemy
+
+from marey_server.access.principal import SYSTEM
+from marey_server.errors import Invalid, StorageFull, Unavailable
+from marey_server.store import database as database_module
+from marey_server.store.clock import DatabaseClock
+from marey_server.store.database import Database
+from marey_server.store.tables import server_state, user
+
+on_sqlite = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+on_postgres = pytest.mark.parametrize("database_url", ["postgres"], indirect=True)
+
+
+def add_user(tx, name="u"):
+    row = {"id": f"user_{name}", "name": name, "administrator": False, "disabled": False, "created_us": 0, "rev": 1}
+    tx.execute(sqlalchemy.insert(user).values(**row))
+
+
+def user_names(tx):
+    return sorted(tx.execute(sqlalchemy.select(user.c.name)).scalars())
+
+
+def test_a_write_that_fails_leaves_nothing(database):
+    def fail(tx):
+        add_user(tx)
+        raise KeyError("on the way")
+
+    with pytest.raises(KeyError):
+        database.write(SYSTEM, fail)
+    assert database.read(SYSTEM, user_names) == []
+
+
+def test_a_read_cannot_write(database):
+    with pytest.raises((sqlalchemy.exc.DBAPIError, Unavailable)):
+        database.read(SYSTEM, add_user)
+    assert database.read(SYSTEM, user_names) == []
+
+
+def test_a_read_sees_one_state_throughout(database):
+    def look(tx):
+        before = user_names(tx)
+        thread = threading.Thread(target=database.write, args=(SYSTEM, add_user))
+        thread.start()
+        thread.join(30)
+        return before, user_names(tx)
+
+    assert database.read(SYSTEM, look) == ([], [])
+    assert database.read(SYSTEM, user_names) == ["u"]
+
+
+def test_what_waits_for_the_commit_runs_once_after_it_and_not_after_a_failure(database):
+    heard = []
+
+    def work(tx, fail):
+        add_user(tx, "fails" if fail else "works")
+        tx.after_commit(lambda: heard.append(database.read(SYSTEM, user_names)))
+        if fail:
+            raise KeyError("on the way")
+
+    with pytest.raises(KeyError):
+        database.write(SYSTEM, work, True)
+    database.write(SYSTEM, work, False)
+    assert heard == [["works"]]
+
+
+def test_writes_from_many_threads_all_happen(database):
+    futures = [database.submit_write(SYSTEM, add_user, f"u{number:02d}") for number in range(40)]
+    threads = [threading.Thread(target=database.write, args=(SYSTEM, add_user, f"t{number}")) for number in range(8)]
+    for thread in threads:
+        thread.start()
+    for future in futures:
+        future.result(60)
+    for thread in threads:
+        thread.join(60)
+    assert len(database.read(SYSTEM, user_names)) == 48
+
+
+@on_postgres
+def test_a_deadlock_is_resolved_by_trying_again(database):
+    database.write(SYSTEM, lambda tx: [add_user(tx, name) for name in "ab"])
+    both = threading.Barrier(2)
+    met = threading.Event()
+
+    def cross(tx, first, second):
+        tx.execute(sqlalchemy.update(user).where(user.c.name == first).values(rev=user.c.rev + 1))
+        if not met.is_set():
+            both.wait(10)
+            met.set()
+        tx.execute(sqlalchemy.update(user).where(user.c.name == second).values(rev=user.c.rev + 1))
+
+    futures = [database.submit_write(SYSTEM, cross, *pair) for pair in (("a", "b"), ("b", "a"))]
+    for future in futures:
+        future.result(60)
+    revs = database.read(SYSTEM, lambda tx: tx.execute(sqlalchemy.select(user.c.rev)).scalars().all())
+    assert revs == [3, 3]
+
+
+def break_connection(tx):
+    tx.connection.exec_driver_sql("SELECT pg_terminate_backend(pg_backend_pid())")
+
+
+@on_postgres
+def test_a_broken_connection_is_replaced_and_the_work_done_again(database):
+    tries = []
+
+    def work(tx):
+        tries.append(1)
+        if len(tries) == 1:
+            break_connection(tx)
+        add_user(tx)
+
+    database.write(SYSTEM, work)
+    assert (len(tries), database.read(SYSTEM, user_names)) == (2, ["u"])
+
+    def look(tx):
+        tries.append(1)
+        if len(tries) == 3:
+            break_connection(tx)
+        return user_names(tx)
+
+    assert database.read(SYSTEM, look) == ["u"]
+
+
+@on_postgres
+def test_a_commit_whose_answer_is_lost_is_not_done_twice(database, monkeypatch):
+    """Lost after the commit: the row is there, and nobody wrote it a second time behind the caller's back."""
+    tries = []
+
+    def work(tx):
+        tries.append(1)
+        add_user(tx, f"u{len(tries)}")
+
+    real_commit = sqlalchemy.engine.default.DefaultDialect.do_commit
+
+    def commit_then_lose(self, connection):
+        real_commit(self, connection)
+        connection.driver_connection.close()
+        raise psycopg.OperationalError("server closed the connection unexpectedly")
+
+    with monkeypatch.context() as lossy:
+        lossy.setattr(type(database.engine.dialect), "do_commit", commit_then_lose)
+        with pytest.raises(Unavailable):
+            database.write(SYSTEM, work)
+    assert database.read(SYSTEM, user_names) == ["u1"]
+
+
+def test_a_database_that_is_not_there_is_unavailable():
+    database = Database("postgresql://nobody@127.0.0.1:1/none")
+    for run in (database.read, database.write):
+        with pytest.raises(Unavailable) as refused:
+            run(SYSTEM, user_names)
+        assert refused.value.headers["Retry-After"]
+        assert "127.0.0.1" not in refused.value.detail
+    database.close()
+
+
+@on_sqlite
+def test_a_full_database_says_so_and_keeps_what_was_there(database):
+    database.write(SYSTEM, add_user, "before")
+
+    def too_much(tx):
+        tx.connection.exec_driver_sql("PRAGMA max_page_count = 1")
+        for number in range(5000):
+            add_user(tx, f"{number:050d}")
+
+    with pytest.raises(StorageFull):
+        database.write(SYSTEM, too_much)
+    database.engine.dispose()
+    assert database.read(SYSTEM, user_names) == ["before"]
+    database.write(SYSTEM, add_user, "after")
+
+
+@pytest.mark.parametrize(("column", "value"), [(user.c.name, "\ud800"), (user.c.rev, 2**80), (user.c.rev, -(2**80))])
+def test_values_beyond_what_can_be_stored_are_the_callers_mistake(database, column, value):
+    def write(tx):
+        tx.execute(sqlalchemy.update(user).values({column: value}))
+
+    with pytest.raises(Invalid):
+        database.write(SYSTEM, write)
+
+
+@on_sqlite
+def test_a_long_log_is_written_back_under_steady_reads(tmp_path, database, monkeypatch):
+    monkeypatch.setattr(database_module, "WAL_LIMIT_BYTES", 2**20)
+    monkeypatch.setattr(database_module, "WAL_CHECK_EVERY_S", 0.0)
+    stop = threading.Event()
+
+    def keep_reading():
+        while not stop.is_set():
+            database.read(SYSTEM, user_names)
+
+    readers = [threading.Thread(target=keep_reading) for _ in range(3)]
+    for reader in readers:
+        reader.start()
+    try:
+        for number in range(40):
+            row = {"key": f"k{number}", "value": "x" * 300_000}
+            database.write(SYSTEM, lambda tx, row=row: tx.execute(tx.insert_or_ignore(server_state, row)))
+        wal = tmp_path / "marey.db-wal"
+        assert wal.stat().st_size < 4 * 2**20
+    finally:
+        stop.set()
+        for reader in readers:
+            reader.join(30)
+
+
+@on_postgres
+def test_postgres_knows_who_connects_and_does_not_wait_for_ever(database):
+    settings = database.read(
+        SYSTEM,
+        lambda tx: [
+            tx.connection.exec_driver_sql(f"SHOW {name}").scalar()
+            for name in ("application_name", "lock_timeout", "idle_in_transaction_session_timeout")
+        ],
+    )
+    assert settings == ["marey", "30s", "5min"]
+
+
+# -- the clock --------------------------------------------------------------------------------------------------------
+
+HOUR_NS = 3600 * 10**9
+
+
+def now(database):
+    return database.write(SYSTEM, lambda tx: tx.now_us)
+
+
+@pytest.fixture
+def with_own_clock(database_url):
+    opened = []
+
+    def open_one():
+        opened.append(Database(database_url, clock=DatabaseClock()))
+        return opened[-1]
+
+    yield open_one
+    for one in opened:
+        one.close()
+
+
+@pytest.mark.parametrize("jump_ns", [HOUR_NS, -HOUR_NS])
+def test_a_jump_of_the_wall_clock_is_not_felt(with_own_clock, monkeypatch, jump_ns):
+    database = with_own_clock()
+    before = now(database)
+    real = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: real() + jump_ns)
+    assert 0 <= now(database) - before < 60_000_000
+
+
+def test_a_restart_with_a_clock_set_back_does_not_go_back(with_own_clock, monkeypatch):
+    first = with_own_clock()
+    latest = max(now(first) for _ in range(5))
+    first.close()
+    real = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: real() - HOUR_NS)
+    again = now(with_own_clock())
+    assert latest <= again < latest + 60_000_000
+
+
+@on_sqlite
+def test_a_restart_with_a_clock_set_forward_follows_it(with_own_clock, monkeypatch):
+    first = with_own_clock()
+    before = now(first)
+    first.close()
+    real = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: real() + HOUR_NS)
+    assert now(with_own_clock()) - before >= HOUR_NS // 1000
+
+
+def test_time_does_not_pass_within_a_transaction(database):
+    def look(tx):
+        first = tx.now_us
+        time.sleep(0.01)
+        return tx.now_us - first
+
+    assert database.write(SYSTEM, look) == 0
