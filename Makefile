@@ -18,10 +18,12 @@ $(BIN)/python:
 
 $(VENV)/.installed-all: pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) install -c constraints.txt -e '.[all]'
+	$(BIN)/python -m marey_motion.warm_up
 	@touch $@
 
 $(VENV)/.installed-dev: pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) install -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m marey_motion.warm_up
 	@touch $@ $(VENV)/.installed-all
 
 demo: $(VENV)/.installed-all ## From takes to retargeted clips; DATA=folder for your own motion
@@ -47,8 +49,8 @@ bench: $(VENV)/.installed-dev ## Speed against peers, as ratios
 	$(BIN)/python -m benchmarks
 
 fuzz: $(VENV)/.installed-dev ## An hour of malformed motion files and twenty minutes of malformed requests
-	$(BIN)/python -m benchmarks.fuzz_formats 3600
-	$(BIN)/python -m benchmarks.fuzz_api 1200
+	$(BIN)/python tests/motion_fuzz.py 3600
+	MAREY_FUZZ_EXAMPLES=200 $(BIN)/python -m pytest -q tests/integration/test_rest_fuzz.py -o timeout=3600
 
 docs: $(VENV)/.installed-dev ## Write the reference pages that come from the code
 	$(BIN)/python -m docs.generate

@@ -3,8 +3,6 @@
 Each error has a stable `code` (a slug that clients may switch on) and says `where` in the input it was found.
 """
 
-# ruff: noqa: N818 - an error is named for what went wrong, so that `except AmbiguousUnits` reads as a sentence
-
 from __future__ import annotations
 
 from typing import ClassVar
