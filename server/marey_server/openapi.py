@@ -39,6 +39,16 @@ PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
     "job_kind": ("Name of the kind of job.", _NAME),
     "fence": ("Fence of the attempt.", {"type": "integer", "minimum": 0, "maximum": 999_999_999}),
 }  # fmt: skip
+_OFFSET = {"type": "integer", "minimum": 0, "maximum": 10**12 - 1}
+_STATE = {"type": "string", "pattern": r'^(\*|"[0-9]{1,9}\.[a-z-]+")$'}
+_HEADER_SCHEMAS: dict[str, Schema] = {
+    "If-Match": _STATE,
+    "If-None-Match": {"type": "string", "const": "*"},
+    "Idempotency-Key": {"type": "string", "pattern": "^[!-~]{1,255}$"},
+    "Upload-Offset": _OFFSET,
+    "Last-Event-ID": _OFFSET,
+}
+_ALWAYS_NEEDED = {"Upload-Offset"}
 _HEADERS = {
     "If-Match": 'The ETag you read, as in "7.json", or *.',
     "If-None-Match": "* to create only what is not there.",
@@ -185,7 +195,7 @@ def _header_parameters(operation: Operation) -> list[Schema]:
         names.append("If-None-Match")
     if operation.idempotency == "key":
         names.append("Idempotency-Key")
-    needed = {"If-Match"} if operation.precondition == "required" else set()
+    needed = _ALWAYS_NEEDED | ({"If-Match"} if operation.precondition == "required" else set())
     return [
         {
             "name": name, "in": "header", "required": name in needed, "description": _HEADERS[name],

@@ -39,7 +39,7 @@ class Settings(BaseSettings):
     )
     body_timeout_s: float = Field(60.0, gt=0, description="Seconds a whole ordinary request body may take.")
     upload_timeout_s: float = Field(6 * 3600.0, gt=0, description="Seconds a streamed body may take.")
-    max_header_bytes: int = Field(32 * 1024, ge=4096, description="Longest head of a request.")
+    max_header_bytes: int = Field(64 * 1024, ge=4096, description="Longest head of a request.")
     login_tries_per_minute: int = Field(
         10, ge=1, description="Sign-in attempts per user name, and ten times that per address."
     )

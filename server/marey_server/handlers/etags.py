@@ -43,7 +43,7 @@ def parse_tags(header: str) -> list[str]:
     """The opaque values of a list of tags, weak or strong; `["*"]` for the star. Raises `BadRequest`."""
     if header.strip() == "*":
         return ["*"]
-    tags = []
+    tags: list[str] = []
     position = 0
     while position < len(header):
         match = _TAG.match(header, position)
@@ -54,6 +54,8 @@ def parse_tags(header: str) -> list[str]:
         if position < len(header) and header[position] != ",":
             raise BadRequest(f"Entity tags are separated by commas: {header[:200]}")
         position += 1
+    if not tags:
+        raise BadRequest("The header names no entity tag.")
     return tags
 
 

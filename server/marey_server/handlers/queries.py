@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, StringConstraints
 
 from marey_schemas.base import Request
 from marey_server.store.listing import DEFAULT_LIMIT, MAX_LIMIT
 
 MAX_INTEGER = 2**31 - 1
+MAX_VALUES = 256
 
 
 def _split(value: Any) -> Any:
     return tuple(value.split(",")) if isinstance(value, str) else value
 
 
-CommaSeparated = Annotated[tuple[str, ...], BeforeValidator(_split), Field(max_length=1000)]
+_Value = Annotated[str, StringConstraints(max_length=1024)]
+CommaSeparated = Annotated[tuple[_Value, ...], BeforeValidator(_split), Field(max_length=MAX_VALUES)]
 """Several values in one parameter, separated by commas."""
 
 
@@ -24,7 +26,9 @@ class PageQuery(Request):
     """Which page of a list."""
 
     limit: int = Field(DEFAULT_LIMIT, ge=1, le=MAX_LIMIT, description="Longest page.")
-    cursor: str | None = Field(None, max_length=4096, description="`next_cursor` of the page before.")
+    cursor: str | None = Field(
+        None, max_length=4096, pattern="^[A-Za-z0-9_-]+$", description="`next_cursor` of the page before."
+    )
 
 
 class CountedPageQuery(PageQuery):

@@ -206,8 +206,7 @@ class Resource(RequestHandler):
         method = "GET" if self.request.method == "HEAD" else self.request.method
         operation = self.operations.get(method or "")
         if operation is None:
-            allowed = ", ".join(sorted({*self.operations, *(["HEAD"] if "GET" in self.operations else [])}))
-            raise MethodNotAllowed(f"Here one can {allowed}.", headers={"Allow": allowed})
+            raise self._method_not_allowed()
         self.operation = operation
         headers = self.request.headers
         offers = self._offers(operation)
@@ -226,6 +225,10 @@ class Resource(RequestHandler):
         elif operation.precondition == "create":
             write_precondition(None, None, may_create=True)
         self._check_body_head(operation)
+
+    def _method_not_allowed(self) -> MethodNotAllowed:
+        allowed = ", ".join(sorted({*self.operations, *(["HEAD"] if "GET" in self.operations else [])}))
+        return MethodNotAllowed(f"Here one can {allowed}.", headers={"Allow": allowed})
 
     def _offers(self, operation: Operation) -> tuple[negotiation.MediaType, ...]:
         if operation.answer_types:
@@ -370,6 +373,8 @@ class Resource(RequestHandler):
             return
         exc_info = kwargs.get("exc_info")
         error = exc_info[1] if exc_info else HTTPError(status_code)
+        if isinstance(error, HTTPError) and error.status_code == 405:  # a method that Tornado itself does not know
+            error = self._method_not_allowed()
         self.set_header("X-Request-Id", self.request_id)
         self._write_problem(error)
         if not self._finished:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -10,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from marey_schemas import codecs
+from marey_schemas.canonical import canonical_json
 from marey_schemas.problems import FieldError
 from marey_server.errors import BadRequest, Invalid, TooLarge
 
@@ -73,7 +73,7 @@ def validate_body(model: type[Model], tree: Any) -> Model:
     try:
         if survey(tree):
             return model.model_validate(tree)
-        return model.model_validate_json(json.dumps(tree), strict=True)
+        return model.model_validate_json(canonical_json(tree), strict=True)  # in which 1.0 is the integer 1
     except ValidationError as error:
         faults = field_errors(error, tree, json_pointer)
         first = f"{faults[0].pointer or 'the body'}: {faults[0].detail}"
