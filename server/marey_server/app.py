@@ -8,6 +8,7 @@ import json
 import logging
 import os
 import signal
+import sys
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -185,10 +186,22 @@ async def serve(settings: Settings) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    async with serving(settings) as running:
+    async with serving(settings) as running, compiling_kernels():
         log.info("listening on %s", running.address)
         await stop.wait()
         log.info("stopping")
+
+
+@asynccontextmanager
+async def compiling_kernels() -> AsyncIterator[None]:
+    """See in a process of its own, while the server answers already, that imports find their kernels compiled."""
+    process = await asyncio.create_subprocess_exec(sys.executable, "-m", "marey_motion.warm_up")
+    try:
+        yield
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
 
 
 @asynccontextmanager
