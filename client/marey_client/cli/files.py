@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 DOWNLOADS_AT_ONCE = 4
 
 
+WARNINGS_SHOWN = 2  # of each code: a folder of thousands shows what it has, not everything it has
+
+
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
     for command in (upload, ls, show, download):
@@ -79,11 +82,17 @@ def upload(
 def _print_entries(entries: Sequence[ImportEntry]) -> None:
     from marey_client.imports import refusal_text
 
+    found: dict[str, list[str]] = {}
     for entry in entries:
         if entry.error is not None:
             tell(refusal_text(entry))
         for warning in entry.warnings:
-            tell(f"{entry.name}: warning: {warning.message} ({warning.code})")
+            found.setdefault(warning.code, []).append(f"{entry.name}: {warning.message}")
+    for code, texts in found.items():
+        others = len(texts) - WARNINGS_SHOWN
+        more = [f"and {others} more files; --json tells them all"] if others > 0 else []
+        for text in [*texts[:WARNINGS_SHOWN], *more]:
+            tell(f"warning {code}: {text}")
     counts = Counter(entry.status for entry in entries)
     frames = sum(entry.frames or 0 for entry in entries)
     told = ", ".join(
