@@ -1,0 +1,140 @@
+"""A server of its own for a benchmark: one process on a free port of this machine, its data in a folder that goes away.
+
+Settings are the defaults: SQLite with every commit on the disk, blobs in the database, one line of log per request.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+
+from benchmarks.material import noisy_clip
+from marey_client import Marey
+from marey_motion.clip import Clip
+from marey_motion.documents import clip_to_document, skeleton_to_document
+from marey_schemas.access import ProjectCreate
+from marey_schemas.documents import ClipInfo, RevisionRef
+
+PROJECT = "bench"
+START_S = 60
+STOP_S = 40
+
+
+@dataclass(frozen=True)
+class LocalServer:
+    """A running server."""
+
+    url: str
+    data: Path
+    pid: int
+
+    @property
+    def port(self) -> int:
+        """The port it listens on."""
+        return int(self.url.rpartition(":")[2])
+
+    @property
+    def token(self) -> str:
+        """The administrator's."""
+        return (self.data / "admin.token").read_text().strip()
+
+    def client(self) -> Marey:
+        """An administrator's client."""
+        return Marey(self.url, self.token)
+
+
+@contextmanager
+def local_server(prepare: Callable[[Path], None] | None = None) -> Iterator[LocalServer]:
+    """Run a server while the block runs; `prepare` fills its data folder before it starts."""
+    with tempfile.TemporaryDirectory(prefix="marey-bench-") as folder:
+        data = Path(folder, "data")
+        if prepare is not None:
+            prepare(data)
+        with running(data) as server:
+            yield server
+
+
+@contextmanager
+def running(data: Path) -> Iterator[LocalServer]:
+    """Run a server over a data folder while the block runs."""
+    port = _free_port()
+    with Path(data.parent, "server.log").open("ab") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "marey_client.cli", "serve", "--workers", "0"],
+            env=clean_environment() | {"MAREY_DATA": str(data), "MAREY_PORT": str(port)},
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+        )
+    server = LocalServer(f"http://127.0.0.1:{port}", data, process.pid)
+    try:
+        _wait_until_ready(server, process)
+        yield server
+    finally:
+        process.send_signal(signal.SIGTERM)
+        process.wait(STOP_S)
+
+
+def clean_environment() -> dict[str, str]:
+    """This process's environment without settings of servers."""
+    return {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
+
+
+def _wait_until_ready(server: LocalServer, process: subprocess.Popen[bytes]) -> None:
+    deadline = time.monotonic() + START_S
+    while time.monotonic() < deadline:
+        if process.poll() is not None:
+            break
+        try:
+            if httpx.get(f"{server.url}/readyz").status_code == 200:
+                return
+        except httpx.TransportError:
+            time.sleep(0.05)
+    raise RuntimeError(f"the server did not start:\n{Path(server.data.parent, 'server.log').read_text()[-3000:]}")
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@dataclass(frozen=True)
+class Seeded:
+    """What `seed` put into the project: a clip, and the skeleton it is on."""
+
+    clip: str
+    stored_bytes: int
+    skeleton: RevisionRef
+
+
+def seed(server: LocalServer, frames: int, joints: int) -> Seeded:
+    """Make the project, a skeleton and one clip through the client."""
+    clip = noisy_clip(frames, joints)
+    with server.client() as marey:
+        project = marey.create_project(ProjectCreate(name=PROJECT))
+        hierarchy = skeleton_to_document(clip.skeleton).model_dump(by_alias=True)
+        made = project.skeletons.create("rig", {"hierarchy": hierarchy})
+        skeleton = RevisionRef(item=made.id, revision=1)
+        item = project.clips.create("clip", clip_parts(clip, skeleton)).item
+    return Seeded(item.id, item.parts["motion"].size_bytes, skeleton)
+
+
+def clip_parts(clip: Clip, skeleton: RevisionRef) -> dict[str, dict[str, object]]:
+    """The documents of a clip on a stored skeleton."""
+    return {
+        "motion": clip_to_document(clip, skeleton).model_dump(by_alias=True),
+        "info": ClipInfo().model_dump(mode="json", by_alias=True),
+    }
