@@ -103,6 +103,7 @@ class Attempt:
         self._log_path = self._scratch / "log"
         self._log_path.touch(mode=0o600)
         self._log_sent = 0
+        self._sending_log = threading.Lock()
         self._keeper = LeaseKeeper(api, lease)
         self._watch = Watch(lease, self._keeper, stopping, self._log_path, time.monotonic())
         self._transfers = ThreadPoolExecutor(TRANSFERS_AT_ONCE, thread_name_prefix="marey-transfer")
@@ -115,7 +116,6 @@ class Attempt:
             end = self._attend(child)
             if isinstance(end, Stop):
                 child.kill()
-            self._transfers.shutdown(wait=True, cancel_futures=True)
             self._report(end)
         except LeaseLost as error:
             log.warning("%s: given up: %s", self._lease.job, error)
@@ -153,7 +153,7 @@ class Attempt:
             if (stop := self._watch.verdict(child)) is not None:
                 return stop
             if time.monotonic() > log_due:
-                self._transfers.submit(self._send_log)
+                self._transfers.submit(self._try_to_send_log)
                 log_due = time.monotonic() + LOG_EVERY_S
 
     def _serve(self, request: Request, child: ChildProcess) -> None:
@@ -162,7 +162,7 @@ class Attempt:
             child.send(Reply(request.request, self._carried_out(request)))
         except LeaseLost:
             self._keeper.lost.set()
-        except (MareyError, OSError) as error:
+        except Exception as error:  # noqa: BLE001 - whatever happened, the child waits for an answer
             child.send(Reply(request.request, refusal=str(error), missing=isinstance(error, NotFound)))
 
     def _carried_out(self, request: Request) -> Any:
@@ -193,12 +193,12 @@ class Attempt:
     # -- at the end --
 
     def _report(self, end: Done | Failed | Stop) -> None:
-        self._keeper.stop()
+        """Tell the server how it went; heartbeats go on meanwhile, for it may take a while to get through."""
         if end is Stop.LEASE_LOST:
             log.warning("%s: %s", self._lease.job, self._watch.explain(end))
             return
         self._keeper.confirm()
-        self._send_log()
+        self._try_to_send_log()
         if isinstance(end, Done):
             self._complete(end)
         else:
@@ -226,10 +226,16 @@ class Attempt:
             retryable=retryable, interrupted=end is Stop.INTERRUPTED,
         )  # fmt: skip
 
-    def _send_log(self) -> None:
-        with self._log_path.open("rb") as file:
-            file.seek(self._log_sent)
-            data = file.read(LOG_LIMIT_BYTES)
-        if data:
-            self._api.append_log(data)
-            self._log_sent += len(data)
+    def _try_to_send_log(self) -> None:
+        """Append what is new. A log that cannot be sent is no reason to lose a result."""
+        try:
+            with self._sending_log, self._log_path.open("rb") as file:
+                file.seek(self._log_sent)
+                data = file.read(LOG_LIMIT_BYTES)
+                if data:
+                    self._api.append_log(data)
+                    self._log_sent += len(data)
+        except LeaseLost:
+            self._keeper.lost.set()
+        except (MareyError, OSError) as error:
+            log.warning("%s: its log could not be sent: %s", self._lease.job, error)

@@ -33,9 +33,11 @@ def main() -> None:
     pipe.send(Ready())
     while True:
         try:
-            run: Run = pipe.recv()
+            run = pipe.recv()
         except EOFError:
             return
+        if not isinstance(run, Run):  # an answer to a job that did not wait for it
+            continue
         write_output_to(run.log_path)
         end = run_job(run, pipe)
         sys.stdout.flush()

@@ -46,7 +46,7 @@ def work(
     )  # fmt: skip
     supervisor = Supervisor(Transport(credential.url, credential.token), options)
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: supervisor.stop())
+        signal.signal(number, lambda *_: threading.Thread(target=supervisor.stop).start())
     if attached:
         threading.Thread(target=_stop_at_end_of_input, args=(supervisor,), name="attached", daemon=True).start()
     status = supervisor.run()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection
@@ -15,6 +16,9 @@ from marey_schemas.kinds import Kind
 from marey_worker.messages import Made, PutFile, ReadBlob, ReadItem, ReadPart, Reply, Request, Run, Stage
 
 T = TypeVar("T")
+
+_numbers = itertools.count(1)
+"""Of requests, throughout the process: an answer that comes after its job has ended is nobody's."""
 
 READ_AHEAD = 4
 STAGED_AT_ONCE = 2
@@ -48,7 +52,6 @@ class Context:
         self.seed = run.seed
         self.scratch: Path = run.scratch
         self._pipe = pipe
-        self._requests = 0
         self._replies: dict[int, Reply] = {}
         self._staging: deque[int] = deque()
 
@@ -122,9 +125,9 @@ class Context:
         return self._value(self._send(make))
 
     def _send(self, make: Callable[[int], Request]) -> int:
-        self._requests += 1
-        self._pipe.send(make(self._requests))
-        return self._requests
+        request = next(_numbers)
+        self._pipe.send(make(request))
+        return request
 
     def _value(self, request: int) -> Any:
         while request not in self._replies:

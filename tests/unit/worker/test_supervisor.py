@@ -99,6 +99,14 @@ def _holds_more_than(process, size):
         return False
 
 
+def test_answers_that_come_too_late_do_not_reach_the_next_job(server, start_worker):
+    server.documents["clip_1", 1, "motion"] = {"some": "document"}
+    start_worker()
+    for _ in range(3):
+        assert server.ended(server.submit("misbehave", {"how": "give-up-early"}))["code"] == "exception"
+        assert server.ended(server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
+
+
 def test_a_job_is_stopped_at_its_time_limit(server, start_worker):
     start_worker()
     failed = server.ended(server.submit("misbehave", {"how": "sleep", "seconds": 60}, time_limit_s=1))

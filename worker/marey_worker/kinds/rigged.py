@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Generic, NamedTuple, TypeVar
 
 from marey_motion import documents
+from marey_motion.errors import MappingError
 from marey_motion.retargeting import RetargetPlan, plan_retarget
 from marey_motion.rigs import JointAxes, JointMapping, guess_axes, map_joints
 from marey_motion.skeleton import Skeleton
@@ -18,6 +19,7 @@ Key = TypeVar("Key")
 Value = TypeVar("Value")
 
 MOST_KEPT = 512
+LEAST_CONFIDENCE = 0.3
 
 
 class Rigged(NamedTuple):
@@ -84,6 +86,17 @@ def _read(context: Context, rig: Rig) -> Rigged:
         stored = context.document(Kind.SKELETON, rig.mapping.item, rig.mapping.revision, "mapping")
     except NoSuchThing:
         mapping = map_joints(skeleton)
+        _require_trust(mapping)
         return Rigged(skeleton, mapping, guess_axes(skeleton, mapping))
     mapping, axes = documents.mapping_from_document(SkeletonMapping.model_validate(stored), skeleton)
+    _require_trust(mapping)
     return Rigged(skeleton, mapping, axes)
+
+
+def _require_trust(mapping: JointMapping) -> None:
+    """A dog has legs and a head, too: what was hardly recognised is not used before a person has looked."""
+    if mapping.confidence < LEAST_CONFIDENCE:
+        found = f"its joints were recognised with a confidence of {mapping.confidence:.2f} only"
+        reasons = f" ({'; '.join(mapping.notes)})" if mapping.notes else ""
+        advice = "correct them with `marey skeleton map`, or confirm them with its --confirm"
+        raise MappingError(f"{found}{reasons}; {advice}", code="mapping-uncertain")

@@ -7,6 +7,7 @@ import time
 
 from marey_schemas.base import Request
 from marey_schemas.job_kinds import KindDeclaration
+from marey_schemas.jobs import PinnedInput
 from marey_worker.context import JobRefused
 
 
@@ -30,7 +31,7 @@ def misbehave(context, params):
     return {
         "raise": _raise, "refuse": _refuse, "segfault": _segfault, "exit": _exit, "eat": _eat, "hoard": _hoard,
         "sleep": lambda: _sleep(params.seconds), "shout": _shout, "ignore-term": lambda: _ignore_term(params.seconds),
-        "put": lambda: _put(context),
+        "give-up-early": lambda: _give_up_early(context), "put": lambda: _put(context),
     }[params.how]()  # fmt: skip
 
 
@@ -80,6 +81,14 @@ def _shout():
     print("said on standard output")
     print("said on standard error", file=sys.stderr)
     return {}
+
+
+def _give_up_early(context):
+    """Fail while answers are still on their way."""
+    pin = PinnedInput(item="clip_1", revision=1, kind="clip", name="walk", collection="")
+    reading = context.documents([pin] * 20, "motion")
+    next(reading)
+    raise ArithmeticError("enough")
 
 
 def _put(context):
