@@ -180,7 +180,7 @@ class Desk:
 
     def reap(self) -> int:
         """Take back what is overdue."""
-        return self.database.write(SYSTEM, reap_page).taken
+        return self.database.write(SYSTEM, reap_page, self.policy).taken
 
     def write_id(self) -> str:
         """A new one."""

@@ -62,8 +62,8 @@ class ModelQueue:
             job.state = "running"
             job.fence += 1
             job.attempt += 1
-            job.lease_expires_us = now_us + TTL_US
             job.deadline_us = now_us + job.time_limit_us
+            job.lease_expires_us = min(now_us + TTL_US, job.deadline_us + GRACE_US)
             taken.append(job.id)
         return taken
 
@@ -130,7 +130,7 @@ class ModelQueue:
             job.fence += 1
             if job.cancel_requested:
                 self._end(job, "cancelled")
-            elif job.deadline_us <= now_us or job.attempt >= job.max_attempts:
+            elif job.lease_expires_us >= job.deadline_us + GRACE_US or job.attempt >= job.max_attempts:
                 self._end(job, "failed")
             else:
                 self._queue(job, now_us)

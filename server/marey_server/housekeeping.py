@@ -79,10 +79,12 @@ def _look_round(tx: Transaction, holder: str, grace: StartGrace) -> tuple[bool, 
 
 async def _reap(services: Services) -> None:
     """Take back every overdue lease, page by page."""
-    page = await _write(services, reaper.reap_page)
+    if await _write(services, reaper.correct_times, services.queue_policy):
+        log.warning("the database's clock was set back; times of leases were corrected")
+    page = await _write(services, reaper.reap_page, services.queue_policy)
     taken = page.taken
     while page.after is not None:
-        page = await _write(services, reaper.reap_page, page.after)
+        page = await _write(services, reaper.reap_page, services.queue_policy, page.after)
         taken += page.taken
     if taken:
         log.warning("took %d jobs back from workers that are not heard of any more", taken)

@@ -74,11 +74,13 @@ class Transaction:
         """Run one statement."""
         return self.connection.execute(statement, parameters)
 
-    def insert_or_ignore(self, table: Table, row: Mapping[str, Any]) -> postgresql.Insert | sqlite.Insert:
-        """An INSERT that does nothing where a unique index refuses the row; `returning` then gives nothing."""
-        if self.is_postgres:
-            return postgresql.insert(table).values(**row).on_conflict_do_nothing()
-        return sqlite.insert(table).values(**row).on_conflict_do_nothing()
+    def insert_or_ignore(self, table: Table, row: Mapping[str, Any] | None = None) -> postgresql.Insert | sqlite.Insert:
+        """An INSERT that does nothing where a unique index refuses the row; `returning` then gives nothing.
+
+        Without `row`, give the rows when executing it.
+        """
+        added = postgresql.insert(table) if self.is_postgres else sqlite.insert(table)
+        return (added if row is None else added.values(**row)).on_conflict_do_nothing()
 
     def lock(self, name: str) -> None:
         """Wait until nobody else holds the lock `name`, and hold it to the end of a write.
@@ -302,7 +304,6 @@ def _postgres_engine(url: URL, connections: int, echo: bool) -> Engine:
         url,
         pool_size=connections,
         max_overflow=4,
-        pool_pre_ping=True,
         pool_timeout=30,
         echo=echo,
         isolation_level="READ COMMITTED",
@@ -319,7 +320,12 @@ _FAILURES = (exc.DBAPIError, exc.TimeoutError, OSError, OverflowError, UnicodeEn
 def _worth_retrying(error: Exception) -> bool:
     if not isinstance(error, exc.DBAPIError):
         return False
-    return error.connection_invalidated or getattr(error.orig, "sqlstate", None) in _TRY_AGAIN
+    constraint = getattr(getattr(error.orig, "diag", None), "constraint_name", None)
+    return (
+        error.connection_invalidated
+        or getattr(error.orig, "sqlstate", None) in _TRY_AGAIN
+        or constraint == tables.ONE_RUNS_PER_KEY
+    )
 
 
 _TRY_AGAIN = ("40001", "40P01")

@@ -18,7 +18,10 @@ MOST_GATHERED = 1000
 
 
 def gather(tx: Transaction, parent_id: str) -> list[Ended]:
-    """End the gathering job, all of whose tasks have ended: failed if one failed, else cancelled if one was."""
+    """End the gathering job, all of whose tasks have ended.
+
+    It has succeeded if they all have; else it is cancelled if that was asked for, and failed if a task failed.
+    """
     rows = tx.execute(
         select(job.c.id, job.c.state, job.c.result, job.c.failure)
         .where(job.c.parent_id == parent_id)
@@ -27,7 +30,8 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
     result = {"tasks": len(rows), **combine_results(row.result for row in rows if row.result is not None)}
     running = and_(job.c.id == parent_id, job.c.state == RUNNING)
     failed = [row for row in rows if row.state == "failed"]
-    if failed:
+    asked_to_stop = select(job.c.cancel_requested_us).where(job.c.id == parent_id)
+    if failed and tx.execute(asked_to_stop).scalar_one() is None:
         first = failed[0]
         failure = failure_document(
             FailureReason(first.failure["reason"]),
@@ -35,7 +39,7 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
             f"{len(failed)} of {len(rows)} tasks failed; the first, {first.id}: {first.failure['detail']}",
         )
         return end_jobs(tx, running, "failed", failure=failure, result=result)
-    state = "cancelled" if any(row.state == "cancelled" for row in rows) else "succeeded"
+    state = "succeeded" if all(row.state == "succeeded" for row in rows) else "cancelled"
     return end_jobs(tx, running, state, result=result)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -18,7 +19,7 @@ from marey_server.store.clock import datetime_of
 from marey_server.store.database import Transaction
 from marey_server.store.fencing import RUNNING, earlier
 from marey_server.store.job_documents import as_documents, job_documents, select_jobs
-from marey_server.store.job_ends import ENDED_COLUMNS, Ended, as_ended
+from marey_server.store.job_ends import ENDED_COLUMNS, as_ended
 from marey_server.store.job_events import emit_job_events
 from marey_server.store.job_logs import MOST_READ_BYTES, LogPage, read_log
 from marey_server.store.projects import ProjectRow
@@ -148,17 +149,17 @@ def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLIC
     """
     row, project = _find(tx, job_id, "jobs")
     _require_own(tx, row, project, "cancel")
-    if row.size is not None:
-        settle(tx, _cancel(tx, and_(job.c.parent_id == job_id, job.c.state.in_(UNFINISHED)), policy))
-    settle(tx, _cancel(tx, and_(job.c.id == job_id, job.c.state.in_(UNFINISHED)), policy))
+    tasks = _cancel(tx, job.c.parent_id == job_id, policy) if row.size is not None else []
+    whole = _cancel(tx, job.c.id == job_id, policy)
+    settle(tx, [as_ended(one) for one in (*tasks, *whole) if one.state != "running"])
     document = job_documents(tx, [job_id])[0]
-    if document.state in (JobState.SUCCEEDED, JobState.FAILED):
+    if not whole and document.state != JobState.CANCELLED:
         raise Conflict(f"The job has {document.state} already; nothing can be cancelled.", code="job-ended")
     return document
 
 
-def _cancel(tx: Transaction, condition: ColumnElement[bool], policy: QueuePolicy) -> list[Ended]:
-    """Cancel the jobs that meet the condition, in one statement whatever their state; those that ended by it.
+def _cancel(tx: Transaction, which: ColumnElement[bool], policy: QueuePolicy) -> Sequence[Row[Any]]:
+    """Cancel those of the jobs that have not ended, in one statement whatever their state, and read how they stand now.
 
     A running job's time is over with the cancellation, so that its lease cannot outlive the grace. A gathering job has
     no lease, and ends with its tasks.
@@ -167,7 +168,7 @@ def _cancel(tx: Transaction, condition: ColumnElement[bool], policy: QueuePolicy
     leased = and_(running, job.c.size.is_(None))
     rows = tx.execute(
         update(job)
-        .where(condition)
+        .where(which, job.c.state.in_(UNFINISHED))
         .values(
             state=case((running, "running"), else_="cancelled"),
             cancel_requested_us=func.coalesce(job.c.cancel_requested_us, tx.now_us),
@@ -182,7 +183,7 @@ def _cancel(tx: Transaction, condition: ColumnElement[bool], policy: QueuePolicy
     ).all()
     told = [row for row in rows if row.state == "running"]
     emit_job_events(tx, "job.cancel_requested", [(row.project_id, row.id, {}) for row in told])
-    return [as_ended(row) for row in rows if row.state != "running"]
+    return rows
 
 
 # -- trying again ------------------------------------------------------------------------------------------------------

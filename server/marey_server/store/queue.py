@@ -109,6 +109,7 @@ def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
     """Pick and claim. Building it takes longer than running it, so each variant is built once."""
     pick = _pick(restriction)
     now_us = bindparam("now_us", type_=BigInteger)
+    deadline_us = now_us + cast(job.c.time_limit_s, BigInteger) * SECOND_US
     return (
         update(job)
         .where(job.c.id == pick.c.id)
@@ -116,8 +117,8 @@ def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
             state="running",
             fence=job.c.fence + 1,
             attempt=job.c.attempt + 1,
-            lease_expires_us=bindparam("lease_expires"),
-            deadline_us=now_us + cast(job.c.time_limit_s, BigInteger) * SECOND_US,
+            lease_expires_us=earlier(deadline_us + bindparam("end_grace"), now_us + bindparam("lease_ttl")),
+            deadline_us=deadline_us,
             started_us=func.coalesce(job.c.started_us, now_us),
             progress=None,
             rev=job.c.rev + 1,
@@ -213,7 +214,8 @@ def _claim_rows(tx: Transaction, request: ClaimRequest, policy: QueuePolicy) -> 
     restriction = _Restriction(request.job is not None, "work" not in scopes, not caller.administrator)
     parameters: dict[str, Any] = {
         "now_us": tx.now_us,
-        "lease_expires": tx.now_us + policy.lease_ttl_us,
+        "lease_ttl": policy.lease_ttl_us,
+        "end_grace": policy.end_grace_us,
         "kinds": list(request.kinds),
         "label_keys": keys_within(request.labels),
         "most": request.max,

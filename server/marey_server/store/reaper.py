@@ -5,15 +5,15 @@ from __future__ import annotations
 import threading
 from typing import NamedTuple
 
-from sqlalchemy import and_, select, tuple_
+from sqlalchemy import and_, select, tuple_, update
 
 from marey_schemas.jobs import ClaimRequest, Lease
 from marey_server.store import job_cache
 from marey_server.store.database import Transaction
-from marey_server.store.fencing import RUNNING, held
+from marey_server.store.fencing import QUEUED, RUNNING, held
 from marey_server.store.job_ends import AttemptEnd
 from marey_server.store.queue import claim
-from marey_server.store.queue_policy import DEFAULT_POLICY, QueuePolicy
+from marey_server.store.queue_policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.settling import settle
 from marey_server.store.tables import job
 from marey_server.store.verdicts import ENDING_COLUMNS, carry_out, judge_expired
@@ -55,7 +55,12 @@ class ReapedPage(NamedTuple):
     after: tuple[int, str] | None
 
 
-def reap_page(tx: Transaction, after: tuple[int, str] | None = None, limit: int = PAGE) -> ReapedPage:
+def reap_page(
+    tx: Transaction,
+    policy: QueuePolicy = DEFAULT_POLICY,
+    after: tuple[int, str] | None = None,
+    limit: int = PAGE,
+) -> ReapedPage:
     """Take back up to `limit` jobs, longest overdue first, from `after` on.
 
     Each is moved by an update of its own that repeats fence and overdue lease, so that a heartbeat or a result which
@@ -63,7 +68,7 @@ def reap_page(tx: Transaction, after: tuple[int, str] | None = None, limit: int 
     """
     overdue = and_(job.c.state == RUNNING, job.c.lease_expires_us <= tx.now_us)
     statement = (
-        select(*ENDING_COLUMNS, job.c.lease_expires_us)
+        select(*ENDING_COLUMNS)
         .where(overdue)
         .order_by(job.c.lease_expires_us, job.c.id)
         .limit(limit)
@@ -73,7 +78,7 @@ def reap_page(tx: Transaction, after: tuple[int, str] | None = None, limit: int 
         statement = statement.where(tuple_(job.c.lease_expires_us, job.c.id) > after)
     rows = tx.execute(statement).all()
     for row in rows:
-        verdict = judge_expired(row, tx.now_us)
+        verdict = judge_expired(row, policy)
         condition = and_(held((row.id, row.fence)), job.c.lease_expires_us <= tx.now_us)
         end = AttemptEnd(row.id, row.fence, verdict.outcome, "The lease ran out.")
         carry_out(tx, row, condition, verdict, end, fence=job.c.fence + 1)
@@ -86,9 +91,22 @@ def claim_after_reaping(
 ) -> list[Lease]:
     """Claim; where there is nothing to claim, take back what is overdue and look once more."""
     leases = claim(tx, request, policy)
-    if not leases and grace.over(tx.now_us) and reap_page(tx).taken:
+    if not leases and grace.over(tx.now_us) and reap_page(tx, policy).taken:
         leases = claim(tx, request, policy)
     return leases
+
+
+def correct_times(tx: Transaction, policy: QueuePolicy = DEFAULT_POLICY) -> int:
+    """Shorten leases and rests that end later than any can that began by now: the database's clock was set back."""
+    latest_us = tx.now_us + policy.lease_ttl_us
+    leases = tx.execute(
+        update(job).where(job.c.state == RUNNING, job.c.lease_expires_us > latest_us).values(lease_expires_us=latest_us)
+    )
+    rested_us = tx.now_us + round(policy.longest_backoff_s * SECOND_US)
+    rests = tx.execute(
+        update(job).where(job.c.state == QUEUED, job.c.run_at_us > rested_us).values(run_at_us=tx.now_us)
+    )
+    return leases.rowcount + rests.rowcount
 
 
 def share_waiting(tx: Transaction) -> int:

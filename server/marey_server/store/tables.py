@@ -219,6 +219,9 @@ lineage = Table(
     Index("ix_lineage_input", "input_item_id", "input_number"),
 )
 
+ONE_RUNS_PER_KEY = "uq_job_concurrency"
+"""Two claims may pick jobs of one concurrency key at the same moment: the later one hits this index and looks again."""
+
 job = Table(
     "job",
     metadata,
@@ -299,7 +302,7 @@ job = Table(
         postgresql_where=text("state = 'running'"),
     ),
     Index(
-        "uq_job_concurrency",
+        ONE_RUNS_PER_KEY,
         "project_id",
         "concurrency_key",
         unique=True,

@@ -29,6 +29,7 @@ ENDING_COLUMNS = (
     job.c.interruptions,
     job.c.cancel_requested_us,
     job.c.deadline_us,
+    job.c.lease_expires_us,
     job.c.time_limit_s,
 )
 
@@ -64,11 +65,15 @@ def judge(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, poisoned:
     return Verdict("queued", "failed", policy.backoff_us(row.attempt))
 
 
-def judge_expired(row: Row[Any], now_us: int) -> Verdict:
-    """The verdict on an attempt whose lease ran out. The job is queued at once: it has rested for a lease already."""
+def judge_expired(row: Row[Any], policy: QueuePolicy) -> Verdict:
+    """The verdict on an attempt whose lease ran out. The job is queued at once: it has rested for a lease already.
+
+    A lease that was renewed to the last moment allowed belonged to a worker that lived and did not stop in time; one
+    that ended earlier, to a worker that was lost, however late that is noticed.
+    """
     if row.cancel_requested_us is not None:
         return Verdict("cancelled", "cancelled")
-    if row.deadline_us <= now_us:
+    if row.lease_expires_us >= row.deadline_us + policy.end_grace_us:
         return _over_time(row)
     if row.attempt >= row.max_attempts:
         detail = f"{row.attempt} attempts were made; the last worker was not heard of again."

@@ -44,7 +44,6 @@ class Wakeups:
         for listener in woken:
             listener.wake()
 
-
     def wake_everybody(self) -> None:
         """Wake every listener: the server is about to stop."""
         with self._lock:

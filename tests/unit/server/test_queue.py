@@ -142,6 +142,14 @@ def test_a_lease_cannot_be_kept_beyond_the_time_limit_and_its_grace(desk: Desk) 
         desk.complete(lease)
 
 
+def test_a_worker_lost_long_before_its_time_was_over_is_lost_and_not_late(desk: Desk) -> None:
+    job = desk.submit(resources={"time_limit_s": 100})
+    desk.claim()
+    desk.clock.advance(5000)
+    assert desk.reap() == 1
+    assert desk.state(job) == "queued"
+
+
 def test_the_same_write_gets_the_same_answer_and_another_one_none(desk: Desk) -> None:
     desk.submit()
     lease = desk.claim()

@@ -199,6 +199,26 @@ def test_cancelling_the_whole_cancels_its_tasks(desk: Desk) -> None:
     assert desk.claim_many() == []
 
 
+def test_a_whole_of_which_a_task_has_failed_can_be_cancelled(desk: Desk) -> None:
+    desk.things(6)
+    job = desk.submit("square", inputs={"things": {"collection": "raw"}})
+    fail_for_good(desk)
+    assert desk.cancel(job).state == "cancelled"
+    assert desk.job(job).children == {"failed": 1, "cancelled": 2}
+
+
+def test_a_cancelled_whole_waits_for_its_tasks_however_long_they_take_to_stop(desk: Desk) -> None:
+    desk.things(4)
+    job = desk.submit("square", inputs={"things": {"collection": "raw"}})
+    leases = desk.claim_many()
+    desk.cancel(job)
+    desk.complete(leases[0])
+    desk.clock.advance(31)
+    assert desk.reap() == 1
+    assert desk.job(job).children == {"succeeded": 1, "cancelled": 1}
+    assert desk.state(job) == "cancelled"
+
+
 def test_tasks_wait_with_the_job_they_belong_to(desk: Desk) -> None:
     desk.things(4)
     first = desk.submit()

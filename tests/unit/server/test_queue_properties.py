@@ -67,7 +67,7 @@ class QueueMachine(RuleBasedStateMachine):
         priority=st.integers(-1, 1),
         key=st.sampled_from([None, None, "a", "b"]),
         max_attempts=st.integers(1, 3),
-        time_limit_s=st.sampled_from([40, 3600]),
+        time_limit_s=st.sampled_from([20, 40, 3600]),
         on_failure=st.sampled_from(["fail", "skip"]),
         data=st.data(),
     )

@@ -1,0 +1,317 @@
+"""Two transactions at once, at every step of a job's life: whichever order they commit in, a job has one end."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from sqlalchemy import ColumnElement, func, select, true
+
+from interleaving import Abandoned, Step, interleave
+from marey_schemas.jobs import ClaimRequest, CompleteRequest, FailRequest, Heartbeat, JobCreate, Lease
+from marey_server.access.principal import SYSTEM, Principal
+from marey_server.errors import Conflict, LeaseLost, MareyError
+from marey_server.store import completion, fencing, job_logs, jobs, leader, queue, staging, submission
+from marey_server.store.database import Database, Transaction
+from marey_server.store.reaper import reap_page
+from marey_server.store.tables import attempt, event, job
+from queue_desk import Desk, output
+
+TERMINAL = ("succeeded", "failed", "cancelled")
+
+
+def _ends_told(tx: Transaction, job_id: str) -> int:
+    kinds = [f"job.{state}" for state in TERMINAL]
+    statement = select(func.count()).select_from(event).where(event.c.subject == job_id, event.c.kind.in_(kinds))
+    return int(tx.execute(statement).scalar_one())
+
+
+class Bout:
+    """A claimed job whose lease is about to run out, and the things that can happen to it."""
+
+    def __init__(self, desk: Desk, other: Database) -> None:
+        self.desk = desk
+        self.other = other
+        self.job = desk.submit(max_attempts=5)
+        self.dependant = desk.submit(after=[self.job])
+        self.lease = desk.claim(job=self.job)
+        self.worker = desk._attempt_of(self.lease)
+        desk.stage(self.lease, "result")
+
+    def does(self, name: str, database: Database) -> Step:
+        """The step called `name` over a connection."""
+        actions: dict[str, tuple[Principal, Callable[[Transaction], object]]] = {
+            "complete": (
+                self.worker,
+                lambda tx: completion.complete(tx, *self._place, CompleteRequest(write_id="write-one")),
+            ),
+            "fail": (
+                self.worker,
+                lambda tx: completion.fail(tx, *self._place, FailRequest(write_id="write-two", code="x")),
+            ),
+            "heartbeat": (self.worker, lambda tx: queue.heartbeat(tx, *self._place, Heartbeat())),
+            "log": (self.worker, lambda tx: job_logs.append_log(tx, *self._place, 0, b"hello")),
+            "stage": (
+                self.worker,
+                lambda tx: staging.stage(tx, *self._place, [staging.prepare_output(output("more"))]),
+            ),
+            "cancel": (self.desk.user, lambda tx: jobs.cancel_job(tx, self.job)),
+            "reap": (SYSTEM, reap_page),
+            "claim": (SYSTEM, lambda tx: queue.claim(tx, ClaimRequest(worker="v", kinds=("errand",), job=self.job))),
+        }
+        principal, action = actions[name]
+        return Step(database, principal, action)
+
+    @property
+    def _place(self) -> tuple[str, int]:
+        return self.lease.job, self.lease.fence
+
+    def assert_sound(self) -> None:
+        """One end at most, told once, and its consequences with it."""
+        job = self.desk.job(self.job)
+        told = self.desk.database.read(SYSTEM, _ends_told, self.job)
+        assert told == (1 if job.state.terminal else 0)
+        expected = {"succeeded": "queued", "failed": "failed", "cancelled": "failed"}.get(job.state, "waiting")
+        assert self.desk.state(self.dependant) == expected
+        names = [one.name for one in self.desk.outputs(self.job)]
+        assert names in ([["result"], ["result", "more"]] if job.state == "succeeded" else [[]])
+
+
+@pytest.fixture
+def other(open_database: Callable[[], Database]) -> Database:
+    """The same database over other connections."""
+    return open_database()
+
+
+STEPS = ("complete", "fail", "heartbeat", "log", "stage", "cancel", "reap", "claim")
+
+
+@pytest.mark.parametrize("commit", [True, False], ids=["commits", "rolls-back"])
+@pytest.mark.parametrize("second", STEPS)
+@pytest.mark.parametrize("first", STEPS)
+def test_a_job_has_one_end_whichever_of_two_comes_first(
+    desk: Desk, other: Database, first: str, second: str, commit: bool
+) -> None:
+    bout = Bout(desk, other)
+    desk.clock.advance(61)
+    one, two = interleave(bout.does(first, desk.database), bout.does(second, other), commit=commit)
+    for outcome in (one, two):
+        assert not isinstance(outcome, MareyError) or isinstance(outcome, Conflict), outcome
+    if not commit:
+        assert isinstance(one, Abandoned | MareyError)
+    if {first, second} == {"complete", "reap"} and commit:
+        completed = one if first == "complete" else two
+        assert isinstance(completed, LeaseLost) == (desk.state(bout.job) == "queued")
+    bout.assert_sound()
+
+
+def test_the_first_of_complete_and_cancel_to_commit_decides(desk: Desk, other: Database) -> None:
+    bout = Bout(desk, other)
+    _, cancelled = interleave(bout.does("complete", desk.database), bout.does("cancel", other))
+    assert isinstance(cancelled, Conflict)
+    assert desk.state(bout.job) == "succeeded"
+
+
+def test_a_dependant_submitted_while_its_job_completes_is_not_left_waiting(desk: Desk, other: Database) -> None:
+    for order in ("complete first", "submit first"):
+        bout = Bout(desk, other)
+        late = Step(
+            other,
+            desk.user,
+            lambda tx, upstream=bout.job: submission.submit(tx, "lab", [JobCreate(kind="errand", after=(upstream,))]),
+        )
+        done = bout.does("complete", desk.database)
+        made = interleave(done, late)[1] if order == "complete first" else interleave(late, done)[0]
+        assert desk.state(made[0].id) == "queued", order
+
+
+def test_an_identical_job_submitted_while_the_first_completes_shares_its_result(desk: Desk, other: Database) -> None:
+    for number, order in enumerate(("complete first", "submit first")):
+        wanted = JobCreate(kind="sum", params={"number": number})
+        desk.submit_many(wanted)
+        lease = desk.claim(kinds=("sum",))
+        worker = desk._attempt_of(lease)
+        done = Step(
+            desk.database,
+            worker,
+            lambda tx, lease=lease: completion.complete(
+                tx, lease.job, lease.fence, CompleteRequest(write_id="write-one")
+            ),
+        )
+        again = Step(other, desk.user, lambda tx, wanted=wanted: submission.submit(tx, "lab", [wanted]))
+        made = interleave(done, again)[1] if order == "complete first" else interleave(again, done)[0]
+        assert desk.state(made[0].id) == "succeeded", order
+
+
+def test_two_identical_jobs_submitted_at_once_are_computed_once(desk: Desk, other: Database) -> None:
+    one, two = (
+        Step(database, desk.user, lambda tx: submission.submit(tx, "lab", [JobCreate(kind="sum")]))
+        for database in (desk.database, other)
+    )
+    interleave(one, two)
+    assert len(desk.claim_many()) == 1
+
+
+def test_the_last_two_tasks_end_at_once_and_the_whole_ends_once(desk: Desk, other: Database) -> None:
+    desk.things(4)
+    job = desk.submit("square", inputs={"things": {"collection": "raw"}})
+    steps = [
+        Step(
+            database,
+            desk._attempt_of(lease),
+            lambda tx, lease=lease: completion.complete(
+                tx, lease.job, lease.fence, CompleteRequest(write_id="write-one")
+            ),
+        )
+        for lease, database in zip(desk.claim_many(), (desk.database, other), strict=True)
+    ]
+    interleave(*steps)
+    assert desk.state(job) == "succeeded"
+    assert desk.database.read(SYSTEM, _ends_told, job) == 1
+
+
+def test_cancelling_the_whole_while_a_task_completes_ends_both(desk: Desk, other: Database) -> None:
+    desk.things(4)
+    for seed, order in enumerate(("complete first", "cancel first")):
+        head = desk.submit("square", inputs={"things": {"collection": "raw"}}, seed=seed)
+        lease, rest = desk.claim_many()
+        done = Step(
+            desk.database,
+            desk._attempt_of(lease),
+            lambda tx, lease=lease: completion.complete(
+                tx, lease.job, lease.fence, CompleteRequest(write_id="write-one")
+            ),
+        )
+        stop = Step(other, desk.user, lambda tx, head=head: jobs.cancel_job(tx, head))
+        interleave(*((done, stop) if order == "complete first" else (stop, done)))
+        desk.fail(rest, "cancelled")
+        assert desk.state(head) == "cancelled"
+        assert desk.database.read(SYSTEM, _ends_told, head) == 1
+
+
+# -- many at once ------------------------------------------------------------------------------------------------------
+
+
+def test_eight_claimers_get_every_job_once_and_never_two_of_one_key(desk: Desk, other: Database) -> None:
+    keyed = [JobCreate(kind="errand", concurrency_key=f"key{n % 3}", priority=n % 2) for n in range(60)]
+    desk.submit_many(*keyed, *(JobCreate(kind="errand") for _ in range(60)))
+    claimed: Counter[str] = Counter()
+    lock = threading.Lock()
+
+    def work(number: int) -> None:
+        database = (desk.database, other)[number % 2]
+        request = ClaimRequest(worker=f"w{number}", kinds=("errand",), max=5)
+        while leases := database.write(desk.user, queue.claim, request):
+            running = database.read(SYSTEM, _running_keys)
+            assert max(Counter(running).values(), default=0) <= 1
+            for lease in leases:
+                database.write(
+                    desk._attempt_of(lease),
+                    completion.complete,
+                    lease.job,
+                    lease.fence,
+                    CompleteRequest(write_id="write-one"),
+                )
+            with lock:
+                claimed.update(lease.job for lease in leases)
+
+    with ThreadPoolExecutor(8) as pool:
+        for _ in range(30):
+            list(pool.map(work, range(8)))
+            if claimed.total() == 120:
+                break
+    assert (len(claimed), claimed.total()) == (120, 120)
+
+
+def _running_keys(tx: Transaction) -> list[str]:
+    statement = select(job.c.concurrency_key).where(job.c.state == "running", job.c.concurrency_key.is_not(None))
+    return list(tx.execute(statement).scalars())
+
+
+def test_two_reapers_at_once_take_a_job_back_once(desk: Desk, other: Database) -> None:
+    for _ in range(20):
+        desk.submit(max_attempts=5)
+    desk.claim_many()
+    desk.clock.advance(61)
+    interleave(Step(desk.database, SYSTEM, reap_page), Step(other, SYSTEM, reap_page))
+    again = desk.claim_many()
+    assert {lease.attempt for lease in again} == {2}
+    lost = desk.database.read(
+        SYSTEM, lambda tx: tx.execute(select(func.count()).where(attempt.c.outcome == "lost")).scalar_one()
+    )
+    assert lost == 20
+
+
+def test_of_two_leaders_the_one_whose_lease_ran_out_leads_no_more(desk: Desk, other: Database) -> None:
+    minute_us = 60_000_000
+    first = desk.database.write(SYSTEM, leader.take_lead, "reaper", "one", minute_us)
+    assert first is not None
+    assert other.write(SYSTEM, leader.take_lead, "reaper", "two", minute_us) is None
+    assert desk.database.write(SYSTEM, leader.take_lead, "reaper", "one", minute_us) == first
+
+    desk.clock.advance(61)
+    second = other.write(SYSTEM, leader.take_lead, "reaper", "two", minute_us)
+    assert second == first + 1
+    assert not desk.database.write(SYSTEM, leader.still_leads, "reaper", "one", first)
+    assert other.write(SYSTEM, leader.still_leads, "reaper", "two", second)
+    assert desk.database.write(SYSTEM, leader.take_lead, "reaper", "one", minute_us) is None
+
+    other.write(SYSTEM, leader.give_up_lead, "reaper", "two")
+    assert desk.database.write(SYSTEM, leader.take_lead, "reaper", "one", minute_us) == second + 1
+
+
+def test_two_that_want_to_lead_at_once_make_one_leader(desk: Desk, other: Database) -> None:
+    one, two = (
+        Step(database, SYSTEM, lambda tx, holder=holder: leader.take_lead(tx, "reaper", holder, 60_000_000))
+        for database, holder in ((desk.database, "one"), (other, "two"))
+    )
+    assert interleave(one, two) == (1, None)
+
+
+# -- the fence, and what happens without it ----------------------------------------------------------------------------
+
+
+def stale_worker_story(desk: Desk, act: Callable[[Desk, Lease], object]) -> None:
+    """A worker sleeps through its lease, another one takes the job; the sleeper wakes and goes on."""
+    job = desk.submit()
+    slept = desk.claim()
+    desk.clock.advance(61)
+    assert desk.reap() == 1
+    awake = desk.claim()
+    with pytest.raises(LeaseLost):
+        act(desk, slept)
+    assert desk.state(job) == "running"
+    desk.stage(awake, "second")
+    desk.complete(awake)
+    assert [one.name for one in desk.outputs(job)] == ["second"]
+
+
+STALE_ACTS: dict[str, Callable[[Desk, Lease], object]] = {
+    "heartbeat": lambda desk, lease: desk.heartbeat(lease),
+    "stage": lambda desk, lease: desk.stage(lease, "first"),
+    "complete": lambda desk, lease: desk.complete(lease),
+    "fail": lambda desk, lease: desk.fail(lease),
+    "log": lambda desk, lease: desk.database.write(
+        desk._attempt_of(lease), job_logs.append_log, lease.job, lease.fence, 0, b"late"
+    ),
+}
+
+
+@pytest.mark.parametrize("act", STALE_ACTS)
+def test_a_worker_that_slept_through_its_lease_is_refused_everywhere(desk: Desk, act: str) -> None:
+    stale_worker_story(desk, STALE_ACTS[act])
+
+
+@pytest.mark.parametrize("act", STALE_ACTS)
+def test_without_the_fence_the_stale_worker_gets_through(desk: Desk, act: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The negative control of the test above: it is the fence in the predicate that stops him, and nothing else."""
+
+    def no_fence(*_attempts: tuple[str, int]) -> ColumnElement[bool]:
+        return true()
+
+    monkeypatch.setattr(fencing, "same_fence", no_fence)
+    with pytest.raises((pytest.fail.Exception, AssertionError, LookupError, MareyError)):
+        stale_worker_story(desk, STALE_ACTS[act])

@@ -1,0 +1,90 @@
+"""The declarations of job kinds."""
+
+import subprocess
+import sys
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from marey_schemas import job_kinds
+from marey_schemas.job_kinds import BUILT_IN, IMPORT, KindDeclaration, UnknownKindError, find_kind
+from marey_schemas.jobs import InputSpec, RetargetParams
+from marey_schemas.kinds import Kind
+
+
+def declare(**fields: object) -> KindDeclaration:
+    stated: dict[str, object] = {
+        "name": "tidy",
+        "description": "Tidies up.",
+        "params": RetargetParams,
+        "implementation": "tidy:run",
+        "version": 1,
+        "outputs": {},
+    }
+    return KindDeclaration(**{**stated, **fields})  # type: ignore[arg-type]
+
+
+TIDY = declare()
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> list[EntryPoint]:
+    """Entry points of other distributions, as the test fills them in."""
+    entries: list[EntryPoint] = []
+    monkeypatch.setattr(job_kinds, "entry_points", lambda group: [e for e in entries if e.group == group])
+    job_kinds.job_kinds.cache_clear()
+    yield entries  # type: ignore[misc]
+    job_kinds.job_kinds.cache_clear()
+
+
+def entry(value: str) -> EntryPoint:
+    return EntryPoint("tidy", value, job_kinds.ENTRY_POINT_GROUP)
+
+
+def test_every_kind_describes_itself_with_a_json_schema() -> None:
+    for kind in BUILT_IN:
+        document = kind.document()
+        assert document.params_schema["type"] == "object"
+        assert document.name == kind.name
+    assert find_kind("retarget").fan_out == "clips"
+
+
+def test_an_unknown_kind_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(UnknownKindError, match="retarget"):
+        find_kind("levitate")
+
+
+def test_other_distributions_add_kinds(installed: list[EntryPoint]) -> None:
+    installed.append(entry(f"{__name__}:TIDY"))
+    sys.modules[__name__] = sys.modules.get(__name__) or __import__("types").ModuleType(__name__)
+    sys.modules[__name__].TIDY = TIDY  # type: ignore[attr-defined]
+    assert find_kind("tidy") is TIDY
+
+
+@pytest.mark.parametrize(
+    ("value", "error"),
+    [("marey_schemas.job_kinds:IMPORT", ValueError), ("marey_schemas.job_kinds:BUILT_IN", TypeError)],
+)
+def test_a_name_that_is_taken_or_a_thing_that_is_no_kind_is_refused(
+    installed: list[EntryPoint], value: str, error: type[Exception]
+) -> None:
+    installed.append(entry(value))
+    with pytest.raises(error, match="entry point"):
+        job_kinds.job_kinds()
+    assert IMPORT.name == "import"
+
+
+def test_a_fan_out_needs_an_input_of_many_items() -> None:
+    with pytest.raises(ValueError, match="fan_out"):
+        declare(fan_out="clips")
+    with pytest.raises(ValueError, match="fan_out"):
+        declare(fan_out="clips", inputs={"clips": InputSpec(kind=Kind.CLIP)})
+    with pytest.raises(ValueError, match="batch_size"):
+        declare(batch_size=0)
+
+
+def test_the_declarations_import_no_numeric_code() -> None:
+    numeric = ("scipy", "numba", "marey_motion")
+    code = f"import sys, marey_schemas.job_kinds; print([name for name in {numeric} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

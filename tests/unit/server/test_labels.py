@@ -1,0 +1,36 @@
+"""Labels as one text."""
+
+from itertools import combinations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from marey_server.errors import Invalid
+from marey_server.store.labels import MOST_LABELS, keys_within, labels_key
+
+names = st.text(min_size=1, max_size=8)
+label_sets = st.dictionaries(names, st.text(max_size=8), max_size=4)
+
+
+@given(label_sets, label_sets)
+def test_a_worker_matches_exactly_the_jobs_whose_labels_it_carries(job: dict[str, str], worker: dict[str, str]) -> None:
+    assert (labels_key(job) in keys_within(worker)) == (job.items() <= worker.items())
+
+
+@given(label_sets, label_sets)
+def test_different_labels_have_different_keys(one: dict[str, str], other: dict[str, str]) -> None:
+    assert (labels_key(one) == labels_key(other)) == (one == other)
+
+
+def test_a_worker_with_all_its_labels_matches_every_subset() -> None:
+    labels = {f"label{n}": str(n) for n in range(MOST_LABELS)}
+    subsets = [dict(some) for size in range(MOST_LABELS + 1) for some in combinations(labels.items(), size)]
+    assert sorted(keys_within(labels)) == sorted(labels_key(subset) for subset in subsets)
+
+
+def test_labels_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(Invalid):
+        labels_key({f"label{n}": "x" for n in range(MOST_LABELS + 1)})
+    with pytest.raises(Invalid):
+        labels_key({"name": "x" * 600})
