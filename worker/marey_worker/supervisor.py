@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 CLAIM_WAIT_S = 20.0
 LONGEST_PAUSE_S = 15.0
 INTERRUPTED_STATUS = 143
-REFUSED_STATUS = 1
+FAILED_STATUS = 1
 JOBS_PER_CHILD = 1000
 
 
@@ -64,7 +64,7 @@ class Supervisor:
         self._cache = InputCache(options.cache, options.cache_bytes)
         self._stopping = threading.Event()
         self._running: set[str] = set()
-        self._interrupted = False
+        self._interrupted = self._failed = False
         self._refusal: MareyError | None = None
 
     def stop(self) -> None:
@@ -72,7 +72,7 @@ class Supervisor:
         self._stopping.set()
 
     def run(self) -> int:
-        """Work until stopped; the exit status: not 0 if a job was running then, or if the server refused the worker."""
+        """Work until stopped; the exit status: not 0 if a job was running then, or the worker failed or was refused."""
         slots = [threading.Thread(target=self._work, name=f"slot-{n}", daemon=True) for n in range(self._options.slots)]
         for slot in slots:
             slot.start()
@@ -82,12 +82,22 @@ class Supervisor:
             time.sleep(0.02)
         if self._refusal is not None:
             log.error("the server refuses this worker: %s", self._refusal)
-            return REFUSED_STATUS
+        if self._failed or self._refusal is not None:
+            return FAILED_STATUS
         return INTERRUPTED_STATUS if self._interrupted else 0
 
     # -- one slot --
 
     def _work(self) -> None:
+        """Work until stopped. A fault of ours ends the whole worker: one that runs on without its slots helps nobody."""
+        try:
+            self._claim_and_run()
+        except Exception:  # noqa: BLE001 - logged, and told by the exit status
+            log.exception("a slot failed")
+            self._failed = True
+            self.stop()
+
+    def _claim_and_run(self) -> None:
         failures = 0
         with _Bench(self._options) as bench:
             while not self._stopping.is_set():
