@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
-from sqlalchemy import Connection, delete, insert, select
+from sqlalchemy import Connection, bindparam, delete, insert, select
 
 from marey_server.store.tables import blob_chunk
 
@@ -49,6 +49,11 @@ class BlobBacking(Protocol):
         ...
 
 
+_CHUNK = select(blob_chunk.c.data).where(
+    blob_chunk.c.digest == bindparam("digest"), blob_chunk.c.position == bindparam("position")
+)
+
+
 class DatabaseBlobs:
     """In the database, in rows of 1 MiB."""
 
@@ -59,9 +64,8 @@ class DatabaseBlobs:
 
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
         """Bytes `start` to `stop`."""
-        statement = select(blob_chunk.c.data).where(blob_chunk.c.digest == digest)
         for position in range(start // CHUNK_BYTES, -(-stop // CHUNK_BYTES)):
-            data = connection.execute(statement.where(blob_chunk.c.position == position)).scalar()
+            data = connection.execute(_CHUNK, {"digest": digest, "position": position}).scalar()
             if data is None:
                 return
             base = position * CHUNK_BYTES

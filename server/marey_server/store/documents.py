@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from numpy.typing import NDArray
 from pydantic import ValidationError
-from sqlalchemy import insert, select
+from sqlalchemy import bindparam, insert, select
 
 from marey_schemas import blocks
 from marey_schemas.arrays import EncodedArray
@@ -219,6 +219,13 @@ def _refer(tx: Transaction, digest: str, held: Mapping[str, str]) -> None:
 # -- reading ----------------------------------------------------------------------------------------------------------
 
 
+_BLOBS_OF_DOCUMENT = (  # built once: every read of a motion runs it
+    select(document_blob.c.pointer, document_blob.c.blob_digest, blob.c.size_bytes)
+    .join(blob, blob.c.digest == document_blob.c.blob_digest)
+    .where(document_blob.c.document_digest == bindparam("digest"))
+)
+
+
 def load_document(tx: Transaction, digest: str, *, arrays: Literal["encoded", "decoded", "none"] = "encoded") -> Tree:
     """A stored document; its arrays as stored, as numpy arrays, or as references."""
     body = load_body(tx, digest)
@@ -239,11 +246,7 @@ def attach_stored(
     tx: Transaction, digest: str, body: Tree, convert: Callable[[EncodedArray], Any] | None = None
 ) -> Tree:
     """`body` with its arrays in place of the references, each passed through `convert`."""
-    statement = select(document_blob.c.pointer, document_blob.c.blob_digest, blob.c.size_bytes).join(
-        blob, blob.c.digest == document_blob.c.blob_digest
-    )
-    rows = tx.execute(statement.where(document_blob.c.document_digest == digest)).all()
-    places = {row.pointer: row for row in rows}
+    places = {row.pointer: row for row in tx.execute(_BLOBS_OF_DOCUMENT, {"digest": digest})}
     leaves, _ = references_of(OPEN_SCHEMA, body)
     loaded: dict[str, Any] = {}
     for pointer, leaf in leaves.items():

@@ -5,7 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, Select, and_, false, insert, or_, select, true
+from sqlalchemy import (
+    BindParameter,
+    ColumnElement,
+    Row,
+    Select,
+    and_,
+    bindparam,
+    false,
+    insert,
+    literal_column,
+    or_,
+    select,
+    true,
+)
 
 from marey_schemas.access import Project, ProjectChange, ProjectCreate, Role, Visibility
 from marey_schemas.items import Page
@@ -73,9 +86,8 @@ def require(
     Raises `NotFound` where the caller may not know the project, `Forbidden` where he may not do this in it,
     `Unauthenticated` where signing in could help.
     """
-    alive = project.c.deleted_us.is_not(None) if deleted else project.c.deleted_us.is_(None)
-    found = _with_my_role(tx.principal).where(project.c.name == name, alive)
-    row = tx.execute(found.order_by(project.c.deleted_us.desc()).limit(1) if deleted else found).first()
+    me = tx.principal.user_id or ""
+    row = tx.execute(_DELETED_BY_NAME if deleted else _ALIVE_BY_NAME, {"name": name, "me": me}).first()
     seen = None if row is None else _as_seen(tx.principal, row)
     if seen is None or (seen.guest and deleted):
         raise NotFound(f"There is no project {name!r} that you may see.", code="no-project")
@@ -90,13 +102,21 @@ def require(
 
 def find_by_id(tx: Transaction, project_id: str) -> ProjectRow:
     """A project, deleted or not, for the server's own work: nobody is asked."""
-    row = tx.execute(_with_my_role(tx.principal).where(project.c.id == project_id)).one()
+    row = tx.execute(_with_role_of(tx.principal.user_id or "").where(project.c.id == project_id)).one()
     return _row(row, Role.READER, guest=False)
 
 
-def _with_my_role(principal: Principal) -> Select[Any]:
-    mine = and_(member.c.project_id == project.c.id, member.c.user_id == (principal.user_id or ""))
+def _with_role_of(user_id: str | BindParameter[str]) -> Select[Any]:
+    mine = and_(member.c.project_id == project.c.id, member.c.user_id == user_id)
     return select(project, member.c.role).select_from(project.outerjoin(member, mine))
+
+
+# Almost every request runs one of these, so they are built once.
+_BY_NAME = _with_role_of(bindparam("me")).where(project.c.name == bindparam("name"))
+_ALIVE_BY_NAME = _BY_NAME.where(project.c.deleted_us.is_(None))
+_DELETED_BY_NAME = (
+    _BY_NAME.where(project.c.deleted_us.is_not(None)).order_by(project.c.deleted_us.desc()).limit(literal_column("1"))
+)
 
 
 def _as_seen(principal: Principal, row: Row[Any]) -> ProjectRow | None:
@@ -145,7 +165,7 @@ def list_projects(
     """The projects that the caller may read."""
     order = listing.parse_order(sort, SORT_KEYS)
     identity = ["projects", tx.principal.user_id]
-    statement = _with_my_role(tx.principal).where(is_visible(tx.principal))
+    statement = _with_role_of(tx.principal.user_id or "").where(is_visible(tx.principal))
     rows, next_cursor = listing.read_page(tx, statement, order, identity, cursor, limit)
     seen = (_as_seen(tx.principal, row) for row in rows)
     return Page(items=tuple(one.shown() for one in seen if one is not None), next_cursor=next_cursor)

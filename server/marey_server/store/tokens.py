@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import Row, delete, insert, or_, select, update
+from sqlalchemy import Row, bindparam, delete, insert, or_, select, update
 
 from marey_schemas.access import NewToken, Token, TokenCreate
 from marey_schemas.items import Page
@@ -30,6 +30,14 @@ NOTE_USE_EVERY_S = 3600
 
 _ATTEMPT_SCOPES = ("read",)
 
+# Every request runs this, so it is built once.
+_USER_TOKEN = (
+    select(token.c.id, token.c.secret_hash, token.c.scopes, token.c.expires_us)
+    .add_columns(user.c.id.label("user_id"), user.c.name, user.c.administrator, user.c.disabled)
+    .join(user, user.c.id == token.c.user_id)
+    .where(token.c.prefix == bindparam("prefix"))
+)
+
 
 def resolve_token(tx: Transaction, text: str) -> Principal:
     """The principal that a bearer token stands for. Raises `Unauthenticated` where it stands for nobody."""
@@ -45,13 +53,7 @@ def _unknown() -> Unauthenticated:
 
 
 def _resolve_user(tx: Transaction, prefix: str, secret: str) -> Principal:
-    statement = (
-        select(token.c.id, token.c.secret_hash, token.c.scopes, token.c.expires_us)
-        .add_columns(user.c.id.label("user_id"), user.c.name, user.c.administrator, user.c.disabled)
-        .join(user, user.c.id == token.c.user_id)
-        .where(token.c.prefix == prefix)
-    )
-    row = tx.execute(statement).first()
+    row = tx.execute(_USER_TOKEN, {"prefix": prefix}).first()
     if row is None or not secret_matches(secret, row.secret_hash) or row.disabled:
         raise _unknown()
     if row.expires_us is not None and row.expires_us <= tx.now_us:

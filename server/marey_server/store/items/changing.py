@@ -14,10 +14,10 @@ from marey_server.errors import Conflict, Invalid
 from marey_server.store import collections, documents, projects
 from marey_server.store.database import Transaction
 from marey_server.store.documents import PreparedDocument
-from marey_server.store.items import references
 from marey_server.store.items.drafts import Draft
 from marey_server.store.items.publishing import publish
 from marey_server.store.items.reading import find_item, no_item, shown_items
+from marey_server.store.items.references import ReferenceCheck
 from marey_server.store.items.revisions import emit_item, read_part_digests, write_head, write_revision
 from marey_server.store.projects import ProjectRow
 from marey_server.store.revs import change_row, moved_on
@@ -76,7 +76,7 @@ def put_part(
     found = find_item(tx, project_row, kind, item_id)
     prepared = prepare_part(kind, part, content)
     digest = documents.store_document(tx, prepared)
-    references.require_references(tx, project_row, kind, {part: prepared.body})
+    ReferenceCheck(tx, project_row).require(kind, {part: prepared.body})
     while expected_rev in (None, found.rev):
         parts = read_part_digests(tx, item_id, found.head)
         if parts.get(part) == digest:

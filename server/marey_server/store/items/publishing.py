@@ -102,13 +102,16 @@ class _Publication:
     done: dict[str, Published] = field(default_factory=dict)
     _collection_ids: dict[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self._references = references.ReferenceCheck(self.tx, self.project)
+
     def add(self, draft: Draft, loaded: Mapping[str, _Part], *, resolve: bool) -> None:
         digests, bodies = {}, {}
         for part, held in loaded.items():
             body = references.resolved(held.body, self.done) if resolve else held.body
             digests[part] = self._store(held, body)
             bodies[part] = body
-        references.require_references(self.tx, self.project, draft.kind, bodies)
+        self._references.require(draft.kind, bodies)
         for _ in range(_RACES):
             head = self._find(draft, digests)
             if head is None:
@@ -194,8 +197,9 @@ class _Publication:
 
     def _write_revision(self, draft: Draft, item_id: str, number: int, parts: Mapping[str, str]) -> None:
         write_revision(self.tx, item_id, number, parts, self.author_id, draft.message, self.job_id)
-        for tag in dict.fromkeys(draft.tags):
-            self.tx.execute(self.tx.insert_or_ignore(item_tag, {"item_id": item_id, "tag": tag}))
+        tags = [{"item_id": item_id, "tag": tag} for tag in dict.fromkeys(draft.tags)]
+        if tags:
+            self.tx.execute(self.tx.insert_or_ignore(item_tag), tags)
         sources = [
             {
                 "item_id": item_id, "number": number, "role": role, "position": position,

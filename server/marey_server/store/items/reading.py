@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Row, Select, select
+from sqlalchemy import Row, Select, bindparam, select
 
 from marey_schemas.access import Role
 from marey_schemas.arrays import EncodedArray
@@ -32,12 +32,41 @@ def item_rows() -> Select[Any]:
     return select(item, collection.c.path).join(collection, collection.c.id == item.c.collection_id)
 
 
+# What single items are read with is built once: building a statement takes longer than running it.
+_THIS_ITEM = (
+    item.c.id == bindparam("item_id"),
+    item.c.project_id == bindparam("project_id"),
+    item.c.kind == bindparam("kind"),
+)
+_ITEM = item_rows().where(*_THIS_ITEM, item.c.deleted_us.is_(None))
+_DELETED_ITEM = item_rows().where(*_THIS_ITEM, item.c.deleted_us.is_not(None))
+_TAGS = select(item_tag.c.item_id, item_tag.c.tag).where(item_tag.c.item_id.in_(bindparam("items", expanding=True)))
+_PARTS = (
+    select(
+        revision_part.c.item_id, revision_part.c.number, revision_part.c.part,
+        document.c.digest, document.c.schema, document.c.size_bytes,
+    )
+    .join(document, document.c.digest == revision_part.c.document_digest)
+    .where(
+        # Not pairs: SQLite would scan the table for them. What this finds beyond them is one row here and there.
+        revision_part.c.item_id.in_(bindparam("items", expanding=True)),
+        revision_part.c.number.in_(bindparam("numbers", expanding=True)),
+    )
+)  # fmt: skip
+_PART = (
+    select(item.c.rev, revision_part.c.number, document.c.digest, document.c.schema, document.c.body)
+    .join(revision_part, revision_part.c.item_id == item.c.id)
+    .join(document, document.c.digest == revision_part.c.document_digest)
+    .where(*_THIS_ITEM, item.c.deleted_us.is_(None), revision_part.c.part == bindparam("part"))
+)
+_PART_OF_HEAD = _PART.where(revision_part.c.number == item.c.head)
+_PART_OF_REVISION = _PART.where(revision_part.c.number == bindparam("number"))
+
+
 def find_item(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, *, deleted: bool = False) -> Row[Any]:
     """Row of an item. Raises `NotFound`."""
-    state = item.c.deleted_us.is_not(None) if deleted else item.c.deleted_us.is_(None)
-    row = tx.execute(
-        item_rows().where(item.c.id == item_id, item.c.project_id == project_row.id, item.c.kind == kind.value, state)
-    ).first()
+    which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value}
+    row = tx.execute(_DELETED_ITEM if deleted else _ITEM, which).first()
     if row is None:
         raise no_item(kind, item_id)
     return row
@@ -66,7 +95,7 @@ def shown_items(tx: Transaction, rows: Sequence[Row[Any]], *, tags: bool = True,
 def read_tags(tx: Transaction, item_ids: Collection[str]) -> dict[str, tuple[str, ...]]:
     """Tags by item, sorted."""
     found: dict[str, list[str]] = {}
-    for row in tx.execute(select(item_tag.c.item_id, item_tag.c.tag).where(item_tag.c.item_id.in_(item_ids))):
+    for row in tx.execute(_TAGS, {"items": list(item_ids)}):
         found.setdefault(row.item_id, []).append(row.tag)
     return {item_id: tuple(sorted(tags)) for item_id, tags in found.items()}
 
@@ -75,20 +104,9 @@ def read_parts(
     tx: Transaction, revisions: Collection[tuple[str, int]]
 ) -> dict[tuple[str, int], dict[str, PartSummary]]:
     """Parts by item and revision number."""
-    statement = (
-        select(
-            revision_part.c.item_id, revision_part.c.number, revision_part.c.part,
-            document.c.digest, document.c.schema, document.c.size_bytes,
-        )
-        .join(document, document.c.digest == revision_part.c.document_digest)
-        .where(
-            # Not pairs: SQLite would scan the table for them. What this finds beyond them is one row here and there.
-            revision_part.c.item_id.in_({item_id for item_id, _ in revisions}),
-            revision_part.c.number.in_({number for _, number in revisions}),
-        )
-    )  # fmt: skip
+    keys = {"items": list({item_id for item_id, _ in revisions}), "numbers": list({number for _, number in revisions})}
     found: dict[tuple[str, int], dict[str, PartSummary]] = {}
-    for row in tx.execute(statement):
+    for row in tx.execute(_PARTS, keys):
         summary = PartSummary(document=row.digest, schema_=row.schema, size_bytes=row.size_bytes)
         found.setdefault((row.item_id, row.number), {})[row.part] = summary
     return found
@@ -123,17 +141,11 @@ def read_part(
     Raises `NotFound` where there is no such item, revision or part, `Invalid` where a cut makes no sense.
     """
     project_row = projects.require(tx, project, Role.READER)
-    number = item.c.head if revision is None else revision
-    statement = (
-        select(item.c.rev, revision_part.c.number, document.c.digest, document.c.schema, document.c.body)
-        .join(revision_part, revision_part.c.item_id == item.c.id)
-        .join(document, document.c.digest == revision_part.c.document_digest)
-        .where(
-            item.c.id == item_id, item.c.project_id == project_row.id, item.c.kind == kind.value,
-            item.c.deleted_us.is_(None), revision_part.c.number == number, revision_part.c.part == part,
-        )
-    )  # fmt: skip
-    row = tx.execute(statement).first()
+    which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value, "part": part}
+    if revision is None:
+        row = tx.execute(_PART_OF_HEAD, which).first()
+    else:
+        row = tx.execute(_PART_OF_REVISION, {**which, "number": revision}).first()
     if row is None:
         raise NotFound(f"There is no part {part!r} of {kind} {item_id!r} at that revision.", code="no-part")
     body = dict(row.body)

@@ -11,10 +11,9 @@ from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
 from marey_server.errors import Invalid
 from marey_server.store.database import Transaction
-from marey_server.store.documents import load_body
 from marey_server.store.items.drafts import Published
 from marey_server.store.projects import ProjectRow
-from marey_server.store.tables import item, revision_part
+from marey_server.store.tables import document, item, revision_part
 
 Tree = dict[str, Any]
 
@@ -63,44 +62,65 @@ def resolved(tree: Any, done: Mapping[str, Published]) -> Any:
     return tree
 
 
-def require_references(tx: Transaction, project_row: ProjectRow, kind: Kind, bodies: Mapping[str, Tree]) -> None:
-    """Check what the new parts of an item refer to. Raises `Invalid` where it is not there or does not fit."""
-    if kind is Kind.CLIP and "motion" in bodies:
-        motion = bodies["motion"]
-        hierarchy = _referred(tx, project_row, motion["skeleton"], Kind.SKELETON, "hierarchy", "/motion/skeleton")
+class ReferenceCheck:
+    """Checks what the parts of items refer to; looks each revision up once."""
+
+    def __init__(self, tx: Transaction, project_row: ProjectRow) -> None:
+        self._tx = tx
+        self._project_id = project_row.id
+        self._seen: dict[tuple[str, int, Kind, str], Tree] = {}
+
+    def require(self, kind: Kind, bodies: Mapping[str, Tree]) -> None:
+        """Raise `Invalid` where something the new parts of an item refer to is not there or does not fit."""
+        if kind is Kind.CLIP and "motion" in bodies:
+            self._require_joints(bodies["motion"])
+        elif kind is Kind.ANNOTATION:
+            self._require_frames(bodies["annotation"])
+
+    def _require_joints(self, motion: Tree) -> None:
+        hierarchy = self._referred(motion["skeleton"], Kind.SKELETON, "hierarchy", "/motion/skeleton")
         known = [joint["name"] for joint in hierarchy["joints"]]
         if sorted(known) != sorted(motion["joints"]):
             odd = sorted(set(known) ^ set(motion["joints"]))[:5]
             detail = f"The joints of the motion and of its skeleton differ: {', '.join(odd) or 'a name stands twice'}."
             raise _invalid("/motion/joints", "wrong-joints", detail)
-    elif kind is Kind.ANNOTATION:
-        body = bodies["annotation"]
-        motion = _referred(tx, project_row, body["clip"], Kind.CLIP, "motion", "/annotation/clip")
-        frames = motion["poses"]["shape"][0]
-        ends = [segment["end"] for segment in body.get("segments", ())]
-        ends += [keyframe["frame"] + 1 for keyframe in body.get("keyframes", ())]
+
+    def _require_frames(self, annotation: Tree) -> None:
+        frames = self._referred(annotation["clip"], Kind.CLIP, "motion", "/annotation/clip")["poses"]["shape"][0]
+        ends = [segment["end"] for segment in annotation.get("segments", ())]
+        ends += [keyframe["frame"] + 1 for keyframe in annotation.get("keyframes", ())]
         if max(ends, default=0) > frames:
             raise _invalid("/annotation", "beyond-end", f"The clip has {frames} frames; the annotation {max(ends)}.")
 
+    def _referred(self, ref: Tree, kind: Kind, part: str, pointer: str) -> Tree:
+        """Body of a part of the revision that `ref` names."""
+        if "output" in ref:
+            raise _invalid(pointer, f"no-{kind.value}", f"There is no result {ref['output']!r} in this write.")
+        key = (ref["item"], ref["revision"], kind, part)
+        if key not in self._seen:
+            body = self._look_up(*key)
+            if body is None:
+                detail = f"There is no {kind.value} {ref['item']!r} at revision {ref['revision']} in this project."
+                raise _invalid(pointer, f"no-{kind.value}", detail)
+            self._seen[key] = body
+        return self._seen[key]
 
-def _referred(tx: Transaction, project_row: ProjectRow, ref: Tree, kind: Kind, part: str, pointer: str) -> Tree:
-    statement = (
-        select(revision_part.c.document_digest)
-        .join(item, item.c.id == revision_part.c.item_id)
-        .where(
-            item.c.id == ref.get("item"),
-            item.c.project_id == project_row.id,
-            item.c.kind == kind.value,
-            item.c.deleted_us.is_(None),
-            revision_part.c.number == ref.get("revision"),
-            revision_part.c.part == part,
+    def _look_up(self, item_id: str, number: int, kind: Kind, part: str) -> Tree | None:
+        statement = (
+            select(document.c.body)
+            .join(revision_part, revision_part.c.document_digest == document.c.digest)
+            .join(item, item.c.id == revision_part.c.item_id)
+            .where(
+                item.c.id == item_id,
+                item.c.project_id == self._project_id,
+                item.c.kind == kind.value,
+                item.c.deleted_us.is_(None),
+                revision_part.c.number == number,
+                revision_part.c.part == part,
+            )
         )
-    )
-    digest = tx.execute(statement).scalar()
-    if digest is None:
-        what = ref.get("output") or f"{ref.get('item')} at revision {ref.get('revision')}"
-        raise _invalid(pointer, f"no-{kind.value}", f"There is no {kind.value} {what} in this project.")
-    return load_body(tx, digest)
+        body: Tree | None = self._tx.execute(statement).scalar()
+        return body
 
 
 def _invalid(pointer: str, code: str, detail: str) -> Invalid:
