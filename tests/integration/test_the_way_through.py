@@ -354,3 +354,16 @@ def test_an_edited_mapping_of_the_clips_own_skeleton_is_gone_by(project, marey, 
     assert "left_elbow" in after.info().source.details["missing"]
     used = {(edge.role, edge.revision) for edge in after.lineage().inputs}
     assert ("rigs", 2) in used
+
+
+def test_a_body_that_was_hardly_recognised_is_refused_until_somebody_confirms_it(project, marey, takes, run):
+    project.imports.upload(find_files([takes / "walk.bvh"]).files, ImportOptions(collection="raw"))
+    studio = target_skeleton(project)
+    (source,) = [skeleton for skeleton in project.skeletons.list() if skeleton.id != studio.id]
+    source.put_mapping(source.mapping().model_copy(update={"confidence": 0.2}))
+    sources = [CollectionInput(collection="raw")]
+    ended = marey.jobs.wait(project.retarget(sources, studio.id, into="doubtful").id, timeout_s=60)
+    assert [refusal["code"] for refusal in ended.result["refused"]] == ["mapping-uncertain"]
+    run("skeleton", "map", f"{project.name}/{source.id}", "--confirm")
+    ended = marey.jobs.wait(project.retarget(sources, studio.id, into="confirmed").id, timeout_s=60)
+    assert ended.result["clips"] == 1

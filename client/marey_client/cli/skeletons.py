@@ -26,6 +26,9 @@ def map_joints(
     assignments: Annotated[
         list[str] | None, typer.Argument(help="standard_joint=JointName to set one, standard_joint= to clear it.")
     ] = None,
+    confirm: Annotated[
+        bool, typer.Option("--confirm", help="Take what was recognised as right, however doubtful it was.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Show which joint plays which standard joint, or change it; a change is a new revision."""
@@ -34,9 +37,9 @@ def map_joints(
     with connect(context) as marey:
         found = require_item(marey, Address.parse(place), [Kind.SKELETON])
         mapping = found.mapping()
-        if assignments:
+        if assignments or confirm:
             known = {joint.name for joint in found.hierarchy().joints}
-            joints = {**mapping.joints, **_assigned(assignments, known)}
+            joints = {**mapping.joints, **_assigned(assignments or [], known)}
             chosen = {standard: joint for standard, joint in joints.items() if joint}
             mapping = mapping.model_copy(update={"joints": chosen, "method": "manual", "confidence": 1.0})
             item = found.put_mapping(mapping)
