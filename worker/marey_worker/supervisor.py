@@ -89,10 +89,10 @@ class Supervisor:
     # -- one slot --
 
     def _work(self) -> None:
-        """Work until stopped. A fault of ours ends the whole worker: one that runs on without its slots helps nobody."""
+        """Work until stopped. A fault of ours ends the whole worker: one without its slots helps nobody."""
         try:
             self._claim_and_run()
-        except Exception:  # noqa: BLE001 - logged, and told by the exit status
+        except Exception:
             log.exception("a slot failed")
             self._failed = True
             self.stop()
