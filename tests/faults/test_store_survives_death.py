@@ -32,9 +32,7 @@ FILES = [f"file {number}".encode() * 1000 for number in range(3)]
 def publish(tx):
     row = projects.require(tx, "lab", scope="write")
     trees = [{"n": n, "blob": blobs.digest_of(data)} for n, data in enumerate(FILES)]
-    drafts = [
-        items.Draft(f"d{n}", Kind.STUDY, f"study {n}", {"study": tree}, collection="a/b") for n, tree in enumerate(trees)
-    ]
+    drafts = [items.Draft(f"d{n}", Kind.STUDY, f"study {n}", {"study": tree}, "a/b") for n, tree in enumerate(trees)]
     return items.publish(tx, row, drafts, author_id=user_id)
 
 if work == "send":
@@ -63,9 +61,17 @@ class Writer:
         return done.returncode
 
 
-@pytest.fixture(params=["rows", "files"])
-def folder(request, tmp_path):
-    return "" if request.param == "rows" else str(tmp_path / "blobs")
+in_rows_and_in_files = pytest.mark.parametrize("backing", ["rows", "files"])
+
+
+@pytest.fixture
+def backing():
+    return "rows"
+
+
+@pytest.fixture
+def folder(backing, tmp_path):
+    return "" if backing == "rows" else str(tmp_path / "blobs")
 
 
 @pytest.fixture
@@ -90,6 +96,7 @@ def assert_sound(lab):
     assert list(fsck.check_store(lab.database)) == []
 
 
+@in_rows_and_in_files
 @pytest.mark.parametrize(
     ("fault", "left"),
     [
@@ -97,7 +104,7 @@ def assert_sound(lab):
         ("blob.put.after_commit@2:kill", [True, True, False]),
     ],
 )
-def test_a_sender_that_dies_leaves_whole_blobs(lab, writer, fault, left):
+def test_a_sender_that_dies_leaves_whole_blobs(lab, writer, fault, left, backing):
     assert writer.run("send", fault) == -signal.SIGKILL
     assert stored(lab) == left
     assert_sound(lab)
@@ -118,7 +125,8 @@ def test_a_publisher_that_dies_leaves_everything_or_nothing(lab, writer, fault, 
     assert_sound(lab)
 
 
-def test_a_collector_that_dies_deletes_nothing_it_did_not_finish(lab, writer):
+@in_rows_and_in_files
+def test_a_collector_that_dies_deletes_nothing_it_did_not_finish(lab, writer, backing):
     writer.run("send")
     assert writer.run("collect", "garbage.before_commit:kill") == -signal.SIGKILL
     assert stored(lab) == [True, True, True]
