@@ -16,7 +16,7 @@ from marey_server.store.database import Database, Transaction
 
 Action = Callable[[Transaction], Any]
 
-HEAD_START_S = 0.15
+HEAD_START_S = 0.1
 """How long the second transaction may run, or wait for the first one's locks, before the first commits."""
 
 

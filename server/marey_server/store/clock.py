@@ -52,19 +52,21 @@ def stored_high_water_us(connection: Connection) -> int:
     return int(connection.execute(statement).scalar() or 0)
 
 
-def save_high_water(connection: Connection, now_us: int) -> None:
+def save_high_water(connection: Connection, now_us: int) -> int:
     """See that no time up to `now_us` is ever used again, whatever the wall clock says after a restart.
 
-    Writes at most once a second: what is stored lies up to a second ahead.
+    What is stored lies a second ahead, so that it need not be written more often. It is returned: until then nothing
+    needs to be saved.
     """
     stored = stored_high_water_us(connection)
     if now_us < stored:
-        return
+        return stored
     ahead = now_us + _SAVE_EVERY_US
     if stored == 0:
         connection.execute(insert(server_state).values(key=_HIGH_WATER, value=ahead))
     else:
         connection.execute(update(server_state).where(server_state.c.key == _HIGH_WATER).values(value=ahead))
+    return ahead
 
 
 def datetime_of(us: int) -> datetime:

@@ -120,19 +120,21 @@ def _complete(
     return done
 
 
+_RECORD = (
+    update(job)
+    .where(job.c.id == bindparam("of_job"))
+    .values(
+        result=bindparam("its_result"),
+        outputs=bindparam("its_outputs"),
+        code_version=bindparam("its_code"),
+        environment=bindparam("its_environment"),
+    )
+)
+
+
 def _record(tx: Transaction, records: Sequence[dict[str, Any]]) -> None:
     """Write down what the jobs brought; this transaction has won them already."""
-    statement = (
-        update(job)
-        .where(job.c.id == bindparam("of_job"))
-        .values(
-            result=bindparam("its_result"),
-            outputs=bindparam("its_outputs"),
-            code_version=bindparam("its_code"),
-            environment=bindparam("its_environment"),
-        )
-    )
-    tx.execute(statement, records)
+    tx.execute(_RECORD, records)
 
 
 def _pass_fault_points(tx: Transaction) -> None:

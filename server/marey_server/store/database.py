@@ -28,6 +28,7 @@ from marey_server.errors import Invalid, StorageFull, Unavailable
 from marey_server.store import tables
 from marey_server.store.blob_backings import BlobBacking, DatabaseBlobs
 from marey_server.store.clock import Clock, DatabaseClock, save_high_water
+from marey_server.store.write_lane import WriteLane
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -64,6 +65,10 @@ class Transaction:
         if self._now_us is None:
             self._now_us = self._clock.now_us(self.connection)
         return self._now_us
+
+    def beside(self, principal: Principal) -> Transaction:
+        """Another one, on behalf of `principal`, that is committed with this one."""
+        return Transaction(self.connection, principal, self._clock, self.blobs)
 
     @property
     def is_postgres(self) -> bool:
@@ -143,11 +148,12 @@ class Database:
                 isolation_level="REPEATABLE READ", postgresql_readonly=True
             )
         self.clock: Clock = clock or DatabaseClock()
+        self._high_water_us = 0
         self.blobs: BlobBacking = blobs or DatabaseBlobs()
         self._lane: AbstractContextManager[Any] = threading.Lock() if self.is_sqlite else nullcontext()
         self._wal_checked_s = 0.0
         self._readers = ThreadPoolExecutor(readers, thread_name_prefix="marey-read")
-        self._writers = ThreadPoolExecutor(1, thread_name_prefix="marey-write") if self.is_sqlite else self._readers
+        self._write_lane = WriteLane(self.write) if self.is_sqlite else None
 
     # -- running functions in transactions ----------------------------------------------------------------------------
 
@@ -206,8 +212,9 @@ class Database:
     ) -> T:
         with tx.connection.begin() as transaction:
             answer = function(tx, *args, **kwargs)
-            if self.is_sqlite:
-                save_high_water(tx.connection, tx.now_us)
+            high_water_us = self._high_water_us
+            if self.is_sqlite and tx.now_us >= high_water_us:
+                high_water_us = save_high_water(tx.connection, tx.now_us)
             try:
                 transaction.commit()
             except exc.DBAPIError as error:
@@ -216,6 +223,7 @@ class Database:
                 ):  # nobody knows whether it was committed; doing it again could do it twice
                     raise _no_answer("Whether this was written is not known; look before you try again.") from error
                 raise
+        self._high_water_us = high_water_us
         if self.is_sqlite:
             self._keep_wal_short(tx.connection)
         return answer
@@ -249,11 +257,14 @@ class Database:
         **kwargs: P.kwargs,
     ) -> Future[T]:
         """`write` in a thread of the pool (SQLite: in the writer lane), for callers on an event loop."""
-        return self._writers.submit(self.write, principal, function, *args, **kwargs)  # type: ignore[arg-type]
+        if self._write_lane is not None:
+            return self._write_lane.submit(principal, function, *args, **kwargs)
+        return self._readers.submit(self.write, principal, function, *args, **kwargs)  # type: ignore[arg-type]
 
     def close(self) -> None:
         """Finish what runs, then close every connection."""
-        self._writers.shutdown(wait=True)
+        if self._write_lane is not None:
+            self._write_lane.close()
         self._readers.shutdown(wait=True)
         self._read_engine.dispose()
         self.engine.dispose()

@@ -74,28 +74,30 @@ class AttemptEnd:
     answer: dict[str, Any] | None = None
 
 
+_END_ATTEMPT = (
+    update(attempt)
+    .where(
+        attempt.c.job_id == bindparam("of_job"),
+        attempt.c.fence == bindparam("of_fence"),
+        attempt.c.ended_us.is_(None),
+    )
+    .values(
+        ended_us=bindparam("now"),
+        outcome=bindparam("its_outcome"),
+        detail=bindparam("its_detail"),
+        signature=bindparam("its_signature"),
+        write_id=bindparam("its_write_id"),
+        answer=bindparam("its_answer"),
+    )
+)
+
+
 def end_attempts(tx: Transaction, ends: Sequence[AttemptEnd]) -> None:
     """Record how attempts ended; one that has ended already keeps its end."""
     if not ends:
         return
-    statement = (
-        update(attempt)
-        .where(
-            attempt.c.job_id == bindparam("of_job"),
-            attempt.c.fence == bindparam("of_fence"),
-            attempt.c.ended_us.is_(None),
-        )
-        .values(
-            ended_us=tx.now_us,
-            outcome=bindparam("its_outcome"),
-            detail=bindparam("its_detail"),
-            signature=bindparam("its_signature"),
-            write_id=bindparam("its_write_id"),
-            answer=bindparam("its_answer"),
-        )
-    )
     tx.execute(
-        statement,
+        _END_ATTEMPT,
         [
             {
                 "of_job": end.job_id,
@@ -105,6 +107,7 @@ def end_attempts(tx: Transaction, ends: Sequence[AttemptEnd]) -> None:
                 "its_signature": end.signature,
                 "its_write_id": end.write_id,
                 "its_answer": end.answer,
+                "now": tx.now_us,
             }
             for end in ends
         ],

@@ -15,16 +15,17 @@ EventOfJob = tuple[str, str, dict[str, Any]]
 """Project id, job id, body."""
 
 
+_INSERT = insert(event)
+_INSERT_WITH_XID = insert(event).values(xid=text("pg_current_xact_id()::text::bigint"))
+
+
 def emit_job_events(tx: Transaction, kind: str, events: Sequence[EventOfJob]) -> None:
     """Record one event per job, visible when the transaction commits."""
     if not events:
         return
-    statement = insert(event)
-    if tx.is_postgres:
-        statement = statement.values(xid=text("pg_current_xact_id()::text::bigint"))
     common = {"at_us": tx.now_us, "kind": kind, "actor": tx.principal.actor}
     rows = [{**common, "project_id": project, "subject": subject, "body": body} for project, subject, body in events]
-    tx.execute(statement, rows)
+    tx.execute(_INSERT_WITH_XID if tx.is_postgres else _INSERT, rows)
 
 
 def wake_workers(tx: Transaction, kinds: Iterable[str]) -> None:

@@ -73,9 +73,8 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
         ],
     )
     emit_job_events(tx, "job.started", [(row.project_id, row.id, {"fence": row.fence}) for row in rows])
-    names = _project_names(tx, {row.project_id for row in rows})
     tx.after_commit(lambda: faults.point("claim.after_commit"))
-    return [_lease(row, names[row.project_id], token, policy) for row, token in zip(rows, tokens, strict=True)]
+    return [_lease(row, token, policy) for row, token in zip(rows, tokens, strict=True)]
 
 
 def heartbeat(
@@ -126,6 +125,7 @@ def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
         .returning(
             job.c.id,
             job.c.project_id,
+            select(project.c.name).where(project.c.id == job.c.project_id).scalar_subquery().label("project_name"),
             job.c.kind,
             job.c.params,
             job.c.inputs,
@@ -232,15 +232,10 @@ def _claim_rows(tx: Transaction, request: ClaimRequest, policy: QueuePolicy) -> 
 # -- answers ----------------------------------------------------------------------------------------------------------
 
 
-def _project_names(tx: Transaction, ids: set[str]) -> dict[str, str]:
-    rows = tx.execute(select(project.c.id, project.c.name).where(project.c.id.in_(ids)))
-    return {row.id: row.name for row in rows}
-
-
-def _lease(row: Row[Any], project_name: str, token: IssuedToken, policy: QueuePolicy) -> Lease:
+def _lease(row: Row[Any], token: IssuedToken, policy: QueuePolicy) -> Lease:
     return Lease(
         job=row.id,
-        project=project_name,
+        project=row.project_name,
         kind=row.kind,
         params=row.params,
         inputs={name: tuple(PinnedInput(**pin) for pin in pins) for name, pins in row.inputs.items()},

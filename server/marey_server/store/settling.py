@@ -66,16 +66,18 @@ def _announce(tx: Transaction, ended: Sequence[Ended]) -> None:
 # -- dependants -------------------------------------------------------------------------------------------------------
 
 
+_RELEASE = (
+    update(job_dependency)
+    .where(job_dependency.c.on_job_id.in_(bindparam("ended", expanding=True)), job_dependency.c.satisfied == false())
+    .values(satisfied=True)
+    .returning(job_dependency.c.job_id, job_dependency.c.on_job_id)
+)
+
+
 def _move_dependants(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
     ends = {end.id: end for end in ended}
-    statement = (
-        update(job_dependency)
-        .where(job_dependency.c.on_job_id.in_(ends), job_dependency.c.satisfied == false())
-        .values(satisfied=True)
-        .returning(job_dependency.c.job_id, job_dependency.c.on_job_id)
-    )
     upstream: dict[str, list[Ended]] = {}
-    for row in tx.execute(statement):
+    for row in tx.execute(_RELEASE, {"ended": list(ends)}):
         upstream.setdefault(row.job_id, []).append(ends[row.on_job_id])
     following: list[Ended] = []
     ids = iter(sorted(upstream))

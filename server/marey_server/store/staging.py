@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import delete, func, insert, select, tuple_, update
+from sqlalchemy import ColumnElement, and_, delete, func, insert, select, tuple_, update
 
 from marey_schemas.jobs import StagedOutput
 from marey_schemas.kinds import PARTS, Kind
@@ -129,9 +129,7 @@ def staged_drafts(
 ) -> dict[tuple[str, int], dict[str, StagedDraft]]:
     """What attempts (job id and fence) staged: drafts by name, in the order staged."""
     statement = (
-        select(staged_output)
-        .where(tuple_(staged_output.c.job_id, staged_output.c.fence).in_(list(attempts)))
-        .order_by(staged_output.c.job_id, staged_output.c.position)
+        select(staged_output).where(_staged_by(attempts)).order_by(staged_output.c.job_id, staged_output.c.position)
     )
     drafts: dict[tuple[str, int], dict[str, StagedDraft]] = {}
     for row in tx.execute(statement):
@@ -151,7 +149,14 @@ def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> boo
 
 def drop_staged(tx: Transaction, attempts: Collection[tuple[str, int]]) -> None:
     """Forget what attempts (job id and fence) staged: they ended without success, or no identical job can use it."""
-    tx.execute(delete(staged_output).where(tuple_(staged_output.c.job_id, staged_output.c.fence).in_(list(attempts))))
+    tx.execute(delete(staged_output).where(_staged_by(attempts)))
+
+
+def _staged_by(attempts: Collection[tuple[str, int]]) -> ColumnElement[bool]:
+    if len(attempts) == 1:
+        ((job_id, fence),) = attempts
+        return and_(staged_output.c.job_id == job_id, staged_output.c.fence == fence)
+    return tuple_(staged_output.c.job_id, staged_output.c.fence).in_(list(attempts))
 
 
 def with_inputs(drafts: Mapping[str, StagedDraft], pins: PinnedInputs) -> dict[str, StagedDraft]:
