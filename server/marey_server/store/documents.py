@@ -17,7 +17,7 @@ from sqlalchemy import bindparam, insert, select
 
 from marey_schemas import blocks
 from marey_schemas.arrays import EncodedArray
-from marey_schemas.canonical import attach_arrays, canonical_json, detach_arrays
+from marey_schemas.canonical import canonical_json, detach_arrays
 from marey_schemas.documents import SCHEMAS
 from marey_schemas.problems import FieldError
 from marey_server.errors import Invalid, NotFound
@@ -228,7 +228,7 @@ _BLOBS_OF_DOCUMENT = (  # built once: every read of a motion runs it
 
 def load_document(tx: Transaction, digest: str, *, arrays: Literal["encoded", "decoded", "none"] = "encoded") -> Tree:
     """A stored document; its arrays as stored, as numpy arrays, or as references."""
-    body = load_body(tx, digest)
+    body = load_body(tx, digest)  # freshly read, so that it may be changed
     if arrays == "none":
         return body
     return attach_stored(tx, digest, body, (lambda stored: stored.decode()) if arrays == "decoded" else None)
@@ -245,15 +245,24 @@ def load_body(tx: Transaction, digest: str) -> Tree:
 def attach_stored(
     tx: Transaction, digest: str, body: Tree, convert: Callable[[EncodedArray], Any] | None = None
 ) -> Tree:
-    """`body` with its arrays in place of the references, each passed through `convert`."""
-    places = {row.pointer: row for row in tx.execute(_BLOBS_OF_DOCUMENT, {"digest": digest})}
-    leaves, _ = references_of(OPEN_SCHEMA, body)
+    """`body` with its arrays in place of the references, each passed through `convert`; `body` itself is changed."""
     loaded: dict[str, Any] = {}
-    for pointer, leaf in leaves.items():
+    for row in tx.execute(_BLOBS_OF_DOCUMENT, {"digest": digest}).all():
+        holder, key = _place(body, row.pointer)
+        leaf = holder[key]
+        if not _is_reference(leaf):  # the name of a file
+            continue
         if leaf["content"] not in loaded:
-            row = places[pointer]
             data = blobs.read_blob(tx, row.blob_digest, 0, row.size_bytes)
             stored = EncodedArray(leaf["dtype"], tuple(leaf["shape"]), data)
             loaded[leaf["content"]] = convert(stored) if convert else stored
-    attached: Tree = attach_arrays(body, loaded.__getitem__)
-    return attached
+        holder[key] = loaded[leaf["content"]]
+    return body
+
+
+def _place(tree: Any, pointer: str) -> tuple[Any, str | int]:
+    """The object or list that holds what a JSON Pointer names, and its key there."""
+    steps = [step.replace("~1", "/").replace("~0", "~") for step in pointer.split("/")[1:]]
+    for step in steps[:-1]:
+        tree = tree[int(step) if isinstance(tree, list) else step]
+    return tree, int(steps[-1]) if isinstance(tree, list) else steps[-1]
