@@ -92,12 +92,14 @@ def list_collections(
     return Page(items=tuple(_shown(row) for row in rows), next_cursor=next_cursor)
 
 
-def _find(tx: Transaction, project_row: ProjectRow, collection_id: str, state: ColumnElement[bool]) -> Row[Any]:
-    """Row of a collection, locked for a change. Raises `NotFound`."""
+def _find(
+    tx: Transaction, project_row: ProjectRow, collection_id: str, state: ColumnElement[bool], *, lock: bool = False
+) -> Row[Any]:
+    """Row of a collection; with `lock`, nobody else changes it before this write ends. Raises `NotFound`."""
     statement = select(collection).where(
         collection.c.id == collection_id, collection.c.project_id == project_row.id, state
     )
-    row = tx.execute(statement).first()
+    row = tx.execute(statement.with_for_update() if lock else statement).first()
     if row is None:
         raise _no_collection(collection_id)
     return row
@@ -134,7 +136,7 @@ def move_collection(
 ) -> Collection:
     """Rename or move a folder with all it holds. Raises `Conflict` where there is a folder at the new path."""
     project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
-    old, new = _find(tx, project_row, collection_id, _ALIVE).path, request.path
+    old, new = _find(tx, project_row, collection_id, _ALIVE, lock=True).path, request.path
     _require_no_root(old)
     if new.startswith(f"{old}/"):
         raise Invalid(f"{old!r} cannot move into itself.", code="into-itself")
@@ -164,7 +166,7 @@ def _move_contents(tx: Transaction, project_row: ProjectRow, old: str, new: str)
 def delete_collection(tx: Transaction, project: str, collection_id: str, *, expected_rev: int | None) -> None:
     """Hide a folder with all it holds; it can be restored."""
     project_row = projects.require(tx, project, Role.MAINTAINER, "write")
-    path = _find(tx, project_row, collection_id, _ALIVE).path
+    path = _find(tx, project_row, collection_id, _ALIVE, lock=True).path
     _require_no_root(path)
     change_row(
         tx, collection, (collection.c.id == collection_id, collection.c.path == path, _ALIVE),
@@ -187,7 +189,7 @@ def restore_collection(
 ) -> Collection:
     """Bring back a folder with what was deleted along with it. Raises `Conflict` where its path is taken again."""
     project_row = projects.require(tx, project, Role.MAINTAINER, "write")
-    gone = _find(tx, project_row, collection_id, collection.c.deleted_us.is_not(None))
+    gone = _find(tx, project_row, collection_id, collection.c.deleted_us.is_not(None), lock=True)
     ensure(tx, project_row, gone.path.rpartition("/")[0])
     with taken(_path_taken(gone.path)):
         row = change_row(

@@ -324,6 +324,23 @@ def test_an_item_whose_collection_is_gone_comes_back_with_it(lab, rig):
     assert lab.write(items.restore_item, "lab", Kind.CLIP, clip.id).collection == "raw"
 
 
+def test_a_folder_moved_by_two_at_once_without_a_precondition_ends_at_one_place(lab):
+    folder = lab.write(collections.create_collection, "lab", CollectionCreate(path="a"))
+    lab.write(collections.create_collection, "lab", CollectionCreate(path="a/b"))
+    futures = [
+        lab.database.submit_write(
+            lab.owner, collections.move_collection, "lab", folder.id, CollectionChange(path=f"m{n}"), expected_rev=None
+        )
+        for n in range(6)
+    ]
+    for future in futures:
+        future.result(60)
+    last = lab.read(collections.read_collection, "lab", folder.id)
+    assert last.rev == 7
+    paths = [one.path for one in lab.read(collections.list_collections, "lab").items]
+    assert paths == [last.path, f"{last.path}/b"]
+
+
 def test_collections_refuse_what_would_tangle_them(lab):
     a = lab.write(collections.create_collection, "lab", CollectionCreate(path="a"))
     lab.write(collections.create_collection, "lab", CollectionCreate(path="ab/c"))
