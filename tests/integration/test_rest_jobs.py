@@ -1,0 +1,231 @@
+"""Jobs and the worker protocol, as they look over HTTP."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from database_fixtures import AdjustableClock
+from marey_schemas import codecs
+from marey_server.access.principal import SYSTEM
+from marey_server.store import reaper
+from marey_server.store.database import Database
+from rest_server import Server, running
+
+BLOCKS = "application/msgpack; arrays=blocks"
+
+
+@pytest.fixture
+def server(database: Database, tmp_path: Path, test_kinds: None) -> Iterator[Server]:
+    """A server that knows the kinds of the queue's tests."""
+    with running(database, tmp_path) as one:
+        yield one
+
+
+@pytest.fixture
+def owner(server: Server) -> httpx.Client:
+    """Who submits."""
+    return server.client(server.make_project())
+
+
+@pytest.fixture
+def worker(server: Server) -> httpx.Client:
+    """Who works."""
+    return server.client(server.make_user("wanda", administrator=True, scopes=("work",)))
+
+
+def ok(response: httpx.Response, status: int = 200) -> Any:
+    assert response.status_code == status, response.text
+    return response.json()
+
+
+def submit(owner: httpx.Client, kind: str = "errand", **fields: Any) -> Any:
+    return ok(owner.post("/projects/lab/jobs", json={"kind": kind, **fields}), 202)
+
+
+def claim(worker: httpx.Client, **fields: Any) -> list[Any]:
+    wanted = {"worker": "w", "kinds": ["errand", "sum", "square"], "max": 10, **fields}
+    return list(ok(worker.post("/leases", json=wanted))["leases"])
+
+
+def attempt(server: Server, lease: Any) -> httpx.Client:
+    client = server.client(lease["attempt_token"])
+    client.base_url = httpx.URL(f"{server.api}/jobs/{lease['job']}/attempts/{lease['fence']}/")
+    return client
+
+
+def thing(name: str, value: Any = 1) -> dict[str, Any]:
+    parts = {"motion": {"schema": "marey/document@1", "value": value}}
+    return {"name": name, "kind": "processed", "item_name": name, "parts": parts}
+
+
+def test_a_job_goes_from_its_submission_to_its_outputs(
+    server: Server, owner: httpx.Client, worker: httpx.Client
+) -> None:
+    response = owner.post("/projects/lab/jobs", json={"kind": "errand", "into": "made"})
+    job = ok(response, 202)
+    assert response.headers["Location"] == f"/api/v1/jobs/{job['id']}"
+    assert response.headers["Retry-After"] == "1"
+    (lease,) = claim(worker)
+    mine = attempt(server, lease)
+    assert ok(mine.post("heartbeat", json={"progress": {"done": 1, "total": 2}}))["cancel_requested"] is False
+    assert ok(owner.get(f"/jobs/{job['id']}"))["progress"]["done"] == 1
+    assert ok(mine.post("outputs", json={"outputs": [thing("a")]}))["staged"] == 1
+    body = codecs.encode_tree({"outputs": [thing("b", np.arange(12.0))]}, "application/msgpack", arrays="blocks")
+    assert ok(mine.post("outputs", content=body, headers={"Content-Type": BLOCKS}))["staged"] == 2
+
+    done = ok(mine.post("complete", json={"write_id": "write-one", "result": {"seconds": 1.5}}))
+    assert [one["name"] for one in done["outputs"]] == ["a", "b"]
+    assert ok(mine.post("complete", json={"write_id": "write-one"})) == done
+    assert mine.post("complete", json={"write_id": "write-two"}).status_code == 409
+    assert ok(owner.get(f"/jobs/{job['id']}/outputs"))["items"] == done["outputs"]
+    assert ok(owner.get(f"/jobs/{job['id']}"))["result"] == {"seconds": 1.5, "outputs": 2}
+    (tried,) = ok(owner.get(f"/jobs/{job['id']}/attempts"))["items"]
+    assert (tried["worker"], tried["outcome"]) == ("w", "succeeded")
+    told = [one["kind"] for one in ok(owner.get(f"/jobs/{job['id']}/events"))["items"]]
+    assert told == ["job.submitted", "job.started", "job.succeeded"]
+    made = ok(owner.get("/projects/lab/processed", params={"collection": "made"}))["items"]
+    assert sorted(one["name"] for one in made) == ["a", "b"]
+
+
+def test_a_waiting_worker_hears_of_a_job_when_it_is_submitted(owner: httpx.Client, worker: httpx.Client) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(claim, worker, wait_s=30)
+        time.sleep(0.3)
+        assert not waiting.done()
+        job = submit(owner)
+        (lease,) = waiting.result(30)
+    assert lease["job"] == job["id"]
+    assert claim(worker, wait_s=0.1) == []
+
+
+def test_who_prefers_to_wait_is_answered_when_the_job_has_ended(
+    server: Server, owner: httpx.Client, worker: httpx.Client
+) -> None:
+    job = submit(owner)
+    (lease,) = claim(worker)
+    prefer = {"Prefer": "wait=30"}
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(owner.get, f"/jobs/{job['id']}", headers=prefer)
+        time.sleep(0.3)
+        assert not waiting.done()
+        ok(attempt(server, lease).post("complete", json={"write_id": "write-one"}))
+        assert ok(waiting.result(30))["state"] == "succeeded"
+    started = time.monotonic()
+    late = ok(owner.post("/projects/lab/jobs", json={"kind": "errand"}, headers={"Prefer": "wait=1"}), 202)
+    assert late["state"] == "queued"
+    assert time.monotonic() - started >= 0.9
+
+
+def test_the_same_submission_sent_twice_is_one_job(owner: httpx.Client) -> None:
+    key = {"Idempotency-Key": "once"}
+    first = owner.post("/projects/lab/jobs", json={"kind": "errand"}, headers=key)
+    second = owner.post("/projects/lab/jobs", json={"kind": "errand"}, headers=key)
+    assert ok(first, 202) == ok(second, 202)
+    assert len(ok(owner.get("/projects/lab/jobs"))["items"]) == 1
+
+
+def test_many_are_submitted_claimed_and_completed_at_once(owner: httpx.Client, worker: httpx.Client) -> None:
+    wanted = [{"kind": "errand", "params": {"number": n}} for n in range(20)]
+    made = ok(owner.post("/projects/lab/jobs/batch", json={"jobs": wanted}), 202)["jobs"]
+    leases = claim(worker, max=256)
+    assert {one["job"] for one in leases} == {one["id"] for one in made}
+    done = [{"job": one["job"], "fence": one["fence"], "write_id": "write-one"} for one in leases]
+    done.append({"job": "job_none", "fence": 1, "write_id": "write-one"})
+    results = ok(worker.post("/leases/completions", json={"completions": done}))["results"]
+    assert [one["answer"] is not None for one in results] == [True] * 20 + [False]
+    refused = owner.post("/projects/lab/jobs/batch", json={"jobs": [*wanted, {"kind": "errand", "params": {"no": 1}}]})
+    assert refused.status_code == 422
+    assert refused.json()["errors"][0]["pointer"] == "/jobs/20/params/no"
+
+
+def test_a_worker_that_was_too_slow_gets_409_everywhere(
+    server: Server, owner: httpx.Client, worker: httpx.Client, clock: AdjustableClock
+) -> None:
+    job = submit(owner)
+    (slept,) = claim(worker)
+    clock.advance(61)
+    assert server.database.write(SYSTEM, reaper.reap_page).taken == 1
+    (awake,) = claim(worker)
+    stale = attempt(server, slept)
+    requests: list[tuple[str, dict[str, Any]]] = [
+        ("heartbeat", {"json": {}}),
+        ("log", {"content": b"late", "headers": {"Upload-Offset": "0"}}),
+        ("outputs", {"json": {"outputs": [thing("late")]}}),
+        ("complete", {"json": {"write_id": "write-one"}}),
+        ("fail", {"json": {"write_id": "write-one", "code": "late"}}),
+    ]
+    for name, content in requests:
+        response = stale.post(name, **content)
+        assert (response.status_code, response.json()["code"]) == (409, "lease-lost"), name
+    fresh = attempt(server, awake)
+    ok(fresh.post("complete", json={"write_id": "write-two"}))
+    for name, content in requests:
+        assert stale.post(name, **content).status_code == 409, name
+    outcomes = [one["outcome"] for one in ok(owner.get(f"/jobs/{job['id']}/attempts"))["items"]]
+    assert outcomes == ["lost", "succeeded"]
+
+
+def test_a_log_is_appended_by_offset_and_read_from_any_byte(
+    server: Server, owner: httpx.Client, worker: httpx.Client
+) -> None:
+    job = submit(owner)
+    (lease,) = claim(worker)
+    mine = attempt(server, lease)
+    for offset, piece in ((0, b"one\n"), (4, b"two\n"), (0, b"one\n")):
+        ok(mine.post("log", content=piece, headers={"Upload-Offset": str(offset)}))
+    refused = mine.post("log", content=b"three", headers={"Upload-Offset": "5"})
+    assert (refused.status_code, refused.json()["context"]) == (409, {"offset": 8})
+    assert mine.post("log", content=b"three").status_code == 400
+    read = owner.get(f"/jobs/{job['id']}/log", params={"offset": 4}, headers={"Accept": "text/plain"})
+    assert (read.content, read.headers["Log-Offset"], read.headers["Log-Sealed"]) == (b"two\n", "8", "false")
+    ok(mine.post("complete", json={"write_id": "write-one"}))
+    assert owner.get(f"/jobs/{job['id']}/log").headers["Log-Sealed"] == "true"
+
+
+def test_a_job_is_cancelled_and_tried_again(server: Server, owner: httpx.Client, worker: httpx.Client) -> None:
+    job = submit(owner)
+    (lease,) = claim(worker)
+    assert ok(owner.post(f"/jobs/{job['id']}/cancel"))["cancel_requested"]
+    mine = attempt(server, lease)
+    assert ok(mine.post("heartbeat", json={}))["cancel_requested"]
+    assert ok(mine.post("fail", json={"write_id": "write-one", "code": "cancelled"}))["state"] == "cancelled"
+    again = owner.post(f"/jobs/{job['id']}/retry")
+    assert ok(again, 202)["retry_of"] == job["id"]
+    assert again.headers["Location"].endswith(again.json()["id"])
+    assert owner.post(f"/jobs/{again.json()['id']}/retry").status_code == 409
+
+
+def test_strangers_neither_see_nor_touch_jobs(server: Server, owner: httpx.Client) -> None:
+    job = submit(owner)
+    stranger = server.client(server.make_user("sam"))
+    for method, path in (("GET", ""), ("GET", "/log"), ("GET", "/events"), ("POST", "/cancel"), ("POST", "/retry")):
+        assert stranger.request(method, f"/jobs/{job['id']}{path}").status_code == 404, path
+    assert stranger.post("/leases", json={"worker": "w", "kinds": ["errand"]}).status_code == 403
+
+
+def test_the_kinds_of_job_are_told_to_anybody(server: Server) -> None:
+    anybody = server.client()
+    kinds = ok(anybody.get("/job-kinds"))["items"]
+    assert {"import", "retarget", "export"} <= {kind["name"] for kind in kinds}
+    assert ok(anybody.get("/job-kinds/retarget"))["inputs"]["clips"]["kind"] == "clip"
+    assert anybody.get("/job-kinds/levitate").status_code == 404
+
+
+def test_the_server_takes_back_jobs_of_lost_workers_by_itself(
+    database: Database, tmp_path: Path, test_kinds: None
+) -> None:
+    with running(database, tmp_path, lease_ttl_s=1, heartbeat_s=0.3) as server:
+        owner = server.client(server.make_project())
+        worker = server.client(server.make_user("wanda", administrator=True, scopes=("work",)))
+        job = submit(owner)
+        (first,) = claim(worker)
+        (second,) = claim(worker, wait_s=20)
+        assert (second["job"], second["fence"] > first["fence"]) == (job["id"], True)
