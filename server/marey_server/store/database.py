@@ -357,7 +357,7 @@ def _translated(error: Exception) -> Exception:
     message = str(error.orig)
     if "disk is full" in message or getattr(error.orig, "sqlstate", None) == "53100":
         return StorageFull("The database's disk has no room left; nothing was written.")
-    if isinstance(error, exc.OperationalError):
+    if isinstance(error, exc.OperationalError) and not message.startswith(("no such", "near ")):  # those are our faults
         return _no_answer("The database does not answer; nothing was written. Try again.")
     return error
 
