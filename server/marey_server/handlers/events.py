@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 
 from pydantic import Field
@@ -73,7 +72,7 @@ class Events(Resource):
             if not found and time.monotonic() - sent_at >= KEEP_ALIVE_S:
                 self.write(": still here\n\n")
             if self._write_buffer:
-                await asyncio.wait_for(self.flush(), WRITE_TIMEOUT_S)
+                await self.flush_within(WRITE_TIMEOUT_S)
                 sent_at = time.monotonic()
             if not found and await self.pause(POLL_S):
                 return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
+from marey_server.errors import StorageFull
 from marey_server.services import Services
 from marey_server.store.blobs import Spool
 
@@ -36,4 +37,7 @@ class Receiver:
 
     async def _flush(self) -> None:
         batch, self._pending = bytes(self._pending), bytearray()
-        await asyncio.wrap_future(self._services.submit(self.spool.write, batch))
+        try:
+            await asyncio.wrap_future(self._services.submit(self.spool.write, batch))
+        except OSError as error:
+            raise StorageFull(f"There is no room to take this in: {error.strerror}.") from error

@@ -27,47 +27,35 @@ from typing import Any, ClassVar, Concatenate, ParamSpec, TypeVar
 from urllib.parse import urlencode
 
 from pydantic import BaseModel
-from tornado.web import HTTPError, RequestHandler, stream_request_body
+from tornado.web import stream_request_body
 
 from marey_server.access.principal import ANONYMOUS, Principal
-from marey_server.errors import BadRequest, MareyError, MethodNotAllowed, TooLarge
-from marey_server.handlers import negotiation, problem
+from marey_server.errors import BadRequest, MareyError, TooLarge
+from marey_server.handlers import negotiation
 from marey_server.handlers.calls import Call, Caller, only_identify, require_access, run_call, run_plain
 from marey_server.handlers.declarations import Bytes, Declared, Document, Operation
 from marey_server.handlers.etags import ANY_STATE, Precondition, write_precondition
-from marey_server.handlers.reply import API, Form, Rendered, Reply, render
+from marey_server.handlers.exchange import Exchange
+from marey_server.handlers.reply import Form, Rendered, Reply, render
 from marey_server.handlers.validation import decode_body, parse_query, validate_body
-from marey_server.observe import request_id
-from marey_server.services import Services
 from marey_server.store.database import Transaction
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-LINGER_BYTES = 64 * 2**20
-"""How much of a refused body is read and thrown away, so that its sender gets to read why."""
 INLINE_BYTES = 32 * 1024
 """Bodies and answers up to this size are converted on the event loop; larger ones in a thread."""
 EARLY_CHECK_BYTES = 1024 * 1024
 """Before a larger body is taken in, the credential is looked up."""
 _METHODS = ("get", "post", "put", "patch", "delete")
 _KEY = re.compile(r"[\x21-\x7e]{1,255}")
-_SECURITY_HEADERS = {
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
-    "Cross-Origin-Resource-Policy": "same-origin",
-}
 
 
 @stream_request_body
-class Resource(RequestHandler):
+class Resource(Exchange):
     """A thing with a path and declared methods."""
 
-    path: ClassVar[str]
     tag: ClassVar[str]
-    root: ClassVar[str] = API
-    operations: ClassVar[dict[str, Operation]] = {}
 
     operation: Operation
     caller: Caller
@@ -81,24 +69,10 @@ class Resource(RequestHandler):
         if "get" in methods:
             cls.head = cls.get
 
-    @classmethod
-    def template(cls) -> str:
-        """The template of the address, as in `/api/v1/projects/{project}`."""
-        return cls.root + cls.path.replace(":int}", "}")
-
     def initialize(self) -> None:
         """Set up the state of one request."""
-        self.request_id = request_id(self.request.headers.get("X-Request-Id"))
-        self.set_header("X-Request-Id", self.request_id)
+        super().initialize()
         self._received = bytearray()
-        self.received_bytes = 0
-        self._refused = self._performing = self._gone = False
-
-    @property
-    def services(self) -> Services:
-        """What the server holds."""
-        services: Services = self.application.services  # type: ignore[attr-defined]
-        return services
 
     @property
     def principal(self) -> Principal | None:
@@ -146,6 +120,12 @@ class Resource(RequestHandler):
         """What `function` returns, computed in a thread away from the event loop."""
         return await asyncio.wrap_future(self.services.submit(function, *args, **kwargs))
 
+    def on_finish(self) -> None:
+        """The answer is on its way."""
+        super().on_finish()
+        if self.principal is not None:
+            self.services.note_use(self.principal)
+
     async def pause(self, seconds: float) -> bool:
         """Wait; return at once, with True, when the server is stopping."""
         try:
@@ -153,10 +133,6 @@ class Resource(RequestHandler):
         except TimeoutError:
             return False
         return True
-
-    def is_awaited(self) -> bool:
-        """Whether an answer still has somebody to go to, and the server time to make one."""
-        return not self._gone and not self.services.draining.is_set()
 
     @property
     def answer_form(self) -> Form:
@@ -200,13 +176,13 @@ class Resource(RequestHandler):
             elif self.declared_length() > EARLY_CHECK_BYTES:
                 await self.look_up(only_identify)
         except MareyError as error:
-            await self._refuse(error)
+            await self.refuse(error)
 
     def _check_head(self) -> None:
         method = "GET" if self.request.method == "HEAD" else self.request.method
         operation = self.operations.get(method or "")
         if operation is None:
-            raise self._method_not_allowed()
+            raise self.method_not_allowed()
         self.operation = operation
         headers = self.request.headers
         offers = self._offers(operation)
@@ -226,10 +202,6 @@ class Resource(RequestHandler):
             write_precondition(None, None, may_create=True)
         self._check_body_head(operation)
 
-    def _method_not_allowed(self) -> MethodNotAllowed:
-        allowed = ", ".join(sorted({*self.operations, *(["HEAD"] if "GET" in self.operations else [])}))
-        return MethodNotAllowed(f"Here one can {allowed}.", headers={"Allow": allowed})
-
     def _offers(self, operation: Operation) -> tuple[negotiation.MediaType, ...]:
         if operation.answer_types:
             return tuple(negotiation.MediaType(name, "bytes") for name in operation.answer_types)
@@ -240,20 +212,12 @@ class Resource(RequestHandler):
     def _check_body_head(self, operation: Operation) -> None:
         body = operation.body
         negotiation.require_plain_encoding(self.request.headers.get("Content-Encoding"))
-        if body is None or not self._expects_body():
+        if body is None or not self.expects_body():
             return
         if self.declared_length() > body.max_bytes:
             raise TooLarge(f"The body has {self.declared_length()} bytes; at most {body.max_bytes} are taken here.")
         if body.content is not Bytes and not body.streamed:
             self.body_type = negotiation.body_type(self.request.headers.get("Content-Type"))
-
-    def declared_length(self) -> int:
-        """The length of the body as its sender says; 0 where it does not."""
-        text = self.request.headers.get("Content-Length", "0")
-        return int(text) if text.isdigit() else 0
-
-    def _expects_body(self) -> bool:
-        return self.declared_length() > 0 or "Transfer-Encoding" in self.request.headers
 
     @property
     def path_variables(self) -> dict[str, Any]:
@@ -264,9 +228,8 @@ class Resource(RequestHandler):
     async def data_received(self, chunk: bytes) -> None:
         """Take a piece of the body in, or throw it away where the request was refused already."""
         self.received_bytes += len(chunk)
-        if self._refused:
-            if self.received_bytes > LINGER_BYTES:
-                self.request.connection.close()  # type: ignore[union-attr]
+        if self.refused:
+            self.drop()
             return
         body = self.operation.body
         try:
@@ -278,22 +241,13 @@ class Resource(RequestHandler):
             else:
                 self._received += chunk
         except MareyError as error:
-            await self._refuse(error)
-
-    async def _refuse(self, error: MareyError) -> None:
-        """Answer before the body is read. The rest of it is read and dropped: closing at once could lose the answer."""
-        self._refused = True
-        self._write_problem(error)
-        if self.request.headers.get("Expect", "").lower() == "100-continue":
-            self.finish()
-        elif self._expects_body():
-            await self.flush()
+            await self.refuse(error)
 
     async def perform(self, method: Callable[..., Awaitable[Reply | Rendered | None]]) -> None:
         """Run a declared method and send what it answers."""
-        if self._refused:
+        if self.refused:
             return
-        self._performing = True
+        self.performing = True
         arguments = self.path_variables
         if self.query is not None:
             arguments["query"] = self.query
@@ -319,15 +273,6 @@ class Resource(RequestHandler):
         read = partial(_decode, data, self.body_type, body.content)
         return read() if len(data) <= INLINE_BYTES else await self.compute(read)
 
-    def send(self, rendered: Rendered) -> None:
-        """Put status, headers and body of an answer into the response."""
-        self.set_status(rendered.status)
-        for name, value in rendered.headers.items():
-            self.set_header(name, value)
-        if rendered.status not in (204, 304):
-            self.set_header("Content-Length", str(len(rendered.body)))
-            self.write(rendered.body)
-
     # -- idempotency --------------------------------------------------------------------------------------------------
 
     def _idempotency_key(self) -> str | None:
@@ -343,62 +288,6 @@ class Resource(RequestHandler):
         digest.update(self.request.headers.get("Content-Type", "").encode() + b"\n")
         digest.update(self._received)
         return f"sha256:{digest.hexdigest()}"
-
-    async def _undeclared(self, **_path: str) -> None:
-        """Methods without a declaration are refused before they are called."""
-
-    get: Declared = _undeclared
-    head: Declared = _undeclared
-    post: Declared = _undeclared
-    put: Declared = _undeclared
-    patch: Declared = _undeclared
-    delete: Declared = _undeclared
-    options: Declared = _undeclared
-
-    # -- what Tornado asks for ----------------------------------------------------------------------------------------
-
-    def set_default_headers(self) -> None:
-        """Headers of every answer."""
-        self.clear_header("Server")
-        for name, value in _SECURITY_HEADERS.items():
-            self.set_header(name, value)
-
-    def compute_etag(self) -> None:
-        """No tag from the bytes of an answer: tags name states, and hashing an answer costs more than sending it."""
-
-    def write_error(self, status_code: int, **kwargs: Any) -> None:
-        """Any error as a problem document; details of our own faults stay in the log."""
-        if self._headers_written:  # part of an answer is out: only a cut connection says that it is not whole
-            self.request.connection.close()  # type: ignore[union-attr]
-            return
-        exc_info = kwargs.get("exc_info")
-        error = exc_info[1] if exc_info else HTTPError(status_code)
-        if isinstance(error, HTTPError) and error.status_code == 405:  # a method that Tornado itself does not know
-            error = self._method_not_allowed()
-        self.set_header("X-Request-Id", self.request_id)
-        self._write_problem(error)
-        if not self._finished:
-            self.finish()
-
-    def _write_problem(self, error: BaseException) -> None:
-        self.send(problem.render(error, self.request_id))
-
-    def log_exception(self, _type: Any, value: Any, _traceback: Any) -> None:
-        """Faults of ours are logged with their traceback, refusals are not faults."""
-        problem.log_fault(value, self.request_id, self.request.method or "", self.template())
-
-    def on_finish(self) -> None:
-        """The answer is on its way."""
-        if self.principal is not None:
-            self.services.note_use(self.principal)
-        self.services.in_flight.discard(self)
-
-    def on_connection_close(self) -> None:
-        """The caller has gone."""
-        super().on_connection_close()
-        self._gone = True
-        if not self._performing:  # a method that runs ends by itself, and a draining server waits for it
-            self.services.in_flight.discard(self)
 
 
 def _decode(data: bytes, media_type: str, content: Any) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import base64
 from dataclasses import dataclass
 from urllib.parse import quote
@@ -76,7 +75,7 @@ class BlobSender(Resource):
             return
         position = opened.start + len(first.body)
         while position < opened.stop:
-            await asyncio.wait_for(self.flush(), WRITE_TIMEOUT_S)
+            await self.flush_within(WRITE_TIMEOUT_S)
             stop = min(opened.stop, position + PIECE_BYTES)
             piece = await self.look_up(blobs.read_range, digest, position, stop)
             if len(piece) != stop - position:

@@ -1,0 +1,28 @@
+"""How often sign-in may be tried."""
+
+import pytest
+
+from marey_server.access.limits import REMEMBERED, TryLimit
+from marey_server.errors import TooManyRequests
+
+
+def test_tries_are_limited_by_key_and_come_back_with_time():
+    now = [0.0]
+    limit = TryLimit(3, clock=lambda: now[0])
+    for _ in range(3):
+        limit.take("ann")
+    with pytest.raises(TooManyRequests) as refusal:
+        limit.take("ann")
+    assert refusal.value.headers["Retry-After"] == "20"
+    limit.take("ben")
+    now[0] += 20
+    limit.take("ann")
+    with pytest.raises(TooManyRequests):
+        limit.take("ann")
+
+
+def test_guesses_at_many_names_do_not_fill_the_memory():
+    limit = TryLimit(1)
+    for number in range(REMEMBERED + 100):
+        limit.take(str(number))
+    assert len(limit._buckets) == REMEMBERED

@@ -1,0 +1,84 @@
+"""The published description against the routes it describes."""
+
+import json
+import re
+
+import pytest
+
+from marey_schemas.codecs import MEDIA_TYPES
+from marey_server.docs_page import render_page
+from marey_server.handlers.catalogue import RESOURCES
+from marey_server.handlers.routes import RouteTable
+from marey_server.openapi import build_document
+
+ROUTES = list(RouteTable(None, RESOURCES))
+DOCUMENT = build_document(ROUTES, "1.2.3")
+OPERATIONS = [
+    (path, method, operation)
+    for path, entry in DOCUMENT["paths"].items()
+    for method, operation in entry.items()
+    if method != "parameters"
+]
+
+
+def test_every_route_is_described_once_and_nothing_else_is():
+    described = {(path, method.upper()) for path, method, _ in OPERATIONS}
+    assert described == {(route.template, route.operation.method) for route in ROUTES}
+    names = [operation["operationId"] for _, _, operation in OPERATIONS]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize(("path", "operation"), [(path, operation) for path, _, operation in OPERATIONS])
+def test_an_operation_says_what_it_does_who_may_and_what_can_go_wrong(path, operation):
+    assert operation["summary"]
+    assert operation["x-access"]
+    assert "default" in operation["responses"]
+    success = [status for status in operation["responses"] if status.startswith("2")]
+    assert success
+    if operation["x-access"] not in ("anyone",):
+        assert {"401", "403", "404"} <= operation["responses"].keys()
+    variables = set(re.findall(r"\{(\w+)\}", path))
+    assert {parameter["name"] for parameter in DOCUMENT["paths"][path]["parameters"]} == variables
+
+
+def test_models_are_offered_in_every_form():
+    content = DOCUMENT["paths"]["/api/v1/projects/{project}"]["get"]["responses"]["200"]["content"]
+    assert set(content) == set(MEDIA_TYPES)
+    part = DOCUMENT["paths"]["/api/v1/projects/{project}/{kind}/{item}/parts/{part}"]["get"]["responses"]["200"]
+    assert "application/msgpack; arrays=blocks" in part["content"]
+
+
+def test_preconditions_and_keys_are_parameters():
+    patch = DOCUMENT["paths"]["/api/v1/projects/{project}"]["patch"]["parameters"]
+    assert {parameter["name"]: parameter["required"] for parameter in patch} == {"If-Match": True}
+    post = DOCUMENT["paths"]["/api/v1/projects"]["post"]["parameters"]
+    assert [parameter["name"] for parameter in post] == ["Idempotency-Key"]
+
+
+def test_every_reference_leads_somewhere():
+    references = set(re.findall(r'"#/components/(\w+)/([^"]+)"', json.dumps(DOCUMENT)))
+    assert references
+    for section, name in references:
+        assert name in DOCUMENT["components"][section]
+
+
+def test_lists_that_can_show_some_fields_are_described_so():
+    schema = DOCUMENT["paths"]["/api/v1/projects/{project}/{kind}"]["get"]["responses"]["200"]["content"]
+    element = schema["application/json"]["schema"]["properties"]["items"]["items"]["$ref"].rpartition("/")[2]
+    assert "required" not in DOCUMENT["components"]["schemas"][element]
+
+
+def test_the_page_shows_every_operation_and_asks_nobody_else():
+    page = render_page(DOCUMENT).decode()
+    for path, _, operation in OPERATIONS:
+        assert path in page
+        assert f"id='{operation['operationId']}'" in page
+    assert "http://" not in page
+    assert "https://" not in page
+    assert "<script" not in page
+    assert "id='problem-precondition-required'" in page
+
+
+def test_no_two_resources_share_an_address():
+    with pytest.raises(ValueError, match="twice"):
+        RouteTable(None, [*RESOURCES, RESOURCES[0]])

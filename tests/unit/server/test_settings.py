@@ -1,0 +1,29 @@
+"""Where settings come from."""
+
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from marey_server.settings import Settings
+
+
+def test_flags_win_over_variables_and_variables_over_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "marey.toml").write_text('port = 1111\nhost = "10.0.0.1"\nlog_level = "error"\n')
+    monkeypatch.setenv("MAREY_HOST", "10.0.0.2")
+    monkeypatch.setenv("MAREY_LOG_LEVEL", "warning")
+    chosen = Settings(log_level="debug")
+    assert (chosen.port, chosen.host, chosen.log_level) == (1111, "10.0.0.2", "debug")
+
+
+def test_a_misspelt_setting_in_the_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "marey.toml").write_text("prot = 1111\n")
+    with pytest.raises(ValidationError, match="prot"):
+        Settings()
+
+
+def test_every_setting_is_documented():
+    undocumented = {name for name, field in Settings.model_fields.items() if not field.description}
+    assert undocumented <= {"log_level"}

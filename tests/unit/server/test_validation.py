@@ -1,0 +1,99 @@
+"""Query parameters and bodies against their models."""
+
+import json
+
+import numpy as np
+import pytest
+from pydantic import Field
+
+from marey_schemas.access import ProjectCreate
+from marey_schemas.items import ItemCreate, UploadCreate
+from marey_schemas.jobs import JobCreate
+from marey_server.errors import BadRequest, Invalid
+from marey_server.handlers.queries import CommaSeparated, PageQuery
+from marey_server.handlers.validation import decode_body, json_pointer, parse_query, validate_body
+
+
+class Query(PageQuery):
+    """A query for tests."""
+
+    tag_in: CommaSeparated = Field((), alias="tag.in")
+
+
+def pointers(refusal) -> set[str]:
+    return {error.pointer for error in refusal.value.errors}
+
+
+def test_parameters_are_read_by_the_names_they_have_in_addresses():
+    query = parse_query(Query, {"limit": [b"7"], "tag.in": [b"a,b"]})
+    assert (query.limit, query.tag_in) == (7, ("a", "b"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wrong"),
+    [
+        ({"colour": [b"red"]}, {"colour"}),
+        ({"tag_in": [b"a"]}, {"tag_in"}),
+        ({"limit": [b"1", b"2"]}, {"limit"}),
+        ({"limit": [b"0"], "cursor": [b"a b"]}, {"limit", "cursor"}),
+        ({"cursor": [b"\xff"]}, {"cursor"}),
+        ({"cursor": [b"a\x00"]}, {"cursor"}),
+        ({"tag.in": [b"," * 300]}, {"tag.in"}),
+    ],
+)
+def test_each_wrong_parameter_is_named(arguments, wrong):
+    with pytest.raises(BadRequest) as refusal:
+        parse_query(Query, arguments)
+    assert pointers(refusal) == wrong
+
+
+def test_where_nothing_can_be_asked_every_parameter_is_unknown():
+    assert parse_query(None, {}) is None
+    with pytest.raises(BadRequest):
+        parse_query(None, {"limit": [b"1"]})
+
+
+def test_a_body_that_is_no_document_is_a_bad_request_and_one_that_may_not_travel_is_invalid():
+    with pytest.raises(BadRequest):
+        decode_body(b"{", "application/json")
+    with pytest.raises(BadRequest):
+        decode_body(b"\xff", "application/bson")
+    with pytest.raises((BadRequest, Invalid)):
+        decode_body(b'{"a": NaN}', "application/json")
+
+
+def test_a_whole_number_is_an_integer_however_it_is_spelt():
+    assert validate_body(UploadCreate, json.loads('{"length": 5.0}')).length == 5
+    for spelling in ("5", True, 5.5, None):
+        with pytest.raises(Invalid):
+            validate_body(UploadCreate, {"length": spelling})
+
+
+def test_faults_point_into_the_body_even_inside_alternatives():
+    with pytest.raises(Invalid) as refusal:
+        validate_body(JobCreate, {"kind": "x", "inputs": {"clips": [{"item": "a", "revision": 0}]}, "priority": 1000})
+    assert "/priority" in pointers(refusal)
+    assert any(pointer.startswith("/inputs/clips") for pointer in pointers(refusal))
+    assert not any("ItemInput" in pointer for pointer in pointers(refusal))
+
+
+def test_a_missing_field_is_pointed_at_where_it_should_be():
+    with pytest.raises(Invalid) as refusal:
+        validate_body(ProjectCreate, {})
+    assert pointers(refusal) == {"/name"}
+
+
+def test_arrays_pass_through_untouched():
+    array = np.zeros((2, 3), "<f4")
+    made = validate_body(ItemCreate, {"name": "n", "parts": {"motion": {"poses": array}}})
+    assert made.parts["motion"]["poses"] is array
+
+
+def test_nul_is_found_however_deep():
+    with pytest.raises(Invalid) as refusal:
+        validate_body(ItemCreate, {"name": "n", "parts": {"a/b": {"c": ["ok", "no\0"]}}})
+    assert pointers(refusal) == {"/parts/a~1b/c/1"}
+
+
+def test_pointers_escape_as_rfc_6901_says():
+    assert json_pointer(["a/b", "m~n", "0"]) == "/a~1b/m~0n/0"
