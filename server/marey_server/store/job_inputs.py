@@ -24,7 +24,9 @@ Pin = dict[str, Any]
 PinnedInputs = dict[str, list[Pin]]
 
 
-class _Found(NamedTuple):
+class FoundItem(NamedTuple):
+    """An item as it stands."""
+
     id: str
     kind: str
     name: str
@@ -32,17 +34,33 @@ class _Found(NamedTuple):
     path: str
 
 
+def find_items(tx: Transaction, project: ProjectRow, requests: Iterable[JobCreate]) -> dict[str, FoundItem]:
+    """Those items of the project that the requests name one by one, by id."""
+    choices = (choice for request in requests for many in request.inputs.values() for choice in _as_many(many))
+    wanted = sorted({choice.item for choice in choices if isinstance(choice, ItemInput)})
+    rows = [
+        FoundItem(row.id, row.kind, row.name, row.head, row.path)
+        for start in range(0, len(wanted), IN_LIST)
+        for row in tx.execute(_items(project).where(item.c.id.in_(wanted[start : start + IN_LIST])))
+    ]
+    return {row.id: row for row in rows}
+
+
 def pin_inputs(
-    tx: Transaction, project: ProjectRow, kind: KindDeclaration, request: JobCreate, at: str = ""
+    tx: Transaction,
+    project: ProjectRow,
+    kind: KindDeclaration,
+    request: JobCreate,
+    known: dict[str, FoundItem],
+    at: str = "",
 ) -> PinnedInputs:
     """Every input with the revision it has now, or had when it was named; collections become their items.
 
+    `known` holds what `find_items` found of the request's items.
     Raises `Invalid`, with a pointer below `at` for each thing that is wrong: an input the kind does not have or lacks,
     an item or revision that is not in the project, an item of another kind, a collection that holds none.
     """
     errors = _misnamed(kind, request, at)
-    named = [choice for choices in request.inputs.values() for choice in _as_many(choices)]
-    known = _find_items(tx, project, [choice.item for choice in named if isinstance(choice, ItemInput)])
     pins: PinnedInputs = {}
     for name, choices in request.inputs.items():
         spec = kind.inputs.get(name)
@@ -84,7 +102,7 @@ def _pin_input(
     spec: InputSpec,
     choices: Any,
     pointer: str,
-    known: dict[str, _Found],
+    known: dict[str, FoundItem],
     errors: list[FieldError],
 ) -> list[Pin]:
     single = not isinstance(choices, tuple)
@@ -111,30 +129,20 @@ def _pin_input(
     return list(pins.values())
 
 
-def _pin(found: _Found, number: int) -> Pin:
+def _pin(found: FoundItem, number: int) -> Pin:
     return {"item": found.id, "revision": number, "kind": found.kind, "name": found.name, "collection": found.path}
 
 
 # -- looking up -------------------------------------------------------------------------------------------------------
 
 
-def _find_items(tx: Transaction, project: ProjectRow, ids: Iterable[str]) -> dict[str, _Found]:
-    wanted = sorted(set(ids))
-    rows = [
-        _Found(row.id, row.kind, row.name, row.head, row.path)
-        for start in range(0, len(wanted), IN_LIST)
-        for row in tx.execute(_items(project).where(item.c.id.in_(wanted[start : start + IN_LIST])))
-    ]
-    return {row.id: row for row in rows}
-
-
-def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: str) -> list[_Found]:
+def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: str) -> list[FoundItem]:
     """The items of the input's kind in a collection and below it, by place and name."""
     statement = _items(project).where(item.c.kind == spec.kind.value).limit(MOST_INPUTS + 1)
     if path:
         statement = statement.where(_within(path))
     rows = tx.execute(statement.order_by(collection.c.path, item.c.name, item.c.id))
-    return [_Found(row.id, row.kind, row.name, row.head, row.path) for row in rows]
+    return [FoundItem(row.id, row.kind, row.name, row.head, row.path) for row in rows]
 
 
 def _within(path: str) -> ColumnElement[bool]:
@@ -151,7 +159,7 @@ def _items(project: ProjectRow) -> Select[Any]:
     )
 
 
-def _missing_revisions(request: JobCreate, known: dict[str, _Found], at: str) -> list[FieldError]:
+def _missing_revisions(request: JobCreate, known: dict[str, FoundItem], at: str) -> list[FieldError]:
     """Revisions that were named by number and do not exist."""
     asked: list[tuple[str, ItemInput]] = []
     for name, choices in request.inputs.items():

@@ -21,7 +21,7 @@ from marey_server.store.ids import new_id
 from marey_server.store.job_documents import job_documents
 from marey_server.store.job_ends import Ended, dependency_failure
 from marey_server.store.job_events import emit_job_events, wake_workers
-from marey_server.store.job_inputs import PinnedInputs, pin_inputs
+from marey_server.store.job_inputs import FoundItem, PinnedInputs, find_items, pin_inputs
 from marey_server.store.labels import labels_key
 from marey_server.store.projects import ProjectRow, require
 from marey_server.store.settling import settle
@@ -76,7 +76,8 @@ def submit(tx: Transaction, project: str, requests: Sequence[JobCreate]) -> list
     """
     row = require(tx, project, Role.CONTRIBUTOR, "jobs")
     many = len(requests) > 1
-    checked = [_check(tx, row, one, f"/jobs/{index}" if many else "") for index, one in enumerate(requests)]
+    known = find_items(tx, row, requests)
+    checked = [_check(tx, row, one, known, f"/jobs/{index}" if many else "") for index, one in enumerate(requests)]
     return submit_checked(tx, row, checked)
 
 
@@ -109,7 +110,9 @@ def submit_checked(tx: Transaction, project: ProjectRow, submissions: Sequence[S
 # -- checking ---------------------------------------------------------------------------------------------------------
 
 
-def _check(tx: Transaction, project: ProjectRow, request: JobCreate, at: str) -> Submission:
+def _check(
+    tx: Transaction, project: ProjectRow, request: JobCreate, known: dict[str, FoundItem], at: str
+) -> Submission:
     try:
         kind = find_kind(request.kind)
     except UnknownKindError as error:
@@ -123,7 +126,7 @@ def _check(tx: Transaction, project: ProjectRow, request: JobCreate, at: str) ->
         ]
         detail = f"These are no parameters of {kind.name}: {found[0].pointer}: {found[0].detail}"
         raise Invalid(detail, errors=found) from error
-    pins = pin_inputs(tx, project, kind, request, at)
+    pins = pin_inputs(tx, project, kind, request, known, at)
     return Submission(kind, request, params, pins, labels_key(request.labels), pointer=at)
 
 
