@@ -122,8 +122,8 @@ class Motion(Request):
             raise ValueError(
                 f"translations: shape {self.translations.shape}, expected {(frames, len(self.translated_joints), 3)}"
             )
-        if unknown := set(self.translated_joints) - set(self.joints[1:]):
-            raise ValueError(f"translated_joints: {sorted(unknown)} are no joints below the root")
+        if unknown := set(self.translated_joints) - set(self.joints):
+            raise ValueError(f"translated_joints: {sorted(unknown)} are none of the joints")
         return self
 
 

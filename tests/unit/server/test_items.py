@@ -387,6 +387,8 @@ def test_a_motion_names_a_skeleton_of_the_project_with_its_joints(lab, rig, data
     assert refused(lab, Kind.CLIP, {"motion": motion_tree({"item": rig.id, "revision": 2})})
     assert refused(lab, Kind.CLIP, {"motion": motion_tree({"output": "other"})})
     assert refused(lab, Kind.CLIP, {"motion": motion_tree(rig, joints=2)}).error_code == "wrong-joints"
+    moved_root = motion_tree(rig) | {"translations": np.zeros((5, 1, 3), "<f4"), "translated_joints": ["j0"]}
+    assert refused(lab, Kind.CLIP, {"motion": moved_root}).error_code == "root-translated"
     from store_fixtures import Lab
 
     elsewhere = Lab(database, "elsewhere").add_skeleton()

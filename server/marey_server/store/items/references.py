@@ -84,6 +84,9 @@ class ReferenceCheck:
             odd = sorted(set(known) ^ set(motion["joints"]))[:5]
             detail = f"The joints of the motion and of its skeleton differ: {', '.join(odd) or 'a name stands twice'}."
             raise _invalid("/motion/joints", "wrong-joints", detail)
+        if known[0] in motion.get("translated_joints", ()):
+            detail = f"The root {known[0]!r} has its translation in the poses already."
+            raise _invalid("/motion/translated_joints", "root-translated", detail)
 
     def _require_frames(self, annotation: Tree) -> None:
         frames = self._referred(annotation["clip"], Kind.CLIP, "motion", "/annotation/clip")["poses"]["shape"][0]
