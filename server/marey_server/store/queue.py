@@ -11,7 +11,6 @@ from sqlalchemy import (
     ColumnElement,
     FromClause,
     Row,
-    Select,
     and_,
     bindparam,
     cast,
@@ -150,7 +149,7 @@ def _pick(restriction: _Restriction) -> CTE:
             candidate.c.run_at_us <= bindparam("now_us", type_=BigInteger),
             candidate.c.kind.in_(bindparam("kinds", expanding=True)),
             candidate.c.labels_key.in_(bindparam("label_keys", expanding=True)),
-            candidate.c.project_id.in_(_workable_projects(restriction)),
+            _is_workable(candidate, restriction),
         ]
         if restriction.one_job:
             conditions.append(candidate.c.id == bindparam("one_job"))
@@ -180,16 +179,19 @@ def _pick_order(row: Row[Any]) -> tuple[Any, ...]:
     return -row.priority, row.run_at_us, row.id
 
 
-def _workable_projects(restriction: _Restriction) -> Select[Any]:
-    """Projects whose work the caller may do: a worker reads what a project holds and writes in its name."""
-    projects = select(project.c.id).where(project.c.deleted_us.is_(None))
+def _is_workable(candidate: FromClause, restriction: _Restriction) -> ColumnElement[bool]:
+    """The caller may do the work of the job's project: a worker reads what a project holds and writes in its name.
+
+    Asked row by row, so that no plan begins with the projects instead of the pick order.
+    """
+    conditions = [project.c.id == candidate.c.project_id, project.c.deleted_us.is_(None)]
     if restriction.named_projects:
-        projects = projects.where(project.c.name.in_(bindparam("project_names", expanding=True)))
+        conditions.append(project.c.name.in_(bindparam("project_names", expanding=True)))
     if restriction.own_projects:
         roles = (Role.MAINTAINER.value, Role.OWNER.value)
-        mine = select(member.c.project_id).where(member.c.user_id == bindparam("user"), member.c.role.in_(roles))
-        projects = projects.where(project.c.id.in_(mine))
-    return projects
+        mine = (member.c.project_id == project.c.id, member.c.user_id == bindparam("user"), member.c.role.in_(roles))
+        conditions.append(exists().where(*mine))
+    return exists().where(*conditions)
 
 
 class _Restriction(NamedTuple):

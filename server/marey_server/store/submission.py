@@ -224,7 +224,7 @@ def _fan_out(head: _NewJob, batches: Sequence[Any]) -> list[_NewJob]:
 
 def _set_cache_keys(tx: Transaction, jobs: Sequence[_NewJob]) -> None:
     cached = [one for one in jobs if one.submission.kind.deterministic and one.cache_mode != "off"]
-    parts = job_cache.part_digests(tx, [one.submission.pins for one in cached])
+    parts = job_cache.part_digests(tx, {id(one.submission): one.submission.pins for one in cached}.values())
     for one in cached:
         submission = one.submission
         contents = job_cache.input_contents(one.pins, parts)
