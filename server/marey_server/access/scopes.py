@@ -11,6 +11,11 @@ def allows(scopes: Iterable[str], need: str, project: str | None = None) -> bool
     return not wanted.isdisjoint(scopes)
 
 
+def reaches_somewhere(scopes: Iterable[str], need: str) -> bool:
+    """Whether `scopes` reach `need` in all projects or in some."""
+    return any(scope.partition("!")[0] == need for scope in scopes)
+
+
 def exceeding(wanted: Iterable[str], held: Iterable[str]) -> list[str]:
     """Those of `wanted` that reach further than `held` does."""
     held = set(held)

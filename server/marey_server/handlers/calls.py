@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from marey_server.access import scopes
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.errors import Forbidden, Unauthenticated
 from marey_server.handlers.declarations import Access, Operation
@@ -53,15 +54,10 @@ def require_access(operation: Operation, principal: Principal) -> None:
         return
     if access is Access.ADMINISTRATOR and not principal.administrator:
         raise Forbidden("Only administrators may do this.", code="administrators-only")
-    if operation.scope is not None and not holds_scope(principal, operation.scope):
+    if operation.scope is not None and not scopes.reaches_somewhere(principal.scopes, operation.scope):
         raise Forbidden(
             f"The token lacks the scope {operation.scope!r}.", code="scope-missing", context={"scope": operation.scope}
         )
-
-
-def holds_scope(principal: Principal, scope: str) -> bool:
-    """Whether a credential holds a scope, for all projects or for some."""
-    return any(held.partition("!")[0] == scope for held in principal.scopes)
 
 
 @dataclass(frozen=True)

@@ -121,7 +121,8 @@ def reads(
     """Declare a method that changes nothing.
 
     `answer` is what one answer holds, or with `paged` one element of a page; `answer_types` are the media types where
-    they are not those of models and documents. `public=False`: guests of a public project may not.
+    they are not those of models and documents. `stream`: it also comes as server-sent events. `public=False`: guests of
+    a public project may not. `also` are further statuses, `headers` further request headers.
     """
     return _declare(
         access=access, scope=scope, query=query, answer=answer, paged=paged, etag=etag, status=status,
