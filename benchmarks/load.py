@@ -7,7 +7,7 @@ import secrets
 import statistics
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -33,6 +33,11 @@ class Load:
 
     seconds: float
     latencies_s: list[float]
+
+    @classmethod
+    def joined(cls, loads: Sequence[Load]) -> Load:
+        """Several of the same kind as one."""
+        return cls(sum(one.seconds for one in loads), [latency for one in loads for latency in one.latencies_s])
 
     @property
     def per_second(self) -> float:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
+import psutil
 
 from benchmarks.material import noisy_clip
 from marey_client import Marey
@@ -49,6 +50,11 @@ class LocalServer:
         """The administrator's."""
         return (self.data / "admin.token").read_text().strip()
 
+    def processor_s(self) -> float:
+        """Processor time it has used so far, seconds."""
+        times = psutil.Process(self.pid).cpu_times()
+        return float(times.user + times.system)
+
     def client(self) -> Marey:
         """An administrator's client."""
         return Marey(self.url, self.token)
@@ -68,7 +74,7 @@ def local_server(prepare: Callable[[Path], None] | None = None) -> Iterator[Loca
 @contextmanager
 def running(data: Path) -> Iterator[LocalServer]:
     """Run a server over a data folder while the block runs."""
-    port = _free_port()
+    port = free_port()
     with Path(data.parent, "server.log").open("ab") as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "marey_client.cli", "serve", "--workers", "0"],
@@ -104,7 +110,8 @@ def _wait_until_ready(server: LocalServer, process: subprocess.Popen[bytes]) -> 
     raise RuntimeError(f"the server did not start:\n{Path(server.data.parent, 'server.log').read_text()[-3000:]}")
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A port of this machine that nobody listens on just now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
