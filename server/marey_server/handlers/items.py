@@ -30,7 +30,7 @@ class ItemsQuery(CountedPageQuery):
     frames_lte: int | None = Field(None, alias="frames.lte", ge=0, le=MAX_INTEGER, description="At most so long.")
     q: str | None = Field(None, max_length=255, description="Part of the name, in any case.")
     deleted: bool = Field(False, description="Among the deleted ones.")
-    sort: str = Field("-created_at,id", max_length=100, description="Of id, name, created_at, updated_at, frames.")
+    sort: str = Field("-created_at", max_length=100, description="Of id, name, created_at, updated_at, frames.")
     fields: CommaSeparated | None = Field(None, description="Only these members of each item.")
 
     def filters(self) -> ItemFilters:
