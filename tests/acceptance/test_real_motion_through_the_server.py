@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pymotion.io.bvh import BVH
-from pymotion.rotations import quat_np
 
+from another_loader import positions_by_another_loader
 from marey_client import Marey
 from marey_client.imports import find_files
 from marey_client.motions import ClipHandle
@@ -96,16 +95,3 @@ def positions_of(lab: ProjectHandle, clip: ClipHandle) -> NDArray[np.float32]:
     motion = Motion.model_validate(clip.part("motion"))
     skeleton = lab.skeletons.get(motion.skeleton.model_dump()["item"])
     return global_positions(clip_from_document(motion, skeleton_from_document(skeleton.hierarchy())))
-
-
-def positions_by_another_loader(path: Path) -> NDArray[np.float64]:
-    """(F, J, 3) in the file's unit and axes."""
-    loader = BVH()
-    loader.load(str(path))
-    rotations, positions, parents, *_ = loader.get_data()
-    turned, placed = rotations.copy(), positions.copy()
-    for joint, parent in enumerate(parents):
-        if joint:
-            turned[:, joint] = quat_np.mul(turned[:, parent], rotations[:, joint])
-            placed[:, joint] = placed[:, parent] + quat_np.mul_vec(turned[:, parent], positions[:, joint])
-    return np.asarray(placed)

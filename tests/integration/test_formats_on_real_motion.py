@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pymotion.io.bvh import BVH
-from pymotion.rotations import quat_np
 
+from another_loader import positions_by_another_loader
 from marey_motion.checks import CODES
 from marey_motion.errors import AmbiguousUnits, FormatError, MotionError
 from marey_motion.formats import ImportedMotion, pair_companions, read_motion, write_bvh
@@ -135,27 +134,14 @@ def test_written_bvh_puts_every_joint_where_another_loader_saw_it_in_the_origina
         assert motion.clip is not None
         path = tmp_path / "written.bvh"
         path.write_bytes(write_bvh(motion.clip, source=motion.source))
-        written = _positions_by_another_loader(path) * 0.01
+        written = positions_by_another_loader(path) * 0.01
         assert np.abs(written - global_positions(motion.clip)).max() < 1e-4, name
         if name in DISPLACED or name == "torture/Boxing_Toes.bvh":
             continue  # the other loader folds the first two and stops at the declared frames of the third
-        original = _positions_by_another_loader(collection.folder / name) * motion.source.unit_scale_m
+        original = positions_by_another_loader(collection.folder / name) * motion.source.unit_scale_m
         if motion.source.up_axis == "z":
             original = original[..., [0, 2, 1]] * [1, 1, -1]
         assert np.abs(written - original).max() < 1e-4, name
-
-
-def _positions_by_another_loader(path: Path) -> NDArray[np.float64]:
-    """(F, J, 3) in the file's unit and axes."""
-    loader = BVH()
-    loader.load(str(path))
-    rotations, positions, parents, *_ = loader.get_data()
-    turned, placed = rotations.copy(), positions.copy()
-    for joint, parent in enumerate(parents):
-        if joint:
-            turned[:, joint] = quat_np.mul(turned[:, parent], rotations[:, joint])
-            placed[:, joint] = placed[:, parent] + quat_np.mul_vec(turned[:, parent], positions[:, joint])
-    return placed
 
 
 def test_a_take_in_both_formats_is_the_same_take(collection: Collection) -> None:

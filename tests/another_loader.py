@@ -1,0 +1,23 @@
+"""BVH files as an independent reader sees them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pymotion.io.bvh import BVH
+from pymotion.rotations import quat_np
+
+
+def positions_by_another_loader(path: Path) -> NDArray[np.float64]:
+    """(F, J, 3) in the file's unit and axes."""
+    loader = BVH()
+    loader.load(str(path))
+    rotations, positions, parents, *_ = loader.get_data()
+    turned, placed = rotations.copy(), positions.copy()
+    for joint, parent in enumerate(parents):
+        if joint:
+            turned[:, joint] = quat_np.mul(turned[:, parent], rotations[:, joint])
+            placed[:, joint] = placed[:, parent] + quat_np.mul_vec(turned[:, parent], positions[:, joint])
+    return np.asarray(placed)
