@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import bindparam, exists, select, tuple_, update
@@ -51,16 +51,15 @@ def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> li
     """Complete many jobs in one transaction, for the worker that claimed them; each is refused by itself."""
     requests = {(one.job, one.fence): one for one in reversed(completions)}
     own = _claimed_by_caller(tx, requests)
-    staging_jobs = _jobs_with_outputs(tx, own)
-    ended = _complete(tx, {place: requests[place] for place in own if place[0] not in staging_jobs})
+    publishing = {place for place in own if any(staging.named_blobs(requests[place].result))} | _staged(tx, own)
+    ended = _complete(tx, {place: requests[place] for place in own - publishing})
     refused: dict[_Place, MareyError] = {}
-    for place in sorted(own):
-        if place[0] in staging_jobs:
-            try:
-                with tx.connection.begin_nested():
-                    ended |= _complete(tx, {place: requests[place]})
-            except MareyError as error:
-                refused[place] = error
+    for place in sorted(publishing):  # what one of them may not publish must not keep the others from it
+        try:
+            with tx.connection.begin_nested():
+                ended |= _complete(tx, {place: requests[place]})
+        except MareyError as error:
+            refused[place] = error
     settle(tx, [end for end, _ in ended.values()])
     _pass_fault_points(tx)
     answers = {place: answer for place, (_, answer) in ended.items()}
@@ -162,10 +161,11 @@ def _claimed_by_caller(tx: Transaction, places: Iterable[_Place]) -> set[_Place]
     return {(row.job_id, row.fence) for row in tx.execute(statement)}
 
 
-def _jobs_with_outputs(tx: Transaction, places: Iterable[_Place]) -> set[str]:
-    ids = sorted({job_id for job_id, _ in places})
-    statement = select(staged_output.c.job_id).where(staged_output.c.job_id.in_(ids)).distinct()
-    return set(tx.execute(statement).scalars())
+def _staged(tx: Transaction, places: Collection[_Place]) -> set[_Place]:
+    """Those of the attempts that have staged something."""
+    columns = (staged_output.c.job_id, staged_output.c.fence)
+    rows = tx.execute(select(*columns).where(tuple_(*columns).in_(list(places))).distinct())
+    return {(row.job_id, row.fence) for row in rows}
 
 
 def _result(
@@ -173,7 +173,7 @@ def _result(
     one: BatchCompletion,
     answers: Mapping[_Place, CompleteAnswer],
     refused: Mapping[_Place, MareyError],
-    own: Container[_Place],
+    own: Collection[_Place],
 ) -> BatchCompletionResult:
     place = (one.job, one.fence)
     try:

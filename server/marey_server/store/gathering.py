@@ -50,18 +50,16 @@ def combine_results(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
     combined: dict[str, Any] = {}
     for result in results:
         for name, value in result.items():
-            if isinstance(value, bool):
-                continue
-            if isinstance(value, int | float):
-                combined[name] = _as_kind(combined.get(name), 0) + value
-            elif isinstance(value, list | tuple):
-                combined[name] = [*_as_kind(combined.get(name), []), *value][:MOST_GATHERED]
-            elif isinstance(value, dict):
-                combined[name] = combine_results([_as_kind(combined.get(name), {}), value])
-    return combined
+            combined[name] = _combine(combined.get(name), value)
+    return {name: value for name, value in combined.items() if value is not None}
 
 
-def _as_kind(value: Any, empty: Any) -> Any:
-    """What was combined so far, unless an earlier task gave something of another type under the name."""
-    same = isinstance(value, int | float) if empty == 0 else isinstance(value, type(empty))
-    return value if same else empty
+def _combine(known: Any, value: Any) -> Any:
+    """What was combined so far and one more; what does not fit together is left out."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return value + (known if isinstance(known, int | float) else 0)
+    if isinstance(value, list):
+        return [*(known if isinstance(known, list) else []), *value][:MOST_GATHERED]
+    if isinstance(value, dict):
+        return combine_results([known if isinstance(known, dict) else {}, value])
+    return known

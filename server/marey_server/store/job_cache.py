@@ -168,7 +168,13 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")
     own = (job.c.id, job.c.project_id, job.c.kind, job.c.into_path, job.c.author_id, job.c.message, job.c.inputs)
-    shared = (source.c.fence, source.c.result, source.c.code_version, source.c.environment)
+    shared = (
+        source.c.inputs.label("source_inputs"),
+        source.c.fence,
+        source.c.result,
+        source.c.code_version,
+        source.c.environment,
+    )
     row = tx.execute(
         select(*own, source.c.id.label("source_id"), *shared)
         .join(source, source.c.id == job.c.cached_from)
@@ -178,7 +184,7 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     drafts = staging.staged_drafts(tx, [place]).get(place, {})
     if not staging.take_up_documents(tx, drafts):
         return _compute_again(tx, row)
-    outputs = staging.publish_drafts(tx, row, staging.with_inputs(drafts, row.inputs))
+    outputs = staging.publish_drafts(tx, row, staging.with_inputs(drafts, row.source_inputs, row.inputs))
     blobs.keep_for_job(tx, row.id, staging.named_blobs(row.result))
     return end_jobs(
         tx,

@@ -58,7 +58,7 @@ def _announce(tx: Transaction, ended: Sequence[Ended]) -> None:
         emit_job_events(
             tx,
             f"job.{state}",
-            [(end.project_id, end.id, {"failure": end.failure}) for end in ended if end.state == state],
+            [(end.project_id, end.id, end.failure or {}) for end in ended if end.state == state],
         )
     wake_watchers(tx, [end.id for end in ended])
 
@@ -93,20 +93,24 @@ def _waiting(tx: Transaction, ids: Sequence[str]) -> Sequence[Row[Any]]:
 
 
 def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[Ended]]) -> list[Ended]:
-    sharing = [row for row in rows if row.cached_from is not None]
-    others = [row for row in rows if row.cached_from is None]
-    following = _doom(tx, [(row, upstream[row.id]) for row in others if not all(e.succeeded for e in upstream[row.id])])
-    met = [(row, row.dependencies_left - len(upstream[row.id])) for row in others if _all_succeeded(upstream[row.id])]
-    _store_counts(tx, {row.id: left for row, left in met})
-    following += make_ready(tx, [row for row, left in met if left == 0])
-    following += job_cache.share(tx, [row for row in sharing if _all_succeeded(upstream[row.id])])
-    orphans = [row for row in sharing if not _all_succeeded(upstream[row.id])]
+    """Let waiting jobs go on, or end, now that jobs they waited for have ended."""
+    following: list[Ended] = []
+    left: dict[str, int] = {}
+    shared: list[Row[Any]] = []
+    orphans: list[Row[Any]] = []
+    for row in rows:
+        missed = [end for end in upstream[row.id] if not end.succeeded]
+        if row.cached_from is not None:
+            (orphans if missed else shared).append(row)
+        elif missed:
+            following += _doom(tx, row, missed[0])
+        else:
+            left[row.id] = row.dependencies_left - len(upstream[row.id])
+    _store_counts(tx, left)
+    following += make_ready(tx, [row for row in rows if left.get(row.id) == 0])
+    following += job_cache.share(tx, shared)
     _stop_sharing(tx, orphans)
     return following + make_ready(tx, orphans)
-
-
-def _all_succeeded(ends: Iterable[Ended]) -> bool:
-    return all(end.succeeded for end in ends)
 
 
 def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
@@ -115,22 +119,13 @@ def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
         tx.execute(statement, [{"of_job": job_id, "left": count} for job_id, count in left.items()])
 
 
-def _doom(tx: Transaction, doomed: Sequence[tuple[Row[Any], list[Ended]]]) -> list[Ended]:
-    """End the jobs that depend on one that did not succeed: failed, or cancelled where they are to be skipped."""
-    following: list[Ended] = []
-    for row, ends in doomed:
-        cause = next(end for end in ends if not end.succeeded)
-        following += doom(tx, row.id, cause.id, cause.state, row.on_failure)
-    return following
-
-
-def doom(tx: Transaction, job_id: str, cause: str, cause_state: str, on_failure: str) -> list[Ended]:
-    """End a waiting job, and its tasks, because `cause` did not succeed."""
-    waits = and_(job.c.id == job_id, job.c.state == WAITING)
-    tasks = end_jobs(tx, and_(job.c.parent_id == job_id, job.c.state == WAITING), "cancelled")
-    if on_failure == "skip":
+def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
+    """End a waiting job, and its tasks, because `cause` did not succeed: failed, or cancelled if to be skipped."""
+    waits = and_(job.c.id == row.id, job.c.state == WAITING)
+    tasks = end_jobs(tx, and_(job.c.parent_id == row.id, job.c.state == WAITING), "cancelled")
+    if row.on_failure == "skip":
         return [*tasks, *end_jobs(tx, waits, "cancelled")]
-    return [*tasks, *end_jobs(tx, waits, "failed", failure=dependency_failure(cause, cause_state))]
+    return [*tasks, *end_jobs(tx, waits, "failed", failure=dependency_failure(cause.id, cause.state))]
 
 
 # -- fan-out ----------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, and_, delete, func, insert, select, tuple_, update
 
-from marey_schemas.jobs import StagedOutput
+from marey_schemas.jobs import ItemInput, StagedOutput
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import FieldError
 from marey_server import faults
@@ -110,15 +110,18 @@ def _pinned_sources(output: StagedOutput, pins: PinnedInputs) -> dict[str, list[
     """The inputs a result names, or all, as (item, revision); only what the job was given can be a source."""
     if not output.sources:
         return {role: [[pin["item"], pin["revision"]] for pin in many] for role, many in pins.items()}
-    sources: dict[str, list[list[Any]]] = {}
-    for role, named in output.sources.items():
-        given = {pin["item"]: pin["revision"] for pin in pins.get(role, ())}
-        for source in named:
-            if source.item not in given or source.revision not in (None, given[source.item]):
-                detail = f"{source.item} (revision {source.revision}) is not among the job's inputs {role!r}."
-                raise Invalid(detail, code="no-input")
-        sources[role] = [[source.item, given[source.item]] for source in named]
-    return sources
+    return {role: [_pinned_source(role, source, pins) for source in named] for role, named in output.sources.items()}
+
+
+def _pinned_source(role: str, source: ItemInput, pins: PinnedInputs) -> list[Any]:
+    given = [pin["revision"] for pin in pins.get(role, ()) if pin["item"] == source.item]
+    if source.revision is None and len(given) == 1:
+        return [source.item, given[0]]
+    if source.revision in given:
+        return [source.item, source.revision]
+    asked = "" if source.revision is None else f" at revision {source.revision}"
+    known = f"; it is there at {', '.join(map(str, given))}" if given else ""
+    raise Invalid(f"{source.item}{asked} is not among the job's inputs {role!r}{known}.", code="no-input")
 
 
 # -- publishing -------------------------------------------------------------------------------------------------------
@@ -159,14 +162,19 @@ def _staged_by(attempts: Collection[tuple[str, int]]) -> ColumnElement[bool]:
     return tuple_(staged_output.c.job_id, staged_output.c.fence).in_(list(attempts))
 
 
-def with_inputs(drafts: Mapping[str, StagedDraft], pins: PinnedInputs) -> dict[str, StagedDraft]:
-    """The drafts of an identical job, with the revisions that this job's inputs have."""
-    revisions = {(role, pin["item"]): pin["revision"] for role, many in pins.items() for pin in many}
+def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: PinnedInputs) -> dict[str, StagedDraft]:
+    """The drafts of an identical job, made from our inputs: the same items, at revisions of the same content."""
+    revisions = {
+        (role, their["item"], their["revision"]): our["revision"]
+        for role, many in theirs.items()
+        for their, our in zip(many, ours[role], strict=True)
+    }
     return {
         name: draft
         | {
             "sources": {
-                role: [[item, revisions[role, item]] for item, _ in pairs] for role, pairs in draft["sources"].items()
+                role: [[item, revisions[role, item, revision]] for item, revision in pairs]
+                for role, pairs in draft["sources"].items()
             }
         }
         for name, draft in drafts.items()

@@ -287,6 +287,17 @@ def test_many_jobs_are_claimed_and_completed_at_once_each_with_its_own_answer(de
     assert desk.database.write(desk.user, completion.complete_many, asked) == results
 
 
+def test_one_result_that_names_unknown_bytes_is_refused_and_the_others_are_not(desk: Desk) -> None:
+    desk.submit_many(*(JobCreate(kind="errand") for _ in range(3)))
+    leases = desk.claim_many()
+    asked = [BatchCompletion(job=one.job, fence=one.fence, write_id="write-one") for one in leases]
+    archive = {"archive": {"blob": f"sha256:{'0' * 64}"}}
+    asked[1] = asked[1].model_copy(update={"result": archive})
+    results = desk.database.write(desk.user, completion.complete_many, asked)
+    assert [one.code for one in results] == [None, "missing-blobs", None]
+    assert [desk.state(one.job) for one in leases] == ["succeeded", "running", "succeeded"]
+
+
 def test_a_worker_cannot_complete_what_another_token_claimed(desk: Desk) -> None:
     job = desk.submit()
     lease = desk.claim()

@@ -12,7 +12,7 @@ from marey_schemas.jobs import JobCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import Conflict, Forbidden, Invalid, NotFound
-from marey_server.store import jobs, members, users
+from marey_server.store import items, jobs, members, users
 from marey_server.store.database import Transaction
 from marey_server.store.items.drafts import Draft
 from marey_server.store.reaper import share_waiting
@@ -303,6 +303,36 @@ def test_a_changed_input_or_a_new_version_of_the_kind_is_computed_again(
     newer = {**job_kinds.job_kinds(), "sum": replace(SUM, version=2)}
     monkeypatch.setattr(job_kinds, "job_kinds", lambda: newer)
     assert desk.state(desk.submit("sum")) == "queued"
+
+
+def test_results_know_exactly_which_revisions_they_were_made_from(desk: Desk) -> None:
+    (thing,) = desk.things(1)
+    desk.publish(Draft("again", Kind.PROCESSED, "thing0", {"motion": document(number=77)}, "raw"))
+    both: Any = {"things": [{"item": thing, "revision": 1}, {"item": thing, "revision": 2}]}
+    desk.submit("square", inputs=both)
+    lease = desk.claim()
+    with pytest.raises(Invalid, match="at 1, 2"):
+        desk.stage(lease, "vague", sources={"things": [{"item": thing}]})
+    with pytest.raises(Invalid, match="revision 3"):
+        desk.stage(lease, "wrong", sources={"things": [{"item": thing, "revision": 3}]})
+    desk.stage(lease, "first", sources={"things": [{"item": thing, "revision": 1}]})
+    desk.stage(lease, "second", sources={"things": [{"item": thing, "revision": 2}]})
+    desk.complete(lease)
+
+    def made_from(job: str) -> dict[str, list[int]]:
+        return {
+            one.name: [
+                edge.revision
+                for edge in desk.database.read(
+                    desk.user, items.read_lineage, "lab", Kind.PROCESSED, one.item, revision_number=one.revision
+                ).inputs
+            ]
+            for one in desk.outputs(job)
+        }
+
+    assert made_from(lease.job) == {"first": [1], "second": [2]}
+    again = desk.submit("square", inputs=both, into="again")
+    assert made_from(again) == {"first": [1], "second": [2]}
 
 
 def test_jobs_identical_to_one_under_way_wait_for_it_and_share_its_result(desk: Desk) -> None:
