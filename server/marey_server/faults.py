@@ -10,6 +10,7 @@ import errno
 import itertools
 import os
 import signal
+import time
 from collections.abc import Iterator
 
 VARIABLE = "MAREY_FAULT"
@@ -32,6 +33,7 @@ class _Fault:
             os.kill(os.getpid(), signal.SIGKILL)
         elif self.action == "stop":
             os.kill(os.getpid(), signal.SIGSTOP)
+            time.sleep(0.2)  # a stop reaches the threads of a process one by one
         else:
             raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)} (fault point {self.name})")
 

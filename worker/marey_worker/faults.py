@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections import Counter
 
 VARIABLE = "MAREY_FAULT"
+SETTLE_S = 0.2
+"""A stop reaches the threads of a process one by one; the one that asked for it must not run ahead."""
 ACTIONS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
 
 _passes: Counter[str] = Counter()
@@ -28,3 +31,4 @@ def point(name: str) -> None:
         where, _, nth = place.partition("@")
         if where == name and action in ACTIONS and (not nth or int(nth) == _passes[name]):
             os.kill(os.getpid(), ACTIONS[action])
+            time.sleep(SETTLE_S)
