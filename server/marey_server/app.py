@@ -159,7 +159,7 @@ def open_database(settings: Settings) -> Database:
 def connect_database(settings: Settings) -> Database:
     """The database as it stands."""
     blobs = DirectoryBlobs(settings.data / "blobs") if settings.blobs == "directory" else None
-    return Database(settings.resolved_database_url, readers=settings.database_threads, blobs=blobs)
+    return Database(settings.resolved_database_url, readers=settings.resolved_database_threads, blobs=blobs)
 
 
 def make_first_administrator(tx: Transaction, token_file: Path) -> None:

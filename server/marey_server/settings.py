@@ -24,7 +24,12 @@ class Settings(BaseSettings):
     database_url: str | None = Field(
         None, description="SQLAlchemy URL; absent: the file marey.db in the data folder. postgresql://... for Postgres."
     )
-    database_threads: int = Field(8, ge=2, le=128, description="Reading transactions that run at the same time.")
+    database_threads: int | None = Field(
+        None,
+        ge=1,
+        le=128,
+        description="Reading transactions that run at the same time. Absent: 2 on SQLite, which only computes; 8 on Postgres.",
+    )
     blobs: Literal["database", "directory"] = Field(
         "database", description="Where bytes are kept: in the database, or in the folder blobs of the data folder."
     )
@@ -63,6 +68,11 @@ class Settings(BaseSettings):
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """Flags win over variables, variables over the file."""
         return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
+
+    @property
+    def resolved_database_threads(self) -> int:
+        """How many threads read. More than two that compute take turns at the interpreter, and everybody waits longer."""
+        return self.database_threads or (2 if self.resolved_database_url.startswith("sqlite") else 8)
 
     @property
     def resolved_database_url(self) -> str:
