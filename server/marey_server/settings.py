@@ -28,7 +28,7 @@ class Settings(BaseSettings):
         None,
         ge=1,
         le=128,
-        description="Reading transactions that run at the same time. Absent: 2 on SQLite, which only computes; 8 on Postgres.",
+        description="Reading transactions that run at the same time. Absent: 2 on SQLite, 8 on Postgres.",
     )
     blobs: Literal["database", "directory"] = Field(
         "database", description="Where bytes are kept: in the database, or in the folder blobs of the data folder."
@@ -71,7 +71,7 @@ class Settings(BaseSettings):
 
     @property
     def resolved_database_threads(self) -> int:
-        """How many threads read. More than two that compute take turns at the interpreter, and everybody waits longer."""
+        """How many threads read. On SQLite they compute and never wait: more of them only take turns."""
         return self.database_threads or (2 if self.resolved_database_url.startswith("sqlite") else 8)
 
     @property
