@@ -11,6 +11,7 @@ from typing import Any
 import typer
 from pydantic_core import PydanticUndefined
 
+import marey_server.app  # noqa: F401 - loads every module, and so every class of errors
 from marey_client.cli.app import app
 from marey_motion import checks
 from marey_schemas.job_kinds import job_kinds

@@ -35,7 +35,13 @@ class Export(BlobSender):
         access=Access.READER,
         query=ExportQuery,
         answer=Bytes,
-        answer_types=("application/octet-stream",),
+        answer_types=(
+            "application/octet-stream",
+            "text/plain",
+            "application/json",
+            "application/x-npz",
+            "application/x-bzip2",
+        ),
         also=((206, None), (416, None)),
         headers=("Range", "If-Range"),
     )

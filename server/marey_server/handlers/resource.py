@@ -204,7 +204,9 @@ class Resource(Exchange):
 
     def _offers(self, operation: Operation) -> tuple[negotiation.MediaType, ...]:
         if operation.answer_types:
-            return tuple(negotiation.MediaType(name, "bytes") for name in operation.answer_types)
+            return (
+                negotiation.MediaType(operation.answer_types[0], "bytes"),
+            )  # what bytes are is not the caller's choice
         if operation.stream:
             return (*negotiation.MODEL_FORMS, negotiation.EVENT_STREAM)
         return negotiation.DOCUMENT_FORMS if operation.answer is Document else negotiation.MODEL_FORMS
