@@ -230,7 +230,7 @@ def _fail(
         raise lines.error(
             f"{state[_FOUND]} values for {len(bone.channels)} degrees of freedom"
             + ("; the file is cut off" if cut else ""),
-            code="file-truncated" if cut else "frame_width",
+            code="file-truncated" if cut else "frame-width",
             joint=bone.name,
         )
     moving = np.array([len(bone.channels) > 0 for bone in skeleton.bones])
@@ -238,6 +238,6 @@ def _fail(
     at_end = not lines.data[state[_POSITION] :].strip()
     raise lines.error(
         f"frame {state[_NUMBER]} lacks this bone" + ("; the file is cut off" if at_end else ""),
-        code="file-truncated" if at_end else "frame_width",
+        code="file-truncated" if at_end else "frame-width",
         joint=missing.name,
     )

@@ -116,7 +116,7 @@ def _read_frames(
         raise lines.error(
             f"{table.ragged_count} values where the channels need {width}"
             + ("; the file is cut off in its last line" if cut else ""),
-            code="file-truncated" if cut else "frame_width",
+            code="file-truncated" if cut else "frame-width",
         )
     if frames == 0 and header.declared_frames:
         lines.number = header.data_line

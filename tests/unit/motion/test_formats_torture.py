@@ -31,7 +31,7 @@ CENTIMETRES = ImportOptions(unit_scale_m=0.01, up_axis="y")
         (big.short_lines, f"read {big.SIZE // 18}"),
         (big.long_numbers, f"read {big.SIZE // 207}"),
         (big.endless_hierarchy, "format-limit"),
-        (big.one_line, "frame_width"),
+        (big.one_line, "frame-width"),
         (big.rubbish, "not-bvh"),
     ],
 )
