@@ -355,7 +355,9 @@ def test_a_database_that_is_away_for_a_while_delays_work_and_loses_none(
         uploading.start()
         _disturb(database_url, seconds=5)
         uploading.join(120)
-        assert [entry.status for entry in uploaded] == ["created"] * 40
+        # an import that was cut short and sent again finds what went in before
+        assert len(uploaded) == 40
+        assert {entry.status for entry in uploaded} <= {"created", "unchanged"}
         assert sorted(revision for _, revision in clips_by_name(lab).values()) == [1] * 40
     server.check_database()
 
