@@ -45,14 +45,13 @@ _SKELETON_MEMBERS = (
 )
 _MOTION_MEMBERS = ("frame_rate_hz", "poses")
 _OPTIONAL_MEMBERS = ("translated_joints", "translations")
-# Everything that a damaged or hostile archive makes the standard library and numpy raise.
+# All that a damaged or hostile archive raises; RuntimeError stands for encryption and for unknown compression, too.
 _ARCHIVE_ERRORS = (
     zipfile.BadZipFile,
     zlib.error,
     EOFError,
     OSError,
     OverflowError,
-    NotImplementedError,
     RuntimeError,
     ValueError,
 )
