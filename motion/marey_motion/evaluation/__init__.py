@@ -1,0 +1,5 @@
+"""How good a set of locomotion clips is: accuracy, relevance and coverage measured by simulated motion matching.
+
+After Abichequer Sangalli et al. (2022), "A new framework for the evaluation of locomotive motion datasets through
+motion matching techniques", with every ambiguity of its formulas named (docs/explanation/evaluation.md).
+"""

@@ -1,0 +1,65 @@
+"""The joints of a skeleton that motion matching looks at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.rigs import JointMapping
+from marey_motion.rigs.mapping import symmetric_joints
+from marey_motion.skeleton import Skeleton
+
+SIDES = ("left", "right")
+POSE_JOINTS = ("pelvis", "spine_2", "head", "left_wrist", "right_wrist", "left_ankle", "right_ankle")
+"""Standard joints whose distances make up the pose cost of a transition: hips, spine, head, hands, feet."""
+
+
+@dataclass(frozen=True, eq=False)
+class MatchingBody:
+    """Which joint indices of `skeleton` play which part.
+
+    Parameters
+    ----------
+    hips : the joint whose velocity is matched
+    torso : the joint whose ground projection carries the simulation root: the upper spine, else the hips
+    feet, toes : (left, right); the ankles, and what touches the ground (the ankles where there are no toes)
+    lefts, rights : matching joints of both sides, hips and shoulders, whose difference tells where the body faces
+    pose_joints : the joints of the pose cost, in the order of `POSE_JOINTS`, those that the skeleton has
+    partners : (J,) each joint's partner on the other side, its own index for joints of the centre
+    """
+
+    skeleton: Skeleton
+    hips: int
+    torso: int
+    feet: tuple[int, int]
+    toes: tuple[int, int]
+    lefts: tuple[int, ...]
+    rights: tuple[int, ...]
+    pose_joints: tuple[int, ...]
+    partners: NDArray[np.int32]
+
+    @classmethod
+    def from_mapping(cls, skeleton: Skeleton, mapping: JointMapping) -> MatchingBody:
+        """The parts by their standard names. Raises `MappingError` naming the standard joints that are missing."""
+        hips, left_foot, right_foot, *pairs = mapping.indices(
+            skeleton,
+            ("pelvis", "left_ankle", "right_ankle", "left_hip", "left_shoulder", "right_hip", "right_shoulder"),
+        )
+
+        def optional(name: str, otherwise: int) -> int:
+            return mapping.indices(skeleton, (name,))[0] if name in mapping.joints else otherwise
+
+        known = [joint for joint in POSE_JOINTS if joint in mapping.joints]
+        return cls(
+            skeleton=skeleton,
+            hips=hips,
+            torso=optional("spine_2", hips),
+            feet=(left_foot, right_foot),
+            toes=(optional("left_toe", left_foot), optional("right_toe", right_foot)),
+            lefts=mapping.indices(skeleton, ("left_hip", "left_shoulder")),
+            rights=mapping.indices(skeleton, ("right_hip", "right_shoulder")),
+            pose_joints=tuple(dict.fromkeys(mapping.indices(skeleton, known))),
+            partners=symmetric_joints(skeleton, mapping),
+        )

@@ -1,0 +1,48 @@
+"""What a simulated trial leaves behind: every tick of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Status(IntEnum):
+    """What happened to the displayed clip at a tick."""
+
+    KEPT = 0
+    """The next frame of the clip follows."""
+    REPLACING = 1
+    """A search chose another frame: the displayed row is the first after a switch."""
+    REPLACED = 2
+    """The last row before a switch."""
+    FORCED = 3
+    """The clip ended or looped: there was nothing to continue."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrialRecord:
+    """T ticks of a character led by motion matching.
+
+    Parameters
+    ----------
+    rate_hz : ticks per second
+    rows : (T,) int32    database row displayed
+    positions : (T, 2) float64    root on the ground, metres
+    headings : (T,) float64    radians, continuous
+    status : (T,) int8    `Status`
+    match_cost : (T,) float64    normalised squared cost of the row that was chosen; NaN where nothing was searched
+    continuing_cost : (T,) float64    the same of going on; NaN where nothing was searched or nothing was there to go on
+    pose_cost : (T,) float64    metres: distance over the pose joints between the displayed pose and the next one
+    """
+
+    rate_hz: float
+    rows: NDArray[np.int32]
+    positions: NDArray[np.float64]
+    headings: NDArray[np.float64]
+    status: NDArray[np.int8]
+    match_cost: NDArray[np.float64]
+    continuing_cost: NDArray[np.float64]
+    pose_cost: NDArray[np.float64]
