@@ -43,10 +43,7 @@ class MatchingBody:
     @classmethod
     def from_mapping(cls, skeleton: Skeleton, mapping: JointMapping) -> MatchingBody:
         """The parts by their standard names. Raises `MappingError` naming the standard joints that are missing."""
-        hips, left_foot, right_foot, *pairs = mapping.indices(
-            skeleton,
-            ("pelvis", "left_ankle", "right_ankle", "left_hip", "left_shoulder", "right_hip", "right_shoulder"),
-        )
+        hips, left_foot, right_foot = mapping.indices(skeleton, ("pelvis", "left_ankle", "right_ankle"))
 
         def optional(name: str, otherwise: int) -> int:
             return mapping.indices(skeleton, (name,))[0] if name in mapping.joints else otherwise
