@@ -17,7 +17,7 @@ from marey_server.access.principal import SYSTEM
 from marey_server.app import open_database
 from marey_server.settings import Settings
 from marey_server.store import items, projects, users
-from marey_server.store.database import Transaction
+from marey_server.store.transaction import Transaction
 
 FRAMES, JOINTS = 4, 26
 CLIPS_PER_WRITE = 500

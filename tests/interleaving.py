@@ -12,7 +12,8 @@ from typing import Any
 
 from marey_server.access.principal import Principal
 from marey_server.errors import MareyError
-from marey_server.store.database import Database, Transaction
+from marey_server.store.database import Database
+from marey_server.store.transaction import Transaction
 
 Action = Callable[[Transaction], Any]
 

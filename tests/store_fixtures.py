@@ -10,7 +10,8 @@ from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
 from marey_server.store import items, members, projects, users
-from marey_server.store.database import Database, Transaction
+from marey_server.store.database import Database
+from marey_server.store.transaction import Transaction
 
 ALL_SCOPES = ("read", "write", "jobs", "work", "admin")
 

@@ -38,8 +38,9 @@ from marey_server.services import Description, Services
 from marey_server.settings import Settings
 from marey_server.store import tokens, users
 from marey_server.store.blob_backings import DirectoryBlobs
-from marey_server.store.database import Database, Transaction
+from marey_server.store.database import Database
 from marey_server.store.schema import upgrade_schema
+from marey_server.store.transaction import Transaction
 from marey_server.store.wakeups import wakeups
 
 log = logging.getLogger(__name__)

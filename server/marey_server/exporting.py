@@ -11,7 +11,7 @@ from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_server.errors import Invalid, NotFound
 from marey_server.store import items
-from marey_server.store.database import Transaction
+from marey_server.store.transaction import Transaction
 
 ExportFormat = Literal["original", "bvh", "npz", "predecessor", "json"]
 

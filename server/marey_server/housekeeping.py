@@ -18,9 +18,9 @@ from marey_server.access.principal import SYSTEM
 from marey_server.errors import MareyError
 from marey_server.services import Services
 from marey_server.store import leader, reaper
-from marey_server.store.database import Transaction
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.reaper import StartGrace
+from marey_server.store.transaction import Transaction
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -14,9 +14,9 @@ from marey_schemas.kinds import Kind
 from marey_server.errors import MareyError
 from marey_server.store import blobs, items, projects
 from marey_server.store.blobs import Spool
-from marey_server.store.database import Transaction
 from marey_server.store.documents import prepare_document
 from marey_server.store.items import Draft, Published
+from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:  # numeric modules take a second to load: only who imports files pays for them
     from marey_motion.errors import MotionError

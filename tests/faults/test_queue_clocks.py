@@ -11,8 +11,9 @@ from marey_schemas.jobs import ClaimRequest
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import LeaseLost
 from marey_server.store.clock import DatabaseClock
-from marey_server.store.database import Database, Transaction
+from marey_server.store.database import Database
 from marey_server.store.reaper import StartGrace, claim_after_reaping, correct_times, reap_page
+from marey_server.store.transaction import Transaction
 from queue_desk import Desk
 
 HOUR_S = 3600.0

@@ -15,9 +15,10 @@ from marey_schemas.jobs import ClaimRequest, CompleteRequest, FailRequest, Heart
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import Conflict, LeaseLost, MareyError
 from marey_server.store import completion, fencing, job_logs, jobs, leader, queue, staging, submission
-from marey_server.store.database import Database, Transaction
+from marey_server.store.database import Database
 from marey_server.store.reaper import reap_page
 from marey_server.store.tables import attempt, event, job
+from marey_server.store.transaction import Transaction
 from queue_desk import Desk, output
 
 TERMINAL = ("succeeded", "failed", "cancelled")

@@ -13,7 +13,7 @@ from marey_server.handlers.queries import PageQuery
 from marey_server.handlers.reply import Rendered, Reply
 from marey_server.handlers.resource import Resource
 from marey_server.store import tokens, users
-from marey_server.store.database import Transaction
+from marey_server.store.transaction import Transaction
 
 
 def read_me(tx: Transaction) -> Me:

@@ -15,7 +15,7 @@ from marey_server.errors import Forbidden, Unauthenticated
 from marey_server.handlers.declarations import Access, Operation
 from marey_server.handlers.reply import Form, Rendered, Reply, render
 from marey_server.store import idempotency, tokens
-from marey_server.store.database import Transaction
+from marey_server.store.transaction import Transaction
 
 CHALLENGE = {"WWW-Authenticate": 'Bearer realm="marey"'}
 

@@ -22,7 +22,7 @@ from marey_server.handlers.resource import Resource
 from marey_server.handlers.validation import decode_body, field_errors, json_pointer, validate_body
 from marey_server.importing import PreparedImport, SourceFile
 from marey_server.store import blobs, submission
-from marey_server.store.database import Transaction
+from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:
     from marey_motion.importing import PlannedFile

@@ -38,7 +38,7 @@ from marey_server.handlers.etags import ANY_STATE, Precondition, write_precondit
 from marey_server.handlers.exchange import Exchange
 from marey_server.handlers.reply import Form, Rendered, Reply, render
 from marey_server.handlers.validation import decode_body, parse_query, validate_body
-from marey_server.store.database import Transaction
+from marey_server.store.transaction import Transaction
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -13,7 +13,7 @@ from marey_server.handlers.ranges import ByteRange, parse_range
 from marey_server.handlers.reply import Rendered
 from marey_server.handlers.resource import Resource
 from marey_server.store import blobs
-from marey_server.store.database import Transaction
+from marey_server.store.transaction import Transaction
 
 PIECE_BYTES = MIB
 WRITE_TIMEOUT_S = 60

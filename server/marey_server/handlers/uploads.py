@@ -8,7 +8,7 @@ from marey_server.handlers.declarations import MIB, Access, Body, Bytes, reads, 
 from marey_server.handlers.reply import Rendered, Reply
 from marey_server.handlers.resource import Resource
 from marey_server.store import uploads
-from marey_server.store.database import Transaction
+from marey_server.store.transaction import Transaction
 
 PIECE_BYTES = MIB
 """What a piece that is cut off has kept is a multiple of this."""

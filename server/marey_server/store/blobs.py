@@ -17,7 +17,6 @@ from marey_server import faults
 from marey_server.access.principal import Principal
 from marey_server.errors import Conflict, Forbidden, Invalid, NotFound, Unauthenticated
 from marey_server.store.blob_backings import CHUNK_BYTES
-from marey_server.store.database import Transaction
 from marey_server.store.projects import is_visible
 from marey_server.store.tables import (
     blob,
@@ -29,6 +28,7 @@ from marey_server.store.tables import (
     project,
     revision_part,
 )
+from marey_server.store.transaction import Transaction
 
 GRACE_US = 24 * 3600 * 1_000_000
 """How long a blob or document that nothing refers to is left alone."""

@@ -20,12 +20,12 @@ from marey_schemas.jobs import (
 from marey_server import faults
 from marey_server.errors import MareyError, NotFound
 from marey_server.store import staging
-from marey_server.store.database import Transaction
 from marey_server.store.fencing import earlier_answer, held, hold, lease_lost, require_attempt
 from marey_server.store.job_ends import ENDED_COLUMNS, AttemptEnd, Ended, as_ended, end_attempts
 from marey_server.store.queue_policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.settling import settle
 from marey_server.store.tables import attempt, job, staged_output
+from marey_server.store.transaction import Transaction
 from marey_server.store.verdicts import ENDING_COLUMNS, carry_out, judge
 
 _Place = tuple[str, int]

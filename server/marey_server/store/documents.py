@@ -22,8 +22,8 @@ from marey_schemas.documents import SCHEMAS
 from marey_schemas.problems import FieldError
 from marey_server.errors import Invalid, NotFound
 from marey_server.store import blobs
-from marey_server.store.database import Transaction
 from marey_server.store.tables import blob, document, document_blob
+from marey_server.store.transaction import Transaction
 
 OPEN_SCHEMA = "marey/document@1"
 

@@ -12,8 +12,8 @@ from sqlalchemy import ColumnElement, Row, and_, case, literal_column, select, t
 
 from marey_server.access.principal import Principal
 from marey_server.errors import LeaseLost, NotFound
-from marey_server.store.database import Transaction
 from marey_server.store.tables import attempt, job
+from marey_server.store.transaction import Transaction
 
 # Literals, not parameters: SQLite uses a partial index only where it can see that the condition is met.
 RUNNING: ColumnElement[str] = literal_column("'running'")

@@ -18,7 +18,7 @@ from marey_schemas.kinds import PARTS, Kind
 from marey_server.access.principal import SYSTEM
 from marey_server.store import documents
 from marey_server.store.blobs import digest_of, read_blob
-from marey_server.store.database import Database, Transaction
+from marey_server.store.database import Database
 from marey_server.store.items.summaries import summarise
 from marey_server.store.tables import (
     blob,
@@ -31,6 +31,7 @@ from marey_server.store.tables import (
     upload,
     upload_chunk,
 )
+from marey_server.store.transaction import Transaction
 
 PAGE = 100
 

@@ -16,7 +16,7 @@ from marey_server import faults
 from marey_server.access.principal import SYSTEM
 from marey_server.store import uploads
 from marey_server.store.blobs import GRACE_US
-from marey_server.store.database import Database, Transaction
+from marey_server.store.database import Database
 from marey_server.store.idempotency import LIFETIME_US as KEY_LIFETIME_US
 from marey_server.store.tables import (
     blob,
@@ -30,6 +30,7 @@ from marey_server.store.tables import (
     staged_output,
     upload,
 )
+from marey_server.store.transaction import Transaction
 
 BATCH = 200
 

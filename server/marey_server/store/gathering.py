@@ -8,10 +8,10 @@ from typing import Any
 from sqlalchemy import and_, select
 
 from marey_schemas.jobs import FailureReason
-from marey_server.store.database import Transaction
 from marey_server.store.fencing import RUNNING
 from marey_server.store.job_ends import Ended, end_jobs, failure_document
 from marey_server.store.tables import job
+from marey_server.store.transaction import Transaction
 
 MOST_GATHERED = 1000
 """Entries of a list, such as refusals with their reasons, that the gathering job repeats."""

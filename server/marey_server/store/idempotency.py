@@ -12,8 +12,8 @@ from sqlalchemy import ColumnElement, delete, select, update
 
 from marey_server.access.principal import Principal
 from marey_server.errors import Conflict, Invalid
-from marey_server.store.database import Transaction
 from marey_server.store.tables import idempotency_key
+from marey_server.store.transaction import Transaction
 
 LIFETIME_US = 7 * 86400 * 1_000_000
 IN_FLIGHT_US = 600 * 1_000_000

@@ -16,12 +16,12 @@ from sqlalchemy import Row, and_, insert, or_, select, update
 from marey_schemas.canonical import canonical_json
 from marey_schemas.job_kinds import KindDeclaration
 from marey_server.store import blobs, staging
-from marey_server.store.database import Transaction
 from marey_server.store.fencing import QUEUED, RUNNING, WAITING
 from marey_server.store.job_ends import Ended, end_jobs
 from marey_server.store.job_events import wake_workers
 from marey_server.store.job_inputs import PinnedInputs
 from marey_server.store.tables import job, job_dependency, revision_part
+from marey_server.store.transaction import Transaction
 
 SHARED_AT_ONCE = 64
 """Jobs that get their cached result in the transaction of the submission; the leader serves the others."""

@@ -9,8 +9,8 @@ from sqlalchemy import Row, Select, func, select
 
 from marey_schemas.jobs import Job
 from marey_server.store.clock import datetime_of
-from marey_server.store.database import Transaction
 from marey_server.store.tables import job, project, user
+from marey_server.store.transaction import Transaction
 
 IN_LIST = 1000
 

@@ -9,8 +9,8 @@ from typing import Any
 from sqlalchemy import ColumnElement, Row, bindparam, update
 
 from marey_schemas.jobs import FailureReason, JobFailure
-from marey_server.store.database import Transaction
 from marey_server.store.tables import attempt, job
+from marey_server.store.transaction import Transaction
 
 LONGEST_DETAIL = 20_000
 

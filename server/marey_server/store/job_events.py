@@ -7,8 +7,8 @@ from typing import Any
 
 from sqlalchemy import insert, text
 
-from marey_server.store.database import Transaction
 from marey_server.store.tables import event
+from marey_server.store.transaction import Transaction
 from marey_server.store.wakeups import wakeups
 
 EventOfJob = tuple[str, str, dict[str, Any]]

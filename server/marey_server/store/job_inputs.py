@@ -11,9 +11,9 @@ from marey_schemas.job_kinds import KindDeclaration
 from marey_schemas.jobs import CollectionInput, InputSpec, ItemInput, JobCreate
 from marey_schemas.problems import FieldError
 from marey_server.errors import Invalid
-from marey_server.store.database import Transaction
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import collection, item
+from marey_server.store.transaction import Transaction
 
 MOST_INPUTS = 100_000
 IN_LIST = 1000

@@ -9,10 +9,10 @@ from sqlalchemy import Row, insert, select, update
 
 from marey_schemas.jobs import JobState, LogAnswer
 from marey_server.errors import Conflict
-from marey_server.store.database import Transaction
 from marey_server.store.fencing import hold, require_attempt
 from marey_server.store.queue_policy import DEFAULT_POLICY, QueuePolicy
 from marey_server.store.tables import attempt, job_log
+from marey_server.store.transaction import Transaction
 
 CAPPED = b"\n[the log is full; what follows is not kept]\n"
 MOST_READ_BYTES = 2**20

@@ -16,7 +16,6 @@ from marey_server.access import roles
 from marey_server.errors import Conflict, Forbidden, NotFound
 from marey_server.store import events, listing, projects
 from marey_server.store.clock import datetime_of
-from marey_server.store.database import Transaction
 from marey_server.store.fencing import RUNNING, earlier
 from marey_server.store.job_documents import as_documents, job_documents, select_jobs
 from marey_server.store.job_ends import ENDED_COLUMNS, as_ended
@@ -27,6 +26,7 @@ from marey_server.store.queue_policy import DEFAULT_POLICY, QueuePolicy
 from marey_server.store.settling import settle
 from marey_server.store.submission import Submission, submit_checked
 from marey_server.store.tables import attempt, job, user
+from marey_server.store.transaction import Transaction
 
 SORT_KEYS: dict[str, ColumnElement[Any]] = {
     "id": job.c.id,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from sqlalchemy import and_, case, or_, select, update
 
-from marey_server.store.database import Transaction
 from marey_server.store.tables import leader
+from marey_server.store.transaction import Transaction
 
 
 def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | None:

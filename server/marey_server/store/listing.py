@@ -16,8 +16,8 @@ from sqlalchemy import ColumnElement, Row, Select, UnaryExpression, and_, or_, s
 
 from marey_schemas.canonical import canonical_json
 from marey_server.errors import BadRequest
-from marey_server.store.database import Transaction
 from marey_server.store.tables import server_state
+from marey_server.store.transaction import Transaction
 
 _KEY_NAME = "cursor_key"
 _MAC_BYTES = 16

@@ -11,10 +11,10 @@ from marey_schemas.items import Page
 from marey_server.errors import Conflict, NotFound, PreconditionFailed
 from marey_server.store import listing, projects
 from marey_server.store.clock import datetime_of
-from marey_server.store.database import Transaction
 from marey_server.store.projects import ProjectRow
 from marey_server.store.revs import change_row, moved_on
 from marey_server.store.tables import member, project, user
+from marey_server.store.transaction import Transaction
 
 
 def list_members(

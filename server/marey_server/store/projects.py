@@ -27,10 +27,10 @@ from marey_server.access.principal import Principal
 from marey_server.errors import Conflict, Forbidden, NotFound, Unauthenticated
 from marey_server.store import listing
 from marey_server.store.clock import datetime_of
-from marey_server.store.database import Transaction
 from marey_server.store.ids import new_id
 from marey_server.store.revs import change_row
 from marey_server.store.tables import member, project
+from marey_server.store.transaction import Transaction
 from marey_server.store.violations import taken
 
 SORT_KEYS: dict[str, ColumnElement[Any]] = {

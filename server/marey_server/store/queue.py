@@ -37,12 +37,12 @@ from marey_schemas.problems import FieldError
 from marey_server import faults
 from marey_server.access.secret_tokens import IssuedToken, issue_attempt_token
 from marey_server.errors import Forbidden, Invalid
-from marey_server.store.database import Transaction
 from marey_server.store.fencing import QUEUED, RUNNING, earlier, held, lease_lost, require_attempt
 from marey_server.store.job_events import emit_job_events
 from marey_server.store.labels import keys_within
 from marey_server.store.queue_policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.tables import attempt, job, member, project
+from marey_server.store.transaction import Transaction
 
 
 def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_POLICY) -> list[Lease]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from marey_server.store.database import Transaction
 from marey_server.store.schema import schema_at_head
+from marey_server.store.transaction import Transaction
 
 
 def find_faults(tx: Transaction) -> list[str]:

@@ -9,13 +9,13 @@ from sqlalchemy import and_, select, tuple_, update
 
 from marey_schemas.jobs import ClaimRequest, Lease
 from marey_server.store import job_cache
-from marey_server.store.database import Transaction
 from marey_server.store.fencing import QUEUED, RUNNING, held
 from marey_server.store.job_ends import AttemptEnd
 from marey_server.store.queue import claim
 from marey_server.store.queue_policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.settling import settle
 from marey_server.store.tables import job
+from marey_server.store.transaction import Transaction
 from marey_server.store.verdicts import ENDING_COLUMNS, carry_out, judge_expired
 
 PAGE = 256

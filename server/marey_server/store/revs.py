@@ -7,7 +7,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Row, Table, select, update
 
 from marey_server.errors import MareyError, PreconditionFailed
-from marey_server.store.database import Transaction
+from marey_server.store.transaction import Transaction
 
 
 def change_row(

@@ -12,8 +12,9 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Connection
 
 from marey_server.access.principal import SYSTEM
-from marey_server.store.database import Database, Transaction
+from marey_server.store.database import Database
 from marey_server.store.listing import make_cursor_key
+from marey_server.store.transaction import Transaction
 
 _INSTALLED = Path(__file__).parents[1] / "migrations"
 _CHECKOUT = Path(__file__).parents[3] / "migrations"

@@ -14,12 +14,12 @@ from typing import Any
 from sqlalchemy import Row, and_, bindparam, false, select, update
 
 from marey_server.store import job_cache
-from marey_server.store.database import Transaction
 from marey_server.store.fencing import RUNNING, WAITING
 from marey_server.store.gathering import gather
 from marey_server.store.job_ends import Ended, dependency_failure, end_jobs
 from marey_server.store.job_events import emit_job_events, wake_watchers, wake_workers
 from marey_server.store.tables import job, job_dependency
+from marey_server.store.transaction import Transaction
 
 PAGE = 1000
 """Ended jobs looked at in one statement."""

@@ -15,7 +15,6 @@ from marey_schemas.problems import FieldError
 from marey_server import faults
 from marey_server.errors import Conflict, Invalid
 from marey_server.store import blobs, documents
-from marey_server.store.database import Transaction
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.fencing import hold, require_attempt
 from marey_server.store.items.drafts import Draft, StoredDocument
@@ -23,6 +22,7 @@ from marey_server.store.items.publishing import publish
 from marey_server.store.job_inputs import PinnedInputs
 from marey_server.store.projects import find_by_id
 from marey_server.store.tables import document, job, staged_output
+from marey_server.store.transaction import Transaction
 
 MOST_STAGED = 20_000
 IN_LIST = 1000

@@ -16,7 +16,6 @@ from marey_schemas.problems import FieldError
 from marey_server import faults
 from marey_server.errors import Invalid
 from marey_server.store import job_cache, staging
-from marey_server.store.database import Transaction
 from marey_server.store.ids import new_id
 from marey_server.store.job_documents import job_documents
 from marey_server.store.job_ends import Ended, dependency_failure
@@ -26,6 +25,7 @@ from marey_server.store.labels import labels_key
 from marey_server.store.projects import ProjectRow, require
 from marey_server.store.settling import settle
 from marey_server.store.tables import job, job_dependency
+from marey_server.store.transaction import Transaction
 
 IN_LIST = 1000
 

@@ -21,9 +21,9 @@ from marey_server.access.secret_tokens import (
 from marey_server.errors import Forbidden, LeaseLost, NotFound, Unauthenticated
 from marey_server.store import listing
 from marey_server.store.clock import datetime_of
-from marey_server.store.database import Transaction
 from marey_server.store.ids import new_id
 from marey_server.store.tables import attempt, job, token, user
+from marey_server.store.transaction import Transaction
 
 NOTE_USE_EVERY_S = 3600
 """How exactly `last_used_at` is kept: writing it on every request would make every read a write."""

@@ -15,9 +15,9 @@ from sqlalchemy import Row, delete, insert, select, update
 from marey_server.errors import Conflict, Forbidden, Invalid, NotFound, TooLarge, Unauthenticated
 from marey_server.store import blobs
 from marey_server.store.blob_backings import CHUNK_BYTES
-from marey_server.store.database import Transaction
 from marey_server.store.ids import new_id
 from marey_server.store.tables import upload, upload_chunk
+from marey_server.store.transaction import Transaction
 
 MAX_UPLOAD_BYTES = 16 * 2**30
 LIFETIME_US = 7 * 86400 * 1_000_000

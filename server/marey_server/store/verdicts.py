@@ -10,12 +10,12 @@ from sqlalchemy import ColumnElement, Row, update
 from marey_schemas.jobs import FailRequest, FailureReason
 from marey_server.errors import LeaseLost
 from marey_server.store import staging
-from marey_server.store.database import Transaction
 from marey_server.store.job_ends import AttemptEnd, end_attempts, end_jobs, failure_document
 from marey_server.store.job_events import emit_job_events, wake_workers
 from marey_server.store.queue_policy import QueuePolicy
 from marey_server.store.settling import settle
 from marey_server.store.tables import job
+from marey_server.store.transaction import Transaction
 
 TIME_LIMIT = "time-limit"
 """The code with which a worker reports that it stopped a job because its time was over."""

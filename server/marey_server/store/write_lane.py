@@ -10,13 +10,11 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import MareyError
-
-if TYPE_CHECKING:
-    from marey_server.store.database import Transaction
+from marey_server.store.transaction import Transaction
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -13,10 +13,10 @@ from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import Conflict, Forbidden, Invalid, NotFound
 from marey_server.store import items, jobs, members, users
-from marey_server.store.database import Transaction
 from marey_server.store.items.drafts import Draft
 from marey_server.store.reaper import share_waiting
 from marey_server.store.tables import staged_output
+from marey_server.store.transaction import Transaction
 from queue_desk import SUM, Desk, document
 
 

@@ -15,8 +15,8 @@ from marey_schemas.jobs import Lease
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import Conflict, LeaseLost
 from marey_server.store import submission, tables
-from marey_server.store.database import Transaction
 from marey_server.store.reaper import share_waiting
+from marey_server.store.transaction import Transaction
 from queue_desk import Desk
 from queue_model import TERMINAL, ModelJob, ModelQueue
 

@@ -12,7 +12,6 @@ from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import FieldError
 from marey_server.errors import Conflict, Invalid
 from marey_server.store import collections, documents, projects
-from marey_server.store.database import Transaction
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.items.drafts import Draft
 from marey_server.store.items.publishing import publish
@@ -22,6 +21,7 @@ from marey_server.store.items.revisions import emit_item, read_part_digests, wri
 from marey_server.store.projects import ProjectRow
 from marey_server.store.revs import change_row, moved_on
 from marey_server.store.tables import item, item_tag
+from marey_server.store.transaction import Transaction
 from marey_server.store.violations import taken
 
 

@@ -13,9 +13,9 @@ from marey_schemas.items import Item, Page
 from marey_schemas.kinds import Kind
 from marey_server.errors import BadRequest
 from marey_server.store import collections, listing, projects
-from marey_server.store.database import Transaction
 from marey_server.store.items.reading import item_rows, shown_items
 from marey_server.store.tables import collection, item, item_tag
+from marey_server.store.transaction import Transaction
 
 SORT_KEYS: dict[str, ColumnElement[Any]] = {
     "id": item.c.id,

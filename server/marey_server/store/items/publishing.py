@@ -13,7 +13,6 @@ from marey_schemas.kinds import PARTS
 from marey_server import faults
 from marey_server.errors import Conflict, Invalid
 from marey_server.store import collections, documents
-from marey_server.store.database import Transaction
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.ids import new_id
 from marey_server.store.items import references
@@ -22,6 +21,7 @@ from marey_server.store.items.revisions import read_part_digests, write_head, wr
 from marey_server.store.items.summaries import summarise
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import item, item_tag, lineage, revision_part
+from marey_server.store.transaction import Transaction
 
 Tree = dict[str, Any]
 

@@ -10,10 +10,10 @@ from sqlalchemy import select
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
 from marey_server.errors import Invalid
-from marey_server.store.database import Transaction
 from marey_server.store.items.drafts import Published
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import document, item, revision_part
+from marey_server.store.transaction import Transaction
 
 Tree = dict[str, Any]
 

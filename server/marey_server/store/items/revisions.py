@@ -9,11 +9,11 @@ from sqlalchemy import ColumnElement, insert, select, update
 
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
-from marey_server.store.database import Transaction
 from marey_server.store.documents import load_body
 from marey_server.store.items.summaries import summarise
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import item, revision, revision_part
+from marey_server.store.transaction import Transaction
 
 
 def read_part_digests(tx: Transaction, item_id: str, number: int) -> dict[str, str]:
