@@ -1,14 +1,29 @@
-"""The trials of an evaluation and the trajectories they ask for."""
+"""The trials of an evaluation and the trajectories they ask for.
+
+A trial starts at the origin facing +z, goes straight for its approach and then turns at a constant rate. Its speed is
+constant, or switches between two values at fixed intervals; the turn rate stays, so the path is a chain of tangent arcs.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.errors import MotionError
+from marey_motion.matching.options import TICK_RATE_HZ
+
+if TYPE_CHECKING:  # the result holds trials
+    from marey_motion.evaluation.result import EvaluationOptions
+
 Family = Literal["circle", "switching"]
+Floats = NDArray[np.float64]
+
+LOOK_AHEAD_S = 1.0
+# A boundary belongs to the tick that it falls on, however its time in seconds is rounded.
+TIME_TOLERANCE_S = 1e-9
 
 
 @dataclass(frozen=True)
@@ -50,3 +65,81 @@ class Reference:
     headings: NDArray[np.float64]
     speeds_m_s: NDArray[np.float64]
     turn_rates_rad_s: NDArray[np.float64]
+
+
+def suite_trials(options: EvaluationOptions) -> tuple[Trial, ...]:
+    """Every pair of the grid in every family, ordered by family, speed and turn rate as the options list them."""
+    return tuple(
+        Trial(
+            family=family,
+            speed_m_s=float(speed),
+            turn_rate_rad_s=float(np.radians(turn_rate)),
+            approach_s=options.approach_s,
+            duration_s=options.duration_s,
+            switch_speed_m_s=options.switch_speed_m_s,
+            switch_every_s=options.switch_every_s,
+        )
+        for family in options.families
+        for speed in options.grid.speeds_m_s
+        for turn_rate in options.grid.turn_rates_deg_s
+    )
+
+
+def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float = LOOK_AHEAD_S) -> Reference:
+    """A trial's trajectory in closed form, sampled at t = tick / rate_hz.
+
+    Raises `MotionError` for a trial without ticks, or whose speed switches without an interval.
+    """
+    tick_count = round((trial.approach_s + trial.duration_s) * rate_hz)
+    if tick_count < 1 or trial.approach_s < 0.0 or trial.duration_s < 0.0:
+        raise MotionError(
+            f"a trial of {trial.approach_s:g} s and {trial.duration_s:g} s has no ticks", where=trial.name
+        )
+    if trial.family == "switching" and not trial.switch_every_s > 0.0:
+        raise MotionError("the speed must switch at intervals longer than 0 s", where=trial.name)
+    times = np.arange(tick_count + int(np.ceil(look_ahead_s * rate_hz))) / rate_hz
+    starts, speeds, turn_rates = _pieces(trial, float(times[-1]))
+    origins, headings = _piece_origins(starts, speeds, turn_rates)
+    piece = np.searchsorted(starts, times + TIME_TOLERANCE_S, side="right") - 1
+    along, turned = _arc(speeds[piece], turn_rates[piece], headings[piece], times - starts[piece])
+    return Reference(
+        rate_hz=rate_hz,
+        tick_count=tick_count,
+        positions=origins[piece] + along,
+        headings=turned,
+        speeds_m_s=speeds[piece],
+        turn_rates_rad_s=turn_rates[piece],
+    )
+
+
+def _pieces(trial: Trial, end_s: float) -> tuple[Floats, Floats, Floats]:
+    """Start time, speed and turn rate of each piece of constant speed and turn rate."""
+    circles = 1
+    if trial.family == "switching":
+        circles += max(0, int((end_s - trial.approach_s) / trial.switch_every_s))
+    starts = np.concatenate(([0.0], trial.approach_s + trial.switch_every_s * np.arange(circles)))
+    speeds = np.full(len(starts), trial.speed_m_s)
+    speeds[2::2] = trial.switch_speed_m_s
+    turn_rates = np.full(len(starts), trial.turn_rate_rad_s)
+    turn_rates[0] = 0.0
+    return starts, speeds, turn_rates
+
+
+def _piece_origins(starts: Floats, speeds: Floats, turn_rates: Floats) -> tuple[Floats, Floats]:
+    """Position (P, 2) and heading (P,) where each piece begins: the ends of all earlier ones, added up."""
+    durations = np.diff(starts)
+    headings = np.concatenate(([0.0], np.cumsum(turn_rates[:-1] * durations)))
+    steps, _ = _arc(speeds[:-1], turn_rates[:-1], headings[:-1], durations)
+    return np.concatenate((np.zeros((1, 2)), np.cumsum(steps, axis=0))), headings
+
+
+def _arc(speed: Floats, turn_rate: Floats, heading: Floats, elapsed: Floats) -> tuple[Floats, Floats]:
+    """Displacement (..., 2) and heading after going `elapsed` seconds from `heading`.
+
+    The chord of an arc of angle a is its length times sin(a/2)/(a/2), in the direction half-way through the turn; this
+    form needs no case for a turn rate of zero.
+    """
+    turn = turn_rate * elapsed
+    chord = speed * elapsed * np.sinc(turn / (2.0 * np.pi))
+    direction = heading + 0.5 * turn
+    return np.stack((chord * np.sin(direction), chord * np.cos(direction)), axis=-1), heading + turn
