@@ -120,6 +120,7 @@ class Items(Generic[Handle]):
         self,
         *,
         collection: str | None = None,
+        directly_in: str | None = None,
         path: str | None = None,
         sort: str | None = None,
         filters: Params | None = None,
@@ -127,10 +128,13 @@ class Items(Generic[Handle]):
     ) -> Iterator[Handle]:
         """Items in order, fetched page by page.
 
-        `collection` names a folder, with everything below it; `path` one item; `filters` are the server's, such as
-        `{"frames.gte": 120, "tag.in": "walk,run"}`.
+        `collection` names a folder, with everything below it; `directly_in` one without, of which "" is the root;
+        `path` one item; `filters` are the server's, such as `{"frames.gte": 120, "tag.in": "walk,run"}`.
         """
-        params = {"collection": collection or None, "path": path, "sort": sort, "limit": page_size, **(filters or {})}
+        params = {
+            "collection": collection or None, "directly_in": directly_in, "path": path, "sort": sort,
+            "limit": page_size, **(filters or {}),
+        }  # fmt: skip
         return (self._handle(item) for item in pages(self.transport, Item, self.url, params))
 
     def get(self, item_id: str) -> Handle:

@@ -199,10 +199,27 @@ def test_pages_follow_each_other_and_lose_nothing_while_things_are_added(owner: 
 
 def test_lists_are_filtered_and_show_the_fields_asked_for(owner: httpx.Client, clip: str):
     owner.patch(clip, json={"tags": ["raw", "checked"], "collection": "a/b"}, headers={"If-Match": "*"})
-    for query in ("tag.in=raw,other", "collection=a", "path=a/b/walk", "name=wa*", "frames.gte=40", "q=ALK"):
+    for query in (
+        "tag.in=raw,other",
+        "collection=a",
+        "directly_in=a/b",
+        "path=a/b/walk",
+        "name=wa*",
+        "frames.gte=40",
+        "q=ALK",
+    ):
         found = owner.get(f"/projects/lab/clips?{query}&fields=name,tags").json()["items"]
         assert found == [{"name": "walk", "tags": ["checked", "raw"]}], query
-    for query in ("tag.in=other", "collection=b", "path=a/walk", "name=wal", "frames.gte=41", "frames.lte=39"):
+    for query in (
+        "tag.in=other",
+        "collection=b",
+        "directly_in=a",
+        "directly_in=",
+        "path=a/walk",
+        "name=wal",
+        "frames.gte=41",
+        "frames.lte=39",
+    ):
         assert owner.get(f"/projects/lab/clips?{query}").json()["items"] == [], query
 
 

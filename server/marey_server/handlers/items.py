@@ -22,6 +22,9 @@ class ItemsQuery(CountedPageQuery):
     """Which items, in which order, and how much of each."""
 
     collection: str | None = Field(None, max_length=1024, description="In this folder or below it.")
+    directly_in: str | None = Field(
+        None, max_length=1024, description="In this folder, not below it; the empty path is the root."
+    )
     path: str | None = Field(None, max_length=1300, description="Folder and name of one item.")
     name: str | None = Field(None, max_length=255, description="Exactly this name, or with a final * its beginning.")
     tag_in: CommaSeparated = Field((), alias="tag.in", description="With any of these tags.")
@@ -37,6 +40,7 @@ class ItemsQuery(CountedPageQuery):
         """What the store filters by."""
         return ItemFilters(
             collection=self.collection,
+            directly_in=self.directly_in,
             path=self.path,
             name=self.name,
             tags=self.tag_in,

@@ -40,6 +40,11 @@ FILTERS = (
     ({"collection": "raw/a"}, {"walk 1", "zoë"}),
     ({"collection": "ra"}, set()),
     ({"collection": ""}, {name for name, *_ in CLIPS}),
+    ({"directly_in": "raw"}, {"Walk 10"}),
+    ({"directly_in": "raw/a"}, {"walk 1"}),
+    ({"directly_in": ""}, {"Übung"}),
+    ({"directly_in": "ra"}, set()),
+    ({"directly_in": "raw", "collection": "raw/a"}, set()),
     ({"path": "raw/walk 1"}, set()),
     ({"path": "raw/a/walk 1"}, {"walk 1"}),
     ({"path": "Übung"}, {"Übung"}),
@@ -122,6 +127,24 @@ def test_pages_put_together_are_the_list(filled):
             assert [name for page in pages(filled, limit, sort=sort) for name in page] == whole, (sort, limit)
 
 
+def test_pages_of_one_folder_put_together_are_its_list(filled):
+    for number in range(5):
+        filled.add_clip(filled.rig, f"take {number}", collection="raw", seed=30 + number)
+    folder = ItemFilters(directly_in="raw")
+    for sort in ("name", "-name", "-created_at"):
+        whole = names(filled, sort=sort, directly_in="raw")
+        assert len(whole) == 6
+        assert [name for page in pages(filled, 2, sort=sort, filters=folder) for name in page] == whole
+
+
+def test_deleted_items_are_found_directly_in_the_folder_they_were_in(filled):
+    (gone,) = filled.read(items.list_items, "lab", Kind.CLIP, ItemFilters(name="Walk 10")).items
+    filled.write(items.delete_item, "lab", Kind.CLIP, gone.id, expected_rev=None)
+    assert names(filled, directly_in="raw") == []
+    assert names(filled, directly_in="raw", deleted=True) == ["Walk 10"]
+    assert names(filled, path="raw/Walk 10", deleted=True) == ["Walk 10"]
+
+
 def test_what_is_inserted_meanwhile_neither_repeats_nor_hides_anything(filled):
     seen = []
     for number, page in enumerate(pages(filled, 2, sort="name")):
@@ -169,6 +192,7 @@ def test_cursors_of_one_server_are_worth_nothing_on_another(filled):
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 def test_no_filter_value_breaks_a_list(filled, text, number):
     texts = [{"q": text}, {"name": text}, {"name": f"{text}*"}, {"path": text}, {"tags": (text,)}]
+    texts += [{"directly_in": text}]
     numbers = [{"frames_gte": number}, {"frames_lte": number}]
     for filters in (*texts, {"collection": text}, {"skeleton": text}, *numbers):
         with suppress(Invalid):

@@ -32,6 +32,8 @@ class ItemFilters:
 
     collection: str | None = None
     """A folder, with those below it."""
+    directly_in: str | None = None
+    """A folder without those below it; the empty path is the root."""
     path: str | None = None
     """Folder and name."""
     name: str | None = None
@@ -87,13 +89,11 @@ def _conditions(project_id: str, kind: Kind, filters: ItemFilters) -> list[Colum
     ]
     if filters.collection:
         conditions.append(item.c.collection_id.in_(_below(project_id, filters.collection)))
+    if filters.directly_in is not None:
+        conditions.append(_directly_in(project_id, filters.directly_in, deleted=filters.deleted))
     if filters.path is not None:
         folder, _, name = filters.path.rpartition("/")
-        at = select(collection.c.id).where(
-            collection.c.project_id == project_id, collection.c.path == folder, collection.c.deleted_us.is_(None)
-        )
-        # Equal to one id, not in a set of ids: so SQLite sees that the unique index gives one row.
-        conditions += [item.c.collection_id == at.scalar_subquery(), item.c.name == name]
+        conditions += [_directly_in(project_id, folder, deleted=filters.deleted), item.c.name == name]
     if filters.name is not None:
         conditions += _named(filters.name)
     if filters.tags:
@@ -112,6 +112,14 @@ def _conditions(project_id: str, kind: Kind, filters: ItemFilters) -> list[Colum
 
 def _below(project_id: str, path: str) -> Any:
     return select(collection.c.id).where(collection.c.project_id == project_id, collections.at_or_below(path))
+
+
+def _directly_in(project_id: str, path: str, *, deleted: bool) -> ColumnElement[bool]:
+    found = select(collection.c.id).where(collection.c.project_id == project_id, collection.c.path == path)
+    if deleted:  # what was deleted may have been in folders of this path that were deleted, too
+        return item.c.collection_id.in_(found)
+    # Equal to one id, not in a set of ids: so SQLite sees that the index by folder is in the order of names.
+    return item.c.collection_id == found.where(collection.c.deleted_us.is_(None)).scalar_subquery()
 
 
 def _named(name: str) -> list[ColumnElement[bool]]:
