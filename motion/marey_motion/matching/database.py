@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from marey_motion.clip import Clip
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.normaliser import Normaliser
 from marey_motion.matching.options import DatabaseOptions
+from marey_motion.matching.root_motion import RootMotion, root_motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,3 +88,14 @@ class MatchingDatabase:
     def row_count(self) -> int:
         """N."""
         return len(self.features)
+
+    @cached_property
+    def starts(self) -> NDArray[np.int64]:
+        """(C + 1,) first row of each clip, and N."""
+        return np.array([clip.start for clip in self.clips] + [self.row_count], dtype=np.int64)
+
+    @cached_property
+    def root_motion(self) -> RootMotion:
+        """What follows each row, and how the root moves there."""
+        wraps = np.array([clip.loop and self.options.end_policy == "loop" for clip in self.clips], dtype=np.bool_)
+        return root_motion(self.root_positions, self.root_headings, self.starts, wraps)

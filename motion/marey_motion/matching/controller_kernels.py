@@ -1,0 +1,288 @@
+"""The compiled loop of motion matching, kept apart so that importing the rest of the package does not load numba.
+
+Ground positions are (x, z) metres, headings radians growing to the left. `index` is a
+`marey_motion.matching.search.SearchIndex`, `motion` a `root_motion.RootMotion`, and `wish`, `rules` and `scales` are the
+tuples of `marey_motion.matching.controller`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from marey_motion.matching.search_kernels import cost_of, nearest, nearest_weighted
+
+# How the wished trajectory is taken from the reference.
+BY_TIME = 0
+BY_PATH = 1
+OPEN_LOOP = 2
+
+# `record.Status`
+KEPT = 0
+REPLACING = 1
+REPLACED = 2
+FORCED = 3
+
+# A wish that changes by more than this from one tick to the next is not waited with until the next search.
+JUMP_M_S = 0.5
+JUMP_RAD = np.pi / 6
+# The nearest point of the path is looked for so far from the last one, or a lap could be skipped.
+PATH_WINDOW_S = 0.5
+
+_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+
+
+@_compiled
+def _arc(speed, turn_rate, elapsed):  # type: ignore[no-untyped-def]
+    """Steps to the left and forward, and turn, after `elapsed` seconds at constant speed and turn rate."""
+    half = 0.5 * turn_rate * elapsed
+    chord = speed * elapsed * (np.sin(half) / half if half != 0.0 else 1.0)
+    return chord * np.sin(half), chord * np.cos(half), 2.0 * half
+
+
+@_compiled
+def _outward(heading, left, forward):  # type: ignore[no-untyped-def]
+    """A step in a root's frame as (x, z) in the world."""
+    sine, cosine = np.sin(heading), np.cos(heading)
+    return left * cosine + forward * sine, forward * cosine - left * sine
+
+
+@_compiled
+def _wished(wish, when):  # type: ignore[no-untyped-def]
+    """Position and heading of the wished path at `when` ticks; beyond its end it goes on with its last arc."""
+    last = wish.headings.shape[0] - 1
+    if when >= last:
+        left, forward, turn = _arc(wish.speeds[last], wish.turn_rates[last], (when - last) * wish.tick_s)
+        x, z = _outward(wish.headings[last], left, forward)
+        return wish.positions[last, 0] + x, wish.positions[last, 1] + z, wish.headings[last] + turn
+    tick = int(when)
+    rest = when - tick
+    x, z, heading = wish.positions[tick, 0], wish.positions[tick, 1], wish.headings[tick]
+    x += rest * (wish.positions[tick + 1, 0] - x)
+    z += rest * (wish.positions[tick + 1, 1] - z)
+    return x, z, heading + rest * (wish.headings[tick + 1] - heading)
+
+
+@_compiled
+def _progress(wish, when, x, z):  # type: ignore[no-untyped-def]
+    """Where on the wished path, in ticks, its nearest point to (x, z) lies, near the last one `when`."""
+    window = int(PATH_WINDOW_S / wish.tick_s)
+    best, best_square = 0, np.inf
+    for tick in range(max(0, int(when) - window), int(when) + window + 1):
+        path_x, path_z, _ = _wished(wish, float(tick))
+        square = (path_x - x) ** 2 + (path_z - z) ** 2
+        if square < best_square:
+            best, best_square = tick, square
+    here_x, here_z, _ = _wished(wish, float(best))
+    next_x, next_z, _ = _wished(wish, best + 1.0)
+    step_x, step_z = next_x - here_x, next_z - here_z
+    square = step_x * step_x + step_z * step_z
+    if square == 0.0:
+        return float(best)
+    along = ((x - here_x) * step_x + (z - here_z) * step_z) / square
+    return max(0.0, best + min(0.5, max(-0.5, along)))
+
+
+@_compiled
+def _moment(rules, wish, when, tick, x, z):  # type: ignore[no-untyped-def]
+    """The moment of the wished path, in ticks, that counts as now."""
+    return _progress(wish, when, x, z) if rules.follow == BY_PATH else float(tick)
+
+
+@_compiled
+def moments_along(rules, wish, positions, out):  # type: ignore[no-untyped-def]
+    """Fill `out` (T,) with the moment of the wished path that counted as now at each tick of a trial."""
+    when = 0.0
+    for tick in range(positions.shape[0]):
+        if tick > 0:
+            when = _moment(rules, wish, when, tick, positions[tick, 0], positions[tick, 1])
+        out[tick] = when
+
+
+@_compiled
+def fill_query(index, scales, rules, wish, row, when, x, z, heading, query):  # type: ignore[no-untyped-def]
+    """Fill the normalised query (D,): the pose of `row`, and the wish seen from a root at (x, z) with `heading`."""
+    horizons = scales.horizons_s.shape[0]
+    first = query.shape[0] - 4 * horizons
+    query[:first] = index.rows[row, :first]
+    now = min(int(when), wish.speeds.shape[0] - 1)
+    sine, cosine = np.sin(heading), np.cos(heading)
+    for h in range(horizons):
+        if rules.follow == OPEN_LOOP:
+            left, forward, turn = _arc(wish.speeds[now], wish.turn_rates[now], scales.horizons_s[h])
+        else:
+            path_x, path_z, path_heading = _wished(wish, when + scales.horizons_ticks[h])
+            left = (path_x - x) * cosine - (path_z - z) * sine
+            forward = (path_x - x) * sine + (path_z - z) * cosine
+            turn = path_heading - heading
+        position = first + 2 * h
+        direction = position + 2 * horizons
+        query[position], query[position + 1] = left, forward
+        query[direction], query[direction + 1] = np.sin(turn), np.cos(turn)
+    for d in range(first, query.shape[0]):
+        query[d] = (query[d] - scales.offset[d]) / scales.scale[d]
+
+
+@_compiled
+def pose_distance_cost(index, points, row, other, query, first):  # type: ignore[no-untyped-def]
+    """Summed distance in metres between the pose joints of two rows, plus the cost of the trajectory of `other`."""
+    cost = 0.0
+    for d in range(first, query.shape[0]):
+        difference = index.rows[other, d] - query[d]
+        cost += difference * difference
+    for p in range(points.shape[1]):
+        square = 0.0
+        for c in range(3):
+            difference = float(points[other, p, c]) - float(points[row, p, c])
+            square += difference * difference
+        cost += np.sqrt(square)
+    return cost
+
+
+@_compiled
+def _nearest_by_pose(index, points, row, query, first, skip_start, skip_stop):  # type: ignore[no-untyped-def]
+    best_row, best_cost = -1, np.inf
+    for other in range(index.rows.shape[0]):
+        if not index.selectable[other] or skip_start <= other < skip_stop:
+            continue
+        cost = pose_distance_cost(index, points, row, other, query, first)
+        if cost < best_cost:
+            best_row, best_cost = other, cost
+    return best_row, best_cost
+
+
+@_compiled
+def _search(index, points, rules, row, query, first, skip_start, skip_stop):  # type: ignore[no-untyped-def]
+    if rules.by_pose:
+        return _nearest_by_pose(index, points, row, query, first, skip_start, skip_stop)
+    return nearest(index, query, row, skip_start, skip_stop)
+
+
+@_compiled
+def _going_on(index, points, rules, row, query, first):  # type: ignore[no-untyped-def]
+    if rules.by_pose:
+        return pose_distance_cost(index, points, row, row, query, first)
+    return cost_of(index, row, query)
+
+
+@_compiled
+def _skipped(motion, rules, starts, row):  # type: ignore[no-untyped-def]
+    """The rows of the same clip too near to choose, half open."""
+    if rules.window == 0:
+        return 0, 0
+    clip = np.searchsorted(starts, row, side="right") - 1
+    return max(starts[clip], row - rules.window), min(starts[clip + 1], row + rules.window + 1)
+
+
+@_compiled
+def _turned_into(wish, before, when):  # type: ignore[no-untyped-def]
+    """Whether the wished velocity or direction jumped between two moments."""
+    last = wish.speeds.shape[0] - 1
+    a, b = min(int(before), last), min(int(when), last)
+    if abs(wish.headings[b] - wish.headings[a]) > JUMP_RAD:
+        return True
+    x = wish.speeds[b] * np.sin(wish.headings[b]) - wish.speeds[a] * np.sin(wish.headings[a])
+    z = wish.speeds[b] * np.cos(wish.headings[b]) - wish.speeds[a] * np.cos(wish.headings[a])
+    return x * x + z * z > JUMP_M_S * JUMP_M_S
+
+
+@_compiled
+def _step(motion, rules, row, offsets, root):  # type: ignore[no-untyped-def]
+    """Move `root` (x, z, heading) by the step that follows `row` and what is left of blended velocities.
+
+    offsets (2, 3): what to add to the root's velocity (left, forward, turn), and how that changes per second.
+    """
+    tick_s = rules.tick_s
+    left = motion.steps[row, 0] + offsets[0, 0] * tick_s
+    forward = motion.steps[row, 1] + offsets[0, 1] * tick_s
+    x, z = _outward(root[2], left, forward)
+    root[0] += x
+    root[1] += z
+    root[2] += motion.steps[row, 2] + offsets[0, 2] * tick_s
+    decay = np.exp(-rules.decay_per_s * tick_s)
+    for c in range(3):
+        rate = offsets[1, c] + rules.decay_per_s * offsets[0, c]
+        offsets[0, c] = decay * (offsets[0, c] + rate * tick_s)
+        offsets[1, c] = decay * (offsets[1, c] - rules.decay_per_s * rate * tick_s)
+
+
+@_compiled
+def _hold(rules, wish, when, root):  # type: ignore[no-untyped-def]
+    """Pull the root towards the wished one, and hold it near."""
+    x, z, heading = _wished(wish, when)
+    pull = 1.0 - np.exp(-rules.adjustment_per_s * rules.tick_s)
+    root[0] += pull * (x - root[0])
+    root[1] += pull * (z - root[1])
+    turn = heading - root[2]
+    root[2] += pull * (turn - 2.0 * np.pi * np.round(turn / (2.0 * np.pi)))
+    distance = np.hypot(root[0] - x, root[1] - z)
+    if distance > rules.clamp_m:
+        root[0] = x + (root[0] - x) * rules.clamp_m / distance
+        root[1] = z + (root[1] - z) * rules.clamp_m / distance
+
+
+@_compiled
+def run(index, motion, points, starts, wish, rules, scales, record):  # type: ignore[no-untyped-def]
+    """Play one trial into the arrays of `record`.
+
+    points (N, P, 3) pose joints, starts (C + 1,) first rows of the clips and N.
+    """
+    ticks = record.rows.shape[0]
+    dimensions = index.rows.shape[1]
+    first = dimensions - 4 * scales.horizons_s.shape[0]
+    query = np.empty(dimensions)
+    offsets = np.zeros((2, 3))
+    root = np.array([wish.positions[0, 0], wish.positions[0, 1], wish.headings[0]])
+    record.match_cost[:] = np.nan
+    record.continuing_cost[:] = np.nan
+
+    fill_query(index, scales, rules, wish, 0, 0.0, root[0], root[1], root[2], query)
+    weights = np.ones(dimensions)
+    weights[:first] = 0.0
+    row, record.match_cost[0] = nearest_weighted(index, query, weights, 0, 0)
+    status = FORCED
+    before = when = 0.0
+    forced_at = -rules.period
+    for tick in range(ticks):
+        record.rows[tick], record.status[tick] = row, status
+        record.positions[tick, 0], record.positions[tick, 1], record.headings[tick] = root[0], root[1], root[2]
+
+        ended = motion.successors[row] < 0
+        due = ended or tick % rules.period == 0
+        if not due and tick - forced_at >= rules.period and _turned_into(wish, before, when):
+            due, forced_at = True, tick
+        chosen = row
+        if due and tick > 0:
+            fill_query(index, scales, rules, wish, row, when, root[0], root[1], root[2], query)
+            skip_start, skip_stop = _skipped(motion, rules, starts, row)
+            best, cost = _search(index, points, rules, row, query, first, skip_start, skip_stop)
+            if ended:
+                if best < 0:
+                    best, cost = _search(index, points, rules, row, query, first, 0, 0)
+                chosen = best
+            else:
+                going_on = _going_on(index, points, rules, row, query, first)
+                record.continuing_cost[tick] = going_on
+                if best >= 0 and best != row and cost < going_on + rules.bias - rules.margin:
+                    chosen = best
+                else:
+                    cost = going_on
+            record.match_cost[tick] = cost
+
+        if chosen != row and rules.blends_root:
+            for c in range(3):
+                offsets[0, c] += (motion.steps[row, c] - motion.steps[chosen, c]) / rules.tick_s
+        if ended or motion.successors[chosen] != chosen + 1:
+            status = FORCED
+        else:
+            status = KEPT
+        if chosen != row and not ended:
+            status = REPLACING
+            if record.status[tick] != REPLACING:
+                record.status[tick] = REPLACED
+        _step(motion, rules, chosen, offsets, root)
+        row = motion.successors[chosen]
+        before = when
+        when = _moment(rules, wish, when, tick + 1, root[0], root[1])
+        if rules.holds:
+            _hold(rules, wish, when, root)
