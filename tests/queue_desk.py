@@ -75,7 +75,18 @@ SQUARE = KindDeclaration(
     fan_out="things",
     batch_size=2,
 )
-KINDS = {kind.name: kind for kind in (*job_kinds.BUILT_IN, ERRAND, SUM, SQUARE)}
+SURVEY = KindDeclaration(
+    name="survey",
+    description="Looks at all things in as many parts as its number says, and gathers what it saw.",
+    params=Params,
+    implementation="tests:survey",
+    version=1,
+    inputs={"things": InputSpec(kind=Kind.PROCESSED, many=True)},
+    outputs={"survey": Kind.PROCESSED},
+    task_count=lambda params: params.number,
+    gathering="tests:gather",
+)
+KINDS = {kind.name: kind for kind in (*job_kinds.BUILT_IN, ERRAND, SUM, SQUARE, SURVEY)}
 
 
 @dataclass

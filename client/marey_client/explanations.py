@@ -21,7 +21,7 @@ def explain_job(marey: Marey, job_id: str, *, now: datetime | None = None) -> li
 
 def explain(job: Job, attempts: list[Attempt], running: list[Job], now: datetime) -> list[str]:
     """The same from what is known of the job, its attempts, and the project's running jobs."""
-    if job.size is not None and not job.state.terminal:
+    if job.size is not None and not job.state.terminal and job.children != {"succeeded": job.size}:
         told = ", ".join(f"{count} {state}" for state, count in sorted(job.children.items()))
         return [f"{job.state}: it gathers {job.size} tasks, of which {told or 'none has begun'}."]
     reasons = {

@@ -5,7 +5,7 @@ function behind one. Other distributions add kinds with an entry point of the gr
 `KindDeclaration`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import entry_points
@@ -17,6 +17,8 @@ from marey_schemas.jobs import ExportParams, ImportParams, InputSpec, JobKind, R
 from marey_schemas.kinds import Kind
 
 ENTRY_POINT_GROUP = "marey.job_kinds"
+MOST_TASKS = 1000
+"""Tasks that the parameters of one job may make."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,12 @@ class KindDeclaration:
 
     `version` changes whenever the same inputs, parameters and seed may give other results; cached results of another
     version are not used. `implementation` names the worker's function `run(context, params)` as `module:function`.
+
+    A job is spread over tasks in one of two ways. With `fan_out`, each task gets `batch_size` items of that input, and
+    the whole is the sum of its tasks. With `task_count`, the checked parameters say how many tasks there are; each gets
+    all inputs and learns from `context.task` which it is. When all have succeeded, a worker runs `gathering`, a
+    function `gather(context, params, results)`, over what they returned, in their order. Where `task_count` says one,
+    a single job runs both functions.
     """
 
     name: str
@@ -36,6 +44,8 @@ class KindDeclaration:
     inputs: Mapping[str, InputSpec] = field(default_factory=dict)
     fan_out: str | None = None
     batch_size: int = 1
+    task_count: Callable[[Any], int] | None = None
+    gathering: str | None = None
     deterministic: bool = True
 
     def __post_init__(self) -> None:
@@ -43,6 +53,10 @@ class KindDeclaration:
             raise ValueError(f"{self.name}: fan_out {self.fan_out!r} must be an input that takes many items")
         if self.batch_size < 1:
             raise ValueError(f"{self.name}: batch_size must be at least 1, not {self.batch_size}")
+        if (self.task_count is None) != (self.gathering is None):
+            raise ValueError(f"{self.name}: task_count and gathering go together")
+        if self.task_count is not None and self.fan_out is not None:
+            raise ValueError(f"{self.name}: tasks come from fan_out or from task_count, not from both")
 
     @property
     def code_version(self) -> str:
@@ -59,6 +73,7 @@ class KindDeclaration:
             outputs=dict(self.outputs),
             fan_out=self.fan_out,
             batch_size=self.batch_size,
+            gathers=self.gathering is not None,
             deterministic=self.deterministic,
         )
 

@@ -84,6 +84,7 @@ class JobKind(Answer):
     outputs: dict[str, Kind | Literal["file"]]
     fan_out: str | None = Field(None, description="The input whose items are spread over many workers.")
     batch_size: int = Field(1, description="Items a single task of a fan-out takes.")
+    gathers: bool = Field(False, description="The parameters say how many tasks there are; a worker gathers them.")
     deterministic: bool = Field(
         True, description="Same inputs, parameters and seed give the same bytes: results may be cached."
     )
@@ -180,6 +181,7 @@ class Job(Answer):
     max_attempts: int
     interruptions: int = 0
     parent: str | None = None
+    position: int | None = Field(None, description="Of a task: which of its fan-out it is, from 0.")
     size: int | None = Field(None, description="Tasks of a fan-out.")
     children: dict[str, int] = Field(default_factory=dict, description="Tasks by state.")
     retry_of: str | None = None
@@ -195,6 +197,15 @@ class Job(Answer):
     started_at: datetime | None = None
     finished_at: datetime | None = None
     rev: int
+
+
+class TaskResult(Answer):
+    """What one task of a fan-out brought, as far as it has ended."""
+
+    job: str
+    position: int
+    state: JobState
+    result: dict[str, Any] | None
 
 
 class Attempt(Answer):
@@ -244,6 +255,8 @@ class Lease(Answer):
     inputs: dict[str, tuple[PinnedInput, ...]]
     into: str
     seed: int
+    position: int | None = Field(None, description="Of a task: which of its fan-out it is, from 0.")
+    size: int | None = Field(None, description="Tasks of the fan-out, for its tasks and for the job that gathers them.")
     resources: Resources
     fence: int
     attempt: int

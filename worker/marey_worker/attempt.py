@@ -24,7 +24,20 @@ from marey_worker.cache import InputCache
 from marey_worker.child_process import ChildProcess
 from marey_worker.environment import environment
 from marey_worker.keeper import LeaseKeeper
-from marey_worker.messages import Done, Failed, Made, PutFile, ReadBlob, ReadItem, ReadPart, Reply, Request, Run, Stage
+from marey_worker.messages import (
+    Done,
+    Failed,
+    Made,
+    PutFile,
+    ReadBlob,
+    ReadItem,
+    ReadPart,
+    ReadResults,
+    Reply,
+    Request,
+    Run,
+    Stage,
+)
 
 log = logging.getLogger(__name__)
 
@@ -93,12 +106,20 @@ class Attempt:
     """Runs one lease to its end."""
 
     def __init__(
-        self, api: AttemptApi, lease: Lease, cache: InputCache, server: str, stopping: threading.Event
+        self,
+        api: AttemptApi,
+        lease: Lease,
+        cache: InputCache,
+        server: str,
+        stopping: threading.Event,
+        *,
+        threads: int,
     ) -> None:
         self._api = api
         self._lease = lease
         self._cache = cache
         self._server = server
+        self._threads = threads
         self._scratch = Path(tempfile.mkdtemp(prefix="marey-job-"))
         self._log_path = self._scratch / "log"
         self._log_path.touch(mode=0o600)
@@ -131,7 +152,8 @@ class Attempt:
         lease = self._lease
         return Run(
             lease.job, lease.kind, lease.params, lease.inputs, lease.seed,
-            lease.resources.memory_limit_mb * MIB, self._log_path, self._scratch,
+            lease.resources.memory_limit_mb * MIB, self._log_path, self._scratch, self._threads,
+            lease.position, lease.size,
         )  # fmt: skip
 
     # -- while the child computes --
@@ -173,6 +195,8 @@ class Attempt:
                 return self._api.read_item(kind, item)
             case ReadBlob(_, digest):
                 return self._kept(digest, lambda: self._api.read_blob(digest))
+            case ReadResults():
+                return self._api.read_results()
             case PutFile(_, path):
                 digest = self._api.put_file(path)
                 faults.point("worker.after_blob")

@@ -11,6 +11,7 @@ import httpx
 
 from marey_client.blobs import Blobs
 from marey_client.errors import Conflict, LeaseLost, Unauthenticated
+from marey_client.paging import pages
 from marey_client.retries import Retries
 from marey_client.transport import BLOCKS, Transport, as_json, read_model
 from marey_schemas.items import Item
@@ -23,6 +24,7 @@ from marey_schemas.jobs import (
     Lease,
     LeaseList,
     Progress,
+    TaskResult,
 )
 from marey_schemas.kinds import Kind
 
@@ -47,6 +49,7 @@ class AttemptApi:
         self._transport = transport.with_token(lease.attempt_token)
         self._patient = transport.with_token(lease.attempt_token, retries=PATIENT)
         self._project = lease.project
+        self._job = lease.job
         self._url = f"/jobs/{lease.job}/attempts/{lease.fence}"
         self._log_offset = 0
 
@@ -89,6 +92,11 @@ class AttemptApi:
         """An item as it is now."""
         with _dead_token_is_lost_lease():
             return self._transport.get(Item, f"/projects/{self._project}/{kind.plural}/{item}")
+
+    def read_results(self) -> list[dict[str, Any]]:
+        """What the tasks of the job returned, in their order."""
+        with _dead_token_is_lost_lease():
+            return [one.result or {} for one in pages(self._transport, TaskResult, f"/jobs/{self._job}/results")]
 
     def read_blob(self, digest: str) -> bytes:
         """Bytes by digest."""

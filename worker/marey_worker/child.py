@@ -11,6 +11,7 @@ import sys
 import traceback
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -61,7 +62,7 @@ def run_job(run: Run, pipe: Connection) -> End:
     context = Context(run, pipe)
     allow_memory(run.memory_limit_bytes)
     try:
-        result = _function_of(find_kind(run.kind))(context, find_kind(run.kind).params.model_validate(run.params))
+        result = _perform(find_kind(run.kind), context, run)
         context.finish_staging()
     except JobRefused as error:
         return Failed(error.code, error.detail, None, retryable=False)
@@ -88,8 +89,19 @@ def write_output_to(path: Path) -> None:
     os.close(descriptor)
 
 
-def _function_of(kind: KindDeclaration):  # type: ignore[no-untyped-def]
-    module, _, function = kind.implementation.partition(":")
+def _perform(kind: KindDeclaration, context: Context, run: Run) -> dict[str, Any]:
+    """A task, a gathering, or a job that is neither; one that has no tasks is done and gathered at once."""
+    params = kind.params.model_validate(run.params)
+    is_task, gathers = run.position is not None, run.position is None and run.size is not None
+    results = context.task_results() if gathers else [_function(kind.implementation)(context, params)]
+    if kind.gathering is None or is_task:
+        return results[0]
+    gathered: dict[str, Any] = _function(kind.gathering)(context, params, results)
+    return gathered
+
+
+def _function(name: str) -> Any:
+    module, _, function = name.partition(":")
     return getattr(importlib.import_module(module), function)
 
 

@@ -7,13 +7,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from marey_schemas.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.items import Item
 from marey_schemas.jobs import PinnedInput, Progress, StagedOutput, StageRequest
 from marey_schemas.kinds import Kind
-from marey_worker.messages import Made, PutFile, ReadBlob, ReadItem, ReadPart, Reply, Request, Run, Stage
+from marey_worker.messages import Made, PutFile, ReadBlob, ReadItem, ReadPart, ReadResults, Reply, Request, Run, Stage
 
 T = TypeVar("T")
 
@@ -41,6 +41,13 @@ class NoSuchThing(RequestRefused):
     """What the job asked for does not exist, or the job may not see it."""
 
 
+class Task(NamedTuple):
+    """Which of the tasks of a job this is, from 0, and of how many."""
+
+    position: int
+    size: int
+
+
 class Context:
     """One job: its inputs, and the ways to read documents, tell progress and stage results.
 
@@ -50,6 +57,8 @@ class Context:
     def __init__(self, run: Run, pipe: Connection) -> None:
         self.inputs: Mapping[str, tuple[PinnedInput, ...]] = run.inputs
         self.seed = run.seed
+        self.task = Task(0, 1) if run.position is None else Task(run.position, run.size or 1)
+        self.threads = run.threads
         self.scratch: Path = run.scratch
         self._pipe = pipe
         self._replies: dict[int, Reply] = {}
@@ -61,19 +70,31 @@ class Context:
         """A part of a revision; arrays are numpy arrays. Raises `NoSuchThing` where there is none."""
         return _decoded(self._ask(lambda request: ReadPart(request, kind, item, revision, part)))
 
-    def documents(self, pins: Iterable[PinnedInput], part: str) -> Iterator[tuple[PinnedInput, Any]]:
-        """Each input with a part of it, read ahead while the caller works."""
-        return (
-            (pin, _decoded(data))
-            for pin, data in self._read_ahead(
-                pins, lambda pin, request: ReadPart(request, pin.kind, pin.item, pin.revision, part)
-            )
-        )
+    def documents(
+        self, pins: Iterable[PinnedInput], part: str, *, required: bool = True
+    ) -> Iterator[tuple[PinnedInput, Any]]:
+        """Each input with a part of it, read ahead while the caller works; None where it lacks one that may lack."""
+
+        def request_for(pin: PinnedInput, request: int) -> ReadPart:
+            return ReadPart(request, pin.kind, pin.item, pin.revision, part)
+
+        for pin, request in self._read_ahead(pins, request_for):
+            try:
+                yield pin, _decoded(self._value(request))
+            except NoSuchThing:
+                if required:
+                    raise
+                yield pin, None
 
     def item(self, kind: Kind, item: str) -> Item:
         """An item as it is now. Raises `NoSuchThing` where there is none."""
         found: Item = self._ask(lambda request: ReadItem(request, kind, item))
         return found
+
+    def task_results(self) -> list[dict[str, Any]]:
+        """What the tasks that this job gathers returned, in their order."""
+        results: list[dict[str, Any]] = self._ask(ReadResults)
+        return results
 
     def blob(self, digest: str) -> bytes:
         """Bytes by digest."""
@@ -110,16 +131,14 @@ class Context:
 
     # -- the pipe --
 
-    def _read_ahead(self, things: Iterable[T], request_for: Callable[[T, int], Request]) -> Iterator[tuple[T, bytes]]:
+    def _read_ahead(self, things: Iterable[T], request_for: Callable[[T, int], Request]) -> Iterator[tuple[T, int]]:
+        """Each thing with its request, a few of which are sent before the first is waited for."""
         waiting: deque[tuple[T, int]] = deque()
         for thing in things:
             waiting.append((thing, self._send(lambda request, thing=thing: request_for(thing, request))))  # type: ignore[misc]
             if len(waiting) > READ_AHEAD:
-                first, request = waiting.popleft()
-                yield first, self._value(request)
-        while waiting:
-            first, request = waiting.popleft()
-            yield first, self._value(request)
+                yield waiting.popleft()
+        yield from waiting
 
     def _ask(self, make: Callable[[int], Request]) -> Any:
         return self._value(self._send(make))

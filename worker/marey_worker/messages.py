@@ -25,6 +25,9 @@ class Run:
     memory_limit_bytes: int
     log_path: Path
     scratch: Path
+    threads: int
+    position: int | None = None
+    size: int | None = None
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,13 @@ class ReadBlob:
 
 
 @dataclass(frozen=True)
+class ReadResults:
+    """Read what the tasks of this job returned."""
+
+    request: int
+
+
+@dataclass(frozen=True)
 class PutFile:
     """Send a file; the answer is its digest."""
 
@@ -113,5 +123,5 @@ class Failed:
     retryable: bool
 
 
-Request = ReadPart | ReadItem | ReadBlob | PutFile | Stage
+Request = ReadPart | ReadItem | ReadBlob | ReadResults | PutFile | Stage
 End = Done | Failed

@@ -48,6 +48,11 @@ class WorkerOptions:
     cache_bytes: int = 2 << 30
     threads: int = field(default_factory=lambda: os.cpu_count() or 1)
 
+    @property
+    def threads_of_a_slot(self) -> int:
+        """How many threads one job may use."""
+        return max(1, self.threads // self.slots)
+
 
 def default_cache(environment: Mapping[str, str]) -> Path:
     """Where inputs are kept: below `XDG_CACHE_HOME`, or `~/.cache`."""
@@ -133,7 +138,9 @@ class Supervisor:
             faults.point("worker.after_claim")
             log.info("%s: %s, attempt %d", lease.job, lease.kind, lease.attempt)
             api = AttemptApi(self._transport, lease)
-            end = Attempt(api, lease, self._cache, self._transport.url, self._stopping).run(child)
+            end = Attempt(
+                api, lease, self._cache, self._transport.url, self._stopping, threads=self._options.threads_of_a_slot
+            ).run(child)
             self._interrupted |= end is Stop.INTERRUPTED
         finally:
             self._running.discard(lease.job)
@@ -160,8 +167,8 @@ class _Bench:
             self._child.kill(grace_s=0.0)
             self._child = None
         if self._child is None:
-            threads = max(1, self._options.threads // self._options.slots)
-            self._child, self._jobs = ChildProcess(self._options.kinds, threads=threads), 0
+            self._child = ChildProcess(self._options.kinds, threads=self._options.threads_of_a_slot)
+            self._jobs = 0
             self._child.wait_until_ready()
         self._jobs += 1
         return self._child

@@ -10,10 +10,10 @@ from pydantic import Field
 from marey_schemas.base import Request
 from marey_schemas.items import Event, Page
 from marey_schemas.job_kinds import UnknownKindError, find_kind, job_kinds
-from marey_schemas.jobs import Attempt, Job, JobBatch, JobCreate, JobKind, JobList, JobOutput
+from marey_schemas.jobs import Attempt, Job, JobBatch, JobCreate, JobKind, JobList, JobOutput, JobState, TaskResult
 from marey_server.errors import NotFound
 from marey_server.handlers.declarations import MIB, Access, Body, Bytes, reads, writes
-from marey_server.handlers.queries import CommaSeparated, CountedPageQuery, PageQuery
+from marey_server.handlers.queries import CommaSeparated, CommaSeparatedOf, CountedPageQuery, PageQuery
 from marey_server.handlers.reply import Rendered, Reply
 from marey_server.handlers.resource import Resource
 from marey_server.store import events, jobs, submission
@@ -59,7 +59,7 @@ class JobKindResource(Resource):
 class JobsQuery(CountedPageQuery):
     """Which jobs, in which order."""
 
-    state: CommaSeparated = Field((), description="In any of these states.")
+    state: CommaSeparatedOf[JobState] = Field((), description="In any of these states.")
     kind: CommaSeparated = Field((), description="Of any of these kinds.")
     parent: str | None = Field(None, max_length=64, description="Tasks of this job; without it, no tasks are listed.")
     author: str | None = Field(None, max_length=64, description="Name of who submitted them.")
@@ -195,6 +195,18 @@ class JobOutputs(Resource):
         return await self.answer(jobs.list_outputs, job, query.cursor, query.limit)
 
 
+class JobResults(Resource):
+    """What the tasks of a job brought."""
+
+    path = "/jobs/{job}/results"
+    tag = "Jobs"
+
+    @reads(access=Access.READER, query=PageQuery, answer=TaskResult, paged=True)
+    async def get(self, job: str, query: PageQuery) -> Rendered:
+        """What the tasks of a gathering job brought, in their order; blobs they name stay until it is gathered."""
+        return await self.answer(jobs.list_results, job, query.cursor, query.limit)
+
+
 class JobEventsQuery(Request):
     """Which events."""
 
@@ -273,6 +285,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     JobResource,
     JobAttempts,
     JobOutputs,
+    JobResults,
     JobEvents,
     JobLog,
     JobCancellation,

@@ -21,6 +21,7 @@ from marey_server import faults
 from marey_server.errors import MareyError, NotFound
 from marey_server.store import staging
 from marey_server.store.fencing import earlier_answer, held, hold, lease_lost, require_attempt
+from marey_server.store.gathering import release_tasks
 from marey_server.store.job_ends import ENDED_COLUMNS, AttemptEnd, Ended, as_ended, end_attempts
 from marey_server.store.queue_policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.settling import settle
@@ -76,7 +77,15 @@ def _complete(
         update(job)
         .where(held(*requests))
         .values(state="succeeded", finished_us=tx.now_us, lease_expires_us=None, rev=job.c.rev + 1)
-        .returning(*ENDED_COLUMNS, job.c.fence, job.c.into_path, job.c.author_id, job.c.message, job.c.cache_key)
+        .returning(
+            *ENDED_COLUMNS,
+            job.c.fence,
+            job.c.into_path,
+            job.c.author_id,
+            job.c.message,
+            job.c.cache_key,
+            job.c.gathers,
+        )
     ).all()
     staged = staging.staged_drafts(tx, [(row.id, row.fence) for row in won]) if won else {}
     done: dict[_Place, tuple[Ended, CompleteAnswer]] = {}
@@ -103,6 +112,8 @@ def _complete(
         unshared = {(row.id, row.fence) for row in won if row.cache_key is None} & staged.keys()
         if unshared:
             staging.drop_staged(tx, unshared)
+        if gathered := [row.id for row in won if row.gathers]:
+            release_tasks(tx, gathered)
         end_attempts(
             tx,
             [

@@ -39,9 +39,17 @@ class Source(NamedTuple):
 # -- the key ----------------------------------------------------------------------------------------------------------
 
 
-def cache_key(kind: KindDeclaration, params: Mapping[str, Any], seed: int, inputs: Any) -> str:
-    """The name of a computation. `inputs` as `input_contents` tells them."""
+def cache_key(
+    kind: KindDeclaration,
+    params: Mapping[str, Any],
+    seed: int,
+    inputs: Any,
+    task: tuple[int | None, int] | None = None,
+) -> str:
+    """The name of a computation. `inputs` as `input_contents` tells them; `task` is which of how many has them."""
     tree = {"kind": kind.code_version, "params": params, "seed": seed, "inputs": inputs}
+    if task is not None:
+        tree["task"] = task
     return f"sha256:{hashlib.sha256(canonical_json(tree)).hexdigest()}"
 
 
@@ -182,10 +190,11 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     ).one()
     place = (row.source_id, row.fence)
     drafts = staging.staged_drafts(tx, [place]).get(place, {})
-    if not staging.take_up_documents(tx, drafts):
+    named = set(staging.named_blobs(row.result))
+    if not staging.take_up_documents(tx, drafts) or named - blobs.hold(tx, named):
         return _compute_again(tx, row)
     outputs = staging.publish_drafts(tx, row, staging.with_inputs(drafts, row.source_inputs, row.inputs))
-    blobs.keep_for_job(tx, row.id, staging.named_blobs(row.result))
+    blobs.keep_for_job(tx, row.id, named)
     return end_jobs(
         tx,
         waits,

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import Row, Select, func, select
 
-from marey_schemas.jobs import Job
+from marey_schemas.jobs import Job, JobState, Progress
 from marey_server.store.clock import datetime_of
 from marey_server.store.tables import job, project, user
 from marey_server.store.transaction import Transaction
@@ -35,8 +35,11 @@ def job_documents(tx: Transaction, ids: Sequence[str]) -> list[Job]:
 
 def as_documents(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Job]:
     """Rows of `select_jobs` as they travel; gathering jobs with the states of their tasks."""
-    children = _children(tx, [row.id for row in rows if row.size is not None])
-    return [_document(row, children.get(row.id, {})) for row in rows]
+    gathering = [row for row in rows if row.size is not None]
+    children = _children(tx, [row.id for row in gathering])
+    at_work = [row for row in gathering if row.state == JobState.RUNNING and row.lease_expires_us is None]
+    progress = _progress_of_tasks(tx, at_work, children)
+    return [_document(row, children.get(row.id, {}), progress.get(row.id)) for row in rows]
 
 
 def _children(tx: Transaction, parents: Sequence[str]) -> dict[str, dict[str, int]]:
@@ -53,7 +56,31 @@ def _children(tx: Transaction, parents: Sequence[str]) -> dict[str, dict[str, in
     return counts
 
 
-def _document(row: Row[Any], children: dict[str, int]) -> Job:
+def _progress_of_tasks(
+    tx: Transaction, heads: Sequence[Row[Any]], children: Mapping[str, dict[str, int]]
+) -> dict[str, Progress]:
+    """How far gathering jobs are, counted in tasks: those that have ended, and what is done of those that run."""
+    if not heads:
+        return {}
+    running: dict[str, list[Progress]] = {}
+    statement = (
+        select(job.c.parent_id, job.c.progress)
+        .where(job.c.parent_id.in_([head.id for head in heads]), job.c.state == "running")
+        .order_by(job.c.parent_id, job.c.position)
+    )
+    for row in tx.execute(statement):
+        if row.progress is not None:
+            running.setdefault(row.parent_id, []).append(Progress.model_validate(row.progress))
+    told: dict[str, Progress] = {}
+    for head in heads:
+        ended = sum(count for state, count in children.get(head.id, {}).items() if JobState(state).terminal)
+        at_work = running.get(head.id, [])
+        shares = sum(min(1.0, one.done / one.total) for one in at_work if one.total)
+        told[head.id] = Progress(done=ended + shares, total=head.size, note=at_work[0].note if at_work else "")
+    return told
+
+
+def _document(row: Row[Any], children: dict[str, int], at_work: Progress | None) -> Job:
     return Job(
         id=row.id,
         project=row.project_name,
@@ -69,11 +96,12 @@ def _document(row: Row[Any], children: dict[str, int]) -> Job:
         max_attempts=row.max_attempts,
         interruptions=row.interruptions,
         parent=row.parent_id,
+        position=row.position,
         size=row.size,
         children=children,
         retry_of=row.retry_of,
         cached_from=row.cached_from,
-        progress=row.progress,
+        progress=at_work or row.progress,
         failure=row.failure,
         result=row.result,
         cancel_requested=row.cancel_requested_us is not None,

@@ -11,7 +11,7 @@ from sqlalchemy import ColumnElement, Row, and_, case, func, select, update
 from marey_schemas.access import Role
 from marey_schemas.items import Page
 from marey_schemas.job_kinds import UnknownKindError, find_kind
-from marey_schemas.jobs import Attempt, Job, JobCreate, JobOutput, JobState, Resources
+from marey_schemas.jobs import Attempt, Job, JobCreate, JobOutput, JobState, Resources, TaskResult
 from marey_server.access import roles
 from marey_server.errors import Conflict, Forbidden, NotFound
 from marey_server.store import events, listing, projects
@@ -41,7 +41,7 @@ UNFINISHED = ("waiting", "queued", "running")
 class JobFilters:
     """Which jobs a list holds; what is empty does not matter."""
 
-    states: tuple[str, ...] = ()
+    states: tuple[JobState, ...] = ()
     kinds: tuple[str, ...] = ()
     parent: str | None = None
     """Tasks of this gathering job; without it, tasks are left out."""
@@ -100,15 +100,25 @@ def _attempt_document(row: Row[Any]) -> Attempt:
 
 
 def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
-    """What a job published, or the tasks of a gathering job, job by job."""
+    """What a job published; for the sum of tasks what they did, task by task."""
     row, _ = _find(tx, job_id)
-    if row.size is None:
+    if row.size is None or row.gathers:
         return Page(items=tuple(JobOutput(**output) for output in row.outputs or ()))
     order = listing.parse_order("position", {"position": job.c.position, "id": job.c.id})
     statement = select(job.c.id, job.c.position, job.c.outputs).where(job.c.parent_id == job_id)
     tasks, next_cursor = listing.read_page(tx, statement, order, job_id, cursor, limit)
     outputs = tuple(JobOutput(**output) for task in tasks for output in task.outputs or ())
     return Page(items=outputs, next_cursor=next_cursor)
+
+
+def list_results(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
+    """What the tasks of a gathering job brought, in their order; empty for other jobs."""
+    _find(tx, job_id)
+    order = listing.parse_order("position", {"position": job.c.position, "id": job.c.id})
+    statement = select(job.c.id, job.c.position, job.c.state, job.c.result).where(job.c.parent_id == job_id)
+    tasks, next_cursor = listing.read_page(tx, statement, order, job_id, cursor, limit)
+    results = (TaskResult(job=row.id, position=row.position, state=row.state, result=row.result) for row in tasks)
+    return Page(items=tuple(results), next_cursor=next_cursor)
 
 
 def list_job_events(tx: Transaction, job_id: str, after: int = 0, limit: int = 100) -> Page:
@@ -162,10 +172,10 @@ def _cancel(tx: Transaction, which: ColumnElement[bool], policy: QueuePolicy) ->
     """Cancel those of the jobs that have not ended, in one statement whatever their state, and read how they stand now.
 
     A running job's time is over with the cancellation, so that its lease cannot outlive the grace. A gathering job has
-    no lease, and ends with its tasks.
+    no lease while its tasks are at work, and ends with them.
     """
     running = job.c.state == RUNNING
-    leased = and_(running, job.c.size.is_(None))
+    leased = and_(running, job.c.lease_expires_us.is_not(None))
     rows = tx.execute(
         update(job)
         .where(which, job.c.state.in_(UNFINISHED))
@@ -220,7 +230,8 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
         resources=Resources(time_limit_s=row.time_limit_s, memory_limit_mb=row.memory_limit_mb),
         message=row.message,
     )
-    again = Submission(kind, request, row.params, _pins_of(tx, row, kind.fan_out), row.labels_key, retry_of=row.id)
+    pins = _pins_of(tx, row, kind.fan_out)
+    again = Submission(kind, request, row.params, pins, row.size or 1, row.labels_key, retry_of=row.id)
     return submit_checked(tx, project, [again])[0]
 
 

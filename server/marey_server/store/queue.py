@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -73,7 +74,10 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
     )
     emit_job_events(tx, "job.started", [(row.project_id, row.id, {"fence": row.fence}) for row in rows])
     tx.after_commit(lambda: faults.point("claim.after_commit"))
-    return [_lease(row, token, policy) for row, token in zip(rows, tokens, strict=True)]
+    sizes = _sizes(tx, rows)
+    return [
+        _lease(row, sizes.get(row.parent_id, row.size), token, policy) for row, token in zip(rows, tokens, strict=True)
+    ]
 
 
 def heartbeat(
@@ -130,6 +134,9 @@ def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
             job.c.inputs,
             job.c.into_path,
             job.c.seed,
+            job.c.parent_id,
+            job.c.position,
+            job.c.size,
             job.c.time_limit_s,
             job.c.memory_limit_mb,
             job.c.fence,
@@ -234,7 +241,15 @@ def _claim_rows(tx: Transaction, request: ClaimRequest, policy: QueuePolicy) -> 
 # -- answers ----------------------------------------------------------------------------------------------------------
 
 
-def _lease(row: Row[Any], token: IssuedToken, policy: QueuePolicy) -> Lease:
+def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
+    """How many tasks the gathering jobs have that some of these belong to."""
+    parents = {row.parent_id for row in rows if row.parent_id is not None}
+    if not parents:
+        return {}
+    return {one.id: one.size for one in tx.execute(select(job.c.id, job.c.size).where(job.c.id.in_(parents)))}
+
+
+def _lease(row: Row[Any], size: int | None, token: IssuedToken, policy: QueuePolicy) -> Lease:
     return Lease(
         job=row.id,
         project=row.project_name,
@@ -243,6 +258,8 @@ def _lease(row: Row[Any], token: IssuedToken, policy: QueuePolicy) -> Lease:
         inputs={name: tuple(PinnedInput(**pin) for pin in pins) for name, pins in row.inputs.items()},
         into=row.into_path,
         seed=row.seed,
+        position=row.position,
+        size=size,
         resources=Resources(time_limit_s=row.time_limit_s, memory_limit_mb=row.memory_limit_mb),
         fence=row.fence,
         attempt=row.attempt,

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from sqlalchemy import insert, select
 
 from marey_schemas.access import Role
-from marey_schemas.job_kinds import KindDeclaration, UnknownKindError, find_kind
+from marey_schemas.job_kinds import MOST_TASKS, KindDeclaration, UnknownKindError, find_kind
 from marey_schemas.jobs import Job, JobCreate, JobState
 from marey_schemas.problems import FieldError
 from marey_server import faults
@@ -38,6 +38,7 @@ class Submission:
     request: JobCreate
     params: Mapping[str, Any]
     pins: PinnedInputs
+    task_count: int
     labels_key: str
     retry_of: str | None = None
     pointer: str = ""
@@ -57,6 +58,7 @@ class _NewJob:
     parent_id: str | None = None
     position: int | None = None
     size: int | None = None
+    gathers: bool = False
     cache_key: str | None = None
 
     @property
@@ -84,13 +86,13 @@ def submit(tx: Transaction, project: str, requests: Sequence[JobCreate]) -> list
 def submit_checked(tx: Transaction, project: ProjectRow, submissions: Sequence[Submission]) -> list[Job]:
     """Write the rows of checked jobs and let each go as far as it can."""
     upstream = _lock_upstream(tx, project, submissions)
-    heads, tasks = _rows_to_be(tx, project, submissions, upstream)
+    heads = [_head(project, one, upstream) for one in submissions]
+    gathering = [one for one in heads if one.submission.kind.gathering is not None]
+    sources = _find_results(tx, gathering)
+    tasks = [task for one in heads if one.id not in sources for task in _spread(one)]
     everything = [*heads, *tasks]
-    ready = [one for one in everything if one.state == "queued"]
-    sources = job_cache.decide(tx, ready)
-    for one in ready:
-        if one.id in sources:
-            one.state = "waiting"
+    sources |= _find_results(tx, [one for one in everything if one.size is None and one.cache_key is None])
+    ready = [one for one in everything if one.state == "queued" or one.id in sources]
     for start in range(0, len(everything), IN_LIST):
         tx.execute(insert(job), [_row(tx, one) for one in everything[start : start + IN_LIST]])
     _insert_dependencies(tx, heads, upstream)
@@ -118,7 +120,7 @@ def _check(
     except UnknownKindError as error:
         raise _invalid(f"{at}/kind", "unknown-kind", f"{error}.") from error
     try:
-        params = kind.params.model_validate(request.params).model_dump(mode="json")
+        params = kind.params.model_validate(request.params)
     except ValidationError as error:
         found = [
             FieldError(pointer=f"{at}/params/" + "/".join(map(str, one["loc"])), code=one["type"], detail=one["msg"])
@@ -127,7 +129,16 @@ def _check(
         detail = f"These are no parameters of {kind.name}: {found[0].pointer}: {found[0].detail}"
         raise Invalid(detail, errors=found) from error
     pins = pin_inputs(tx, project, kind, request, known, at)
-    return Submission(kind, request, params, pins, labels_key(request.labels), pointer=at)
+    tasks, plain = _count_tasks(kind, params, at), params.model_dump(mode="json")
+    return Submission(kind, request, plain, pins, tasks, labels_key(request.labels), pointer=at)
+
+
+def _count_tasks(kind: KindDeclaration, params: Any, at: str) -> int:
+    count = 1 if kind.task_count is None else kind.task_count(params)
+    if not 1 <= count <= MOST_TASKS:
+        detail = f"These parameters make {count} tasks; {kind.name} takes 1 to {MOST_TASKS}."
+        raise _invalid(f"{at}/params", "too-many-tasks", detail)
+    return count
 
 
 def _invalid(pointer: str, code: str, detail: str) -> Invalid:
@@ -160,21 +171,20 @@ def _lock_upstream(tx: Transaction, project: ProjectRow, submissions: Sequence[S
 # -- rows -------------------------------------------------------------------------------------------------------------
 
 
-def _rows_to_be(
-    tx: Transaction, project: ProjectRow, submissions: Sequence[Submission], upstream: Mapping[str, str]
-) -> tuple[list[_NewJob], list[_NewJob]]:
-    """One job per submission; where its inputs are many, it gathers tasks that share them."""
-    heads: list[_NewJob] = []
-    tasks: list[_NewJob] = []
-    for submission in submissions:
-        head = _NewJob(new_id("job"), project.id, submission, submission.pins)
-        _set_state(head, upstream)
-        heads.append(head)
-        batches = _batches(submission)
-        if len(batches) > 1:
-            tasks += _fan_out(head, batches)
-    _set_cache_keys(tx, [one for one in (*heads, *tasks) if one.size is None])
-    return heads, tasks
+def _head(project: ProjectRow, submission: Submission, upstream: Mapping[str, str]) -> _NewJob:
+    head = _NewJob(new_id("job"), project.id, submission, submission.pins)
+    _set_state(head, upstream)
+    return head
+
+
+def _find_results(tx: Transaction, jobs: Sequence[_NewJob]) -> dict[str, job_cache.Source]:
+    """Give jobs their cache keys; those whose result is there or under way wait for it instead of being queued."""
+    _set_cache_keys(tx, jobs)
+    sources = job_cache.decide(tx, [one for one in jobs if one.state == "queued"])
+    for one in jobs:
+        if one.id in sources:
+            one.state = "waiting"
+    return sources
 
 
 def _set_state(head: _NewJob, upstream: Mapping[str, str]) -> None:
@@ -191,35 +201,31 @@ def _set_state(head: _NewJob, upstream: Mapping[str, str]) -> None:
         head.state, head.dependencies_left = "waiting", len(unfinished)
 
 
-def _batches(submission: Submission) -> list[Any]:
-    if submission.kind.fan_out is None:
+def _spread(head: _NewJob) -> list[_NewJob]:
+    """The tasks of a job that has several, which makes it a gathering job; they start when it does."""
+    shares = _shares(head.submission)
+    if len(shares) < 2:
         return []
-    pins = submission.pins.get(submission.kind.fan_out, [])
-    size = submission.kind.batch_size
-    return [pins[start : start + size] for start in range(0, len(pins), size)]
-
-
-def _fan_out(head: _NewJob, batches: Sequence[Any]) -> list[_NewJob]:
-    """Make `head` the gathering job of one task per batch. Tasks start when it does."""
-    submission = head.submission
-    fanned = submission.kind.fan_out or ""
-    head.size = len(batches)
-    head.pins = {**submission.pins, fanned: {"count": sum(map(len, batches))}}
+    kind = head.submission.kind
+    head.size, head.gathers = len(shares), kind.gathering is not None
+    if kind.fan_out is not None:
+        head.pins = {**head.pins, kind.fan_out: {"count": len(head.pins[kind.fan_out])}}
     if head.state == "queued":
-        head.state, head.dependencies_left = "running", len(batches)
-    task_state = {"running": "queued", "failed": "cancelled"}.get(head.state, head.state)
+        head.state, head.dependencies_left = "running", len(shares)
+    state = {"running": "queued", "failed": "cancelled"}.get(head.state, head.state)
     return [
-        _NewJob(
-            new_id("job"),
-            head.project_id,
-            submission,
-            {**submission.pins, fanned: batch},
-            task_state,
-            parent_id=head.id,
-            position=position,
-        )
-        for position, batch in enumerate(batches)
+        _NewJob(new_id("job"), head.project_id, head.submission, pins, state, parent_id=head.id, position=position)
+        for position, pins in enumerate(shares)
     ]
+
+
+def _shares(submission: Submission) -> list[PinnedInputs]:
+    """The inputs of each task: some items of the input that is spread, or everything where tasks are counted."""
+    fanned = submission.kind.fan_out
+    if fanned is None:
+        return [submission.pins] * submission.task_count
+    pins, size = submission.pins.get(fanned, []), submission.kind.batch_size
+    return [{**submission.pins, fanned: pins[start : start + size]} for start in range(0, len(pins), size)]
 
 
 def _set_cache_keys(tx: Transaction, jobs: Sequence[_NewJob]) -> None:
@@ -228,7 +234,8 @@ def _set_cache_keys(tx: Transaction, jobs: Sequence[_NewJob]) -> None:
     for one in cached:
         submission = one.submission
         contents = job_cache.input_contents(one.pins, parts)
-        one.cache_key = job_cache.cache_key(submission.kind, submission.params, submission.request.seed, contents)
+        task = None if one.parent_id is None or submission.kind.fan_out else (one.position, submission.task_count)
+        one.cache_key = job_cache.cache_key(submission.kind, submission.params, submission.request.seed, contents, task)
 
 
 def _row(tx: Transaction, one: _NewJob) -> dict[str, Any]:
@@ -252,6 +259,7 @@ def _row(tx: Transaction, one: _NewJob) -> dict[str, Any]:
         "parent_id": one.parent_id,
         "position": one.position,
         "size": one.size,
+        "gathers": one.gathers,
         "dependencies_left": one.dependencies_left,
         "on_failure": request.on_failure,
         "concurrency_key": None if one.size is not None else request.concurrency_key,

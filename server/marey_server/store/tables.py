@@ -14,6 +14,7 @@ from sqlalchemy import (
     String,
     Table,
     Text,
+    false,
     text,
 )
 from sqlalchemy.dialects.postgresql import JSONB
@@ -252,7 +253,8 @@ job = Table(
     Column("publish_conflict", Document),
     Column("parent_id", ID, ForeignKey("job.id"), index=True),
     Column("position", Integer),
-    Column("size", Integer),  # set for the gathering job of a fan-out, which depends on its tasks and does no work
+    Column("size", Integer),  # set for the gathering job of a fan-out, which depends on its tasks
+    Column("gathers", Boolean, nullable=False, default=False, server_default=false()),  # it is worked on after them
     Column("dependencies_left", Integer, nullable=False, default=0),
     Column("on_failure", String(8), nullable=False, default="fail"),
     Column("concurrency_key", String(255)),

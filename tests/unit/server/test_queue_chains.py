@@ -8,11 +8,11 @@ from sqlalchemy import select, update
 
 from marey_schemas import job_kinds
 from marey_schemas.access import MemberChange, Role, UserCreate
-from marey_schemas.jobs import JobCreate
+from marey_schemas.jobs import JobCreate, Progress
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM, Principal
-from marey_server.errors import Conflict, Forbidden, Invalid, NotFound
-from marey_server.store import items, jobs, members, users
+from marey_server.errors import Conflict, Forbidden, Invalid, LeaseLost, NotFound
+from marey_server.store import blobs, garbage, items, jobs, members, users
 from marey_server.store.items.drafts import Draft
 from marey_server.store.reaper import share_waiting
 from marey_server.store.tables import staged_output
@@ -254,6 +254,223 @@ def test_a_task_cancelled_before_its_job_begins_is_not_waited_for(desk: Desk) ->
         desk.cancel(task.id)
     desk.complete(desk.claim())
     assert desk.state(job) == "cancelled"
+
+
+# -- tasks that are counted, and gathered by a worker ------------------------------------------------------------------
+
+
+def a_survey(desk: Desk, tasks: int = 3, **fields: Any) -> str:
+    if not desk.database.read(desk.user, items.list_items, "lab", Kind.PROCESSED).items:
+        desk.things(2)
+    return desk.submit("survey", inputs={"things": {"collection": "raw"}}, params={"number": tasks}, **fields)
+
+
+def kept_bytes(desk: Desk, data: bytes) -> str:
+    """Bytes that ann has sent, as her attempts do."""
+    return desk.database.write(desk.user, blobs.put_blob, data)
+
+
+def test_the_parameters_say_how_many_tasks_there_are_and_each_has_all_inputs(desk: Desk) -> None:
+    job = a_survey(desk)
+    head = desk.job(job)
+    assert (head.size, head.state, head.children) == (3, "running", {"queued": 3})
+    leases = desk.claim_many()
+    places = sorted((lease.position, lease.size, len(lease.inputs["things"])) for lease in leases)
+    assert places == [(0, 3, 2), (1, 3, 2), (2, 3, 2)]
+
+
+def test_when_all_tasks_have_succeeded_a_worker_gathers_what_they_brought(desk: Desk) -> None:
+    job = a_survey(desk, into="made")
+    for lease in reversed(desk.claim_many()):
+        assert desk.state(job) == "running"
+        desk.complete(lease, result={"seen": lease.position})
+    assert desk.state(job) == "queued"
+    gathering = desk.claim()
+    assert (gathering.job, gathering.position, gathering.size) == (job, None, 3)
+    assert len(gathering.inputs["things"]) == 2
+    seen = desk.database.read(desk.user, jobs.list_results, job).items
+    assert [(one.position, one.state, one.result["seen"]) for one in seen] == [
+        (0, "succeeded", 0),
+        (1, "succeeded", 1),
+        (2, "succeeded", 2),
+    ]
+    desk.stage(gathering, "overview")
+    desk.complete(gathering, result={"verdict": "fine"})
+    assert (desk.state(job), desk.job(job).result) == ("succeeded", {"verdict": "fine", "outputs": 1})
+    (made,) = desk.outputs(job)
+    lineage = desk.database.read(desk.user, items.read_lineage, "lab", Kind.PROCESSED, made.item)
+    assert sorted(edge.name for edge in lineage.inputs) == ["thing0", "thing1"]
+
+
+def test_one_task_alone_is_no_task(desk: Desk) -> None:
+    job = a_survey(desk, tasks=1)
+    lease = desk.claim()
+    assert (lease.job, lease.position, lease.size) == (job, None, None)
+
+
+def test_more_tasks_than_can_be_or_none_are_refused(desk: Desk) -> None:
+    for number in (0, job_kinds.MOST_TASKS + 1):
+        with pytest.raises(Invalid) as refused:
+            a_survey(desk, tasks=number)
+        assert refused.value.errors[0].code == "too-many-tasks"
+
+
+def test_dependants_wait_for_the_gathering(desk: Desk) -> None:
+    job = a_survey(desk, tasks=2)
+    dependant = desk.submit(after=[job])
+    for lease in desk.claim_many():
+        desk.complete(lease)
+    assert desk.state(dependant) == "waiting"
+    desk.complete(desk.claim())
+    assert desk.state(dependant) == "queued"
+
+
+def test_a_failed_task_leaves_nothing_to_gather_and_trying_again_repeats_only_what_did_not_succeed(desk: Desk) -> None:
+    job = a_survey(desk)
+    bad, *good = desk.claim_many()
+    desk.fail(bad, "bad-thing", retryable=False, detail="thing0 is crooked")
+    for lease in good:
+        desk.complete(lease)
+    failure = desk.job(job).failure
+    assert failure is not None
+    assert (desk.state(job), failure.code) == ("failed", "bad-thing")
+    assert desk.claim_many() == []
+
+    again = desk.database.write(desk.user, jobs.retry_job, job)
+    assert again.children == {"succeeded": 2, "queued": 1}
+    lease = desk.claim()
+    assert lease.position == bad.position
+    desk.complete(lease)
+    desk.complete(desk.claim(job=again.id))
+    assert desk.state(again.id) == "succeeded"
+
+
+def test_a_gathering_that_is_lost_or_fails_is_done_again_without_the_tasks(desk: Desk) -> None:
+    job = a_survey(desk, tasks=2)
+    for lease in desk.claim_many():
+        desk.complete(lease)
+    lost = desk.claim()
+    desk.clock.advance(61)
+    assert desk.reap() == 1
+    failing = desk.claim()
+    with pytest.raises(LeaseLost):
+        desk.complete(lost)
+    assert failing.job == job
+    desk.fail(failing)
+    desk.clock.advance(600)
+    (last,) = desk.claim_many()
+    assert last.job == job
+    desk.complete(last)
+    assert desk.state(job) == "succeeded"
+
+
+def test_a_gathering_that_fails_for_good_fails_the_whole_and_its_tasks_serve_the_next_try(desk: Desk) -> None:
+    job = a_survey(desk, tasks=2)
+    for lease in desk.claim_many():
+        desk.complete(lease)
+    desk.fail(desk.claim(), retryable=False)
+    assert desk.state(job) == "failed"
+    again = desk.database.write(desk.user, jobs.retry_job, job)
+    assert (again.state, again.children) == ("queued", {"succeeded": 2})
+    (gathering,) = desk.claim_many()
+    assert gathering.job == again.id
+
+
+@pytest.mark.parametrize("when", ["tasks-run", "queued", "gathering"])
+def test_a_job_is_cancelled_as_one_whenever_that_is(desk: Desk, when: str) -> None:
+    job = a_survey(desk, tasks=2)
+    leases = desk.claim_many()
+    if when != "tasks-run":
+        for lease in leases:
+            desk.complete(lease)
+        leases = desk.claim_many() if when == "gathering" else []
+    desk.cancel(job)
+    for lease in leases:
+        assert desk.heartbeat(lease).cancel_requested
+        desk.fail(lease, "cancelled")
+    assert desk.state(job) == "cancelled"
+    assert desk.claim_many() == []
+
+
+def test_tasks_that_succeed_after_the_cancellation_are_not_gathered(desk: Desk) -> None:
+    job = a_survey(desk, tasks=2)
+    leases = desk.claim_many()
+    desk.cancel(job)
+    for lease in leases:
+        desk.complete(lease)
+    assert desk.state(job) == "cancelled"
+
+
+def test_progress_is_that_of_the_tasks_and_then_of_the_gathering(desk: Desk) -> None:
+    job = a_survey(desk)
+    first, second, third = desk.claim_many()
+    desk.complete(first)
+    desk.heartbeat(second, Progress(done=3, total=4, note="trial 7"))
+    assert desk.job(job).progress == Progress(done=1.75, total=3, note="trial 7")
+    for lease in (second, third):
+        desk.complete(lease)
+    gathering = desk.claim()
+    desk.heartbeat(gathering, Progress(done=1, total=2, note="drawing"))
+    assert desk.job(job).progress == Progress(done=1, total=2, note="drawing")
+
+
+def test_what_tasks_brought_is_kept_until_it_has_been_gathered(desk: Desk) -> None:
+    job = a_survey(desk, tasks=2)
+    digests = [kept_bytes(desk, f"record {n}".encode()) for n in range(2)]
+    for lease, digest in zip(desk.claim_many(), digests, strict=True):
+        desk.complete(lease, result={"record": {"blob": digest}})
+    desk.clock.advance(3 * 86400)
+    garbage.collect_garbage(desk.database)
+    gathering = desk.claim()
+    assert desk.database.read(desk.attempt(gathering), blobs.readable, digests) == set(digests)
+    desk.complete(gathering)
+    desk.clock.advance(3 * 86400)
+    garbage.collect_garbage(desk.database)
+    assert desk.state(job) == "succeeded"
+    assert desk.database.read(SYSTEM, blobs.readable, digests) == set()
+
+
+def test_the_same_job_again_shares_what_was_gathered_and_makes_no_tasks(desk: Desk) -> None:
+    first = a_survey(desk, into="one")
+    joined = a_survey(desk, into="two")
+    assert (desk.job(joined).state, desk.job(joined).cached_from, desk.job(joined).size) == ("waiting", first, None)
+    for lease in desk.claim_many():
+        desk.complete(lease)
+    gathering = desk.claim()
+    desk.stage(gathering, "overview")
+    desk.complete(gathering, result={"verdict": "fine"})
+    later = a_survey(desk, into="three")
+    for job in (joined, later):
+        assert (desk.state(job), desk.job(job).cached_from) == ("succeeded", first)
+        assert len(desk.outputs(job)) == 1
+
+
+def test_who_waited_for_a_job_that_failed_does_the_whole_alone(desk: Desk) -> None:
+    a_survey(desk, tasks=2)
+    joined = a_survey(desk, tasks=2, into="two")
+    for lease in desk.claim_many():
+        desk.fail(lease, retryable=False)
+    lease = desk.claim()
+    assert (lease.job, lease.position, lease.size) == (joined, None, None)
+
+
+def test_a_task_whose_source_was_gathered_away_before_its_turn_is_done_again(desk: Desk) -> None:
+    gate = desk.submit()
+    surveys = [a_survey(desk, tasks=2, after=[gate], into=f"place{n}") for n in range(66)]
+    desk.complete(desk.claim(job=gate))
+    leases = desk.claim_many()
+    assert len(leases) == 2  # the tasks of all others wait for these
+    for lease in leases:
+        digest = kept_bytes(desk, f"record {lease.position}".encode())
+        desk.complete(lease, result={"record": {"blob": digest}})
+    (late,) = [job for job in surveys if desk.job(job).children == {"waiting": 2}]
+    for lease in desk.claim_many():
+        desk.complete(lease)
+    desk.clock.advance(3 * 86400)
+    garbage.collect_garbage(desk.database)
+    while desk.database.write(SYSTEM, share_waiting):
+        pass
+    assert desk.job(late).children == {"queued": 2}
 
 
 # -- shared results ----------------------------------------------------------------------------------------------------

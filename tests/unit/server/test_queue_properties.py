@@ -21,7 +21,7 @@ from queue_desk import Desk
 from queue_model import TERMINAL, ModelJob, ModelQueue
 
 ERRANDS = ("errand",)
-CHAINED = ("sum", "square")
+CHAINED = ("sum", "square", "survey")
 
 
 class StillClock:
@@ -109,6 +109,13 @@ class QueueMachine(RuleBasedStateMachine):
         unfinished = [job.id for job in self.model.jobs.values() if job.state not in TERMINAL]
         after = unfinished[:1] if wait else []
         self.desk.submit("square", inputs={"things": {"collection": "raw"}}, seed=seed, after=after)
+
+    @rule(tasks=st.integers(1, 3), wait=st.booleans(), into=st.sampled_from(["x", "y"]))
+    def submit_survey(self, tasks: int, wait: bool, into: str) -> None:
+        self._tick()
+        unfinished = [job.id for job in self.model.jobs.values() if job.state not in TERMINAL]
+        inputs = {"things": {"collection": "raw"}}
+        self.desk.submit("survey", inputs=inputs, params={"number": tasks}, into=into, after=unfinished[:1] * wait)
 
     # -- working -------------------------------------------------------------------------------------------------------
 
@@ -248,15 +255,19 @@ class QueueMachine(RuleBasedStateMachine):
                 tasks = [row for row in rows if row.parent_id == head.id]
                 assert len(tasks) == head.size
                 left = sum(task.state not in TERMINAL for task in tasks)
-                if head.state == "running":
+                if head.state == "running" and head.lease_expires_us is None:
                     assert head.dependencies_left == left > 0
+                elif head.state in ("queued", "running"):
+                    assert head.gathers
+                    assert {task.state for task in tasks} == {"succeeded"}
                 elif head.state in TERMINAL:
                     assert left == 0
 
     @invariant()
     def only_leased_jobs_run(self) -> None:
         for row in self._rows():
-            assert (row.lease_expires_us is not None) == (row.state == "running" and row.size is None)
+            has_tasks_at_work = row.size is not None and row.dependencies_left > 0
+            assert (row.lease_expires_us is not None) == (row.state == "running" and not has_tasks_at_work)
 
     def teardown(self) -> None:
         """Whatever has happened, the queue can be worked off to the end, and every result is there once."""

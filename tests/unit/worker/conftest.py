@@ -20,6 +20,7 @@ from marey_schemas.codecs import MSGPACK, decode_tree, encode_tree
 THIRD_PARTY = Path(__file__).parent / "thirdparty"
 ATTEMPT = re.compile(r"/api/v1/jobs/(\w+)/attempts/(\d+)/(\w+)")
 PART = re.compile(r"/api/v1/projects/lab/(\w+)/(\w+)/parts/(\w+)\?revision=(\d+)")
+RESULTS = re.compile(r"/api/v1/jobs/(\w+)/results")
 BLOB = re.compile(r"/api/v1/blobs/(sha256:[0-9a-f]{64})")
 
 
@@ -30,6 +31,7 @@ class FakeServer:
         self.jobs = []
         self.documents = {}
         self.blobs = {}
+        self.results = {}
         self.reads = []
         self.heartbeats = defaultdict(list)
         self.logs = defaultdict(bytes)
@@ -51,10 +53,21 @@ class FakeServer:
     def url(self):
         return f"http://127.0.0.1:{self.http.server_address[1]}"
 
-    def submit(self, kind, params=None, inputs=None, *, time_limit_s=60, memory_limit_mb=4096, job=None):
+    def submit(
+        self,
+        kind,
+        params=None,
+        inputs=None,
+        *,
+        time_limit_s=60,
+        memory_limit_mb=4096,
+        job=None,
+        position=None,
+        size=None,
+    ):
         with self._lock:
             job = job or f"job{len(self.jobs) + 1}x{self._claims}"
-            self.jobs.append((job, kind, params or {}, inputs or {}, time_limit_s, memory_limit_mb))
+            self.jobs.append((job, kind, params or {}, inputs or {}, time_limit_s, memory_limit_mb, position, size))
         return job
 
     def claim(self, wanted):
@@ -69,12 +82,12 @@ class FakeServer:
             time.sleep(0.01)
         return []
 
-    def _lease(self, job, kind, params, inputs, time_limit_s, memory_limit_mb):
+    def _lease(self, job, kind, params, inputs, time_limit_s, memory_limit_mb, position, size):
         return {
             "job": job, "project": "lab", "kind": kind, "params": params, "inputs": inputs, "into": "out", "seed": 0,
             "resources": {"time_limit_s": time_limit_s, "memory_limit_mb": memory_limit_mb}, "fence": self._claims,
             "attempt": 1, "attempt_token": f"mareyjob_secret_of_{job}", "lease_ttl_s": self.ttl_s,
-            "heartbeat_s": self.heartbeat_s,
+            "heartbeat_s": self.heartbeat_s, "position": position, "size": size,
         }  # fmt: skip
 
     def until(self, condition, timeout_s=60):
@@ -153,6 +166,12 @@ def _handler(server):
                     return self.problem(404, "not-found")
                 body = encode_tree(document, MSGPACK, arrays="blocks")
                 return self.reply(200, body, "application/msgpack; arrays=blocks")
+            if found := RESULTS.match(self.path):
+                told = [
+                    {"job": f"task{n}", "position": n, "state": "succeeded", "result": result}
+                    for n, result in enumerate(server.results[found[1]])
+                ]
+                return self.reply(200, json.dumps({"items": told}).encode())
             data = server.blobs.get(BLOB.fullmatch(self.path)[1])
             return self.problem(404, "not-found") if data is None else self.reply(200, data)
 

@@ -28,6 +28,21 @@ def test_a_child_stays_warm_between_jobs(server, start_worker):
     assert len({end["result"]["pid"] for end in ends}) == 1
 
 
+def test_a_task_knows_its_place_and_the_job_that_gathers_gets_what_the_tasks_returned(server, start_worker):
+    start_worker("--slots", "1")
+    task = server.submit("tally", {"tasks": 3}, position=2, size=3)
+    result = server.ended(task)["result"]
+    assert (result["task"], result["threads"]) == ([2, 3], os.cpu_count())
+    server.results["whole"] = [{"task": [n, 3]} for n in range(3)]
+    server.submit("tally", {"tasks": 3}, job="whole", size=3)
+    assert server.ended("whole")["result"] == {"seen": [[0, 3], [1, 3], [2, 3]]}
+
+
+def test_a_job_that_was_not_spread_over_tasks_is_done_and_gathered_at_once(server, start_worker):
+    start_worker()
+    assert server.ended(server.submit("tally", {"tasks": 1}))["result"] == {"seen": [[0, 1]]}
+
+
 def test_the_attempts_own_token_is_used_for_the_attempt(server, start_worker):
     start_worker()
     job = server.submit("add", {"a": 1, "b": 1})

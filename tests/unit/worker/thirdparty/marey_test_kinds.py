@@ -97,5 +97,21 @@ def _put(context):
     return {"digest": context.put_file(path)}
 
 
+class TallyParams(Request):
+    tasks: int
+
+
+def tally(context, params):
+    return {"task": list(context.task), "threads": context.threads}
+
+
+def gather_tally(context, params, results):
+    return {"seen": [result["task"] for result in results]}
+
+
+TALLY = KindDeclaration(
+    "tally", "Counts its tasks.", TallyParams, "marey_test_kinds:tally", 1, {},
+    task_count=lambda params: params.tasks, gathering="marey_test_kinds:gather_tally",
+)  # fmt: skip
 ADD = KindDeclaration("add", "Adds.", AddParams, "marey_test_kinds:add", 1, {})
 MISBEHAVE = KindDeclaration("misbehave", "Fails.", MisbehaveParams, "marey_test_kinds:misbehave", 1, {})

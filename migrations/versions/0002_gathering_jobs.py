@@ -1,0 +1,19 @@
+"""Gathering jobs that a worker runs."""
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0002"
+down_revision = "0001"
+branch_labels = None
+depends_on = None
+
+
+def upgrade() -> None:
+    """Apply."""
+    op.add_column("job", sa.Column("gathers", sa.Boolean(), nullable=False, server_default=sa.false()))
+
+
+def downgrade() -> None:
+    """Undo."""
+    op.drop_column("job", "gathers")
