@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
 from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.display import pose_costs
+from marey_motion.matching.inertialisation import decay_matrix
 from marey_motion.matching.options import ControllerOptions
 from marey_motion.matching.record import TrialRecord
 from marey_motion.matching.search import SearchIndex
@@ -55,49 +57,33 @@ class Wish(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """Options as compiled code takes them: durations in ticks."""
+    """Options as compiled code takes them: durations in ticks, what happens in one tick worked out."""
 
     follow: int
-    by_pose: bool
+    by_distance: bool
     period: int
     window: int
     bias: float
     margin: float
-    decay_per_s: float
     blends_root: bool
+    decay: Floats
     holds: bool
-    adjustment_per_s: float
+    pull: float
     clamp_m: float
     tick_s: float
 
 
-class Scales(NamedTuple):
-    """What brings a wished trajectory onto the scale of the features."""
+class Playback(NamedTuple):
+    """What a controller needs of a database beside the index: its course, pose joints, normaliser and look-ahead."""
 
+    successors: NDArray[np.int64]
+    steps: Floats
+    starts: NDArray[np.int64]
+    points: NDArray[np.float32]
     offset: Floats
     scale: Floats
     horizons_s: Floats
     horizons_ticks: Floats
-
-
-FOLLOW_CODES = {"time": 0, "path": 1, "open_loop": 2}
-
-
-def run_trial(database: MatchingDatabase, index: SearchIndex, guide: Guide, options: ControllerOptions) -> TrialRecord:
-    """Let motion matching follow a guide from its first tick on.
-
-    `index` is that of the database's normalised features. Raises `MotionError` for options that make no sense, or a
-    guide of another rate than the database's.
-    """
-    from marey_motion.matching import controller_kernels as kernels
-
-    rules = rules_of(options, database.options.rate_hz)
-    wish = wish_of(guide, database)
-    record = _empty_record(guide)
-    kernels.run(
-        index, database.root_motion, database.pose_points, database.starts, wish, rules, scales_of(database), record
-    )
-    return TrialRecord(rate_hz=guide.rate_hz, **record._asdict())
 
 
 class _Arrays(NamedTuple):
@@ -107,62 +93,95 @@ class _Arrays(NamedTuple):
     status: NDArray[np.int8]
     match_cost: Floats
     continuing_cost: Floats
-    pose_cost: Floats
 
 
-def _empty_record(guide: Guide) -> _Arrays:
+def run_trial(database: MatchingDatabase, index: SearchIndex, guide: Guide, options: ControllerOptions) -> TrialRecord:
+    """Let motion matching follow a guide from its first tick on.
+
+    `index` is that of the database's normalised features. The same arguments give the same record, to the last bit.
+    Raises `MotionError` for options that make no sense, and where index, guide and database do not belong together.
+    """
+    from marey_motion.matching import controller_kernels as kernels
+
+    wish, rules, playback = wish_of(guide), rules_of(options, guide.rate_hz), playback_of(database)
+    if guide.rate_hz != database.options.rate_hz:
+        raise MotionError(
+            f"the trajectory has {guide.rate_hz:g} ticks per second, the database {database.options.rate_hz:g}"
+        )
+    if len(index.rows) != database.row_count:
+        raise MotionError(f"the index has {len(index.rows)} rows, the database {database.row_count}")
+    last = database.starts[1:] - 1
+    ends = last[database.selectable[last] & (playback.successors[last] < 0)]
+    if len(ends):
+        raise MotionError(f"row {ends[0]} may be chosen but is the last of its clip", where="selectable")
     ticks = guide.tick_count
-    return _Arrays(
+    arrays = _Arrays(
         rows=np.empty(ticks, np.int32),
         positions=np.empty((ticks, 2)),
         headings=np.empty(ticks),
         status=np.empty(ticks, np.int8),
         match_cost=np.empty(ticks),
         continuing_cost=np.empty(ticks),
-        pose_cost=np.zeros(ticks),
     )
+    kernels.run(index, playback, wish, rules, arrays)
+    costs = pose_costs(database, arrays.rows, options)
+    return TrialRecord(rate_hz=guide.rate_hz, pose_cost=costs, **arrays._asdict())
 
 
 def rules_of(options: ControllerOptions, rate_hz: float) -> Rules:
-    """The options in ticks. Raises `MotionError` naming the one that makes no sense."""
-    period = round(options.search_every_s * rate_hz)
-    if period < 1:
-        raise MotionError("the search period must be at least one tick", where="search_every_s")
-    if not options.half_life_s > 0.0:
-        raise MotionError("the half-life of a blend must be longer than 0 s", where="half_life_s")
-    if options.switch_margin < 0.0:
-        raise MotionError("a negative margin would switch to worse rows", where="switch_margin")
-    if options.reselect_window_s < 0.0 or options.root_adjustment < 0.0:
-        raise MotionError("must not be negative", where="reselect_window_s, root_adjustment")
+    """The options at `rate_hz` ticks per second. Raises `MotionError` naming the one that makes no sense."""
+    _check(options, rate_hz)
     return Rules(
-        follow=FOLLOW_CODES[options.follow],
-        by_pose=options.selection == "pose_distance",
-        period=period,
+        follow=("time", "path", "open_loop").index(options.follow),
+        by_distance=options.selection == "pose_distance",
+        period=round(options.search_every_s * rate_hz),
         window=round(options.reselect_window_s * rate_hz),
         bias=float(options.continuing_bias),
         margin=float(options.switch_margin),
-        decay_per_s=2.0 * np.log(2.0) / options.half_life_s,
         blends_root=options.root_inertialisation,
+        decay=decay_matrix(options.half_life_s, 1.0 / rate_hz),
         holds=options.root_adjustment > 0.0 or options.root_clamp_m is not None,
-        adjustment_per_s=float(options.root_adjustment),
+        pull=1.0 - float(np.exp(-options.root_adjustment / rate_hz)),
         clamp_m=np.inf if options.root_clamp_m is None else float(options.root_clamp_m),
         tick_s=1.0 / rate_hz,
     )
 
 
-def wish_of(guide: Guide, database: MatchingDatabase) -> Wish:
-    """The guide's arrays. Raises `MotionError` when its rate is not the database's."""
-    if guide.rate_hz != database.options.rate_hz:
-        raise MotionError(
-            f"the trajectory has {guide.rate_hz:g} ticks per second, the database {database.options.rate_hz:g}"
-        )
+def _check(options: ControllerOptions, rate_hz: float) -> None:
+    numbers = (options.search_every_s, options.continuing_bias, options.switch_margin, options.reselect_window_s)
+    if not np.all(np.isfinite((*numbers, options.half_life_s, options.root_adjustment))):
+        raise MotionError("every option of the controller must be a finite number")
+    if options.search_every_s * rate_hz < 0.5:
+        raise MotionError("a search period is one tick or longer", where="search_every_s")
+    if options.half_life_s <= 0.0:
+        raise MotionError("a half-life is longer than 0 s", where="half_life_s")
+    for name in ("switch_margin", "reselect_window_s", "root_adjustment"):
+        if getattr(options, name) < 0.0:
+            raise MotionError("must not be negative", where=name)
+    if options.root_clamp_m is not None and not options.root_clamp_m >= 0.0:
+        raise MotionError("must not be negative", where="root_clamp_m")
+
+
+def wish_of(guide: Guide) -> Wish:
+    """The guide's arrays. Raises `MotionError` when they are shorter than its ticks."""
     arrays = (guide.positions, guide.headings, guide.speeds_m_s, guide.turn_rates_rad_s)
     positions, headings, speeds, turn_rates = (np.ascontiguousarray(array, dtype=np.float64) for array in arrays)
+    if not 1 <= guide.tick_count <= min(map(len, arrays)):
+        raise MotionError(f"{guide.tick_count} ticks of a trajectory with {min(map(len, arrays))} samples")
     return Wish(positions, headings, speeds, turn_rates, 1.0 / guide.rate_hz)
 
 
-def scales_of(database: MatchingDatabase) -> Scales:
-    """The database's normaliser and look-ahead."""
-    horizons = np.array(database.options.horizons_s)
-    ticks = np.round(horizons * database.options.rate_hz)
-    return Scales(database.normaliser.offset, database.normaliser.scale, ticks / database.options.rate_hz, ticks)
+def playback_of(database: MatchingDatabase) -> Playback:
+    """The database's arrays."""
+    rate_hz = database.options.rate_hz
+    ticks = np.round(np.array(database.options.horizons_s) * rate_hz)
+    return Playback(
+        successors=database.root_motion.successors,
+        steps=database.root_motion.steps,
+        starts=database.starts,
+        points=database.pose_points,
+        offset=database.normaliser.offset,
+        scale=database.normaliser.scale,
+        horizons_s=ticks / rate_hz,
+        horizons_ticks=ticks,
+    )

@@ -1,8 +1,7 @@
 """The compiled loop of motion matching, kept apart so that importing the rest of the package does not load numba.
 
-Ground positions are (x, z) metres, headings radians growing to the left. `index` is a
-`marey_motion.matching.search.SearchIndex`, `motion` a `root_motion.RootMotion`, and `wish`, `rules` and `scales` are the
-tuples of `marey_motion.matching.controller`.
+Ground positions are (x, z) metres, headings radians growing to the left; `when` is a moment of the wished path, in
+ticks. `index` is a `search.SearchIndex`, `wish`, `rules`, `playback` and `record` are the tuples of `controller`.
 """
 
 from __future__ import annotations
@@ -100,18 +99,18 @@ def moments_along(rules, wish, positions, out):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def fill_query(index, scales, rules, wish, row, when, x, z, heading, query):  # type: ignore[no-untyped-def]
+def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):  # type: ignore[no-untyped-def]
     """Fill the normalised query (D,): the pose of `row`, and the wish seen from a root at (x, z) with `heading`."""
-    horizons = scales.horizons_s.shape[0]
+    horizons = playback.horizons_s.shape[0]
     first = query.shape[0] - 4 * horizons
     query[:first] = index.rows[row, :first]
     now = min(int(when), wish.speeds.shape[0] - 1)
     sine, cosine = np.sin(heading), np.cos(heading)
     for h in range(horizons):
         if rules.follow == OPEN_LOOP:
-            left, forward, turn = _arc(wish.speeds[now], wish.turn_rates[now], scales.horizons_s[h])
+            left, forward, turn = _arc(wish.speeds[now], wish.turn_rates[now], playback.horizons_s[h])
         else:
-            path_x, path_z, path_heading = _wished(wish, when + scales.horizons_ticks[h])
+            path_x, path_z, path_heading = _wished(wish, when + playback.horizons_ticks[h])
             left = (path_x - x) * cosine - (path_z - z) * sine
             forward = (path_x - x) * sine + (path_z - z) * cosine
             turn = path_heading - heading
@@ -120,12 +119,12 @@ def fill_query(index, scales, rules, wish, row, when, x, z, heading, query):  # 
         query[position], query[position + 1] = left, forward
         query[direction], query[direction + 1] = np.sin(turn), np.cos(turn)
     for d in range(first, query.shape[0]):
-        query[d] = (query[d] - scales.offset[d]) / scales.scale[d]
+        query[d] = (query[d] - playback.offset[d]) / playback.scale[d]
 
 
 @_compiled
-def pose_distance_cost(index, points, row, other, query, first):  # type: ignore[no-untyped-def]
-    """Summed distance in metres between the pose joints of two rows, plus the cost of the trajectory of `other`."""
+def distance_cost(index, points, row, other, query, first):  # type: ignore[no-untyped-def]
+    """Summed distance in metres between the pose joints of two rows, plus the trajectory cost of the `other`."""
     cost = 0.0
     for d in range(first, query.shape[0]):
         difference = index.rows[other, d] - query[d]
@@ -133,88 +132,98 @@ def pose_distance_cost(index, points, row, other, query, first):  # type: ignore
     for p in range(points.shape[1]):
         square = 0.0
         for c in range(3):
-            difference = float(points[other, p, c]) - float(points[row, p, c])
+            difference = np.float64(points[other, p, c]) - np.float64(points[row, p, c])
             square += difference * difference
         cost += np.sqrt(square)
     return cost
 
 
 @_compiled
-def _nearest_by_pose(index, points, row, query, first, skip_start, skip_stop):  # type: ignore[no-untyped-def]
+def _nearest_by_distance(index, points, row, query, first, skip_start, skip_stop):  # type: ignore[no-untyped-def]
     best_row, best_cost = -1, np.inf
     for other in range(index.rows.shape[0]):
-        if not index.selectable[other] or skip_start <= other < skip_stop:
-            continue
-        cost = pose_distance_cost(index, points, row, other, query, first)
-        if cost < best_cost:
-            best_row, best_cost = other, cost
+        if index.selectable[other] and not skip_start <= other < skip_stop:
+            cost = distance_cost(index, points, row, other, query, first)
+            if cost < best_cost:
+                best_row, best_cost = other, cost
     return best_row, best_cost
 
 
 @_compiled
-def _search(index, points, rules, row, query, first, skip_start, skip_stop):  # type: ignore[no-untyped-def]
-    if rules.by_pose:
-        return _nearest_by_pose(index, points, row, query, first, skip_start, skip_stop)
+def _search(index, playback, rules, row, query, skip_start, skip_stop):  # type: ignore[no-untyped-def]
+    if rules.by_distance:
+        first = query.shape[0] - 4 * playback.horizons_s.shape[0]
+        return _nearest_by_distance(index, playback.points, row, query, first, skip_start, skip_stop)
     return nearest(index, query, row, skip_start, skip_stop)
 
 
 @_compiled
-def _going_on(index, points, rules, row, query, first):  # type: ignore[no-untyped-def]
-    if rules.by_pose:
-        return pose_distance_cost(index, points, row, row, query, first)
-    return cost_of(index, row, query)
+def _choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
+    """The row to go on from, its cost, and that of going on from `row` itself; NaN where its clip has ended.
+
+    The pose of the query is that of `row`, so that going on costs what its trajectory costs.
+    """
+    skip_start = skip_stop = 0
+    if rules.window > 0:
+        clip = np.searchsorted(playback.starts, row, side="right") - 1
+        skip_start = max(playback.starts[clip], row - rules.window)
+        skip_stop = min(playback.starts[clip + 1], row + rules.window + 1)
+    best, cost = _search(index, playback, rules, row, query, skip_start, skip_stop)
+    if playback.successors[row] < 0:
+        if best < 0:
+            best, cost = _search(index, playback, rules, row, query, 0, 0)
+        return best, cost, np.nan
+    going_on = cost_of(index, row, query)
+    if best >= 0 and cost < going_on + rules.bias - rules.margin:
+        return best, cost, going_on
+    return row, going_on, going_on
 
 
 @_compiled
-def _skipped(motion, rules, starts, row):  # type: ignore[no-untyped-def]
-    """The rows of the same clip too near to choose, half open."""
-    if rules.window == 0:
-        return 0, 0
-    clip = np.searchsorted(starts, row, side="right") - 1
-    return max(starts[clip], row - rules.window), min(starts[clip + 1], row + rules.window + 1)
+def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-untyped-def]
+    """The row a trial starts with: nearest to the wished trajectory whatever its pose."""
+    fill_query(index, playback, rules, wish, 0, 0.0, root[0], root[1], root[2], query)
+    weights = np.ones(query.shape[0])
+    weights[: query.shape[0] - 4 * playback.horizons_s.shape[0]] = 0.0
+    return nearest_weighted(index, query, weights, 0, 0)
 
 
 @_compiled
-def _turned_into(wish, before, when):  # type: ignore[no-untyped-def]
+def _jumped(wish, before, when):  # type: ignore[no-untyped-def]
     """Whether the wished velocity or direction jumped between two moments."""
     last = wish.speeds.shape[0] - 1
     a, b = min(int(before), last), min(int(when), last)
-    if abs(wish.headings[b] - wish.headings[a]) > JUMP_RAD:
-        return True
     x = wish.speeds[b] * np.sin(wish.headings[b]) - wish.speeds[a] * np.sin(wish.headings[a])
     z = wish.speeds[b] * np.cos(wish.headings[b]) - wish.speeds[a] * np.cos(wish.headings[a])
-    return x * x + z * z > JUMP_M_S * JUMP_M_S
+    return x * x + z * z > JUMP_M_S * JUMP_M_S or abs(wish.headings[b] - wish.headings[a]) > JUMP_RAD
 
 
 @_compiled
-def _step(motion, rules, row, offsets, root):  # type: ignore[no-untyped-def]
-    """Move `root` (x, z, heading) by the step that follows `row` and what is left of blended velocities.
+def _advance(playback, rules, row, offsets, root):  # type: ignore[no-untyped-def]
+    """Move `root` (x, z, heading) by the step that follows `row`, and by what is left of blended velocities.
 
     offsets (2, 3): what to add to the root's velocity (left, forward, turn), and how that changes per second.
     """
-    tick_s = rules.tick_s
-    left = motion.steps[row, 0] + offsets[0, 0] * tick_s
-    forward = motion.steps[row, 1] + offsets[0, 1] * tick_s
+    left = playback.steps[row, 0] + offsets[0, 0] * rules.tick_s
+    forward = playback.steps[row, 1] + offsets[0, 1] * rules.tick_s
     x, z = _outward(root[2], left, forward)
     root[0] += x
     root[1] += z
-    root[2] += motion.steps[row, 2] + offsets[0, 2] * tick_s
-    decay = np.exp(-rules.decay_per_s * tick_s)
+    root[2] += playback.steps[row, 2] + offsets[0, 2] * rules.tick_s
     for c in range(3):
-        rate = offsets[1, c] + rules.decay_per_s * offsets[0, c]
-        offsets[0, c] = decay * (offsets[0, c] + rate * tick_s)
-        offsets[1, c] = decay * (offsets[1, c] - rules.decay_per_s * rate * tick_s)
+        offset, change = offsets[0, c], offsets[1, c]
+        offsets[0, c] = rules.decay[0, 0] * offset + rules.decay[0, 1] * change
+        offsets[1, c] = rules.decay[1, 0] * offset + rules.decay[1, 1] * change
 
 
 @_compiled
 def _hold(rules, wish, when, root):  # type: ignore[no-untyped-def]
     """Pull the root towards the wished one, and hold it near."""
     x, z, heading = _wished(wish, when)
-    pull = 1.0 - np.exp(-rules.adjustment_per_s * rules.tick_s)
-    root[0] += pull * (x - root[0])
-    root[1] += pull * (z - root[1])
     turn = heading - root[2]
-    root[2] += pull * (turn - 2.0 * np.pi * np.round(turn / (2.0 * np.pi)))
+    root[0] += rules.pull * (x - root[0])
+    root[1] += rules.pull * (z - root[1])
+    root[2] += rules.pull * (turn - 2.0 * np.pi * np.round(turn / (2.0 * np.pi)))
     distance = np.hypot(root[0] - x, root[1] - z)
     if distance > rules.clamp_m:
         root[0] = x + (root[0] - x) * rules.clamp_m / distance
@@ -222,67 +231,42 @@ def _hold(rules, wish, when, root):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def run(index, motion, points, starts, wish, rules, scales, record):  # type: ignore[no-untyped-def]
-    """Play one trial into the arrays of `record`.
-
-    points (N, P, 3) pose joints, starts (C + 1,) first rows of the clips and N.
-    """
-    ticks = record.rows.shape[0]
-    dimensions = index.rows.shape[1]
-    first = dimensions - 4 * scales.horizons_s.shape[0]
-    query = np.empty(dimensions)
+def run(index, playback, wish, rules, record):  # type: ignore[no-untyped-def]
+    """Play one trial into the arrays of `record`."""
+    query = np.empty(index.rows.shape[1])
     offsets = np.zeros((2, 3))
     root = np.array([wish.positions[0, 0], wish.positions[0, 1], wish.headings[0]])
-    record.match_cost[:] = np.nan
-    record.continuing_cost[:] = np.nan
-
-    fill_query(index, scales, rules, wish, 0, 0.0, root[0], root[1], root[2], query)
-    weights = np.ones(dimensions)
-    weights[:first] = 0.0
-    row, record.match_cost[0] = nearest_weighted(index, query, weights, 0, 0)
+    row, first_cost = _first_row(index, playback, rules, wish, root, query)
     status = FORCED
     before = when = 0.0
     forced_at = -rules.period
-    for tick in range(ticks):
+    for tick in range(record.rows.shape[0]):
         record.rows[tick], record.status[tick] = row, status
         record.positions[tick, 0], record.positions[tick, 1], record.headings[tick] = root[0], root[1], root[2]
+        record.match_cost[tick] = record.continuing_cost[tick] = np.nan
 
-        ended = motion.successors[row] < 0
+        ended = playback.successors[row] < 0
         due = ended or tick % rules.period == 0
-        if not due and tick - forced_at >= rules.period and _turned_into(wish, before, when):
+        if not due and tick - forced_at >= rules.period and _jumped(wish, before, when):
             due, forced_at = True, tick
         chosen = row
-        if due and tick > 0:
-            fill_query(index, scales, rules, wish, row, when, root[0], root[1], root[2], query)
-            skip_start, skip_stop = _skipped(motion, rules, starts, row)
-            best, cost = _search(index, points, rules, row, query, first, skip_start, skip_stop)
-            if ended:
-                if best < 0:
-                    best, cost = _search(index, points, rules, row, query, first, 0, 0)
-                chosen = best
-            else:
-                going_on = _going_on(index, points, rules, row, query, first)
-                record.continuing_cost[tick] = going_on
-                if best >= 0 and best != row and cost < going_on + rules.bias - rules.margin:
-                    chosen = best
-                else:
-                    cost = going_on
-            record.match_cost[tick] = cost
-
-        if chosen != row and rules.blends_root:
-            for c in range(3):
-                offsets[0, c] += (motion.steps[row, c] - motion.steps[chosen, c]) / rules.tick_s
-        if ended or motion.successors[chosen] != chosen + 1:
-            status = FORCED
-        else:
-            status = KEPT
-        if chosen != row and not ended:
-            status = REPLACING
-            if record.status[tick] != REPLACING:
-                record.status[tick] = REPLACED
-        _step(motion, rules, chosen, offsets, root)
-        row = motion.successors[chosen]
-        before = when
+        if tick == 0:
+            record.match_cost[0] = first_cost
+        elif due:
+            fill_query(index, playback, rules, wish, row, when, root[0], root[1], root[2], query)
+            chosen, record.match_cost[tick], record.continuing_cost[tick] = _choose(index, playback, rules, row, query)
+        following = playback.successors[chosen]
+        status = FORCED if ended or following != chosen + 1 else KEPT
+        if chosen != row:
+            if not ended:
+                status = REPLACING
+                if record.status[tick] == KEPT:
+                    record.status[tick] = REPLACED
+            if rules.blends_root:
+                for c in range(3):
+                    offsets[0, c] += (playback.steps[row, c] - playback.steps[chosen, c]) / rules.tick_s
+        _advance(playback, rules, chosen, offsets, root)
+        row, before = following, when
         when = _moment(rules, wish, when, tick + 1, root[0], root[1])
         if rules.holds:
             _hold(rules, wish, when, root)

@@ -1,0 +1,135 @@
+"""Compiled inertialisation of poses, kept apart so that importing the rest of the package does not load numba.
+
+A pose is a row of 3 + 4·J numbers: the position of joint 0 in metres and the rotations (w, x, y, z) of J joints, joint
+0 in the frame of the simulation root, the others in that of their parent. Rotations add by multiplying from the left;
+their offsets and velocities are rotation vectors.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+# Offsets below this, in metres or radians and the same per second, are below what float32 poses can show.
+FORGOTTEN = 1e-9
+# Half of an angle, squared, below which the first terms of the series are exact to the last bit.
+SMALL = 1e-4
+
+_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+
+
+@_compiled
+def _product(aw, ax, ay, az, bw, bx, by, bz):  # type: ignore[no-untyped-def]
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+@_compiled
+def _exponential(x, y, z):  # type: ignore[no-untyped-def]
+    """The rotation about (x, y, z) by its length in radians."""
+    square = 0.25 * (x * x + y * y + z * z)
+    if square < SMALL:
+        cosine = 1.0 - square * (1.0 / 2.0 - square * (1.0 / 24.0 - square / 720.0))
+        scale = 0.5 - square * (1.0 / 12.0 - square * (1.0 / 240.0 - square / 10080.0))
+    else:
+        half = np.sqrt(square)
+        cosine, scale = np.cos(half), 0.5 * np.sin(half) / half
+    return cosine, scale * x, scale * y, scale * z
+
+
+@_compiled
+def _turn_to(pose, column, w, x, y, z):  # type: ignore[no-untyped-def]
+    """The turn of at most half a circle, as a rotation vector, that takes a rotation of `pose` to (w, x, y, z)."""
+    bw, bx, by, bz = (
+        np.float64(pose[column]),
+        np.float64(pose[column + 1]),
+        np.float64(pose[column + 2]),
+        np.float64(pose[column + 3]),
+    )
+    w, x, y, z = _product(w, x, y, z, bw, -bx, -by, -bz)
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    sine = np.sqrt(x * x + y * y + z * z)
+    scale = 2.0 * np.arctan2(sine, w) / sine if sine > 1e-12 else 2.0
+    return scale * x, scale * y, scale * z
+
+
+@_compiled
+def _add_velocity(poses, successors, joints, row, rate, velocities):  # type: ignore[no-untyped-def]
+    """Add `rate` times the step from a row to the next one to `velocities` (1 + K, 3)."""
+    if successors[row] < 0:  # a clip's end goes on as it came
+        if row == 0 or successors[row - 1] != row:
+            return
+        row -= 1
+    here, ahead = poses[row], poses[successors[row]]
+    for c in range(3):
+        velocities[0, c] += rate * (np.float64(ahead[c]) - np.float64(here[c]))
+    for k in range(joints.shape[0]):
+        j = 3 + 4 * joints[k]
+        turn = _turn_to(here, j, ahead[j], ahead[j + 1], ahead[j + 2], ahead[j + 3])
+        for c in range(3):
+            velocities[1 + k, c] += rate * turn[c]
+
+
+@_compiled
+def _show(pose, joints, offsets, shown):  # type: ignore[no-untyped-def]
+    """Fill `shown` (3 + 4·K) with the joints of a pose and their offsets (1 + K, 3)."""
+    for c in range(3):
+        shown[c] = pose[c] + offsets[0, c]
+    for k in range(joints.shape[0]):
+        j, o = 3 + 4 * joints[k], 3 + 4 * k
+        turn = _exponential(offsets[1 + k, 0], offsets[1 + k, 1], offsets[1 + k, 2])
+        shown[o], shown[o + 1], shown[o + 2], shown[o + 3] = _product(
+            turn[0], turn[1], turn[2], turn[3], pose[j], pose[j + 1], pose[j + 2], pose[j + 3]
+        )
+
+
+@_compiled
+def _decay(decay, offsets, velocities):  # type: ignore[no-untyped-def]
+    """One tick of all springs; whether anything is left of them."""
+    left = 0.0
+    for k in range(offsets.shape[0]):
+        for c in range(3):
+            offset, velocity = offsets[k, c], velocities[k, c]
+            offsets[k, c] = decay[0, 0] * offset + decay[0, 1] * velocity
+            velocities[k, c] = decay[1, 0] * offset + decay[1, 1] * velocity
+            left = max(left, abs(offsets[k, c]), abs(velocities[k, c]))
+    return left > FORGOTTEN
+
+
+@_compiled
+def inertialised(poses, successors, joints, rows, cuts, decay, rate_hz, out):  # type: ignore[no-untyped-def]
+    """Fill `out` (T, 3 + 4·K) with the displayed poses of K joints of the database's `poses` (N, 3 + 4·J).
+
+    joints (K,) increasing; rows (T,) displayed at each tick; cuts (T,) the row that takes the place of the displayed
+    one after its tick, or -1; decay (2, 2) of offsets and velocities in one tick.
+    """
+    offsets = np.zeros((1 + joints.shape[0], 3))
+    velocities = np.zeros((1 + joints.shape[0], 3))
+    blends = False
+    for tick in range(rows.shape[0]):
+        shown = out[tick]
+        if blends:
+            _show(poses[rows[tick]], joints, offsets, shown)
+        else:
+            pose = poses[rows[tick]]
+            shown[:3] = pose[:3]
+            for k in range(joints.shape[0]):
+                shown[3 + 4 * k : 7 + 4 * k] = pose[3 + 4 * joints[k] : 7 + 4 * joints[k]]
+        if cuts[tick] >= 0:
+            target = poses[cuts[tick]]
+            for c in range(3):
+                offsets[0, c] = shown[c] - target[c]
+            for k in range(joints.shape[0]):
+                o = 3 + 4 * k
+                turn = _turn_to(target, 3 + 4 * joints[k], shown[o], shown[o + 1], shown[o + 2], shown[o + 3])
+                offsets[1 + k, 0], offsets[1 + k, 1], offsets[1 + k, 2] = turn
+            _add_velocity(poses, successors, joints, rows[tick], rate_hz, velocities)
+            _add_velocity(poses, successors, joints, cuts[tick], -rate_hz, velocities)
+            blends = True
+        if blends:
+            blends = _decay(decay, offsets, velocities)
