@@ -241,7 +241,7 @@ def _floor_offset(tracks: _Tracks) -> CheckWarning | None:
         return None
     return CheckWarning(
         "floor-offset",
-        f"the feet stand at a height of {height:.2f} m; the option align_floor brings them to the ground",
+        f"the feet stand at a height of {height:.2f} m; --align-floor (align_floor) brings them to the ground",
         values={"floor_height_m": height},
     )
 

@@ -52,11 +52,11 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
         raise FormatError(str(error), code=error.code, file=file) from error
     trimmed, floor_shift_m = (0, 0), 0.0
     if clip is not None:
-        warnings += checks.check_clip(clip, landmarks)
         if options.trim_rest_pose:
             clip, trimmed = checks.without_rest_pose(clip)
         if options.align_floor:
             clip, floor_shift_m = checks.on_the_floor(clip)
+        warnings += checks.check_clip(clip, landmarks)  # last: frames and heights are those of the clip that is kept
     info = SourceInfo(
         format=source.format,
         file=file,

@@ -9,8 +9,10 @@ import pytest
 
 from marey_motion.checks import CODES, CheckWarning, check_clip, on_the_floor, without_rest_pose
 from marey_motion.clip import Clip
+from marey_motion.formats import read_motion, write_bvh
 from marey_motion.gait import generate_gait, studio_skeleton
 from marey_motion.kinematics import global_positions
+from marey_motion.source import ImportOptions
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +60,19 @@ class TestRestPose:
         trimmed, dropped = without_rest_pose(clip)
         assert dropped == (20, 5)
         np.testing.assert_array_equal(trimmed.poses, walk.poses)
+
+    def test_what_the_options_mended_is_not_complained_about(self, walk: Clip, standing: Clip) -> None:
+        poses = joined(standing.sliced(0, 20), walk).poses.copy()
+        poses[:, 1] += 0.3
+        clip = replace(walk, poses=poses)
+        told = {}
+        for mended in (False, True):
+            options = ImportOptions(trim_rest_pose=mended, align_floor=mended)
+            told[mended] = {
+                warning.code for warning in read_motion(write_bvh(clip), "walk.bvh", options=options).warnings
+            }
+        # The jump was the one from the rest pose into the walk.
+        assert told[False] - told[True] == {"rest-pose-frame", "rotation-jump", "floor-offset"}
 
     def test_a_t_pose_is_found_in_whatever_way_the_rig_rests(self, walk: Clip, standing: Clip) -> None:
         tilted = standing.poses.copy()
