@@ -69,7 +69,7 @@ def test_other_content_under_a_taken_name_is_numbered(lab):
     )
     publish(lab, rig_draft(bone_m=0.6))
     publish(lab, rig_draft(bone_m=0.7))
-    assert [one.name for one in listed(lab, Kind.SKELETON)] == ["rig", "rig (2)", "rig (3)"]
+    assert [one.name for one in listed(lab, Kind.SKELETON)] == ["rig", "rig-2", "rig-3"]
 
 
 def test_a_new_item_refuses_a_taken_name_and_nothing_is_published(lab):

@@ -223,4 +223,4 @@ def _names(draft: Draft) -> Iterator[str]:
     yield draft.item_name
     if draft.reuse == "by_content":
         for number in itertools.count(2):
-            yield f"{draft.item_name[:240]} ({number})"
+            yield f"{draft.item_name[:240]}-{number}"
