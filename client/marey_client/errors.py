@@ -45,6 +45,10 @@ class NothingToUpload(MareyError):
     """There are no motion files where some were expected."""
 
 
+class SameName(MareyError):
+    """Two files would get the same name."""
+
+
 # How jobs end
 
 
@@ -68,10 +72,11 @@ class RequestFailed(MareyError):
 
     status: ClassVar[int] = 0
 
-    def __init__(self, problem: Problem, *, retry_after_s: float | None = None) -> None:
+    def __init__(self, problem: Problem, *, retry_after_s: float | None = None, anonymous: bool = False) -> None:
         super().__init__(problem.detail)
         self.problem = problem
         self.retry_after_s = retry_after_s
+        self.anonymous = anonymous
 
     @property
     def code(self) -> str:
@@ -209,8 +214,11 @@ _BY_STATUS: dict[int, type[RequestFailed]] = {
 _BY_CODE: dict[str, type[RequestFailed]] = {"lease-lost": LeaseLost}
 
 
-def error_of(problem: Problem, *, retry_after_s: float | None = None) -> RequestFailed:
-    """The exception for a problem document; its class is found by code, then by status."""
+def error_of(problem: Problem, *, retry_after_s: float | None = None, anonymous: bool = False) -> RequestFailed:
+    """The exception for a problem document; its class is found by code, then by status.
+
+    `anonymous` says that the request carried no token.
+    """
     known = _BY_CODE.get(problem.code) or _BY_STATUS.get(problem.status)
     kind = known or (ServerFailed if problem.status >= 500 else RequestFailed)
-    return kind(problem, retry_after_s=retry_after_s)
+    return kind(problem, retry_after_s=retry_after_s, anonymous=anonymous)

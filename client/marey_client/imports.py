@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from marey_client.blobs import Blobs, digest_of_file
-from marey_client.errors import NothingToUpload
+from marey_client.errors import NothingToUpload, SameName
 from marey_client.jobs import Jobs
 from marey_client.transport import Transport, as_json, read_model
 from marey_schemas.imports import ImportAnswer, ImportEntry, ImportFile, ImportOptions, ImportRequest, skeleton_output
 from marey_schemas.jobs import Job, JobOutput
 
-MOTION_SUFFIXES = frozenset({".bvh", ".asf", ".amc", ".c3d", ".npz", ".json"})
+MOTION_SUFFIXES = (".amc", ".asf", ".bson", ".bson.bz2", ".bvh", ".c3d", ".json", ".npz")
 COMPANION_SUFFIX = ".asf"
 NEEDS_COMPANION_SUFFIX = ".amc"
 FILES_PER_IMPORT = 50
@@ -46,13 +46,14 @@ class FoundFiles:
 def find_files(places: Iterable[Path]) -> FoundFiles:
     """Motion files in folders and below, hidden ones left out; files named themselves are taken whatever they are.
 
-    Raises `NothingToUpload` where a place does not exist or none holds a motion file.
+    Raises `NothingToUpload` where a place does not exist or none holds a motion file, `SameName` where files of two
+    places would get one name.
     """
     files: dict[str, LocalFile] = {}
     left_out: list[Path] = []
     for place in places:
         if place.is_file():
-            files[place.name] = LocalFile(place.name, place, place.stat().st_size)
+            _add(files, place.name, place)
             continue
         if not place.is_dir():
             raise NothingToUpload(f"{place} does not exist")
@@ -60,13 +61,22 @@ def find_files(places: Iterable[Path]) -> FoundFiles:
             below = path.relative_to(place)
             if not path.is_file() or any(part.startswith(".") for part in below.parts):
                 continue
-            if path.suffix.lower() in MOTION_SUFFIXES:
-                files[below.as_posix()] = LocalFile(below.as_posix(), path, path.stat().st_size)
+            if path.name.lower().endswith(MOTION_SUFFIXES):
+                _add(files, below.as_posix(), path)
             else:
                 left_out.append(path)
     if not files:
-        raise NothingToUpload(f"no motion files ({', '.join(sorted(MOTION_SUFFIXES))}) in {_listed(places)}")
+        raise NothingToUpload(f"no motion files ({', '.join(MOTION_SUFFIXES)}) in {_listed(places)}")
     return FoundFiles(tuple(files.values()), tuple(left_out))
+
+
+def _add(files: dict[str, LocalFile], name: str, path: Path) -> None:
+    known = files.setdefault(name, LocalFile(name, path, path.stat().st_size))
+    if not known.path.samefile(path):
+        raise SameName(
+            f"{known.path} and {path} would both be {name}; name the folder above them, "
+            "or upload them to two collections"
+        )
 
 
 def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:

@@ -243,8 +243,11 @@ def raise_for_problem(response: httpx.Response) -> None:
     """Raise the error an answer stands for, if it stands for one."""
     if response.status_code < 400:
         return
+    circumstances: dict[str, Any] = {
+        "retry_after_s": retry_after_s(response), "anonymous": "Authorization" not in response.request.headers,
+    }  # fmt: skip
     if response.headers.get("Content-Type", "").startswith(PROBLEM) and response.content:
-        raise error_of(Problem.model_validate_json(response.content), retry_after_s=retry_after_s(response))
+        raise error_of(Problem.model_validate_json(response.content), **circumstances)
     problem = Problem(
         type="about:blank",
         title=response.reason_phrase,
@@ -253,7 +256,7 @@ def raise_for_problem(response: httpx.Response) -> None:
         instance=response.headers.get("X-Request-Id", "unknown"),
         code=f"http-{response.status_code}",
     )
-    raise error_of(problem, retry_after_s=retry_after_s(response))
+    raise error_of(problem, **circumstances)
 
 
 def _present(params: Params | None) -> dict[str, str] | None:

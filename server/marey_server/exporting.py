@@ -64,7 +64,7 @@ def find_original(tx: Transaction, project: str, kind: Kind, item_id: str, revis
         if source.get("file"):
             name = str(source.get("file_name") or item_id).replace("\\", "/").rpartition("/")[2]
             return OriginalFile(name, source["file"])
-    raise NotFound("It was not made from a file.", code="no-original")
+    raise NotFound("It was not made from a file; ask for another format, such as bvh.", code="no-original")
 
 
 def write_file(source: ExportSource, file_format: ExportFormat, unit: str) -> ExportedFile:

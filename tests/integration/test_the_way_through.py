@@ -119,6 +119,58 @@ def test_the_readme_told_in_a_shell(run, takes, tmp_path, marey):
     assert json.loads(run("job", "show", jobs[0]["id"], "--json").stdout)["result"]["clips"] == 2
 
 
+def test_a_folder_is_listed_with_what_stands_directly_in_it(run, takes):
+    run("project", "create", "folders")
+    run("upload", takes / "turns", "--project", "folders")
+    run("upload", takes / "turns", "--project", "folders", "--collection", "a/b")
+    for place, folders, names in (
+        ("folders", ["a", "skeletons"], ["left"]),
+        ("folders/a", ["b"], []),
+        ("folders/a/b", [], ["left"]),
+    ):
+        shown = json.loads(run("ls", place, "--json").stdout)
+        assert (shown["collections"], [item["name"] for item in shown["items"]]) == (folders, names)
+
+
+def test_a_clip_is_shown_with_its_skeleton_its_evidence_and_what_was_noticed(run, takes, tmp_path):
+    text = (takes / "walk.bvh").read_text()
+    (tmp_path / "more.bvh").write_text(text.replace("Frames: 120", "Frames: 119"))
+    run("project", "create", "shown")
+    run("upload", tmp_path / "more.bvh", "--project", "shown", "--unit", "cm")
+    (skeleton,) = json.loads(run("ls", "shown/skeletons", "--json").stdout)["items"]
+    told = run("show", "shown/more").stdout
+    assert f"skeletons/{skeleton['name']} ({skeleton['id']})" in told
+    assert "given by the user" in told
+    assert "the header declares 119 frames" in told
+
+
+def test_the_history_of_a_clip_tells_that_its_source_has_changed(run, takes, marey, tmp_path):
+    run("project", "create", "history")
+    run("upload", takes / "walk.bvh", "--project", "history", "--collection", "raw")
+    studio = target_skeleton(marey.project("history"))
+    run("retarget", "history/raw", "--to", f"history/{studio.id}", "--into", "out")
+    assert "stale" not in run("show", "--history", "history/out/raw/walk").stdout
+    (tmp_path / "walk.bvh").write_bytes(write_bvh(generate_gait(1.3, 0.3, 2.0)))
+    run("upload", tmp_path / "walk.bvh", "--project", "history", "--collection", "raw")
+    told = run("show", "--history", "history/out/raw/walk").stdout
+    assert "stale: clip walk has newer revisions than 1" in told
+
+
+def test_a_job_of_any_kind_is_handed_in_from_the_shell(run, takes, marey):
+    run("project", "create", "jobs")
+    run("upload", takes / "walk.bvh", "--project", "jobs", "--collection", "raw")
+    assert "retarget" in run("job", "kinds").stdout
+    assert "skeleton" in run("job", "kinds", "retarget").stdout
+    studio = target_skeleton(marey.project("jobs"))
+    retarget = ("job", "submit", "jobs", "retarget", "--input", "clips=raw", "--into", "out")
+    ended = run(*retarget, "--input", f"skeleton={studio.name}", "--param", "suffix=-x", "--param", "scale=1.5")
+    assert json.loads(ended.stdout)["clips"] == 1
+    assert [clip.path for clip in marey.project("jobs").clips.list(collection="out")] == ["out/raw/walk-x"]
+    assert "it has clips, skeleton" in run(*retarget, "--input", "nose=raw", status=2).stderr
+    assert "no skeleton at jobs/absent" in run(*retarget, "--input", "skeleton=absent", status=2).stderr
+    assert "there are import" in run("job", "submit", "jobs", "nothing", status=2).stderr
+
+
 def test_the_original_comes_back_byte_for_byte(run, takes, tmp_path):
     run("project", "create", "originals")
     run("upload", takes / "walk.bvh", "--project", "originals")

@@ -42,13 +42,16 @@ def reported(*, verbose: bool) -> Iterator[None]:
 
 def sentence(error: BaseException) -> str:
     """An error in one line, with what is needed to ask for help."""
-    from marey_client.errors import RequestFailed
+    from marey_client.errors import NotFound, RequestFailed
 
     text = " ".join(str(error).split()) or type(error).__name__
     if not isinstance(error, RequestFailed):
         return text
     fields = "".join(f"; {field.pointer}: {field.detail}" for field in error.errors)
-    return f"{text}{fields} ({error.code}, request {error.request_id})"
+    told = f"{text}{fields} ({error.code}, request {error.request_id})"
+    if error.anonymous and (isinstance(error, NotFound) or error.code == "unauthenticated"):
+        return f"{told}; no token was found here: marey login, or --token-file"
+    return told
 
 
 def _exit(status: int, text: str, verbose: bool) -> None:

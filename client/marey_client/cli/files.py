@@ -15,7 +15,7 @@ from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, print_pairs, print_table, progress, tell
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from marey_client.items import ItemHandle
     from marey_client.marey import Marey
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from marey_schemas.kinds import Kind
 
 DOWNLOADS_AT_ONCE = 4
-
+FORMATS = ("original", "bvh", "npz", "predecessor", "json")
 
 WARNINGS_SHOWN = 2  # of each code: a folder of thousands shows what it has, not everything it has
 
@@ -120,7 +120,7 @@ def ls(
         items = _items_in(marey, address, recursive=recursive, kinds=kind, tag=tag)
     if as_json:
         return print_json({"collections": folders, "items": [one.item for one in items]})
-    rows: list[tuple[object, ...]] = [(f"{name}/", "collection", "", "", "", "") for name in folders]
+    rows: list[tuple[object, ...]] = [(f"{name}/", "collection", *[""] * 5) for name in folders]
     for one in items:
         summary = one.item.summary
         rows.append(
@@ -128,19 +128,21 @@ def ls(
                 one.path if recursive else one.name,
                 one.item.kind,
                 one.item.revision,
+                summary.get("joints"),
                 summary.get("frames"),
                 summary.get("frame_rate_hz"),
                 " ".join(one.item.tags),
             )
         )
-    return print_table(("name", "kind", "revision", "frames", "Hz", "tags"), rows, right=("revision", "frames", "Hz"))
+    figures = ("revision", "joints", "frames", "Hz")
+    return print_table(("name", "kind", *figures, "tags"), rows, right=figures)
 
 
 def _folders_in(marey: Marey, address: Address) -> list[str]:
     """Names of the folders directly in the folder an address names."""
-    prefix = f"{address.path}/" if address.path else ""
-    paths = (one.path for one in marey.project(address.project).collections.list())
-    return sorted({path[len(prefix) :].partition("/")[0] for path in paths if path.startswith(prefix) and path != ""})
+    below = marey.project(address.project).collections.list(filters={"path": address.path or None})
+    names = (one.path.removeprefix(address.path).strip("/").partition("/")[0] for one in below)
+    return sorted({name for name in names if name})
 
 
 def _items_in(
@@ -152,8 +154,9 @@ def _items_in(
     project = marey.project(address.project)
 
     def of_kind(kind: Kind) -> list[ItemHandle]:
-        found = project.items(kind).list(collection=address.path, sort="name", filters={"tag.in": tag})
-        return [item for item in found if recursive or item.item.collection == address.path]
+        folder = "collection" if recursive else "directly_in"
+        found: list[ItemHandle] = list(project.items(kind).list(filters={folder: address.path, "tag.in": tag}))
+        return sorted(found, key=lambda item: item.path)
 
     with ThreadPoolExecutor(4) as pool:
         return [item for items in pool.map(of_kind, wanted) for item in items]
@@ -186,27 +189,47 @@ def show(
             return typer.echo(encode_tree(item.part(part), "application/json"))
         if history:
             return _show_history(item, as_json)
-    if as_json:
-        return print_json(item.item)
-    shown = item.item.model_dump(mode="json", exclude={"parts", "summary", "rev"})
-    print_pairs(shown.items())
-    print_pairs(item.item.summary.items())
-    return print_pairs(
-        (f"part {name}", f"{one.size_bytes} bytes, {one.schema_}, {one.document}")
-        for name, one in item.item.parts.items()
-    )
+        if as_json:
+            return print_json(item.item)
+        return print_pairs(_described(marey, item))
+
+
+def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
+    """What people want to know about an item; a clip with its skeleton, its source and what was noticed about it."""
+    from marey_client.motions import ClipHandle
+
+    yield from item.item.model_dump(mode="json", exclude={"parts", "summary", "rev", "tags"}).items()
+    yield "tags", " ".join(item.item.tags)
+    for name, value in item.item.summary.items():
+        if isinstance(item, ClipHandle) and name == "skeleton":
+            yield name, f"{marey.project(item.project).skeletons.get(value).path} ({value})"
+        elif name != "warnings":
+            yield name, value
+    for name, one in item.item.parts.items():
+        yield f"part {name}", f"{one.size_bytes} bytes, {one.schema_}, {one.document}"
+    if isinstance(item, ClipHandle) and "info" in item.item.parts:
+        info = item.info()
+        if info.source is not None:
+            yield "source", info.source.file_name
+            yield from (("evidence", found) for found in info.source.details.get("evidence", ()))
+        for check in info.checks:
+            frames = f", frames {check.frames[0]} to {check.frames[1] - 1}" if check.frames else ""
+            joints = f", joints {' '.join(check.joints)}" if check.joints else ""
+            yield f"warning {check.code}", f"{check.message}{frames}{joints}"
 
 
 def _show_history(item: ItemHandle, as_json: bool) -> None:
-    revisions, lineage = list(item.revisions()), item.lineage()
+    revisions, lineage, staleness = list(item.revisions()), item.lineage(), item.staleness()
     if as_json:
-        return print_json({"revisions": revisions, "lineage": lineage})
+        return print_json({"revisions": revisions, "lineage": lineage, "staleness": staleness})
     rows = [(one.revision, one.created_at, one.author, one.job, one.message) for one in revisions]
     print_table(("revision", "made", "author", "job", "message"), rows)
     for edge in lineage.inputs:
         typer.echo(f"made from {edge.kind} {edge.name} ({edge.item} revision {edge.revision}) as {edge.role}")
     for edge in lineage.outputs:
         typer.echo(f"used for  {edge.kind} {edge.name} ({edge.item} revision {edge.revision}) as {edge.role}")
+    for edge in staleness.because:
+        typer.echo(f"stale: {edge.kind} {edge.name} has newer revisions than {edge.revision}")
     return None
 
 
@@ -219,6 +242,8 @@ def download(
     as_json: AsJson = False,
 ) -> None:
     """Write clips to files. A folder comes with the folders below it."""
+    if format not in FORMATS:
+        raise WrongUsage(f"{format!r} is no format; there are {', '.join(FORMATS)}")
     address = Address.parse(place)
     with connect(context) as marey:
         clips, base = _clips_at(marey, address)

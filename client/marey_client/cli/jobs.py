@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,7 +14,7 @@ from marey_client.cli.output import Advance, print_json, print_pairs, print_tabl
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
-    from marey_schemas.jobs import CollectionInput, ItemInput, Job
+    from marey_schemas.jobs import CollectionInput, InputSpec, ItemInput, Job, JobKind
 
 job = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Jobs.")
 
@@ -99,6 +100,103 @@ def _print_ended(ended: Job, as_json: bool) -> None:
 # -- jobs --
 
 
+@job.command("kinds")
+def list_kinds(
+    context: typer.Context,
+    name: Annotated[str | None, typer.Argument(help="Left out: every kind.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show what can be asked for, or what one kind takes."""
+    with connect(context) as marey:
+        kinds = list(marey.jobs.kinds()) if name is None else [_kind_of_job(marey, name)]
+    if as_json:
+        return print_json(kinds if name is None else kinds[0])
+    if name is None:
+        return print_table(
+            ("name", "inputs", "description"), [(x.name, " ".join(x.inputs), x.description) for x in kinds]
+        )
+    (kind,) = kinds
+    typer.echo(kind.description)
+    takes = [("--input", role, spec.kind, spec.description) for role, spec in kind.inputs.items()]
+    given = [
+        ("--param", key, json.dumps(spec.get("default")), spec.get("description", ""))
+        for key, spec in kind.params_schema.get("properties", {}).items()
+    ]
+    return print_table(("", "name", "kind or default", "meaning"), [*takes, *given])
+
+
+@job.command("submit")
+def submit_job(
+    context: typer.Context,
+    project: str,
+    kind: Annotated[str, typer.Argument(help="What to do; marey job kinds shows what there is.")],
+    inputs: Annotated[
+        list[str] | None, typer.Option("--input", help="name=folder or name=folder/item; may be repeated.")
+    ] = None,
+    params: Annotated[
+        list[str] | None, typer.Option("--param", help="name=value, the value as JSON or plain text; may be repeated.")
+    ] = None,
+    into: Annotated[str, typer.Option(help="The folder in the project that the results go to.")] = "",
+    priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
+    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Hand in a job of any kind, and print its result."""
+    from marey_schemas.jobs import JobCreate
+
+    with connect(context) as marey:
+        roles = _kind_of_job(marey, kind).inputs
+        places: dict[str, list[Any]] = {}
+        for role, place in map(_assigned, inputs or ()):
+            if role not in roles:
+                raise WrongUsage(f"{kind} has no input {role!r}; it has {', '.join(roles) or 'none'}")
+            places.setdefault(role, []).append(_input_at(marey, Address(project, place.strip("/")), roles[role]))
+        wanted = JobCreate(
+            kind=kind,
+            inputs={role: tuple(found) if roles[role].many else found[-1] for role, found in places.items()},
+            params={name: _json_or_text(value) for name, value in map(_assigned, params or ())},
+            into=into.strip("/"),
+            priority=priority,
+        )
+        submitted = marey.project(project).submit(wanted)
+        if not wait:
+            return print_json(submitted) if as_json else typer.echo(submitted.id)
+        ended = _follow(marey, submitted)
+    tell(f"{ended.id} {ended.state}")
+    return print_json(ended if as_json else ended.result)
+
+
+def _kind_of_job(marey: Marey, name: str) -> JobKind:
+    kinds = {kind.name: kind for kind in marey.jobs.kinds()}
+    if name not in kinds:
+        raise WrongUsage(f"{name!r} is no kind of job of this server; there are {', '.join(kinds)}")
+    return kinds[name]
+
+
+def _input_at(marey: Marey, address: Address, spec: InputSpec) -> ItemInput | CollectionInput:
+    """An item, or where the input takes many, a folder."""
+    from marey_schemas.jobs import CollectionInput, ItemInput
+
+    if not spec.many:
+        return ItemInput(item=require_item(marey, address, [spec.kind]).id)
+    item = find_item(marey, address, [spec.kind])
+    return CollectionInput(collection=address.path) if item is None else ItemInput(item=item.id)
+
+
+def _assigned(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not equals or not name:
+        raise WrongUsage(f"{text!r}: write name=value")
+    return name, value
+
+
+def _json_or_text(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
 @job.command("ls")
 def list_jobs(
     context: typer.Context,
@@ -126,7 +224,8 @@ def show_job(context: typer.Context, job_id: str, as_json: AsJson = False) -> No
         attempts = list(marey.jobs.attempts(job_id))
     if as_json:
         return print_json({**found.model_dump(mode="json"), "attempts": attempts})
-    print_pairs(found.model_dump(mode="json", exclude={"rev", "inputs"}, exclude_none=True).items())
+    shown = found.model_dump(mode="json", exclude={"rev", "inputs"}, exclude_none=True)
+    print_pairs((name, json.dumps(value) if isinstance(value, dict) else value) for name, value in shown.items())
     rows = [(one.fence, one.worker, one.started_at, one.ended_at, one.outcome, one.detail) for one in attempts]
     return print_table(("fence", "worker", "started", "ended", "outcome", "detail"), rows)
 

@@ -3,11 +3,16 @@
 import subprocess
 import sys
 
+import httpx
 import pytest
 
 from marey_client.cli import with_global_options_first
 from marey_client.cli.addresses import Address
-from marey_client.cli.failures import WrongUsage
+from marey_client.cli.failures import WrongUsage, sentence
+from marey_client.cli.files import _items_in
+from marey_client.errors import NotFound
+from marey_client.marey import Marey
+from marey_schemas.kinds import Kind
 
 
 def marey(*arguments, env=None, stdin=""):
@@ -102,6 +107,33 @@ def test_addresses_have_a_project_a_path_and_perhaps_an_id():
     assert str(Address.parse("lab/")) == "lab"
     with pytest.raises(WrongUsage):
         Address.parse("/")
+
+
+def test_a_format_that_cannot_be_written_is_refused_before_anything_is_asked(nowhere):
+    done = marey("download", "lab/raw", "--format", "gltf", env=nowhere)
+    assert done.returncode == 2
+    assert "there are original, bvh, npz" in done.stderr
+
+
+def test_a_folder_is_shown_without_reading_those_below_it(script):
+    def empty(request):
+        return httpx.Response(200, content=b'{"items": [], "next_cursor": null}')
+
+    script.answers = [empty] * len(Kind)
+    _items_in(script.marey(), Address("lab", "raw"), recursive=False, kinds=None, tag=None)
+    assert {request.url.params["directly_in"] for request in script.requests} == {"raw"}
+    assert not any("collection" in request.url.params for request in script.requests)
+
+
+@pytest.mark.parametrize(("token", "hinted"), [(None, True), ("marey_secret", False)])
+def test_what_is_hidden_from_a_request_without_a_token_hints_at_that(script, make_problem, token, hinted):
+    script.answers = [make_problem(404, "no-project")]
+    with (
+        Marey("http://server.test", token, http=httpx.MockTransport(script)) as anyone,
+        pytest.raises(NotFound) as raised,
+    ):
+        anyone.project("lab").read()
+    assert ("marey login" in sentence(raised.value)) is hinted
 
 
 def test_completion_is_offered_for_the_users_shell(nowhere):

@@ -33,6 +33,22 @@ def test_a_file_named_itself_is_taken_whatever_it_is(tmp_path):
     assert [file.name for file in find_files([path]).files] == ["odd.ending"]
 
 
+def test_files_that_would_get_one_name_are_refused_and_none_is_left_out_silently(tmp_path):
+    for name in ("monday/walk.bvh", "tuesday/walk.bvh"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text("x")
+    with pytest.raises(errors.SameName, match=r"monday/walk\.bvh and .*tuesday/walk\.bvh would both be walk\.bvh"):
+        find_files([tmp_path / "monday", tmp_path / "tuesday"])
+    assert len(find_files([tmp_path]).files) == 2
+    assert len(find_files([tmp_path / "monday", tmp_path / "monday/walk.bvh"]).files) == 1
+
+
+@pytest.mark.parametrize("name", ["clip.bson", "clip.BSON.bz2", "clip.npz", "clip.json"])
+def test_every_format_with_a_reader_is_found_in_a_folder(tmp_path, name):
+    (tmp_path / name).write_text("x")
+    assert [file.name for file in find_files([tmp_path]).files] == [name]
+
+
 @pytest.mark.parametrize("place", ["absent", "."])
 def test_places_without_motion_are_an_error_that_says_so(tmp_path, place):
     with pytest.raises(errors.NothingToUpload, match=r"does not exist|no motion files"):
