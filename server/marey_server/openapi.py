@@ -161,7 +161,7 @@ def _path_parameter(name: str) -> Schema:
 def _query_parameters(operation: Operation) -> list[Schema]:
     if operation.query is None:
         return []
-    schema = operation.query.model_json_schema(by_alias=True)
+    schema = operation.query.model_json_schema(by_alias=True, ref_template=_REF)
     parameters = []
     for name, found in schema.get("properties", {}).items():
         shown = _without_null(found)

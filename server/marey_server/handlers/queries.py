@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BeforeValidator, Field, StringConstraints
 
 from marey_schemas.base import Request
 from marey_server.store.listing import DEFAULT_LIMIT, MAX_LIMIT
+
+T = TypeVar("T")
 
 MAX_INTEGER = 2**31 - 1
 MAX_VALUES = 256
@@ -17,9 +19,11 @@ def _split(value: Any) -> Any:
     return tuple(value.split(",")) if isinstance(value, str) else value
 
 
-_Value = Annotated[str, StringConstraints(max_length=1024)]
-CommaSeparated = Annotated[tuple[_Value, ...], BeforeValidator(_split), Field(max_length=MAX_VALUES)]
-"""Several values in one parameter, separated by commas."""
+CommaSeparatedOf = Annotated[tuple[T, ...], Field(max_length=MAX_VALUES), BeforeValidator(_split)]
+"""Several values of a type in one parameter, separated by commas."""
+
+CommaSeparated = CommaSeparatedOf[Annotated[str, StringConstraints(max_length=1024)]]
+"""Several texts."""
 
 
 class PageQuery(Request):
