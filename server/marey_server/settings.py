@@ -33,6 +33,9 @@ class Settings(BaseSettings):
     blobs: Literal["database", "directory"] = Field(
         "database", description="Where bytes are kept: in the database, or in the folder blobs of the data folder."
     )
+    answer_cache_bytes: int = Field(
+        64 * MIB, ge=0, description="Memory for documents as they were sent, so that the next reader gets them sooner."
+    )
     trust_proxy: bool = Field(
         False, description="Believe X-Forwarded-For and X-Forwarded-Proto. Only behind a proxy that sets them."
     )

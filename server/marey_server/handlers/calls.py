@@ -12,6 +12,7 @@ from typing import Any
 from marey_server.access import scopes
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.errors import Forbidden, Unauthenticated
+from marey_server.handlers.answer_cache import AnswerCache
 from marey_server.handlers.declarations import Access, Operation
 from marey_server.handlers.reply import Form, Rendered, Reply, render
 from marey_server.store import idempotency, tokens
@@ -66,6 +67,7 @@ class Call:
 
     caller: Caller
     form: Form
+    answers: AnswerCache
     to_reply: Callable[[Any], Reply]
     function: Callable[..., Any]
     args: tuple[Any, ...] = ()
@@ -82,7 +84,7 @@ def run_call(tx: Transaction, call: Call) -> Rendered:
         if stored is not None:
             headers = {**stored.headers, "Idempotent-Replayed": "true"}
             return Rendered(stored.status, headers, stored.body)
-    rendered = render(call.to_reply(call.function(tx, *call.args, **call.kwargs)), call.form)
+    rendered = render(call.to_reply(call.function(tx, *call.args, **call.kwargs)), call.form, call.answers)
     if call.idempotency_key is not None:
         idempotency.finish(tx, call.idempotency_key, rendered.status, dict(rendered.headers), rendered.body)
     return rendered

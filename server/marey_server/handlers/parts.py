@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Annotated, Any
 
 from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Request
 from marey_schemas.items import Item
+from marey_schemas.kinds import Kind
 from marey_schemas.names import Message
 from marey_server.handlers.declarations import Access, Body, Document, reads, writes
 from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
 from marey_server.handlers.queries import MAX_INTEGER, CommaSeparated
-from marey_server.handlers.reply import Rendered, Reply
+from marey_server.handlers.reply import Lasting, Rendered, Reply
 from marey_server.handlers.resource import Resource
 from marey_server.store import items
-from marey_server.store.items import Part
+from marey_server.store.transaction import Transaction
 
 IMMUTABLE = "private, max-age=31536000, immutable"
 FrameRange = Annotated[str, StringConstraints(pattern=r"^\d{0,9}:\d{0,9}$")]
@@ -43,15 +45,15 @@ class PartChange(Request):
     message: Message = Field("", description="Shown in the history.")
 
 
-def part_reply(query: PartQuery) -> Any:
-    """Answers a part: what names its revision never changes."""
-
-    def reply(part: Part) -> Reply:
-        if query.revision is None:
-            return Reply(part.tree, rev=part.rev)
-        return Reply(part.tree, rev=f"r{part.revision}", headers={"Cache-Control": IMMUTABLE})
-
-    return reply
+def read_part(tx: Transaction, project: str, kind: Kind, item: str, part: str, query: PartQuery) -> Reply:
+    """A part, for who may read it. What names its revision never changes."""
+    found = items.find_part(tx, project, kind, item, part, revision=query.revision)
+    load = partial(items.load_part, tx, found, frames=query.frame_slice(), joints=query.joints)
+    whole = query.frames is None and query.joints is None
+    content = Lasting(found.digest, load) if whole else load()
+    if query.revision is None:
+        return Reply(content, rev=found.rev)
+    return Reply(content, rev=f"r{found.revision}", headers={"Cache-Control": IMMUTABLE})
 
 
 class PartResource(Resource):
@@ -66,17 +68,7 @@ class PartResource(Resource):
 
         As MessagePack or BSON with `arrays=blocks` in the media type, arrays come compressed as they are stored.
         """
-        return await self.answer_with(
-            part_reply(query),
-            items.read_part,
-            project,
-            kind_of(kind),
-            item,
-            part,
-            revision=query.revision,
-            frames=query.frame_slice(),
-            joints=query.joints,
-        )
+        return await self.answer_with(lambda reply: reply, read_part, project, kind_of(kind), item, part, query)
 
     @writes(
         access=Access.CONTRIBUTOR,

@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from pydantic import BaseModel
 
 from marey_schemas.codecs import JSON as JSON_NAME
 from marey_schemas.codecs import encode_tree
+from marey_server.handlers.answer_cache import AnswerCache
 from marey_server.handlers.etags import entity_tag, matches
 from marey_server.handlers.negotiation import MediaType
 
 API = "/api/v1"
+
+
+@dataclass(frozen=True, slots=True)
+class Lasting:
+    """A document that never changes, by its digest; `load` is called where the bytes to send are not at hand."""
+
+    digest: str
+    load: Callable[[], Mapping[str, Any]]
+
+
+Content = BaseModel | Mapping[str, Any] | bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +36,7 @@ class Reply:
     `rev` is the state for the ETag; `location` a path below the API's root.
     """
 
-    content: BaseModel | Mapping[str, Any] | bytes | None = None
+    content: Content | Lasting | None = None
     status: int | None = None
     rev: int | str | None = None
     location: str | None = None
@@ -49,7 +62,7 @@ class Form:
     status: int
 
 
-def render(reply: Reply, form: Form) -> Rendered:
+def render(reply: Reply, form: Form, answers: AnswerCache) -> Rendered:
     """The bytes of a reply; 304 without any where the caller holds this state in this form."""
     headers = {"Vary": "Accept, Accept-Encoding", **reply.headers}
     if reply.location is not None:
@@ -61,12 +74,19 @@ def render(reply: Reply, form: Form) -> Rendered:
             return Rendered(304, headers, b"")
     if reply.content is None:
         return Rendered(reply.status or form.status, headers, b"")
-    body = encode(reply.content, form.media)
+    if isinstance(reply.content, Lasting):
+        body = answers.get((reply.content.digest, form.media.form), partial(_load, reply.content, form.media))
+    else:
+        body = encode(reply.content, form.media)
     headers["Content-Type"] = reply.media_type or str(form.media)
     return Rendered(reply.status or form.status, headers, body)
 
 
-def encode(content: BaseModel | Mapping[str, Any] | bytes, media: MediaType) -> bytes:
+def _load(content: Lasting, media: MediaType) -> bytes:
+    return encode(content.load(), media)
+
+
+def encode(content: Content, media: MediaType) -> bytes:
     """A model or tree in a media type; bytes as they are."""
     if isinstance(content, bytes):
         return content

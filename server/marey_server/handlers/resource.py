@@ -111,7 +111,8 @@ class Resource(Exchange):
         """The answer that `to_reply` makes of what `function(tx, ...)` returns, both in the transaction's thread."""
         key = self._idempotency_key()
         fingerprint = self._fingerprint() if key else ""
-        call = Call(self.caller, self.answer_form, to_reply, function, args, kwargs, key, fingerprint)
+        answers = self.services.answers
+        call = Call(self.caller, self.answer_form, answers, to_reply, function, args, kwargs, key, fingerprint)
         database = self.services.database
         submit = database.submit_read if self.operation.method == "GET" else database.submit_write
         return await asyncio.wrap_future(submit(ANONYMOUS, run_call, call))
@@ -258,7 +259,7 @@ class Resource(Exchange):
             arguments["body"] = await self._read_body()
         outcome = await method(self, **arguments)
         if isinstance(outcome, Reply):
-            outcome = render(outcome, self.answer_form)
+            outcome = render(outcome, self.answer_form, self.services.answers)
         if outcome is not None:
             self.send(outcome)
 

@@ -13,10 +13,11 @@ from marey_server.store.items.drafts import Draft, Published, StoredDocument
 from marey_server.store.items.history import list_revisions, read_lineage, read_revision, read_staleness
 from marey_server.store.items.listing import ItemFilters, list_items
 from marey_server.store.items.publishing import publish
-from marey_server.store.items.reading import Part, read_item, read_part
+from marey_server.store.items.reading import FoundPart, Part, find_part, load_part, read_item, read_part
 
 __all__ = [
     "Draft",
+    "FoundPart",
     "ItemFilters",
     "Part",
     "Published",
@@ -24,8 +25,10 @@ __all__ = [
     "change_item",
     "create_item",
     "delete_item",
+    "find_part",
     "list_items",
     "list_revisions",
+    "load_part",
     "prepare_part",
     "prepare_parts",
     "publish",

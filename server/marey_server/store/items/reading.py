@@ -9,7 +9,6 @@ from typing import Any, Literal
 from sqlalchemy import Row, Select, bindparam, select
 
 from marey_schemas.access import Role
-from marey_schemas.arrays import EncodedArray
 from marey_schemas.items import Item, PartSummary
 from marey_schemas.kinds import Kind
 from marey_server.errors import Invalid, NotFound
@@ -54,9 +53,8 @@ _PARTS = (
     )
 )  # fmt: skip
 _PART = (
-    select(item.c.rev, revision_part.c.number, document.c.digest, document.c.schema, document.c.body)
+    select(item.c.rev, revision_part.c.number, revision_part.c.document_digest)
     .join(revision_part, revision_part.c.item_id == item.c.id)
-    .join(document, document.c.digest == revision_part.c.document_digest)
     .where(*_THIS_ITEM, item.c.deleted_us.is_(None), revision_part.c.part == bindparam("part"))
 )
 _PART_OF_HEAD = _PART.where(revision_part.c.number == item.c.head)
@@ -113,14 +111,56 @@ def read_parts(
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
-    """A part of a revision. Arrays of `tree` are as stored, or decoded where a slice was asked for."""
+class FoundPart:
+    """A part of a revision that the caller may read."""
 
-    tree: dict[str, Any]
     digest: str
     revision: int
     rev: int
     """The item's `rev`: what a change of its newest revision expects."""
+
+
+def find_part(
+    tx: Transaction, project: str, kind: Kind, item_id: str, part: str, *, revision: int | None = None
+) -> FoundPart:
+    """The part of the newest revision, or of `revision`. Raises `NotFound` where there is none."""
+    project_row = projects.require(tx, project, Role.READER)
+    which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value, "part": part}
+    if revision is None:
+        row = tx.execute(_PART_OF_HEAD, which).first()
+    else:
+        row = tx.execute(_PART_OF_REVISION, {**which, "number": revision}).first()
+    if row is None:
+        raise NotFound(f"There is no part {part!r} of {kind} {item_id!r} at that revision.", code="no-part")
+    return FoundPart(row.document_digest, row.number, row.rev)
+
+
+def load_part(
+    tx: Transaction,
+    found: FoundPart,
+    *,
+    frames: slice | None = None,
+    joints: Sequence[str] | None = None,
+    arrays: Literal["encoded", "decoded", "none"] = "encoded",
+) -> dict[str, Any]:
+    """The document of a part, its arrays as `arrays` says.
+
+    `frames` (half-open, clipped to what is there) and `joints` (names, in the order wanted) cut a motion; what was cut
+    is decoded. Raises `Invalid` where a cut makes no sense.
+    """
+    if frames is None and joints is None:
+        return documents.load_document(tx, found.digest, arrays=arrays)
+    tree = documents.load_document(tx, found.digest)
+    if tree["schema"] != "marey/motion@1":
+        raise Invalid("Only motions are cut by frames and joints.", code="not-a-motion")
+    return slice_motion(tree, frames, joints)
+
+
+@dataclass(frozen=True, slots=True)
+class Part(FoundPart):
+    """A part with its document."""
+
+    tree: dict[str, Any]
 
 
 def read_part(
@@ -135,27 +175,7 @@ def read_part(
     joints: Sequence[str] | None = None,
     arrays: Literal["encoded", "decoded", "none"] = "encoded",
 ) -> Part:
-    """The document of a part: of the newest revision, or of `revision`.
-
-    `frames` (half-open, clipped to what is there) and `joints` (names, in the order wanted) cut a motion.
-    Raises `NotFound` where there is no such item, revision or part, `Invalid` where a cut makes no sense.
-    """
-    project_row = projects.require(tx, project, Role.READER)
-    which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value, "part": part}
-    if revision is None:
-        row = tx.execute(_PART_OF_HEAD, which).first()
-    else:
-        row = tx.execute(_PART_OF_REVISION, {**which, "number": revision}).first()
-    if row is None:
-        raise NotFound(f"There is no part {part!r} of {kind} {item_id!r} at that revision.", code="no-part")
-    body = dict(row.body)
-    if frames is not None or joints is not None:
-        if row.schema != "marey/motion@1":
-            raise Invalid("Only motions are cut by frames and joints.", code="not-a-motion")
-        tree = slice_motion(documents.attach_stored(tx, row.digest, body), frames, joints)
-    elif arrays == "none":
-        tree = body
-    else:
-        decode = EncodedArray.decode if arrays == "decoded" else None
-        tree = documents.attach_stored(tx, row.digest, body, decode)
-    return Part(tree, row.digest, row.number, row.rev)
+    """`find_part` and `load_part`."""
+    found = find_part(tx, project, kind, item_id, part, revision=revision)
+    tree = load_part(tx, found, frames=frames, joints=joints, arrays=arrays)
+    return Part(found.digest, found.revision, found.rev, tree)

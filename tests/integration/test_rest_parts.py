@@ -1,0 +1,85 @@
+"""Documents that were sent before: sent again to who may read them, and to nobody else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import httpx
+import pytest
+
+from marey_schemas.access import Role
+from rest_server import Server
+
+STUDY = {"schema": "marey/document@1", "answer": 42}
+FORMS = ("application/json", "application/msgpack", "application/bson", "application/msgpack; arrays=blocks")
+
+
+@pytest.fixture
+def reader(server: Server) -> httpx.Client:
+    """Rita."""
+    return server.client(server.make_user("rita"))
+
+
+@pytest.fixture
+def owner(server: Server, reader: httpx.Client) -> httpx.Client:
+    """The owner of `lab`, which Rita may read."""
+    return server.client(server.make_project(rita=Role.READER))
+
+
+@pytest.fixture
+def study(owner: httpx.Client) -> str:
+    """The path of an item's document."""
+    made = owner.post("/projects/lab/studies", json={"name": "s", "parts": {"study": STUDY}})
+    assert made.status_code == 201, made.text
+    return f"/projects/lab/studies/{made.json()['id']}"
+
+
+def ok(response: httpx.Response) -> Any:
+    assert response.is_success, response.text
+    return response.json()
+
+
+def test_each_form_is_sent_again_as_it_was(owner: httpx.Client, study: str) -> None:
+    first = {form: owner.get(f"{study}/parts/study", headers={"Accept": form}) for form in FORMS}
+    assert len({response.content for response in first.values()}) >= 3
+    for form, response in first.items():
+        again = owner.get(f"{study}/parts/study", headers={"Accept": form})
+        assert (again.status_code, again.content) == (200, response.content)
+        assert again.headers["ETag"] == response.headers["ETag"]
+        assert again.headers["Content-Type"] == response.headers["Content-Type"] == form
+
+
+def test_a_document_read_before_is_read_as_it_is_now(owner: httpx.Client, study: str) -> None:
+    part = f"{study}/parts/study"
+    assert ok(owner.get(part))["answer"] == 42
+    assert owner.put(part, json={**STUDY, "answer": 43}, headers={"If-Match": "*"}).is_success
+    assert ok(owner.get(part))["answer"] == 43
+    assert ok(owner.get(part, params={"revision": 1}))["answer"] == 42
+
+
+def test_who_may_read_no_more_does_not_get_what_he_read_before(
+    owner: httpx.Client, reader: httpx.Client, study: str
+) -> None:
+    part = f"{study}/parts/study"
+    assert ok(reader.get(part)) == ok(reader.get(part)) == STUDY
+    etag = reader.get(part).headers["ETag"]
+    assert owner.delete("/projects/lab/members/rita", headers={"If-Match": "*"}).is_success
+    assert reader.get(part).status_code == 404
+    assert reader.get(part, headers={"If-None-Match": etag}).status_code == 404
+    assert ok(owner.get(part)) == STUDY
+
+
+def test_a_revoked_token_does_not_get_what_it_read_before(server: Server, reader: httpx.Client, study: str) -> None:
+    part = f"{study}/parts/study"
+    made = ok(reader.post("/tokens", json={"name": "short", "scopes": ["read"]}))
+    holder = server.client(made["secret"])
+    assert ok(holder.get(part)) == STUDY
+    assert reader.delete(f"/tokens/{made['id']}").is_success
+    assert holder.get(part).status_code == 401
+
+
+def test_a_deleted_item_is_gone_for_who_read_it_before(owner: httpx.Client, reader: httpx.Client, study: str) -> None:
+    part = f"{study}/parts/study"
+    assert ok(reader.get(part)) == STUDY
+    assert owner.delete(study, headers={"If-Match": "*"}).is_success
+    assert reader.get(part).status_code == 404
