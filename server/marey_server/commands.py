@@ -67,8 +67,10 @@ def restore(*, source: Path, **settings: Any) -> None:
     """Put a backup in the place of a database that is not there."""
     chosen = read_settings(**settings)
     target = _sqlite_file(chosen, must_exist=False)
-    if target.exists():
-        raise CommandFailed(f"{target} exists; move it away first, so that nothing is lost")
+    # A log that stays behind would be played into the backup.
+    for left in (target, target.with_name(f"{target.name}-wal"), target.with_name(f"{target.name}-shm")):
+        if left.exists():
+            raise CommandFailed(f"{left} exists; stop the server and move it away first, so that nothing is lost")
     if not source.is_file():
         raise CommandFailed(f"{source} is no file")
     chosen.data.mkdir(parents=True, exist_ok=True, mode=0o700)

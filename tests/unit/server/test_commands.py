@@ -1,0 +1,60 @@
+"""The care of a database from the shell: backup, restore, check."""
+
+import sqlite3
+from contextlib import closing
+
+import pytest
+
+from marey_server import commands
+from marey_server.app import open_database
+from marey_server.settings import Settings
+
+
+@pytest.fixture
+def data(tmp_path):
+    """A data folder with a database that its server left."""
+    folder = tmp_path / "data"
+    open_database(Settings(data=folder)).close()
+    return folder
+
+
+def users_in(file):
+    with closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as database:
+        return [name for (name,) in database.execute("SELECT name FROM user")]
+
+
+def test_a_backup_holds_what_was_written_before_it_though_the_database_is_in_use(data, tmp_path):
+    with closing(sqlite3.connect(data / "marey.db")) as server:
+        server.execute("UPDATE user SET name = 'renamed'")
+        server.commit()
+        server.execute("UPDATE user SET name = 'not yet'")
+        commands.backup(target=tmp_path / "copy.db", data=data)
+        server.rollback()
+    assert users_in(tmp_path / "copy.db") == ["renamed"]
+    assert (tmp_path / "copy.db").stat().st_mode & 0o777 == 0o600
+
+
+def test_a_backup_is_put_in_the_place_of_a_lost_database_and_checked(data, tmp_path, capsys):
+    commands.backup(target=tmp_path / "copy.db", data=data)
+    commands.restore(source=tmp_path / "copy.db", data=tmp_path / "elsewhere")
+    assert users_in(tmp_path / "elsewhere" / "marey.db") == ["admin"]
+    commands.fsck(data=tmp_path / "elsewhere")
+    assert "checked" in capsys.readouterr().out
+
+
+def test_a_backup_never_writes_over_a_file(data, tmp_path):
+    (tmp_path / "copy.db").write_text("precious")
+    with pytest.raises(commands.CommandFailed, match="exists"):
+        commands.backup(target=tmp_path / "copy.db", data=data)
+    assert (tmp_path / "copy.db").read_text() == "precious"
+
+
+@pytest.mark.parametrize("left", ["marey.db", "marey.db-wal", "marey.db-shm"])
+def test_nothing_is_restored_over_or_beside_what_a_server_left(data, tmp_path, left):
+    commands.backup(target=tmp_path / "copy.db", data=data)
+    target = tmp_path / "target"
+    target.mkdir()
+    (target / left).write_text("left by a crash")
+    with pytest.raises(commands.CommandFailed, match=left):
+        commands.restore(source=tmp_path / "copy.db", data=target)
+    assert [path.name for path in target.iterdir()] == [left]
