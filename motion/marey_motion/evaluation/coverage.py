@@ -1,0 +1,237 @@
+"""What speeds and turn rates a set of clips holds: windows of one second, counted over the cells of the trial grid.
+
+Windows lie within one clip. A cell reaches half-way to its neighbours on the grid, so every trial owns one; what is
+faster, slower or turns more than the outermost cells shows among the windows, not in the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.result import Coverage, EvaluationOptions, Grid
+from marey_motion.matching.database import MatchingDatabase
+
+Floats = NDArray[np.float64]
+
+WINDOW_S = 1.0
+SPEED_STEP_M_S, TURN_RATE_STEP_DEG_S = 0.25, 25.0
+"""Width of the only cell of a grid with one speed or turn rate."""
+EDGE_DECIMALS = 9
+"""To which the edges of left and right turns count as the same."""
+
+
+class Windows(NamedTuple):
+    """Means over one second, one window per starting frame; arrays of shape (W,)."""
+
+    speed_m_s: Floats
+    turn_rate_rad_s: Floats
+    forward_m_s: Floats
+    strafe_m_s: Floats
+
+
+def sliding_windows(positions: Floats, headings: Floats, rate_hz: float) -> Windows:
+    """Speed, turn rate and signed velocities of a root over every second of one clip.
+
+    Parameters
+    ----------
+    positions : (F, 2) metres on the ground
+    headings : (F,) radians, continuous
+
+    Returns
+    -------
+    F - rate_hz windows, none for a clip of a second or less. Speed is the path's length, whatever its direction;
+    forward and strafe (positive to the left) are means along the facing half-way through each step.
+    """
+    span = round(WINDOW_S * rate_hz)
+    steps = np.diff(positions, axis=0)
+    facing = 0.5 * (headings[1:] + headings[:-1])
+    sine, cosine = np.sin(facing), np.cos(facing)
+    ahead = steps[:, 0] * sine + steps[:, 1] * cosine
+    leftward = steps[:, 0] * cosine - steps[:, 1] * sine
+    duration_s = span / rate_hz
+    return Windows(
+        speed_m_s=_sums(np.hypot(steps[:, 0], steps[:, 1]), span) / duration_s,
+        turn_rate_rad_s=(headings[span:] - headings[: max(len(headings) - span, 0)]) / duration_s,
+        forward_m_s=_sums(ahead, span) / duration_s,
+        strafe_m_s=_sums(leftward, span) / duration_s,
+    )
+
+
+def measure_coverage(
+    database: MatchingDatabase, options: EvaluationOptions, *, excluded: Sequence[int] = ()
+) -> Coverage:
+    """Windows of all clips but the excluded ones (indices), and how long the cells of the trial grid are covered."""
+    rate = database.options.rate_hz
+    parts: list[Windows] = []
+    owners: list[NDArray[np.int32]] = []
+    too_short: list[int] = []
+    for index, clip in enumerate(database.clips):
+        if index in excluded:
+            continue
+        rows = slice(clip.start, clip.stop)
+        windows = sliding_windows(database.root_positions[rows], database.root_headings[rows], rate)
+        if not len(windows.speed_m_s):
+            too_short.append(index)
+            continue
+        parts.append(windows)
+        owners.append(np.full(len(windows.speed_m_s), index, dtype=np.int32))
+    joined = Windows(*(np.concatenate([np.empty(0), *columns]) for columns in zip(*parts, strict=True)))
+    return coverage_of(
+        joined, np.concatenate([np.empty(0, np.int32), *owners]), tuple(too_short), options, window_s=1.0 / rate
+    )
+
+
+def coverage_of(
+    windows: Windows,
+    owners: NDArray[np.int32],
+    too_short: tuple[int, ...],
+    options: EvaluationOptions,
+    *,
+    window_s: float,
+) -> Coverage:
+    """The map of given windows, each of which stands for `window_s` seconds of data."""
+    grid = options.grid
+    speed_edges = cell_edges(grid.speeds_m_s, SPEED_STEP_M_S)
+    turn_edges = cell_edges(grid.turn_rates_deg_s, TURN_RATE_STEP_DEG_S)
+    turn_rates = np.degrees(windows.turn_rate_rad_s)
+    seconds = window_s * _histogram(windows.speed_m_s, speed_edges, turn_rates, turn_edges)
+    deficit = np.maximum(options.coverage_least_s - seconds, 0.0)
+    # A whole number of windows is meant, however its seconds are rounded.
+    deficit[deficit < 0.5 * window_s] = 0.0
+    return Coverage(
+        clip=owners,
+        speed_m_s=windows.speed_m_s,
+        turn_rate_rad_s=windows.turn_rate_rad_s,
+        forward_m_s=windows.forward_m_s,
+        strafe_m_s=windows.strafe_m_s,
+        speed_edges_m_s=speed_edges,
+        turn_rate_edges_deg_s=turn_edges,
+        seconds=seconds,
+        deficit_s=deficit,
+        index=float(np.mean(deficit == 0.0)),
+        symmetry=symmetry(windows.speed_m_s, turn_rates, speed_edges, turn_edges),
+        too_short=too_short,
+    )
+
+
+def cell_edges(values: Sequence[float], step: float) -> Floats:
+    """Edges half-way between the values of a grid, the outer cells as wide on both sides; `step` wide for one value."""
+    centres = np.unique(np.asarray(values, dtype=np.float64))
+    if not len(centres):
+        raise MotionError("a grid needs at least one speed and one turn rate", where="grid")
+    if len(centres) == 1:
+        return np.array([centres[0] - 0.5 * step, centres[0] + 0.5 * step])
+    halves = 0.5 * np.diff(centres)
+    return np.concatenate(([centres[0] - halves[0]], centres[:-1] + halves, [centres[-1] + halves[-1]]))
+
+
+def symmetry(speeds: Floats, turn_rates_deg_s: Floats, speed_edges: Floats, turn_edges: Floats) -> float:
+    """1 - ½ Σ|h(v, ω) - h(v, -ω)| / Σ h over cells that mirror each other exactly; 1 where there is no data.
+
+    The cells are those of the map and, where the grid itself is one-sided, their mirror images.
+    """
+    sizes = np.unique(np.round(np.abs(turn_edges), EDGE_DECIMALS))
+    bounds = sizes if turn_edges[0] > 0.0 or turn_edges[-1] < 0.0 else np.concatenate(([0.0], sizes[sizes > 0.0]))
+    sides = [
+        _histogram(speeds[side], speed_edges, np.abs(turn_rates_deg_s[side]), bounds)
+        for side in (turn_rates_deg_s > 0.0, turn_rates_deg_s < 0.0, turn_rates_deg_s == 0.0)
+    ]
+    left, right, straight = sides
+    if 0.0 not in sizes and bounds[0] == 0.0:  # one cell lies across zero and mirrors itself
+        straight[:, 0] += left[:, 0] + right[:, 0]
+        left[:, 0] = right[:, 0] = 0.0
+    total = float(np.sum(left) + np.sum(right) + np.sum(straight))
+    return 1.0 - float(np.sum(np.abs(left - right))) / total if total > 0.0 else 1.0
+
+
+@dataclass(frozen=True)
+class Hole:
+    """A trial's cell that lacks data."""
+
+    speed_m_s: float
+    turn_rate_deg_s: float
+    seconds: float
+    deficit_s: float
+
+
+def coverage_holes(coverage: Coverage, grid: Grid) -> tuple[Hole, ...]:
+    """The cells with too little data, the emptiest first, then by speed and turn rate."""
+    speeds, turn_rates = np.unique(grid.speeds_m_s), np.unique(grid.turn_rates_deg_s)
+    holes = [
+        Hole(float(speeds[v]), float(turn_rates[w]), float(coverage.seconds[v, w]), float(coverage.deficit_s[v, w]))
+        for v, w in np.argwhere(coverage.deficit_s > 0.0).tolist()
+    ]
+    return tuple(sorted(holes, key=lambda hole: (-hole.deficit_s, hole.speed_m_s, hole.turn_rate_deg_s)))
+
+
+@dataclass(frozen=True, eq=False)
+class Density:
+    """A smooth map of where data lies, for the eye; measures come from the cells.
+
+    Parameters
+    ----------
+    speeds_m_s, turn_rates_deg_s : (V,), (O,) centres of an even raster
+    seconds : (V, O) seconds of data per m/s and degree/s
+    """
+
+    speeds_m_s: Floats
+    turn_rates_deg_s: Floats
+    seconds: Floats
+
+
+def coverage_density(coverage: Coverage, rate_hz: float, *, resolution: int = 96) -> Density:
+    """Kernel density estimate of the windows, with a Gaussian kernel half as wide as a cell of the map.
+
+    The raster holds all data and the whole map, has about `resolution` points a side and the same to left and right.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    turn_rates = np.degrees(coverage.turn_rate_rad_s)
+    speed_width, turn_width = _typical_cell(coverage)
+    fastest = max(coverage.speed_edges_m_s[-1], float(np.max(coverage.speed_m_s, initial=0.0)) + 2.0 * speed_width)
+    widest = max(
+        float(np.max(np.abs(coverage.turn_rate_edges_deg_s))),
+        float(np.max(np.abs(turn_rates), initial=0.0)) + 2.0 * turn_width,
+    )
+    speed_edges = np.linspace(0.0, fastest, resolution + 1)
+    turn_edges = np.linspace(-widest, widest, resolution + 1 + resolution % 2)
+    counts = _histogram(coverage.speed_m_s, speed_edges, turn_rates, turn_edges)
+    steps = speed_edges[1] - speed_edges[0], turn_edges[1] - turn_edges[0]
+    smooth = gaussian_filter(
+        counts, (0.5 * speed_width / steps[0], 0.5 * turn_width / steps[1]), mode=("reflect", "constant"), truncate=4.0
+    )
+    return Density(
+        speeds_m_s=0.5 * (speed_edges[1:] + speed_edges[:-1]),
+        turn_rates_deg_s=0.5 * (turn_edges[1:] + turn_edges[:-1]),
+        seconds=smooth / (rate_hz * steps[0] * steps[1]),
+    )
+
+
+def _typical_cell(coverage: Coverage) -> tuple[float, float]:
+    return float(np.median(np.diff(coverage.speed_edges_m_s))), float(
+        np.median(np.diff(coverage.turn_rate_edges_deg_s))
+    )
+
+
+def _sums(values: Floats, span: int) -> Floats:
+    """Sum of every `span` consecutive values."""
+    if len(values) < span:
+        return np.empty(0)
+    totals = np.concatenate(([0.0], np.cumsum(values)))
+    return totals[span:] - totals[:-span]
+
+
+def _histogram(speeds: Floats, speed_edges: Floats, turn_rates: Floats, turn_edges: Floats) -> Floats:
+    """Counts (V, O) in half-open cells [lower, upper)."""
+    v = np.searchsorted(speed_edges, speeds, side="right") - 1
+    w = np.searchsorted(turn_edges, turn_rates, side="right") - 1
+    shape = len(speed_edges) - 1, len(turn_edges) - 1
+    inside = (v >= 0) & (v < shape[0]) & (w >= 0) & (w < shape[1])
+    counts = np.bincount(v[inside] * shape[1] + w[inside], minlength=shape[0] * shape[1])
+    return counts.reshape(shape).astype(np.float64)

@@ -1,0 +1,321 @@
+"""How well a trial followed its reference: accuracy, responsiveness and costs, over the whole trial and per regime.
+
+Everything is measured on steps: step k leads from tick k - 1 to tick k. Its speed is the chord's length over its
+duration, its error is recorded minus reference, and its offset is the distance of the two positions at tick k.
+A regime is a stretch of constant demand: the approach, the trial's own speed ("base"), the other one ("switched").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.result import EvaluationOptions, Grid, Metrics, TrialResult
+from marey_motion.evaluation.scenario import TIME_TOLERANCE_S, Reference, Trial
+from marey_motion.matching.record import Status, TrialRecord
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+REGIMES = ("approach", "base", "switched")
+RESPONSE_SHARE = 0.1
+"""A speed has responded when its error is below this share of the speed asked for..."""
+RESPONSE_HOLD_S = 0.5
+"""...for so long."""
+LEAST_TRAVEL_M_S = 0.05
+"""Slower steps have no direction of travel worth the name."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrialSeries:
+    """A trial step by step; S = T - 1 steps, arrays of shape (S,) unless said otherwise.
+
+    Parameters
+    ----------
+    times_s : when the step ends, from the start of the trial
+    speeds_m_s, turn_rates_rad_s : recorded; the turn rate is that of the facing
+    travel_turn_rates_rad_s : of the direction of travel; NaN where the character hardly moves
+    wanted_speeds_m_s, wanted_turn_rates_rad_s : of the reference
+    offsets_m : distance from the reference at the same tick
+    cross_track_m, along_track_m : its components in the reference's frame, positive to the left and ahead
+    regimes : index into `REGIMES`
+    pieces : number of the stretch of constant speed, -1 for the approach
+    """
+
+    rate_hz: float
+    times_s: Floats
+    speeds_m_s: Floats
+    turn_rates_rad_s: Floats
+    travel_turn_rates_rad_s: Floats
+    wanted_speeds_m_s: Floats
+    wanted_turn_rates_rad_s: Floats
+    offsets_m: Floats
+    cross_track_m: Floats
+    along_track_m: Floats
+    regimes: NDArray[np.int8]
+    pieces: NDArray[np.int64]
+
+
+def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> TrialSeries:
+    """What the character did at each step, beside what was asked. Raises `MotionError` for another trial's record."""
+    ticks, rate = len(record.rows), record.rate_hz
+    if ticks != reference.tick_count or rate != reference.rate_hz:
+        raise MotionError(
+            f"the record has {ticks} ticks at {rate:g} Hz, its reference {reference.tick_count} at "
+            f"{reference.rate_hz:g} Hz",
+            where=trial.name,
+        )
+    steps = np.diff(record.positions, axis=0)
+    apart = record.positions[1:] - reference.positions[1:ticks]
+    sine, cosine = np.sin(reference.headings[1:ticks]), np.cos(reference.headings[1:ticks])
+    pieces = _pieces(trial, np.arange(ticks - 1) / rate)
+    speeds = np.hypot(steps[:, 0], steps[:, 1]) * rate
+    return TrialSeries(
+        rate_hz=rate,
+        times_s=np.arange(1, ticks) / rate,
+        speeds_m_s=speeds,
+        turn_rates_rad_s=np.diff(record.headings) * rate,
+        travel_turn_rates_rad_s=_travel_turn_rates(steps, speeds, pieces, rate),
+        wanted_speeds_m_s=reference.speeds_m_s[: ticks - 1],
+        wanted_turn_rates_rad_s=reference.turn_rates_rad_s[: ticks - 1],
+        offsets_m=np.hypot(apart[:, 0], apart[:, 1]),
+        cross_track_m=apart[:, 0] * cosine - apart[:, 1] * sine,
+        along_track_m=apart[:, 0] * sine + apart[:, 1] * cosine,
+        regimes=np.where(pieces < 0, 0, 1 + pieces % 2).astype(np.int8),
+        pieces=pieces,
+    )
+
+
+def measure_trial(trial: Trial, reference: Reference, record: TrialRecord, options: EvaluationOptions) -> TrialResult:
+    """Every metric of one trial (docs/explanation/evaluation.md), and those of its regimes where it has several.
+
+    Raises `MotionError` when record and reference are not of one trial.
+    """
+    series = trial_series(trial, reference, record)
+    window = np.full(len(series.times_s), True) if options.window == "all" else series.pieces >= 0
+    metrics = _metrics(series, record, window)
+    if options.literal_formulas:
+        metrics |= _literal_metrics(series, window, options.grid)
+    regimes = {}
+    present = np.unique(series.regimes[window]).tolist()
+    for regime in present if len(present) > 1 else ():
+        regimes[REGIMES[regime]] = _metrics(series, record, window & (series.regimes == regime))
+    return TrialResult(trial, metrics, regimes)
+
+
+def _pieces(trial: Trial, times_s: Floats) -> NDArray[np.int64]:
+    """Number of the stretch of constant speed that each time falls into, -1 before the circle."""
+    on_circle = times_s + TIME_TOLERANCE_S - trial.approach_s
+    if trial.family == "switching":
+        return np.maximum(np.floor(on_circle / trial.switch_every_s), -1.0).astype(np.int64)
+    return np.where(on_circle < 0.0, -1, 0).astype(np.int64)
+
+
+def _travel_turn_rates(steps: Floats, speeds: Floats, pieces: NDArray[np.int64], rate: float) -> Floats:
+    """Change of direction from the step before; NaN where either is too short or the two have different demands."""
+    turned = np.diff(np.arctan2(steps[:, 0], steps[:, 1]))
+    turned -= 2.0 * np.pi * np.round(turned / (2.0 * np.pi))
+    moving = speeds >= LEAST_TRAVEL_M_S
+    known = moving[1:] & moving[:-1] & ((pieces[1:] < 0) == (pieces[:-1] < 0))
+    return np.concatenate(([np.nan], np.where(known, turned * rate, np.nan)))[: len(steps)]
+
+
+def _metrics(series: TrialSeries, record: TrialRecord, window: Mask) -> dict[str, float | None]:
+    return {
+        **_speed_metrics(series, window),
+        **_offset_metrics(series, window),
+        **_response_metrics(series, window),
+        **_switch_metrics(record, window),
+        **_cost_metrics(record, window),
+    }
+
+
+def _speed_metrics(series: TrialSeries, window: Mask) -> dict[str, float | None]:
+    metrics: dict[str, float | None] = {}
+    degrees = 180.0 / np.pi
+    for name, recorded, wanted, scale in (
+        ("v", series.speeds_m_s, series.wanted_speeds_m_s, 1.0),
+        ("omega_deg", series.turn_rates_rad_s, series.wanted_turn_rates_rad_s, degrees),
+        ("omega_path_deg", series.travel_turn_rates_rad_s, series.wanted_turn_rates_rad_s, degrees),
+    ):
+        known = window & np.isfinite(recorded)
+        bias = _of(np.mean, (recorded - wanted)[known])
+        metrics[f"se_{name}"] = None if bias is None else scale * bias
+        metrics[f"abs_se_{name}"] = None if bias is None else scale * abs(bias)
+        spread = _pooled_spread(recorded[known], series.regimes[known])
+        metrics[f"dse_{name}"] = None if spread is None else scale * spread
+    return metrics
+
+
+def _pooled_spread(values: Floats, regimes: NDArray[np.int8]) -> float | None:
+    """Standard deviation about the mean of each regime, all regimes together."""
+    if not len(values):
+        return None
+    squares = 0.0
+    for regime in np.unique(regimes):
+        own = values[regimes == regime]
+        squares += float(np.sum((own - np.mean(own)) ** 2))
+    return float(np.sqrt(squares / len(values)))
+
+
+def _offset_metrics(series: TrialSeries, window: Mask) -> dict[str, float | None]:
+    offsets = series.offsets_m[window]
+    total = _of(np.sum, offsets)
+    metrics = {
+        "offset_mean": _of(np.mean, offsets),
+        "offset_rms": _of(_rms, offsets),
+        "offset_max": _of(np.max, offsets),
+        "offset_final": float(offsets[-1]) if len(offsets) else None,
+        "offset_sum": total,
+        "offset_integral": None if total is None else total / series.rate_hz,
+    }
+    for name, values in (("cross_track", series.cross_track_m[window]), ("along_track", series.along_track_m[window])):
+        metrics[f"{name}_mean"] = _of(np.mean, values)
+        metrics[f"{name}_rms"] = _of(_rms, values)
+        metrics[f"{name}_max"] = _of(np.max, np.abs(values))
+    return metrics
+
+
+def _response_metrics(series: TrialSeries, window: Mask) -> dict[str, float | None]:
+    """Mean time to answer a switch, None when none was answered, and how many were not."""
+    times = [
+        _response_s(series, first, stop)
+        for first, stop in _stretches(series.pieces)
+        if series.pieces[first] > 0 and window[first] and stop - first >= _hold_steps(series)
+    ]
+    answered = [time for time in times if time is not None]
+    return {
+        "response_s": float(np.mean(answered)) if answered else None,
+        "response_missed": float(len(times) - len(answered)),
+    }
+
+
+def _stretches(pieces: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """Half-open ranges of equal pieces."""
+    bounds = [0, *(np.flatnonzero(np.diff(pieces)) + 1).tolist(), len(pieces)]
+    return list(pairwise(bounds))
+
+
+def _hold_steps(series: TrialSeries) -> int:
+    return max(1, round(RESPONSE_HOLD_S * series.rate_hz))
+
+
+def _response_s(series: TrialSeries, first: int, stop: int) -> float | None:
+    """Seconds from a switch to where the speed is right and stays so; None if that never comes before the next."""
+    wanted = series.wanted_speeds_m_s[first:stop]
+    right = np.abs(series.speeds_m_s[first:stop] - wanted) < RESPONSE_SHARE * wanted
+    hold = _hold_steps(series)
+    held = np.convolve(right, np.ones(hold), mode="valid") >= hold - 0.5
+    return float(np.argmax(held)) / series.rate_hz if held.any() else None
+
+
+def _switch_metrics(record: TrialRecord, window: Mask) -> dict[str, float | None]:
+    """Transitions are chosen; that a clip ended or began again is not one."""
+    status = record.status[1:][window]
+    transitions = float(np.count_nonzero(status == Status.REPLACING))
+    return {
+        "transitions": transitions,
+        "transitions_per_s": transitions * record.rate_hz / len(status) if len(status) else None,
+        "clip_ends": float(np.count_nonzero(status == Status.FORCED)),
+    }
+
+
+def _cost_metrics(record: TrialRecord, window: Mask) -> dict[str, float | None]:
+    entered = window & (record.status[1:] == Status.REPLACING)
+    series = {
+        "pose_cost": record.pose_cost[1:][window],
+        "switch_pose_cost": record.pose_cost[:-1][entered],
+        "match_cost": record.match_cost[1:][window],
+        "continuing_cost": record.continuing_cost[1:][window],
+    }
+    metrics: dict[str, float | None] = {}
+    for name, costs in series.items():
+        known = costs[np.isfinite(costs)]
+        metrics[f"{name}_mean"] = _of(np.mean, known)
+        metrics[f"{name}_p95"] = _of(_p95, known)
+        metrics[f"{name}_max"] = _of(np.max, known)
+    return metrics
+
+
+def _literal_metrics(series: TrialSeries, window: Mask, grid: Grid) -> Metrics:
+    """Equations 1 to 4 as printed: a sum of m + 1 terms over m, and the square of a sum over a count of settings."""
+    metrics: dict[str, float | None] = {}
+    for name, recorded, wanted, settings in (
+        ("v", series.speeds_m_s, series.wanted_speeds_m_s, grid.speeds_m_s),
+        (
+            "omega_deg",
+            np.degrees(series.turn_rates_rad_s),
+            np.degrees(series.wanted_turn_rates_rad_s),
+            grid.turn_rates_deg_s,
+        ),
+    ):
+        values, asked = recorded[window], wanted[window]
+        if len(values) < 2:
+            metrics[f"se_{name}_literal"] = metrics[f"dse_{name}_literal"] = None
+            continue
+        static = float(np.sum(values)) / (len(values) - 1) - float(np.mean(asked))
+        metrics[f"se_{name}_literal"] = static
+        metrics[f"dse_{name}_literal"] = float(np.sqrt(np.sum((values - static + asked) ** 2) / len(settings)))
+    return metrics
+
+
+def _of(measure: Callable[[Floats], np.float64 | float], values: Floats) -> float | None:
+    """The measure of the values, None where there are none."""
+    return float(measure(values)) if len(values) else None
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _p95(values: Floats) -> float:
+    return float(np.percentile(values, 95.0))
+
+
+SUMMED = ("transitions", "clip_ends", "response_missed")
+"""Counts: a suite has their sums."""
+
+
+def pooled_metrics(results: Sequence[TrialResult]) -> dict[str, float | None]:
+    """Metrics of several trials as one, and of their regimes under the regime's name.
+
+    A maximum is the largest, a root mean square that of all trials, a count the sum, and all others are means over the
+    trials that define them. `dse_…_pooled` is the root mean square of the trials' spreads.
+    """
+    pooled = _pooled([result.metrics for result in results])
+    for regime in REGIMES:
+        several = [result.regimes[regime] for result in results if regime in result.regimes]
+        pooled |= {f"{regime}.{name}": value for name, value in _pooled(several).items()}
+    return pooled
+
+
+def _pooled(several: Sequence[Metrics]) -> dict[str, float | None]:
+    names = dict.fromkeys(name for metrics in several for name in metrics)
+    pooled: dict[str, float | None] = {}
+    for name in names:
+        values = np.array([value for metrics in several if (value := metrics.get(name)) is not None])
+        measure = np.sum if name in SUMMED else np.max if name.endswith("_max") else np.mean
+        pooled[name] = _of(_rms if name.endswith("_rms") else measure, values)
+        if name in ("dse_v", "dse_omega_deg", "dse_omega_path_deg"):
+            pooled[f"{name}_pooled"] = _of(_rms, values)
+    return pooled
+
+
+def offset_asymmetry(results: Sequence[TrialResult]) -> float | None:
+    """Mean difference of `offset_mean` between turning left and right at the same speed, metres; None without pairs."""
+    offsets = {
+        (result.trial.family, result.trial.speed_m_s, round(result.trial.turn_rate_rad_s, 9)): offset
+        for result in results
+        if (offset := result.metrics["offset_mean"]) is not None
+    }
+    differences = [
+        abs(offset - offsets[family, speed, -turn_rate])
+        for (family, speed, turn_rate), offset in offsets.items()
+        if turn_rate > 0.0 and (family, speed, -turn_rate) in offsets
+    ]
+    return float(np.mean(differences)) if differences else None

@@ -1,0 +1,98 @@
+"""What an evaluation was made from and under which conditions, as digests of canonical content."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, is_dataclass
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.result import EvaluationOptions, Provenance
+from marey_motion.evaluation.scenario import Trial
+from marey_motion.matching.database import DatabaseClip, MatchingDatabase
+
+
+def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials: Sequence[Trial]) -> Provenance:
+    """Digests of the data, of what decides its costs and of what was asked of it."""
+    clips = {clip.uid: _clip_content(database, clip) for clip in database.clips}
+    return Provenance(
+        dataset=_digest(sorted(clips.values())),
+        clips=clips,
+        normaliser=_digest(
+            {"offset": database.normaliser.offset.tolist(), "scale": database.normaliser.scale.tolist()}
+        ),
+        options=_digest({"database": database.options, "controller": options.controller, "window": options.window}),
+        scenarios=_digest(list(trials)),
+        code_version=_code_version(),
+    )
+
+
+def require_comparable(before: Provenance, after: Provenance) -> None:
+    """Raise `MotionError`, naming all that differs, unless costs, options and scenarios of two evaluations agree."""
+    remedies = {
+        "normaliser": "evaluate both with one pinned normaliser, or with their union's",
+        "options": "evaluate both with the same options for database, controller and window",
+        "scenarios": "evaluate both over the same trials",
+    }
+    different = [name for name in remedies if getattr(before, name) != getattr(after, name)]
+    if different:
+        raise MotionError(
+            "these evaluations cannot be compared: "
+            + "; ".join(
+                f"their {name} {'differ' if name.endswith('s') else 'differs'} "
+                f"({_short(getattr(before, name))} and {_short(getattr(after, name))}): {remedies[name]}"
+                for name in different
+            ),
+            code="not-comparable",
+            where=", ".join(different),
+        )
+
+
+def _clip_content(database: MatchingDatabase, clip: DatabaseClip) -> str:
+    """Digest of what a clip contributes: its rows as they are played, however its file came about."""
+    rows = slice(clip.start, clip.stop)
+    digest = hashlib.sha256()
+    for array in (
+        database.features[rows],
+        database.selectable[rows],
+        database.root_positions[rows],
+        database.root_headings[rows],
+        database.pose_points[rows],
+    ):
+        digest.update(f"{array.dtype.str} {list(array.shape)}\n".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return f"sha256:{digest.hexdigest()}"
+
+
+def _digest(value: Any) -> str:
+    text = json.dumps(_canonical(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return f"sha256:{hashlib.sha256(text.encode()).hexdigest()}"
+
+
+def _canonical(value: Any) -> Any:
+    """Plain values with one spelling per number: 3 and 3.0 are the same option, and -0.0 is 0.0."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return _canonical(asdict(value))
+    if isinstance(value, Mapping):
+        return {key: _canonical(member) for key, member in value.items()}
+    if isinstance(value, list | tuple):
+        return [_canonical(item) for item in value]
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value) + 0.0
+    return value
+
+
+def _short(digest: str) -> str:
+    return digest[: len("sha256:") + 12]
+
+
+def _code_version() -> str:
+    try:
+        return f"marey@{version('marey')}"
+    except PackageNotFoundError:  # run from a source tree that is not installed
+        return "marey@unknown"

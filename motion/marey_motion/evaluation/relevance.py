@@ -1,0 +1,128 @@
+"""Which clips and frames carry the load: use, popularity and the jumps between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.evaluation.result import ClipUsage
+from marey_motion.matching.database import DatabaseClip
+from marey_motion.matching.record import Status, TrialRecord
+
+
+class Jumps(NamedTuple):
+    """Where a character left the course of a clip.
+
+    Parameters
+    ----------
+    ticks : (J,) int64    the first tick after the jump
+    left, entered : (J,) int64    rows displayed before and after
+    forced : (J,) bool    the clip had ended; the others were chosen
+    """
+
+    ticks: NDArray[np.int64]
+    left: NDArray[np.int64]
+    entered: NDArray[np.int64]
+    forced: NDArray[np.bool_]
+
+
+def clip_starts(clips: Sequence[DatabaseClip]) -> NDArray[np.int64]:
+    """(C + 1,) first row of each clip and the number of all rows."""
+    return np.array([clip.start for clip in clips] + [clips[-1].stop if clips else 0], dtype=np.int64)
+
+
+def clips_of_rows(clips: Sequence[DatabaseClip], rows: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Index of the clip that each row belongs to."""
+    found: NDArray[np.int64] = np.searchsorted(clip_starts(clips)[1:], rows, side="right")
+    return found
+
+
+def find_jumps(clips: Sequence[DatabaseClip], record: TrialRecord) -> Jumps:
+    """Every jump of a trial, in its order. That a loop begins again is none."""
+    rows = record.rows.astype(np.int64)
+    owners = clips_of_rows(clips, rows)
+    left, entered = rows[:-1], rows[1:]
+    starts = clip_starts(clips)
+    same = owners[1:] == owners[:-1]
+    again = same & (left == starts[owners[:-1] + 1] - 1) & (entered == starts[owners[:-1]])
+    chosen = record.status[1:] == Status.REPLACING
+    at = np.flatnonzero(chosen | ((~same | (entered != left + 1)) & ~again))
+    return Jumps(at + 1, left[at], entered[at], ~chosen[at])
+
+
+def measure_usage(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> tuple[ClipUsage, ...]:
+    """How much each clip was displayed and jumped to, over all records; one per clip, in their order."""
+    starts = clip_starts(clips)
+    popularity = np.zeros(starts[-1], dtype=np.int64)
+    entries = np.zeros(len(clips), dtype=np.int64)
+    trials = np.zeros(len(clips), dtype=np.int64)
+    for record in records:
+        popularity += np.bincount(record.rows, minlength=len(popularity))
+        trials += np.bincount(clips_of_rows(clips, record.rows), minlength=len(clips)) > 0
+        entered = clips_of_rows(clips, find_jumps(clips, record).entered)
+        entries += np.bincount(entered, minlength=len(clips))
+    total = max(int(popularity.sum()), 1)
+    usage = []
+    for index, clip in enumerate(clips):
+        frames = popularity[clip.start : clip.stop]
+        ticks = int(frames.sum())
+        usage.append(ClipUsage(index, ticks, ticks / total, int(entries[index]), int(trials[index]), frames))
+    return tuple(usage)
+
+
+def count_switches(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> NDArray[np.int64]:
+    """(S, 3) row left, row entered and how often, over all records, ordered by the first two."""
+    jumps = [find_jumps(clips, record) for record in records]
+    left = np.concatenate([jump.left for jump in jumps] or [np.empty(0, np.int64)])
+    entered = np.concatenate([jump.entered for jump in jumps] or [np.empty(0, np.int64)])
+    pairs, counts = np.unique(np.stack((left, entered), axis=1), axis=0, return_counts=True)
+    return np.concatenate((pairs, counts[:, None]), axis=1).astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class SourceUsage:
+    """How much a source clip and its mirrored twin were used together.
+
+    Parameters
+    ----------
+    uid, name : of the source clip
+    clips : indices of the one or two clips made from it
+    ticks, share, entries : sums
+    popularity : (frames,) int64    summed frame by frame
+    """
+
+    uid: str
+    name: str
+    clips: tuple[int, ...]
+    ticks: int
+    share: float
+    entries: int
+    popularity: NDArray[np.int64]
+
+
+def sum_by_source(clips: Sequence[DatabaseClip], usage: Sequence[ClipUsage]) -> tuple[SourceUsage, ...]:
+    """The use of clips as recorded, whichever way round they were shown, in the order of their uids."""
+    families: dict[str, list[int]] = {}
+    for index, clip in enumerate(clips):
+        families.setdefault(clip.mirrored_from or clip.uid, []).append(index)
+    return tuple(
+        SourceUsage(
+            uid=uid,
+            name=next((clips[index].name for index in own if clips[index].mirrored_from is None), clips[own[0]].name),
+            clips=tuple(own),
+            ticks=sum(usage[index].ticks for index in own),
+            share=sum(usage[index].share for index in own),
+            entries=sum(usage[index].entries for index in own),
+            popularity=np.sum([usage[index].popularity for index in own], axis=0, dtype=np.int64),
+        )
+        for uid, own in sorted(families.items())
+    )
+
+
+def unused_clips(usage: Sequence[ClipUsage]) -> tuple[int, ...]:
+    """Indices of the clips that were never displayed."""
+    return tuple(index for index, own in enumerate(usage) if own.ticks == 0)

@@ -1,0 +1,174 @@
+"""Evaluations and records to and from trees of plain values and arrays that travel and are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.result import (
+    ClipUsage,
+    Coverage,
+    EvaluationOptions,
+    EvaluationResult,
+    Grid,
+    Provenance,
+    TrialResult,
+)
+from marey_motion.evaluation.scenario import Trial
+from marey_motion.matching.database import DatabaseClip
+from marey_motion.matching.options import ControllerOptions, DatabaseOptions, FeatureWeights
+from marey_motion.matching.record import TrialRecord
+
+EVALUATION_SCHEMA = "marey/evaluation@1"
+RECORDS_SCHEMA = "marey/evaluation-records@1"
+
+Tree = dict[str, Any]
+
+
+def result_to_tree(result: EvaluationResult) -> Tree:
+    """An evaluation without its records; they are a document of their own."""
+    return {"schema": EVALUATION_SCHEMA, **_result_body(result)}
+
+
+def _result_body(result: EvaluationResult) -> Tree:
+    return {
+        "options": _plain(asdict(result.options)),
+        "provenance": _plain(asdict(result.provenance)),
+        "clips": [_plain(asdict(clip)) for clip in result.clips],
+        "trials": [
+            {"trial": asdict(one.trial), "metrics": dict(one.metrics), "regimes": _plain(one.regimes)}
+            for one in result.trials
+        ],
+        "suite": dict(result.suite),
+        "usage": {
+            "clip": np.array([usage.clip for usage in result.usage], dtype=np.int32),
+            "ticks": np.array([usage.ticks for usage in result.usage], dtype=np.int64),
+            "share": np.array([usage.share for usage in result.usage], dtype=np.float64),
+            "entries": np.array([usage.entries for usage in result.usage], dtype=np.int64),
+            "trials": np.array([usage.trials for usage in result.usage], dtype=np.int64),
+            "popularity": np.concatenate([np.empty(0, np.int64), *(usage.popularity for usage in result.usage)]),
+        },
+        "switches": result.switches,
+        "coverage": {field.name: _listed(getattr(result.coverage, field.name)) for field in fields(Coverage)},
+        "baseline": None if result.baseline is None else _result_body(result.baseline),
+        "notes": list(result.notes),
+    }
+
+
+def result_from_tree(tree: Mapping[str, Any], records: Sequence[TrialRecord] = ()) -> EvaluationResult:
+    """The evaluation of a tree, with its records where they are at hand."""
+    _require(tree, EVALUATION_SCHEMA)
+    return _result(tree, records)
+
+
+def _result(tree: Mapping[str, Any], records: Sequence[TrialRecord]) -> EvaluationResult:
+    clips = tuple(DatabaseClip(**{**clip, "tags": tuple(clip["tags"])}) for clip in tree["clips"])
+    return EvaluationResult(
+        options=options_from_tree(tree["options"]),
+        provenance=Provenance(**tree["provenance"]),
+        clips=clips,
+        trials=tuple(TrialResult(Trial(**one["trial"]), one["metrics"], one["regimes"]) for one in tree["trials"]),
+        suite=tree["suite"],
+        usage=_usage(tree["usage"], clips),
+        switches=tree["switches"],
+        coverage=Coverage(**{**tree["coverage"], "too_short": tuple(tree["coverage"]["too_short"])}),
+        records=tuple(records),
+        baseline=None if tree["baseline"] is None else _result(tree["baseline"], ()),
+        notes=tuple(tree["notes"]),
+    )
+
+
+def options_from_tree(tree: Mapping[str, Any]) -> EvaluationOptions:
+    """Options as `result_to_tree` wrote them."""
+    database = dict(tree["database"])
+    database["weights"] = FeatureWeights(**database["weights"])
+    for name in ("horizons_s", "extra_joints"):
+        database[name] = tuple(database[name])
+    return EvaluationOptions(
+        **{
+            **tree,
+            "grid": Grid(**{name: tuple(values) for name, values in tree["grid"].items()}),
+            "families": tuple(tree["families"]),
+            "database": DatabaseOptions(**database),
+            "controller": ControllerOptions(**tree["controller"]),
+        }
+    )
+
+
+def _usage(tree: Mapping[str, Any], clips: Sequence[DatabaseClip]) -> tuple[ClipUsage, ...]:
+    columns = zip(*(tree[name].tolist() for name in ("clip", "ticks", "share", "entries", "trials")), strict=True)
+    return tuple(
+        ClipUsage(clip, ticks, share, entries, trials, tree["popularity"][own.start : own.stop])
+        for own, (clip, ticks, share, entries, trials) in zip(clips, columns, strict=True)
+    )
+
+
+COSTS = ("match_cost", "continuing_cost", "pose_cost")
+
+
+def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> Tree:
+    """Records of all or some trials, joined to few large arrays.
+
+    `starts` (R + 1,) bounds each record's ticks. A cost that is not defined at every tick is kept as the ticks where it
+    is, counted over all records, and its values.
+    """
+    rates = {record.rate_hz for record in records}
+    if len(trials) != len(records) or len(rates) != 1:
+        raise MotionError(f"{len(records)} records at rates {sorted(rates)} for {len(trials)} trials")
+    return {
+        "schema": RECORDS_SCHEMA,
+        "rate_hz": rates.pop(),
+        "trials": [trial.name for trial in trials],
+        "starts": np.cumsum([0, *(len(record.rows) for record in records)], dtype=np.int64),
+        **{
+            name: np.concatenate([getattr(record, name) for record in records])
+            for name in ("rows", "positions", "headings", "status")
+        },
+        **{name: _known(np.concatenate([getattr(record, name) for record in records])) for name in COSTS},
+    }
+
+
+def records_from_tree(tree: Mapping[str, Any]) -> dict[str, TrialRecord]:
+    """Records by the name of their trial, in the order they were written."""
+    _require(tree, RECORDS_SCHEMA)
+    starts = tree["starts"].tolist()
+    columns = {name: tree[name] for name in ("rows", "positions", "headings", "status")}
+    columns |= {name: _everywhere(tree[name], starts[-1]) for name in COSTS}
+    return {
+        trial: TrialRecord(rate_hz=tree["rate_hz"], **{name: column[start:stop] for name, column in columns.items()})
+        for trial, start, stop in zip(tree["trials"], starts, starts[1:], strict=False)
+    }
+
+
+def _known(costs: NDArray[np.float64]) -> Tree:
+    ticks = np.flatnonzero(~np.isnan(costs)).astype(np.int32)
+    return {"ticks": ticks, "values": costs[ticks]}
+
+
+def _everywhere(tree: Mapping[str, Any], count: int) -> NDArray[np.float64]:
+    costs = np.full(count, np.nan)
+    costs[tree["ticks"]] = tree["values"]
+    return costs
+
+
+def _require(tree: Mapping[str, Any], schema: str) -> None:
+    if tree.get("schema") != schema:
+        raise MotionError(f"a document of schema {schema} is needed, not {tree.get('schema')}", where="schema")
+
+
+def _listed(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _plain(value: Any) -> Any:
+    """Tuples as lists, mappings as dictionaries."""
+    if isinstance(value, Mapping):
+        return {key: _plain(member) for key, member in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value

@@ -1,0 +1,179 @@
+"""A suite of trials over a database: run on several threads, measured, and put together.
+
+The result depends on the database, the options and the trials alone, not on threads or the order of work.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import replace
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.baseline import baseline_database
+from marey_motion.evaluation.coverage import measure_coverage
+from marey_motion.evaluation.metrics import measure_trial, offset_asymmetry, pooled_metrics
+from marey_motion.evaluation.provenance import provenance_of
+from marey_motion.evaluation.relevance import count_switches, measure_usage, unused_clips
+from marey_motion.evaluation.result import EvaluationOptions, EvaluationResult, TrialResult
+from marey_motion.evaluation.scenario import Trial, reference, suite_trials
+from marey_motion.matching.controller import run_trial
+from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.record import TrialRecord
+from marey_motion.matching.search import SearchIndex, build_index
+
+ProgressCallback = Callable[[int, int, str], None]
+CancelCallback = Callable[[], bool]
+
+
+class EvaluationCancelled(MotionError):
+    """The evaluation was asked to stop; the trials that were finished were handed over."""
+
+    default_code = "evaluation-cancelled"
+
+
+def run_suite(
+    database: MatchingDatabase,
+    options: EvaluationOptions,
+    *,
+    trials: Sequence[Trial] | None = None,
+    done: Mapping[str, TrialRecord] | None = None,
+    index: SearchIndex | None = None,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+    finished: Callable[[Trial, TrialRecord], None] | None = None,
+    cancelled: CancelCallback | None = None,
+) -> list[TrialRecord]:
+    """Let motion matching follow each trial's reference; one record per trial, in the order of `trials`.
+
+    Parameters
+    ----------
+    trials : all of the suite's when None; any part of them can be run alone
+    done : records made before, by the name of their trial; these trials are not run again
+    index : of the database's normalised features, built when None
+    threads : at most so many trials at once, one per processor when None
+    progress : called as progress(trials done, of how many, name of the last one)
+    finished : called with each trial and its record as soon as it is made, to keep it
+    cancelled : asked before each trial is begun
+
+    Callbacks run in the calling thread. Raises `EvaluationCancelled` once trials already begun are finished.
+    """
+    wanted = suite_trials(options) if trials is None else tuple(trials)
+    records = dict(done or {})
+    ahead = [trial for trial in wanted if trial.name not in records]
+    if ahead and index is None:
+        index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
+    tell = progress or (lambda _done, _total, _note: None)
+    tell(len(wanted) - len(ahead), len(wanted), "")
+
+    def run(trial: Trial) -> TrialRecord:
+        return run_trial(database, index, reference(trial, database.options.rate_hz), options.controller)
+
+    def keep(trial: Trial, record: TrialRecord) -> None:
+        records[trial.name] = record
+        if finished is not None:
+            finished(trial, record)
+        tell(sum(one.name in records for one in wanted), len(wanted), trial.name)
+
+    _run_ahead(run, ahead, keep, threads or len(os.sched_getaffinity(0)), cancelled or (lambda: False))
+    return [records[trial.name] for trial in wanted]
+
+
+def _run_ahead(
+    run: Callable[[Trial], TrialRecord],
+    trials: Sequence[Trial],
+    keep: Callable[[Trial, TrialRecord], None],
+    threads: int,
+    cancelled: CancelCallback,
+) -> None:
+    """Run trials, `threads` at a time, each handed over as it ends."""
+    waiting = list(reversed(trials))
+    running: dict[Future[TrialRecord], Trial] = {}
+    with ThreadPoolExecutor(max_workers=threads, thread_name_prefix="trial") as pool:
+        while waiting or running:
+            stopping = bool(waiting) and cancelled()
+            while waiting and not stopping and len(running) < threads:
+                trial = waiting.pop()
+                running[pool.submit(run, trial)] = trial
+            if stopping and not running:
+                raise EvaluationCancelled(f"stopped with {len(waiting)} of {len(trials)} trials not begun")
+            ended, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in sorted(ended, key=lambda one: running[one].name):
+                keep(running.pop(future), future.result())
+
+
+def assemble(
+    database: MatchingDatabase,
+    options: EvaluationOptions,
+    trials: Sequence[Trial],
+    records: Sequence[TrialRecord],
+    *,
+    baseline: EvaluationResult | None = None,
+) -> EvaluationResult:
+    """Measure finished trials and put everything together. Raises `MotionError` for other trials' records."""
+    if len(trials) != len(records):
+        raise MotionError(f"{len(records)} records for {len(trials)} trials")
+    rate = database.options.rate_hz
+    results = tuple(
+        measure_trial(trial, reference(trial, rate), record, options)
+        for trial, record in zip(trials, records, strict=True)
+    )
+    usage = measure_usage(database.clips, records)
+    return EvaluationResult(
+        options=options,
+        provenance=provenance_of(database, options, trials),
+        clips=database.clips,
+        trials=results,
+        suite=_suite_metrics(results, options) | {"unused_clips": float(len(unused_clips(usage)))},
+        usage=usage,
+        switches=count_switches(database.clips, records),
+        coverage=measure_coverage(database, options),
+        records=tuple(records),
+        baseline=baseline,
+    )
+
+
+def _suite_metrics(results: Sequence[TrialResult], options: EvaluationOptions) -> dict[str, float | None]:
+    metrics = _pooled_with_asymmetry(results)
+    for family in options.families:
+        own = [result for result in results if result.trial.family == family]
+        metrics |= {f"{family}.{name}": value for name, value in _pooled_with_asymmetry(own).items()}
+    return metrics
+
+
+def _pooled_with_asymmetry(results: Sequence[TrialResult]) -> dict[str, float | None]:
+    return {**pooled_metrics(results), "offset_asymmetry": offset_asymmetry(results)}
+
+
+def evaluate(
+    database: MatchingDatabase,
+    options: EvaluationOptions,
+    *,
+    threads: int | None = None,
+    with_baseline: bool = True,
+    progress: ProgressCallback | None = None,
+    cancelled: CancelCallback | None = None,
+) -> EvaluationResult:
+    """Run the whole suite and measure it, beside the same suite over generated clips unless told not to."""
+    trials = suite_trials(options)
+    records = run_suite(database, options, trials=trials, threads=threads, progress=progress, cancelled=cancelled)
+    baseline = evaluate_baseline(options, threads=threads, cancelled=cancelled) if with_baseline else None
+    return assemble(database, options, trials, records, baseline=baseline)
+
+
+_baselines: dict[EvaluationOptions, EvaluationResult] = {}
+
+
+def evaluate_baseline(
+    options: EvaluationOptions, *, threads: int | None = None, cancelled: CancelCallback | None = None
+) -> EvaluationResult:
+    """The suite over generated clips that own every cell, without its records; the last one is kept."""
+    if options not in _baselines:
+        trials = suite_trials(options)
+        database, notes = baseline_database(options)
+        records = run_suite(database, options, trials=trials, threads=threads, cancelled=cancelled)
+        made = replace(assemble(database, options, trials, records), records=(), notes=tuple(notes))
+        _baselines.clear()
+        _baselines[options] = made
+    return _baselines[options]

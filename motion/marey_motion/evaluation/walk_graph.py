@@ -1,0 +1,180 @@
+"""The walk that characters took through the frames of a set of clips, as a directed graph.
+
+After Kovar et al. (2002) for the vocabulary: clips that lead to each other and back form a strongly connected
+component; a dead end is a component that is not left again.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.evaluation.relevance import clip_starts, clips_of_rows, count_switches
+from marey_motion.matching.database import DatabaseClip
+from marey_motion.matching.record import TrialRecord
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class WalkGraph:
+    """Frames that were displayed, jumps between them, and the order of it all.
+
+    Parameters
+    ----------
+    rows : (N,) int64    database rows displayed, ascending: the nodes
+    ticks : (N,) int64    how long each was displayed
+    edges : (E, 3) int64    row left, row entered, how often; ordered by the first two
+    walks : for each record (R, 3) int64    first tick, first row and number of frames of each uninterrupted run
+    """
+
+    clips: tuple[DatabaseClip, ...]
+    rows: Ints
+    ticks: Ints
+    edges: Ints
+    walks: tuple[Ints, ...]
+
+
+def walk_graph(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> WalkGraph:
+    """The graph of the walks of one or several trials."""
+    popularity = np.zeros(clip_starts(clips)[-1], dtype=np.int64)
+    for record in records:
+        popularity += np.bincount(record.rows, minlength=len(popularity))
+    rows = np.flatnonzero(popularity)
+    walks = tuple(_runs(clips, record) for record in records)
+    return WalkGraph(tuple(clips), rows, popularity[rows], count_switches(clips, records), walks)
+
+
+def _runs(clips: Sequence[DatabaseClip], record: TrialRecord) -> Ints:
+    """First tick, first row and length of each run of consecutive frames of one clip."""
+    rows = record.rows.astype(np.int64)
+    owners = clips_of_rows(clips, rows)
+    firsts = np.concatenate(([0], np.flatnonzero((np.diff(rows) != 1) | (np.diff(owners) != 0)) + 1))
+    lengths = np.diff(np.concatenate((firsts, [len(rows)])))
+    return np.stack((firsts, rows[firsts], lengths), axis=1)
+
+
+def graph_to_tree(graph: WalkGraph) -> dict[str, Any]:
+    """The graph as plain values for JSON; edges name their nodes by index."""
+    owners = clips_of_rows(graph.clips, graph.rows)
+    frames = graph.rows - clip_starts(graph.clips)[owners]
+    edges = np.column_stack((np.searchsorted(graph.rows, graph.edges[:, :2]), graph.edges[:, 2]))
+    return {
+        "clips": [{"uid": clip.uid, "name": clip.name, "frames": clip.frame_count} for clip in graph.clips],
+        "nodes": {"clip": owners.tolist(), "frame": frames.tolist(), "ticks": graph.ticks.tolist()},
+        "edges": {"source": edges[:, 0].tolist(), "target": edges[:, 1].tolist(), "count": edges[:, 2].tolist()},
+        "walks": [_walk_to_tree(graph, walk) for walk in graph.walks],
+    }
+
+
+def _walk_to_tree(graph: WalkGraph, walk: Ints) -> dict[str, list[int]]:
+    owners = clips_of_rows(graph.clips, walk[:, 1])
+    return {
+        "tick": walk[:, 0].tolist(),
+        "clip": owners.tolist(),
+        "frame": (walk[:, 1] - clip_starts(graph.clips)[owners]).tolist(),
+        "frames": walk[:, 2].tolist(),
+    }
+
+
+_GRAPHML_KEYS = (
+    ("node", "clip", "string"),
+    ("node", "name", "string"),
+    ("node", "frame", "long"),
+    ("node", "ticks", "long"),
+    ("edge", "count", "long"),
+)
+
+
+def graph_to_graphml(graph: WalkGraph) -> bytes:
+    """The graph as a GraphML document: nodes n<row> with clip, frame and ticks, edges with their count.
+
+    The ordered walks are data of the graph, walk0 and so on: `n12:30 n140:6` is thirty frames from row 12 on, then six
+    from row 140.
+    """
+    owners = clips_of_rows(graph.clips, graph.rows)
+    frames = graph.rows - clip_starts(graph.clips)[owners]
+    names = [(_text(clip.uid), _text(clip.name)) for clip in graph.clips]
+    keys = [*_GRAPHML_KEYS, *(("graph", f"walk{index}", "string") for index in range(len(graph.walks)))]
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        '<graphml xmlns="http://graphml.graphdrawing.org/xmlns">',
+        *(f'<key id="{name}" for="{of}" attr.name="{name}" attr.type="{kind}"/>' for of, name, kind in keys),
+        '<graph edgedefault="directed">',
+        *(f'<data key="walk{index}">{_walk_to_text(walk)}</data>' for index, walk in enumerate(graph.walks)),
+    ]
+    for row, owner, frame, ticks in zip(
+        graph.rows.tolist(), owners.tolist(), frames.tolist(), graph.ticks.tolist(), strict=True
+    ):
+        uid, name = names[owner]
+        lines.append(
+            f'<node id="n{row}"><data key="clip">{uid}</data><data key="name">{name}</data>'
+            f'<data key="frame">{frame}</data><data key="ticks">{ticks}</data></node>'
+        )
+    lines += [
+        f'<edge source="n{left}" target="n{entered}"><data key="count">{count}</data></edge>'
+        for left, entered, count in graph.edges.tolist()
+    ]
+    lines += ["</graph>", "</graphml>", ""]
+    return "\n".join(lines).encode()
+
+
+def _walk_to_text(walk: Ints) -> str:
+    return " ".join(f"n{row}:{length}" for _, row, length in walk.tolist())
+
+
+_NOT_IN_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def _text(text: str) -> str:
+    """Text that may stand in XML 1.0, which has no control characters."""
+    allowed = _NOT_IN_XML.sub("\ufffd", text)
+    return escape(allowed)
+
+
+@dataclass(frozen=True, eq=False)
+class ClipGraph:
+    """Switches between clips.
+
+    Parameters
+    ----------
+    counts : {(clip left, clip entered): how often}, in ascending order; a clip may follow itself
+    components : strongly connected components of the clips that were displayed, largest first, then by lowest index
+    dead_ends : components that were entered and not left again
+    """
+
+    counts: Mapping[tuple[int, int], int]
+    components: tuple[tuple[int, ...], ...]
+    dead_ends: tuple[tuple[int, ...], ...]
+
+
+def clip_graph(clips: Sequence[DatabaseClip], switches: Ints, used: Sequence[int]) -> ClipGraph:
+    """The clips' graph from the frames' edges (S, 3); `used` are the indices of the clips that were displayed."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    left, entered = (clips_of_rows(clips, switches[:, column]) for column in (0, 1))
+    matrix = coo_array((switches[:, 2], (left, entered)), shape=(len(clips), len(clips))).tocsr()
+    _, labels = connected_components(matrix, directed=True, connection="strong")
+    members: dict[int, list[int]] = {}
+    for clip in sorted(used):
+        members.setdefault(int(labels[clip]), []).append(clip)
+    pairs = matrix.tocoo()
+    order = np.lexsort((pairs.coords[1], pairs.coords[0]))
+    counts = {(int(pairs.coords[0][at]), int(pairs.coords[1][at])): int(pairs.data[at]) for at in order.tolist()}
+    left_again = {int(labels[a]) for a, b in counts if labels[a] != labels[b]}
+    entered_from_elsewhere = {int(labels[b]) for a, b in counts if labels[a] != labels[b]}
+    ranked = sorted(members.items(), key=lambda item: (-len(item[1]), item[1][0]))
+    return ClipGraph(
+        counts=counts,
+        components=tuple(tuple(own) for _, own in ranked),
+        dead_ends=tuple(
+            tuple(own) for label, own in ranked if label in entered_from_elsewhere and label not in left_again
+        ),
+    )
