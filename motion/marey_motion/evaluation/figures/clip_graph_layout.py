@@ -1,0 +1,87 @@
+"""Where figure 10 puts clips, frames and transitions: circles on a ring, so that no line has to cross a circle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+SMALLEST, LARGEST = 0.45, 1.0  # radius of a circle; the square root of its frames decides between
+BETWEEN = 0.28  # room between circles
+OPEN = 0.07  # of a turn is left open above, where a clip begins and ends
+MOST_DOTS = 1_200
+FEWEST_DOTS, FULLEST = 12, 120  # dots on one circle
+
+
+@dataclass(frozen=True, eq=False)
+class Circle:
+    """A clip's circle: centre, radius and the number of dots its frames are summed up in."""
+
+    centre: Floats
+    radius: float
+    frames: int
+    dots: int
+
+    def dot_of(self, frames: Ints) -> Ints:
+        """Which dot holds each frame."""
+        return np.asarray(np.minimum(frames * self.dots // max(self.frames, 1), self.dots - 1), dtype=np.int64)
+
+    def place_of(self, dots: Ints) -> Floats:
+        """(..., 2) of each dot: clockwise from above."""
+        turn = OPEN / 2 + (1.0 - OPEN) * (np.asarray(dots) + 0.5) / self.dots
+        return self.centre + self.radius * np.stack((np.sin(2 * np.pi * turn), np.cos(2 * np.pi * turn)), axis=-1)
+
+
+def arrange(frames: Mapping[str, int], links: Mapping[tuple[str, str], int]) -> dict[str, Circle]:
+    """Circles of clips by uid, those with most transitions between them side by side.
+
+    Parameters
+    ----------
+    frames : number of frames by uid, the most used clip first
+    links : transitions from clip to clip, by both uids
+    """
+    order = _neighbours(list(frames), links)
+    largest = max(frames.values(), default=1)
+    radii = np.array([max(SMALLEST, LARGEST * (frames[uid] / largest) ** 0.5) for uid in order])
+    dots = _dots([frames[uid] for uid in order])
+    return {
+        uid: Circle(centre, float(radius), frames[uid], int(count))
+        for uid, centre, radius, count in zip(order, _ring(radii), radii, dots, strict=True)
+    }
+
+
+def _neighbours(uids: Sequence[str], links: Mapping[tuple[str, str], int]) -> list[str]:
+    """Begin with the first; go on with the clip that has most transitions with the last one."""
+    left, order = list(uids), []
+    while left:
+        last = order[-1] if order else None
+        best = max(left, key=lambda uid: links.get((last, uid), 0) + links.get((uid, last), 0) if last else 0)
+        order.append(best)
+        left.remove(best)
+    return order
+
+
+def _ring(radii: Floats) -> Floats:
+    """(n, 2) centres of circles that touch none of their neighbours; the first above, then clockwise."""
+    if len(radii) < 2:
+        return np.zeros((len(radii), 2))
+    rooms = radii + BETWEEN / 2
+    widths = 2 * np.pi * rooms / rooms.sum()
+    angles = np.cumsum(widths) - widths / 2 - widths[0] / 2
+    if len(radii) == 2:
+        angles = np.array([-0.5, 0.5]) * np.pi
+    steps = np.diff(np.append(angles, angles[0] + 2 * np.pi))
+    needed = (rooms + np.roll(rooms, -1)) / (2.0 * np.sin(np.minimum(steps, np.pi) / 2))
+    return np.asarray(needed.max() * np.stack((np.sin(angles), np.cos(angles)), axis=1))
+
+
+def _dots(frames: Sequence[int]) -> Ints:
+    """Dots per circle: one per frame while they fit, else as many as its share of all frames earns."""
+    counts = np.asarray(frames, dtype=np.float64)
+    earned = np.clip(MOST_DOTS * counts**0.5 / max((counts**0.5).sum(), 1.0), FEWEST_DOTS, FULLEST)
+    return np.maximum(1, np.minimum(counts, earned)).astype(np.int64)

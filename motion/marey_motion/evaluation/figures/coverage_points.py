@@ -1,0 +1,158 @@
+"""Figure 1: the speeds and turn rates of every clip, told apart by colour and marker."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.evaluation.figures.drawn import Sketch
+from marey_motion.evaluation.figures.paper import (
+    COLOURS,
+    INK,
+    MARKERS,
+    QUIET,
+    REFERENCE,
+    SMALL,
+    SPEED,
+    TURN_RATE,
+    Place,
+    add_panel,
+    mark_sides,
+    new_figure,
+    plain,
+    shortened,
+)
+from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MOST_POINTS = 6_000  # per subject; more only cover each other
+DRAWN_AS_SHAPES = 800  # beyond, the points are one image inside the SVG
+CATEGORIES = len(COLOURS) * len(MARKERS)
+
+
+class _Points(NamedTuple):
+    """What is drawn of a subject: windows (index into the coverage), and the clips that get a colour of their own."""
+
+    windows: NDArray[np.int64]
+    named: list[int]
+
+
+def draw_points(subjects: Sequence[Subject], _trial: str | None, options: FigureOptions) -> Sketch:
+    """One point per window of a second, of up to `MOST_POINTS` windows at even intervals."""
+    chosen = [_choose(subject, min(options.most_clips, CATEGORIES)) for subject in subjects]
+    width = 9.6 if len(subjects) > 1 else 8.6
+    keys = 2.5
+    each = (width - 0.75 - keys - 0.45 * (len(subjects) - 1)) / len(subjects)
+    figure = new_figure(width, 4.9)
+    limits = _limits(subjects, chosen)
+    styles: dict[str, int] = {}  # a clip looks the same in both panels
+    for number, (subject, points) in enumerate(zip(subjects, chosen, strict=True)):
+        place = Place(0.65 + number * (each + 0.45), 0.55, each, 3.85)
+        panel = add_panel(figure, place, title=subject.label, x=TURN_RATE, y=SPEED if number == 0 else "")
+        panel.set_title(plain(subject.label), pad=17, loc="left", fontweight="bold", color=INK, parse_math=False)
+        _draw(panel, subject, points, styles)
+        panel.set(xlim=limits[0], ylim=limits[1])
+        mark_sides(panel)
+    _draw_keys(figure.axes[-1], subjects, chosen, styles)
+    return Sketch(figure, {"points": _table(subjects, chosen)}, _caption(subjects, chosen))
+
+
+def _choose(subject: Subject, most_clips: int) -> _Points:
+    """The clips with most data get a look of their own; windows at even intervals within the whole."""
+    clips = subject.result.coverage.clip
+    step = max(1, -(-len(clips) // MOST_POINTS))
+    windows = np.arange(0, len(clips), step)
+    held = np.bincount(clips, minlength=len(subject.result.clips))
+    order = np.argsort(-held, kind="stable")[:most_clips]
+    return _Points(windows, [int(clip) for clip in order if held[clip]])
+
+
+def _limits(subjects: Sequence[Subject], chosen: Sequence[_Points]) -> tuple[tuple[float, float], tuple[float, float]]:
+    turn, speed = 1.0, 1.0
+    for subject, points in zip(subjects, chosen, strict=True):
+        coverage = subject.result.coverage
+        turn = max(turn, float(np.abs(coverage.turn_rate_edges_deg_s).max(initial=0.0)))
+        speed = max(speed, float(coverage.speed_edges_m_s.max(initial=0.0)))
+        if len(points.windows):
+            turn = max(turn, float(np.abs(np.degrees(coverage.turn_rate_rad_s[points.windows])).max()))
+            speed = max(speed, float(coverage.speed_m_s[points.windows].max()))
+    return (-1.04 * turn, 1.04 * turn), (0.0, 1.04 * speed)
+
+
+def _draw(panel: Axes, subject: Subject, points: _Points, styles: dict[str, int]) -> None:
+    coverage = subject.result.coverage
+    clips = coverage.clip[points.windows]
+    turn, speed = np.degrees(coverage.turn_rate_rad_s[points.windows]), coverage.speed_m_s[points.windows]
+    as_image = len(points.windows) > DRAWN_AS_SHAPES
+    others = ~np.isin(clips, points.named)
+    panel.scatter(turn[others], speed[others], s=6, c=REFERENCE, alpha=0.5, lw=0, rasterized=as_image, zorder=2)
+    for clip in reversed(points.named):  # the clip with most data lies below the others
+        mine = clips == clip
+        style = styles.setdefault(subject.result.clips[clip].uid, len(styles) % CATEGORIES)
+        panel.scatter(turn[mine], speed[mine], s=13, alpha=0.75, lw=0, rasterized=as_image, zorder=3, **_look(style))
+
+
+def _look(style: int) -> dict[str, str]:
+    """Neighbours differ in colour and in marker."""
+    row = style // len(COLOURS)
+    return {"c": COLOURS[style % len(COLOURS)], "marker": MARKERS[(style + row) % len(MARKERS)]}
+
+
+def _draw_keys(panel: Axes, subjects: Sequence[Subject], chosen: Sequence[_Points], styles: dict[str, int]) -> None:
+    from matplotlib.lines import Line2D
+
+    names = {
+        subject.result.clips[clip].uid: subject.result.clips[clip].name
+        for subject, points in zip(subjects, chosen, strict=True)
+        for clip in points.named
+    }
+    keys, labels = [], []
+    for uid, style in styles.items():
+        look = _look(style)
+        keys.append(Line2D([], [], ls="", color=look["c"], marker=look["marker"], markersize=5, markeredgewidth=0))
+        labels.append(plain(shortened(names[uid])))
+    rest = max(_other_clips(subject, points) for subject, points in zip(subjects, chosen, strict=True))
+    if rest:
+        keys.append(Line2D([], [], ls="", color=REFERENCE, marker="o", markersize=3.5, markeredgewidth=0))
+        labels.append(f"{rest} other clip{'s' if rest > 1 else ''}")
+    if not keys:
+        panel.text(0.5, 0.5, "no clip of a second or longer", transform=panel.transAxes, ha="center", color=QUIET)
+        return
+    legend = panel.legend(
+        keys, labels, loc="upper left", bbox_to_anchor=(1.01, 1.03), frameon=False, fontsize=SMALL, handletextpad=0.2
+    )
+    for text in legend.get_texts():
+        text.set_color(INK)
+        text.set_parse_math(False)
+
+
+def _other_clips(subject: Subject, points: _Points) -> int:
+    return len(np.unique(subject.result.coverage.clip)) - len(points.named)
+
+
+def _table(subjects: Sequence[Subject], chosen: Sequence[_Points]) -> dict[str, object]:
+    table: dict[str, list[object]] = {"dataset": [], "clip": [], "name": [], "speed_m_s": [], "turn_rate_deg_s": []}
+    for subject, points in zip(subjects, chosen, strict=True):
+        coverage = subject.result.coverage
+        clips = [subject.result.clips[clip] for clip in coverage.clip[points.windows]]
+        table["dataset"] += [subject.label] * len(clips)
+        table["clip"] += [clip.uid for clip in clips]
+        table["name"] += [clip.name for clip in clips]
+        table["speed_m_s"] += coverage.speed_m_s[points.windows].tolist()
+        table["turn_rate_deg_s"] += np.degrees(coverage.turn_rate_rad_s[points.windows]).tolist()
+    return dict(table)
+
+
+def _caption(subjects: Sequence[Subject], chosen: Sequence[_Points]) -> str:
+    parts = []
+    for subject, points in zip(subjects, chosen, strict=True):
+        held, total = len(np.unique(subject.result.coverage.clip)), len(subject.result.coverage.clip)
+        drawn = "all of them" if len(points.windows) == total else f"{len(points.windows)} of them, evenly spaced"
+        start = f"{subject.label}: " if subject.label else ""
+        parts.append(f"{start}{total} windows of one second from {held} clips, {drawn} drawn.")
+    return "What the clips hold: each point is the mean speed and turn rate of one second. " + " ".join(parts)

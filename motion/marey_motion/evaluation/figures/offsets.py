@@ -1,0 +1,200 @@
+"""Figure 5: how far from the wished path the character was, over the grid of speeds and turn rates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.figures.drawn import Sketch
+from marey_motion.evaluation.figures.paper import (
+    CHANGE,
+    DARK,
+    LIGHT,
+    MORE_IS_WORSE,
+    SPEED,
+    TURN_RATE,
+    Place,
+    add_colour_bar,
+    add_panel,
+    luminance,
+    new_figure,
+    nice_ceiling,
+    write,
+)
+from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+FAMILY_TITLES = {"circle": "constant speed", "switching": "switching speed"}
+LEVELS = 12
+
+
+class _Field(NamedTuple):
+    """Mean offset of the trials of one family on their grid; NaN where there is no trial."""
+
+    turn_rates_deg_s: Floats
+    speeds_m_s: Floats
+    offset_m: Floats
+
+
+def draw_offsets(subjects: Sequence[Subject], _trial: str | None, _options: FigureOptions) -> Sketch:
+    """A row per family of trials; two subjects share the scale, and a third column shows the change."""
+    families = [family for family in subjects[0].result.options.families if family in FAMILY_TITLES]
+    fields = [[_field(subject, family) for subject in subjects] for family in families]
+    if not fields or not any(np.isfinite(field.offset_m).any() for row in fields for field in row):
+        raise MotionError("the evaluation has no trial with an offset", code="nothing-to-draw")
+    ceiling = nice_ceiling(max(float(np.nanmax(field.offset_m, initial=0.0)) for row in fields for field in row))
+    sketch = _draw_one if len(subjects) == 1 else _draw_two
+    figure = sketch(subjects, families, fields, ceiling)
+    return Sketch(figure, {"offsets": _table(subjects, families, fields)}, _caption(subjects, families, fields))
+
+
+def _field(subject: Subject, family: str) -> _Field:
+    trials = [each for each in subject.result.trials if each.trial.family == family]
+    speeds = np.unique([each.trial.speed_m_s for each in trials])
+    turn_rates = np.unique([np.round(np.degrees(each.trial.turn_rate_rad_s), 9) for each in trials])
+    offset = np.full((len(speeds), len(turn_rates)), np.nan)
+    for each in trials:
+        row = np.searchsorted(speeds, each.trial.speed_m_s)
+        column = np.searchsorted(turn_rates, np.round(np.degrees(each.trial.turn_rate_rad_s), 9))
+        value = each.metrics.get("offset_mean")
+        offset[row, column] = np.nan if value is None else value
+    return _Field(turn_rates, speeds, offset)
+
+
+def _draw_one(
+    subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]], ceiling: float
+) -> Figure:
+    width, height = 3.75, 3.3
+    figure = new_figure(0.7 + len(families) * (width + 0.35) + 0.75, height + 1.05)
+    drawn = None
+    for number, (family, row) in enumerate(zip(families, fields, strict=True)):
+        place = Place(0.62 + number * (width + 0.35), 0.58, width, height)
+        labels = {"x": TURN_RATE, "y": SPEED if number == 0 else ""}
+        drawn = (
+            _draw_field(figure, place, row[0], FAMILY_TITLES[family], labels, (0.0, ceiling), MORE_IS_WORSE) or drawn
+        )
+    if drawn is not None:
+        bar = Place(0.62 + len(families) * (width + 0.35) - 0.12, 0.58, 0.14, height)
+        add_colour_bar(figure, drawn, bar, "mean offset (m)")
+    return figure
+
+
+def _draw_two(
+    subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]], ceiling: float
+) -> Figure:
+    width, height, gap = 2.62, 2.3, 0.3
+    figure = new_figure(9.6, len(families) * (height + 0.85) + 0.95)
+    changes = [_change(*row) for row in fields]
+    largest = nice_ceiling(max(float(np.nanmax(np.abs(change.offset_m), initial=0.0)) for change in changes))
+    shared, changed = None, None
+    for number, (family, row, change) in enumerate(zip(families, fields, changes, strict=True)):
+        bottom = 1.3 + (len(families) - 1 - number) * (height + 0.85)
+        last = number == len(families) - 1
+        titles = [subject.label for subject in subjects] if number == 0 else ["", ""]
+        for column, field in enumerate(row):
+            place = Place(0.85 + column * (width + gap), bottom, width, height)
+            labels = {"x": TURN_RATE if last else "", "y": f"{FAMILY_TITLES[family]}\n{SPEED}" if column == 0 else ""}
+            shared = _draw_field(figure, place, field, titles[column], labels, (0.0, ceiling), MORE_IS_WORSE) or shared
+        place = Place(0.85 + 2 * (width + gap), bottom, width, height)
+        labels = {"x": TURN_RATE if last else "", "y": ""}
+        title = "change" if number == 0 else ""
+        changed = _draw_field(figure, place, change, title, labels, (-largest, largest), CHANGE) or changed
+    if shared is not None:
+        add_colour_bar(figure, shared, Place(0.85, 0.52, 2 * width + gap, 0.12), "mean offset (m)")
+    if changed is not None:
+        place = Place(0.85 + 2 * (width + gap), 0.52, width, 0.12)
+        add_colour_bar(figure, changed, place, "change of the mean offset (m), blue is better")
+    return figure
+
+
+def _change(before: _Field, after: _Field) -> _Field:
+    """after - before on the grid points that both have."""
+    turn_rates = np.intersect1d(before.turn_rates_deg_s, after.turn_rates_deg_s)
+    speeds = np.intersect1d(before.speeds_m_s, after.speeds_m_s)
+    first, second = (
+        field.offset_m[np.ix_(np.isin(field.speeds_m_s, speeds), np.isin(field.turn_rates_deg_s, turn_rates))]
+        for field in (before, after)
+    )
+    return _Field(turn_rates, speeds, second - first)
+
+
+def _draw_field(
+    figure: Figure,
+    place: Place,
+    field: _Field,
+    title: str,
+    labels: dict[str, str],
+    limits: tuple[float, float],
+    colours: str,
+) -> Any:
+    """Filled contours and one dot per trial; dots alone where trials span no area. None for no trials."""
+    panel = add_panel(figure, place, title=title, grid=False, **labels)
+    known = np.isfinite(field.offset_m)
+    if not known.any():
+        write(panel, (0.5, 0.5), "no trials", transform=panel.transAxes, ha="center")
+        return None
+    turn, speed = np.meshgrid(field.turn_rates_deg_s, field.speeds_m_s)
+    drawn: Any = None
+    if min(field.offset_m.shape) > 1 and np.all(known):
+        levels = np.linspace(*limits, LEVELS * (2 if limits[0] < 0 else 1) + 1)
+        drawn = panel.contourf(turn, speed, field.offset_m, levels=levels, cmap=colours, extend="neither")
+    dots = panel.scatter(
+        turn[known], speed[known], c=field.offset_m[known], s=16, cmap=colours, vmin=limits[0], vmax=limits[1], lw=0.6,
+        zorder=4, clip_on=False,
+    )  # fmt: skip
+    colours_of_dots = dots.cmap(dots.norm(field.offset_m[known]))
+    dots.set_edgecolor([DARK if light else LIGHT for light in luminance(colours_of_dots) > 0.3])
+    _mark_extreme(panel, field, dots)
+    panel.set_xticks(field.turn_rates_deg_s[:: max(1, len(field.turn_rates_deg_s) // 4)])
+    panel.margins(0.02)
+    return drawn or dots
+
+
+def _mark_extreme(panel: Any, field: _Field, dots: Any) -> None:
+    """The value of the dot that is farthest from zero, beside it."""
+    row, column = np.unravel_index(np.nanargmax(np.abs(field.offset_m)), field.offset_m.shape)
+    value, place = field.offset_m[row, column], (field.turn_rates_deg_s[column], field.speeds_m_s[row])
+    right = column <= field.offset_m.shape[1] // 2
+    up = row <= field.offset_m.shape[0] // 2
+    light = luminance(np.asarray(dots.cmap(dots.norm(value)))) > 0.3
+    sign = "+" if value > 0 and dots.norm.vmin < 0 else ""
+    panel.annotate(
+        f"{sign}{value:.2f} m", place, (5 if right else -5, 5 if up else -5), textcoords="offset points", fontsize=8,
+        color=DARK if light else LIGHT, ha="left" if right else "right", va="bottom" if up else "top", zorder=5,
+        fontweight="bold",
+    )  # fmt: skip
+
+
+def _table(
+    subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]]
+) -> dict[str, list[object]]:
+    names = ("dataset", "family", "speed_m_s", "turn_rate_deg_s", "offset_mean_m")
+    table: dict[str, list[object]] = {name: [] for name in names}
+    for family, row in zip(families, fields, strict=True):
+        for subject, field in zip(subjects, row, strict=True):
+            for speed, values in zip(field.speeds_m_s, field.offset_m, strict=True):
+                for turn_rate, value in zip(field.turn_rates_deg_s, values, strict=True):
+                    for name, entry in zip(
+                        names, (subject.label, family, float(speed), float(turn_rate), float(value)), strict=True
+                    ):
+                        table[name].append(entry)
+    return table
+
+
+def _caption(subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]]) -> str:
+    parts = []
+    for family, row in zip(families, fields, strict=True):
+        for subject, field in zip(subjects, row, strict=True):
+            if np.isfinite(field.offset_m).any():
+                name = f"{subject.label}, " if subject.label else ""
+                low, middle, high = np.nanquantile(field.offset_m, (0.0, 0.5, 1.0))
+                parts.append(f"{name}{FAMILY_TITLES[family]}: {low:.2f} to {high:.2f} m, median {middle:.2f} m")
+    return "Mean distance to the wished place over each trial; dots are trials. " + "; ".join(parts) + "."

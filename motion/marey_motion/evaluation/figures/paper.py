@@ -1,0 +1,169 @@
+"""The look that all figures of an evaluation share, and how a figure becomes a PNG and an SVG.
+
+Only matplotlib's object interface is used, and its settings are touched for nothing but the few of the SVG writer that
+have no other way, one figure at a time; threads may draw at once.
+"""
+
+from __future__ import annotations
+
+import io
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.figure import Figure
+
+# These four follow the theme of the page that a figure is shown in; see `marey_motion.evaluation.report`.
+INK, QUIET, HAIRLINE, PAPER = "#1f2430", "#5c6472", "#d5dae1", "#ffffff"
+# On coloured ground, in any theme.
+DARK, LIGHT = "#111318", "#fafbfc"
+
+# Okabe and Ito (2008) without yellow and black, which vanish on a light or a dark page.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+REFERENCE = "#8a8f99"
+MARKERS = "os^DvPX*"
+
+# Lightness runs one way in each, so that they read in grey, too.
+MORE_IS_WORSE = "magma_r"
+MORE_IS_DENSER = "viridis"
+CHANGE = "RdBu_r"
+
+TEXT, SMALL, HEADING = 9.0, 8.0, 10.5
+DPI = 144
+SPEED = "speed (m/s)"
+TURN_RATE = "turn rate (deg/s, left positive)"
+LONGEST_NAME = 30
+
+_SVG_SETTINGS = {"svg.hashsalt": "marey", "svg.fonttype": "none", "svg.image_inline": True, "svg.id": None}
+_svg_writer = threading.Lock()
+
+
+class Place(NamedTuple):
+    """A rectangle on the page, in inches from its lower left corner."""
+
+    left: float
+    bottom: float
+    width: float
+    height: float
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty page."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_in, height_in), dpi=DPI, facecolor=PAPER)
+
+
+def add_panel(figure: Figure, place: Place, *, title: str = "", x: str = "", y: str = "", grid: bool = True) -> Axes:
+    """Axes at a place, in the house's look, with their labels."""
+    width, height = figure.get_size_inches()
+    left, bottom, across, up = place
+    axes = figure.add_axes((left / width, bottom / height, across / width, up / height), facecolor="none")
+    axes.tick_params(colors=QUIET, labelsize=SMALL, length=3, width=0.6)
+    for name, spine in axes.spines.items():
+        spine.set_visible(name in ("left", "bottom"))
+        spine.set_color(HAIRLINE)
+    axes.set_axisbelow(True)
+    if grid:
+        axes.grid(visible=True, color=HAIRLINE, lw=0.5)
+    axes.set_xlabel(x, fontsize=TEXT, color=INK, labelpad=4)
+    axes.set_ylabel(y, fontsize=TEXT, color=INK, labelpad=4)
+    axes.set_title(plain(title), fontsize=HEADING, color=INK, loc="left", fontweight="bold", parse_math=False, pad=7)
+    return axes
+
+
+def add_colour_bar(figure: Figure, mappable: ScalarMappable, place: Place, label: str) -> Axes:
+    """A colour bar at a place, upright when it is higher than wide."""
+    width, height = figure.get_size_inches()
+    left, bottom, across, up = place
+    axes = figure.add_axes((left / width, bottom / height, across / width, up / height))
+    upright = up > across
+    bar = figure.colorbar(mappable, cax=axes, orientation="vertical" if upright else "horizontal")
+    bar.outline.set_visible(False)  # type: ignore[operator]
+    axes.tick_params(colors=QUIET, labelsize=SMALL, length=3, width=0.6)
+    bar.set_label(label, fontsize=TEXT, color=INK)
+    return axes
+
+
+def write(axes: Axes, place: tuple[float, float], text: str, **options: Any) -> None:
+    """Text as it is: dollar signs in a name are not mathematics."""
+    look: dict[str, Any] = {"fontsize": SMALL, "color": INK, "parse_math": False, "va": "center", **options}
+    axes.text(*place, plain(text), **look)
+
+
+def name_ticks(axes: Axes, places: Sequence[float], names: Sequence[str]) -> None:
+    """Names, as clips have, down the vertical axis."""
+    axes.set_yticks(list(places), [plain(shortened(name)) for name in names], parse_math=False)
+    axes.tick_params(axis="y", length=0, labelcolor=INK)
+
+
+def mark_sides(axes: Axes) -> None:
+    """Say which half of an axis of turn rates is which, in the corners above the panel's ground."""
+    look = {"transform": axes.transAxes, "color": QUIET, "fontsize": SMALL, "va": "bottom"}
+    write(axes, (0.0, 1.005), "← right turns", ha="left", **look)
+    write(axes, (1.0, 1.005), "left turns →", ha="right", **look)
+
+
+def plain(text: str) -> str:
+    """A name on one line, without signs that cannot be drawn or written to an SVG."""
+    return "".join(sign if sign.isprintable() else "�" for sign in text)
+
+
+def shortened(name: str, longest: int = LONGEST_NAME) -> str:
+    """A name cut in its middle, where names of takes differ least."""
+    if len(name) <= longest:
+        return name
+    tail = (longest - 1) // 2
+    return f"{name[: longest - 1 - tail]}…{name[-tail:]}"
+
+
+def nice_ceiling(value: float) -> float:
+    """The next number of the form 1, 1.5, 2, 3, 4, 5, 6 or 8 times a power of ten; 1 for what is not above zero."""
+    if not value > 0.0 or not np.isfinite(value):
+        return 1.0
+    scale = 10.0 ** np.floor(np.log10(value))
+    return float(next(step * scale for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if value <= step * scale * (1 + 1e-9)))
+
+
+def luminance(colours: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Relative luminance in [0, 1] of sRGB colours (..., 3 or 4), to choose the text on them."""
+    linear = np.where(
+        colours[..., :3] <= 0.04045, colours[..., :3] / 12.92, ((colours[..., :3] + 0.055) / 1.055) ** 2.4
+    )
+    return np.asarray(linear @ (0.2126, 0.7152, 0.0722), dtype=np.float64)
+
+
+def to_png(figure: Figure) -> bytes:
+    """The same bytes for the same figure and version of matplotlib."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def to_svg(figure: Figure, title: str) -> str:
+    """The same text for the same figure and version of matplotlib; letters stay letters."""
+    buffer = io.StringIO()
+    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    with _svg_settings():
+        figure.savefig(buffer, format="svg", dpi=DPI, metadata={"Title": plain(title), **nothing})
+    return buffer.getvalue()
+
+
+@contextmanager
+def _svg_settings() -> Iterator[None]:
+    import matplotlib
+
+    with _svg_writer:
+        before = {name: matplotlib.rcParams[name] for name in _SVG_SETTINGS}
+        matplotlib.rcParams.update(_SVG_SETTINGS)
+        try:
+            yield
+        finally:
+            matplotlib.rcParams.update(before)
