@@ -95,6 +95,18 @@ def test_a_job_goes_from_its_submission_to_its_outputs(
     assert sorted(one["name"] for one in made) == ["a", "b"]
 
 
+def test_jobs_are_listed_by_the_states_there_are(owner: httpx.Client) -> None:
+    job = submit(owner)
+    assert [one["id"] for one in ok(owner.get("/projects/lab/jobs?state=queued,failed"))["items"]] == [job["id"]]
+    assert ok(owner.get("/projects/lab/jobs?state=failed"))["items"] == []
+    refused = owner.get("/projects/lab/jobs?state=queued,done")
+    assert refused.status_code == 400
+    (fault,) = refused.json()["errors"]
+    assert fault["pointer"] == "state.1"
+    for state in ("waiting", "queued", "running", "succeeded", "failed", "cancelled"):
+        assert f"'{state}'" in fault["detail"]
+
+
 def test_a_waiting_worker_hears_of_a_job_when_it_is_submitted(owner: httpx.Client, worker: httpx.Client) -> None:
     with ThreadPoolExecutor(1) as pool:
         waiting = pool.submit(claim, worker, wait_s=30)

@@ -1,0 +1,43 @@
+"""A job that takes longer than it may, as its user sees it: a real server, a real worker."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from marey_client import Marey
+from marey_client.errors import JobUnsuccessful
+from marey_schemas.access import ProjectCreate
+from marey_schemas.jobs import FailureReason, JobCreate, JobState, Resources
+from server_process import ServerProcess
+
+THIRD_PARTY = Path(__file__).parents[1] / "unit" / "worker" / "thirdparty"
+
+
+@pytest.fixture
+def marey(tmp_path: Path) -> Iterator[Marey]:
+    """A server and a worker that know a kind of job that can sleep."""
+    paths = os.pathsep.join(filter(None, [str(THIRD_PARTY), os.environ.get("PYTHONPATH")]))
+    process = ServerProcess(tmp_path, PYTHONPATH=paths)
+    process.start(workers=1)
+    with process.client() as client:
+        yield client
+    assert process.stop() == 0
+
+
+def test_a_job_over_its_time_has_failed_for_that_and_is_not_tried_again(marey: Marey) -> None:
+    project = marey.create_project(ProjectCreate(name="lab"))
+    sleep = {"how": "sleep", "seconds": 60}
+    job = project.submit(JobCreate(kind="misbehave", params=sleep, resources=Resources(time_limit_s=1)))
+    with pytest.raises(JobUnsuccessful):
+        marey.jobs.wait(job.id, timeout_s=60)
+    ended = marey.jobs.get(job.id)
+    assert ended.state == JobState.FAILED
+    assert ended.failure is not None
+    assert ended.failure.reason == FailureReason.TIMEOUT
+    assert "limit of 1 s" in ended.failure.detail
+    (attempt,) = marey.jobs.attempts(job.id)
+    assert attempt.outcome == "timeout"
