@@ -1,0 +1,554 @@
+"""The controller's rules, on databases made of exact roots."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from made_databases import (
+    arc_track,
+    index_of,
+    made_database,
+    mirrored_track,
+    path_track,
+    random_tracks,
+)
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.scenario import Reference, Trial, reference
+from marey_motion.matching.controller import run_trial
+from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.options import ControllerOptions, DatabaseOptions
+from marey_motion.matching.record import Status, TrialRecord
+from plain_controller import run_plainly
+
+FOLLOWS = ("time", "path", "open_loop")
+EXACT = ControllerOptions(root_inertialisation=False)
+
+
+def circle(speed: float, turn_rate_deg: float, **options: float) -> Trial:
+    return Trial("circle", speed, float(np.radians(turn_rate_deg)), **options)
+
+
+def play(database: MatchingDatabase, trial: Trial | Reference, options: ControllerOptions = EXACT) -> TrialRecord:
+    path = reference(trial) if isinstance(trial, Trial) else trial
+    return run_trial(database, index_of(database), path, options)
+
+
+def offsets(record: TrialRecord, trial: Trial) -> np.ndarray:
+    return np.linalg.norm(record.positions - reference(trial).positions[: len(record.rows)], axis=1)
+
+
+def switches(record: TrialRecord) -> int:
+    return int(np.count_nonzero(record.status == Status.REPLACING))
+
+
+def on_the_circle(record: TrialRecord) -> tuple[np.ndarray, np.ndarray]:
+    """Speeds in m/s and turn rates in deg/s after the approach."""
+    speed = np.linalg.norm(np.diff(record.positions, axis=0), axis=1) * 60
+    turn_rate = np.degrees(np.diff(record.headings)) * 60
+    return speed[180:], turn_rate[180:]
+
+
+# The loop as it is defined
+
+
+@pytest.mark.parametrize("follow", ["time", "open_loop"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        ControllerOptions(),
+        ControllerOptions(root_inertialisation=False, continuing_bias=-0.3, reselect_window_s=0.5),
+        ControllerOptions(search_every_s=1 / 60, switch_margin=0.5, half_life_s=0.3),
+    ],
+    ids=["default", "biased", "eager"],
+)
+def test_the_compiled_loop_does_what_a_plain_one_does(options, follow):
+    database = made_database(random_tracks(12, seed=5))
+    options = replace(options, follow=follow)
+    for trial in (circle(2.2, 60.0), Trial("switching", 1.5, -0.4, approach_s=1.05, switch_every_s=1.35)):
+        record = play(database, trial, options)
+
+        plain = run_plainly(database, reference(trial), options, 420)
+
+        assert record.rows[:420].tolist() == plain.rows
+        np.testing.assert_allclose(
+            record.positions[:420, 1] + 1j * record.positions[:420, 0], plain.positions, atol=1e-9
+        )
+        np.testing.assert_allclose(record.headings[:420], plain.headings, atol=1e-9)
+        assert np.flatnonzero(record.status[:420] == Status.REPLACING).tolist() == [
+            tick + 1 for tick in plain.switches if tick < 419
+        ]
+        assert np.flatnonzero(np.isfinite(record.match_cost[1:420])).tolist() == [tick - 1 for tick in plain.searches]
+
+
+def test_loops_and_ends_are_played_as_a_plain_loop_plays_them():
+    tracks = [track._replace(loop=number % 2 == 0) for number, track in enumerate(random_tracks(5, seed=8))]
+    database = made_database(tracks, DatabaseOptions(end_policy="loop"))
+    options = ControllerOptions(continuing_bias=-50.0)
+
+    record = play(database, circle(2.0, 40.0), options)
+
+    plain = run_plainly(database, reference(circle(2.0, 40.0)), options, 1980)
+    assert plain.forced
+    assert plain.switches
+    wraps = np.isin(record.rows[1:], database.starts) & (np.diff(record.rows) < -140)
+    forced = np.zeros(1980, dtype=bool)
+    forced[[0, *(tick + 1 for tick in plain.forced), *(np.flatnonzero(wraps) + 1)]] = True
+    assert wraps.any()
+    assert record.rows.tolist() == plain.rows
+    assert np.array_equal(record.status == Status.FORCED, forced)
+
+
+# Data that is the scenario
+
+
+@pytest.mark.parametrize("follow", FOLLOWS)
+@pytest.mark.parametrize(("speed", "turn_rate_deg"), [(2.0, 50.0), (1.0, -100.0), (3.0, 25.0)])
+def test_a_clip_that_is_the_trajectory_is_played_from_its_start_to_its_end(speed, turn_rate_deg, follow):
+    trial = circle(speed, turn_rate_deg)
+    record = play(made_database([path_track(trial)]), trial, replace(EXACT, follow=follow))
+
+    speeds, turn_rates = on_the_circle(record)
+    # Where other rows are played than those of the tick, the rounding of a turn's steps adds up instead of repeating.
+    assert offsets(record, trial).max() < (5e-12 if follow == "open_loop" else 1e-12)
+    chord = -speed * (np.radians(turn_rate_deg) / 60) ** 2 / 24
+    np.testing.assert_allclose(speeds.mean() - speed, chord, rtol=1e-3)
+    assert abs(turn_rates.mean() - turn_rate_deg) < 1e-12 * 60
+    assert speeds.std() < 1e-10
+    if follow == "open_loop":
+        assert 1 <= switches(record) <= 5  # what is wished jumps where the circle begins
+    else:
+        assert switches(record) == 0
+        assert record.rows.tolist() == list(range(1980))
+
+
+@pytest.mark.parametrize("follow", FOLLOWS)
+def test_a_straight_line_and_a_circle_give_the_wished_speeds(follow):
+    for speed, turn_rate_deg, bound in ((1.0, 25.0, 0.5), (2.0, 50.0, 1.0), (3.0, 100.0, 1.5)):
+        database = made_database([arc_track(speed, 0.0, 40.0), arc_track(speed, turn_rate_deg, 40.0)])
+        trial = circle(speed, turn_rate_deg)
+
+        record = play(database, trial, replace(EXACT, follow=follow))
+
+        speeds, turn_rates = on_the_circle(record)
+        assert abs(speeds.mean() - speed) <= 2e-4
+        assert abs(turn_rates.mean() - turn_rate_deg) <= 0.5
+        if follow == "open_loop":
+            assert offsets(record, trial).max() < 1e-9
+        if follow == "time":
+            assert offsets(record, trial).mean() < bound
+
+
+def test_a_circle_without_approach_is_followed_exactly():
+    for speed, turn_rate_deg in ((1.0, 25.0), (2.0, 50.0), (3.0, 100.0)):
+        database = made_database([arc_track(speed, 0.0, 40.0), arc_track(speed, turn_rate_deg, 40.0)])
+        trial = circle(speed, turn_rate_deg, approach_s=0.0, duration_s=30.0)
+
+        assert offsets(play(database, trial), trial).max() < 1e-9
+
+
+@pytest.fixture(scope="module")
+def grid() -> dict[tuple[float, float], object]:
+    """Ten seconds of every pair of speed and turn rate."""
+    return {(v, w): arc_track(v, w, 10.0) for v in np.arange(1.0, 3.01, 0.25) for w in np.arange(-100.0, 100.1, 25.0)}
+
+
+def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(grid):
+    # Gaits of both sides in step, so that mirroring changes the roots alone.
+    database = made_database(list(grid.values()))
+    for speed, turn_rate_deg in ((1.0, 25.0), (1.75, 75.0), (3.0, 100.0)):
+        left, right = circle(speed, turn_rate_deg), circle(speed, -turn_rate_deg)
+        difference = offsets(play(database, left), left) - offsets(play(database, right), right)
+        assert np.abs(difference).max() < 1e-12
+
+
+def test_without_tight_turns_tight_circles_are_missed_and_wide_ones_are_not(grid):
+    whole = made_database(list(grid.values()))
+    holed = made_database([track for (_, w), track in grid.items() if abs(w) <= 70.0])
+    for speed in (1.0, 2.0, 3.0):
+        for turn_rate_deg in (75.0, -100.0):
+            trial = circle(speed, turn_rate_deg)
+            assert offsets(play(whole, trial), trial).mean() < 0.3
+            assert offsets(play(holed, trial), trial).mean() > 2.4
+        for turn_rate_deg in (0.0, 25.0, -50.0):
+            trial = circle(speed, turn_rate_deg)
+            assert offsets(play(holed, trial), trial).mean() < 1.0
+
+
+# What must not change the result
+
+
+def test_the_mirrored_dataset_mirrors_the_result():
+    tracks = random_tracks(25, seed=1)
+    database, mirrored = made_database(tracks), made_database([mirrored_track(track) for track in tracks])
+    for number, follow in enumerate(FOLLOWS * 4):
+        trial, opposite = circle(1.0 + number / 6, 20.0 + 6 * number), circle(1.0 + number / 6, -20.0 - 6 * number)
+        options = ControllerOptions(follow=follow)
+
+        record, other = play(database, trial, options), play(mirrored, opposite, options)
+
+        assert np.array_equal(record.rows, other.rows)
+        np.testing.assert_allclose(other.positions, record.positions * (-1.0, 1.0), atol=1e-9)
+        np.testing.assert_allclose(other.headings, -record.headings, atol=1e-9)
+
+
+@pytest.mark.parametrize("selection", ["features", "pose_distance"])
+def test_removing_rows_that_are_never_shown_changes_no_bit(selection):
+    tracks = random_tracks(20, seed=2)
+    database = made_database(tracks)
+    options = ControllerOptions(selection=selection)
+    trials = [circle(1.5, 40.0), circle(2.5, -70.0), Trial("switching", 2.0, 0.3, duration_s=12.0)]
+    records = [play(database, trial, options) for trial in trials]
+    used = np.unique(database_clips(database, np.concatenate([record.rows for record in records])))
+    assert 1 <= len(used) < len(tracks)
+
+    smaller = made_database([tracks[clip] for clip in used], normaliser=database.normaliser)
+
+    for trial, record in zip(trials, records, strict=True):
+        again = play(smaller, trial, options)
+        clips, clips_again = database_clips(database, record.rows), database_clips(smaller, again.rows)
+        assert np.array_equal(clips, used[clips_again])
+        assert np.array_equal(record.rows - database.starts[clips], again.rows - smaller.starts[clips_again])
+        for name in ("positions", "headings", "status", "match_cost", "continuing_cost", "pose_cost"):
+            assert getattr(again, name).tobytes() == getattr(record, name).tobytes(), name
+
+
+def database_clips(database: MatchingDatabase, rows: np.ndarray) -> np.ndarray:
+    return np.searchsorted(database.starts, rows, side="right") - 1
+
+
+def test_a_duplicated_clip_changes_no_trajectory_and_the_lower_uid_is_used():
+    tracks = random_tracks(8, seed=3)
+    database = made_database(tracks)
+    doubled = made_database([track for track in tracks for _ in range(2)], normaliser=database.normaliser)
+    for trial in (circle(1.5, 40.0), circle(2.5, -70.0)):
+        record, again = play(database, trial), play(doubled, trial)
+
+        assert again.positions.tobytes() == record.positions.tobytes()
+        clips = database_clips(doubled, again.rows)
+        assert np.array_equal(clips, 2 * database_clips(database, record.rows))
+
+
+def test_duplicating_the_whole_dataset_leaves_even_a_fitted_normaliser():
+    tracks = random_tracks(8, seed=3)
+    database, doubled = made_database(tracks), made_database(tracks + tracks)
+    trial = circle(1.5, 40.0)
+
+    np.testing.assert_allclose(doubled.normaliser.scale, database.normaliser.scale, rtol=1e-14)
+    np.testing.assert_allclose(play(doubled, trial).positions, play(database, trial).positions, atol=1e-9)
+
+
+def test_where_a_clip_was_recorded_does_not_matter():
+    tracks = random_tracks(10, seed=4)
+    moved = []
+    for number, track in enumerate(tracks):
+        angle = 0.7 * number
+        sine, cosine = np.sin(angle), np.cos(angle)
+        x, z = track.positions.T
+        turned = np.stack((x * cosine + z * sine, z * cosine - x * sine), axis=1)
+        moved.append(track._replace(positions=turned + np.array([3.0 * number, -7.0]), headings=track.headings + angle))
+    trial = circle(2.0, -60.0)
+
+    record, again = play(made_database(tracks), trial), play(made_database(moved), trial)
+
+    assert np.array_equal(record.rows, again.rows)
+    np.testing.assert_allclose(again.positions, record.positions, atol=1e-9)
+
+
+def test_a_turn_rate_near_zero_ends_up_next_to_zero():
+    database = made_database([arc_track(2.0, w, 40.0) for w in (-25.0, 0.0, 25.0)])
+
+    straight, nearly = play(database, circle(2.0, 0.0)), play(database, circle(2.0, 1e-5))
+
+    assert np.linalg.norm(straight.positions - nearly.positions, axis=1).max() < 1e-3
+
+
+def test_the_same_trial_gives_the_same_bytes():
+    database = made_database(random_tracks(6, seed=6))
+    records = [play(database, circle(2.0, 60.0), ControllerOptions()) for _ in range(2)]
+
+    for name in ("rows", "positions", "headings", "status", "match_cost", "continuing_cost", "pose_cost"):
+        assert getattr(records[0], name).tobytes() == getattr(records[1], name).tobytes()
+
+
+# When it searches and what it chooses
+
+
+def searched(record: TrialRecord) -> list[int]:
+    return np.flatnonzero(np.isfinite(record.match_cost)).tolist()
+
+
+def test_a_trial_starts_on_the_row_whose_trajectory_fits_whatever_its_pose():
+    slow, fast = arc_track(1.0, 0.0, 10.0), arc_track(3.0, 0.0, 10.0)
+    database = made_database([slow, fast._replace(pose=fast.pose + 100.0)])
+
+    record = play(database, circle(3.0, 0.0))
+
+    assert record.rows[0] == database.starts[1]
+    assert record.status[0] == Status.FORCED
+    np.testing.assert_allclose(record.match_cost[0], 0.0, atol=1e-20)
+
+
+def test_searches_come_at_multiples_of_the_period():
+    database = made_database([arc_track(2.0, 0.0, 60.0)])
+
+    record = play(database, circle(2.0, 0.0, duration_s=2.0), replace(EXACT, search_every_s=0.25))
+
+    assert searched(record) == list(range(0, 300, 15))
+    assert np.all(np.isnan(record.continuing_cost) == np.isin(np.arange(300), searched(record)[1:], invert=True))
+
+
+def test_a_jump_of_the_wished_speed_is_searched_for_at_once():
+    database = made_database([arc_track(1.0, 0.0, 60.0), arc_track(4.0, 0.0, 60.0)])
+    trial = Trial("switching", 1.0, 0.0, approach_s=1.0, duration_s=4.0, switch_every_s=1.25)
+
+    record = play(database, trial, replace(EXACT, search_every_s=0.5, follow="open_loop"))
+
+    # The speed jumps at 2.25, 3.5 and 4.75 s.
+    assert searched(record) == sorted([*range(0, 300, 30), 135, 285])
+    assert record.status[136] == Status.REPLACING
+
+
+def test_jumps_are_searched_for_at_most_once_in_a_period():
+    database = made_database([arc_track(1.0, 0.0, 60.0), arc_track(4.0, 0.0, 60.0)])
+    trial = Trial("switching", 1.0, 0.0, approach_s=1.0, duration_s=1.0, switch_every_s=5 / 60)
+
+    record = play(database, trial, replace(EXACT, search_every_s=0.5))
+
+    # From 65 on the speed jumps every 5 ticks.
+    assert searched(record) == [0, 30, 60, 65, 90, 95]
+
+
+def test_at_the_end_of_a_clip_another_row_must_be_chosen():
+    database = made_database([arc_track(2.0, 0.0, 5.05)])
+    options = replace(EXACT, search_every_s=0.5, continuing_bias=-1e9)
+
+    record = play(database, circle(2.0, 0.0, duration_s=7.0), options)
+
+    assert record.rows[302] == 302  # the last frame, no multiple of the period
+    assert record.status[303] == Status.FORCED
+    assert np.isnan(record.continuing_cost[302])
+    assert np.isfinite(record.match_cost[302])
+    assert switches(record) == 0
+    assert record.status[302] == Status.KEPT
+
+
+def test_a_loop_goes_round_without_being_forced_to_search():
+    track = arc_track(1.0, 90.0, 4.0, loop=True)
+    database = made_database([track], DatabaseOptions(end_policy="loop"))
+    options = replace(EXACT, follow="open_loop", continuing_bias=-1e9)
+
+    record = play(database, circle(1.0, 90.0, approach_s=0.0, duration_s=20.0), options)
+
+    assert np.array_equal(record.rows, np.arange(1200) % 240)
+    assert np.flatnonzero(record.status == Status.FORCED).tolist() == [0, 240, 480, 720, 960]
+    assert switches(record) == 0
+    trial = circle(1.0, 90.0, approach_s=0.0, duration_s=20.0)
+    assert offsets(record, trial).max() < 1e-9
+
+
+def test_a_clip_not_marked_as_a_loop_ends_even_where_loops_go_round():
+    database = made_database([arc_track(1.0, 90.0, 4.0)], DatabaseOptions(end_policy="loop"))
+
+    record = play(database, circle(1.0, 90.0, approach_s=0.0), replace(EXACT, continuing_bias=-1e9))
+
+    assert np.isnan(record.continuing_cost[239])
+    assert record.status[240] == Status.FORCED
+
+
+def test_going_on_wins_unless_a_switch_is_cheaper_by_more_than_the_margin():
+    database = made_database([arc_track(2.0, 0.0, 60.0), arc_track(2.0, 50.0, 60.0)])
+    trial = circle(2.0, 50.0)
+    eager = play(database, trial, replace(EXACT, follow="open_loop"))
+    assert switches(eager) >= 1
+    first = int(np.flatnonzero(eager.status == Status.REPLACING)[0]) - 1
+    gain = eager.continuing_cost[first] - eager.match_cost[first]
+    assert gain > 0.0
+
+    just_enough = play(database, trial, replace(EXACT, follow="open_loop", switch_margin=0.999 * gain))
+    too_much = play(database, trial, replace(EXACT, follow="open_loop", switch_margin=1.001 * gain))
+
+    assert just_enough.status[first + 1] == Status.REPLACING
+    assert too_much.status[first + 1] == Status.KEPT
+    assert too_much.match_cost[first] == too_much.continuing_cost[first]
+
+
+def test_a_bias_towards_going_on_is_a_margin_and_its_opposite_makes_restless():
+    database = made_database(random_tracks(20, seed=7))
+    trial = circle(2.0, 60.0)
+
+    margin = play(database, trial, replace(EXACT, switch_margin=0.5))
+    bias = play(database, trial, replace(EXACT, switch_margin=0.0, continuing_bias=-0.5))
+    restless = play(database, trial, replace(EXACT, continuing_bias=0.5))
+
+    assert np.array_equal(margin.rows, bias.rows)
+    assert switches(margin) < switches(play(database, trial)) <= switches(restless)
+
+
+def test_rows_near_the_current_one_are_left_out_of_the_search_on_request():
+    database = made_database(random_tracks(12, seed=9))
+    trial = circle(2.0, 60.0)
+
+    free = play(database, trial, EXACT)
+    apart = play(database, trial, replace(EXACT, reselect_window_s=1 / 3))
+
+    def nearest_switch(record: TrialRecord) -> int:
+        ticks = np.flatnonzero(record.status == Status.REPLACING)
+        before, after = record.rows[ticks - 1], record.rows[ticks] - 1
+        same = database_clips(database, before) == database_clips(database, after)
+        return int(np.abs(after - before)[same].min(initial=10**6))
+
+    assert nearest_switch(free) <= 20 < nearest_switch(apart)
+
+
+def test_a_window_wider_than_the_whole_dataset_still_leaves_a_way_on():
+    database = made_database([arc_track(2.0, 0.0, 4.0)])
+
+    record = play(database, circle(2.0, 0.0), replace(EXACT, reselect_window_s=60.0))
+
+    assert record.rows[:240].tolist() == list(range(240))
+    assert record.status[240] == Status.FORCED
+
+
+def test_among_equal_rows_the_lowest_is_chosen():
+    database = made_database([arc_track(2.0, 0.0, 10.0, uid=uid) for uid in ("b", "a", "c")])
+
+    assert play(database, circle(2.0, 0.0)).rows[0] == 0
+
+
+# The paper's literal cost
+
+
+def test_by_pose_distance_the_cost_is_metres_over_the_pose_joints_beside_the_trajectory():
+    database = made_database(random_tracks(12, seed=11))
+    trial = circle(2.0, 60.0, duration_s=4.0)
+
+    record = play(database, trial, replace(EXACT, selection="pose_distance"))
+
+    tick = int(np.flatnonzero(record.status == Status.REPLACING)[0]) - 1
+    row, chosen = record.rows[tick], record.rows[tick + 1] - 1
+    points = database.pose_points.astype(np.float64)
+    distances = np.linalg.norm(points - points[row], axis=-1).sum(axis=-1)
+    costs = distances + trajectory_costs(database, record, reference(trial), tick)
+    costs[~database.selectable] = np.inf
+    assert chosen == np.argmin(costs)
+    np.testing.assert_allclose(record.match_cost[tick], costs[chosen], rtol=1e-12)
+
+
+def trajectory_costs(database: MatchingDatabase, record: TrialRecord, path: Reference, tick: int) -> np.ndarray:
+    ahead = tick + np.array([20, 40, 60])
+    sine, cosine = np.sin(record.headings[tick]), np.cos(record.headings[tick])
+    x, z = (path.positions[ahead] - record.positions[tick]).T
+    turn = path.headings[ahead] - record.headings[tick]
+    places = np.stack((x * cosine - z * sine, x * sine + z * cosine), axis=1)
+    raw = np.concatenate((places.ravel(), np.stack((np.sin(turn), np.cos(turn)), axis=1).ravel()))
+    return (((database.features[:, 15:] - raw) / database.normaliser.scale[15:]) ** 2).sum(axis=1)
+
+
+# The root
+
+
+def test_blended_root_velocity_does_not_jump_at_a_switch():
+    database = made_database([arc_track(1.0, 0.0, 60.0), arc_track(4.0, 0.0, 60.0)])
+    trial = Trial("switching", 1.0, 0.0, approach_s=1.0, duration_s=4.0, switch_every_s=2.0)
+
+    plain = play(database, trial, replace(EXACT, follow="open_loop"))
+    blended = play(database, trial, ControllerOptions(follow="open_loop"))
+
+    def speeds(record: TrialRecord) -> np.ndarray:
+        return np.linalg.norm(np.diff(record.positions, axis=0), axis=1) * 60
+
+    tick = int(np.flatnonzero(blended.status == Status.REPLACING)[0])
+    assert np.abs(np.diff(speeds(plain))).max() > 2.99
+    assert abs(speeds(blended)[tick - 1] - 1.0) < 1e-9  # the first step of the new clip, at the old one's speed
+    y = 2 * np.log(2) / 0.1
+    elapsed = np.arange(60) / 60
+    expected = 4.0 - 3.0 * np.exp(-y * elapsed) * (1 + y * elapsed)
+    np.testing.assert_allclose(speeds(blended)[tick - 1 : tick + 59], expected, atol=1e-9)
+
+
+def test_a_pull_towards_the_reference_and_a_clamp_keep_the_character_near():
+    database = made_database([arc_track(1.0, 0.0, 60.0)])
+    trial = circle(1.0, 50.0)
+
+    free = offsets(play(database, trial), trial).max()
+    pulled = offsets(play(database, trial, replace(EXACT, root_adjustment=5.0)), trial).max()
+    clamped = offsets(play(database, trial, replace(EXACT, root_clamp_m=0.25)), trial).max()
+
+    assert free > 1.0
+    assert pulled < 0.5 * free
+    assert abs(clamped - 0.25) < 1e-9
+
+
+# Following a path
+
+
+def test_following_the_path_a_slow_character_is_not_hurried_along():
+    database = made_database([arc_track(1.0, w, 60.0) for w in (-60.0, -30.0, 0.0, 30.0, 60.0)])
+    trial = circle(2.0, 30.0)
+
+    by_time = play(database, trial, EXACT)
+    by_path = play(database, trial, replace(EXACT, follow="path"))
+
+    def distance_to_path(record: TrialRecord) -> float:
+        path = reference(trial).positions
+        return float(np.linalg.norm(record.positions[:, None] - path[None], axis=-1).min(axis=1).max())
+
+    assert distance_to_path(by_path) < 0.5
+    assert distance_to_path(by_time) > 3.0
+
+
+def test_a_character_faster_than_the_path_goes_on_round_it_past_its_end():
+    database = made_database([arc_track(3.0, w, 60.0) for w in (0.0, 45.0, 90.0, 135.0)])
+    trial = circle(1.5, 45.0, duration_s=20.0)
+
+    record = play(database, trial, replace(EXACT, follow="path"))
+
+    centre = np.array([1.5 / np.radians(45), 4.5])
+    radius = np.linalg.norm(record.positions[240:] - centre, axis=1)
+    assert np.abs(radius - 1.5 / np.radians(45)).max() < 1.0
+    assert record.headings[-1] > 1.3 * np.radians(45) * 20.0
+
+
+# What cannot be played
+
+
+@pytest.mark.parametrize(
+    ("options", "where"),
+    [
+        ({"search_every_s": 0.0}, "search_every_s"),
+        ({"half_life_s": 0.0}, "half_life_s"),
+        ({"switch_margin": -0.1}, "switch_margin"),
+        ({"reselect_window_s": -1.0}, "reselect_window_s"),
+        ({"root_adjustment": -1.0}, "root_adjustment"),
+        ({"root_clamp_m": -1.0}, "root_clamp_m"),
+        ({"continuing_bias": float("nan")}, "finite"),
+    ],
+)
+def test_options_that_make_no_sense_are_named(options, where):
+    database = made_database([arc_track(1.0, 0.0, 5.0)])
+
+    with pytest.raises(MotionError, match=where):
+        play(database, circle(1.0, 0.0), replace(EXACT, **options))
+
+
+def test_a_trajectory_of_another_rate_is_refused():
+    database = made_database([arc_track(1.0, 0.0, 5.0)])
+
+    with pytest.raises(MotionError, match="30 ticks per second, the database 60"):
+        play(database, reference(circle(1.0, 0.0), rate_hz=30.0))
+
+
+def test_an_index_of_other_rows_is_refused():
+    database, other = made_database([arc_track(1.0, 0.0, 5.0)]), made_database([arc_track(1.0, 0.0, 6.0)])
+
+    with pytest.raises(MotionError, match="360 rows, the database 300"):
+        run_trial(database, index_of(other), reference(circle(1.0, 0.0)), EXACT)
+
+
+def test_a_row_that_nothing_follows_may_not_be_choosable():
+    database = made_database([arc_track(1.0, 0.0, 5.0)])
+    everything = replace(database, selectable=np.ones(300, dtype=bool))
+
+    with pytest.raises(MotionError, match="row 299"):
+        play(everything, circle(1.0, 0.0))
