@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 from marey_client.access import Members
 from marey_client.blobs import Blobs
+from marey_client.evaluations import EvaluationHandle, Places, evaluate_request
 from marey_client.imports import Imports
 from marey_client.items import ItemHandle, Items
 from marey_client.jobs import Jobs
@@ -16,6 +17,7 @@ from marey_client.motions import ClipHandle, SkeletonHandle
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.access import Project, ProjectChange
+from marey_schemas.evaluation import EvaluateParams
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate
 from marey_schemas.jobs import CollectionInput, ItemInput, Job, JobCreate, RetargetParams
 from marey_schemas.kinds import Kind
@@ -66,11 +68,15 @@ class ProjectHandle:
         """Its skeletons."""
         return Items(self.transport, self.name, Kind.SKELETON, SkeletonHandle)
 
+    @cached_property
+    def evaluations(self) -> Items[EvaluationHandle]:
+        """Its evaluations."""
+        return Items(self.transport, self.name, Kind.EVALUATION, EvaluationHandle)
+
     def items(self, kind: Kind) -> Items[Any]:
         """Its items of any kind."""
-        if kind is Kind.CLIP:
-            return self.clips
-        return self.skeletons if kind is Kind.SKELETON else Items(self.transport, self.name, kind, ItemHandle)
+        known = {Kind.CLIP: ClipHandle, Kind.SKELETON: SkeletonHandle, Kind.EVALUATION: EvaluationHandle}
+        return Items(self.transport, self.name, kind, known.get(kind, ItemHandle))
 
     @cached_property
     def collections(self) -> Collections:
@@ -107,13 +113,37 @@ class ProjectHandle:
         Mappings of the clips' skeletons that were edited since the clips were imported are gone by.
         """
         inputs: dict[str, Any] = {"clips": tuple(clips), "skeleton": ItemInput(item=skeleton)}
-        if edited := self._edited_rigs(clips):
+        if edited := self.edited_rigs(clips):
             inputs["rigs"] = edited
         given = (params or RetargetParams()).model_dump(exclude_unset=True)
         return self.submit(JobCreate(kind="retarget", inputs=inputs, params=given, into=into, priority=priority))
 
-    def _edited_rigs(self, clips: Sequence[ItemInput | CollectionInput]) -> tuple[ItemInput, ...]:
-        """The skeletons of clips that have more than their first revision."""
+    def evaluate(
+        self,
+        clips: Places,
+        *,
+        into: str = "",
+        normaliser: str | None = None,
+        priority: int = 0,
+        **options: Any,
+    ) -> Job:
+        """Hand in the evaluation of clips of one skeleton: a folder by its path, or folders and clips.
+
+        `options` are those of `EvaluateParams`, for example `name="walks-eval"` or `database={"mirroring": "add"}`;
+        `normaliser` is the id of an evaluation that the result shall be comparable with.
+        """
+        params = EvaluateParams.model_validate(options)
+        return self.submit(evaluate_request(self, clips, params, into=into, normaliser=normaliser, priority=priority))
+
+    def evaluation(self, job: Job, *, on_progress: Callable[[Job], None] | None = None) -> EvaluationHandle:
+        """The evaluation that a job makes, once it is there. Raises `JobUnsuccessful`."""
+        jobs = Jobs(self.transport)
+        jobs.wait(job.id, on_progress=on_progress)
+        (made,) = jobs.outputs(job.id)
+        return self.evaluations.get(made.item)
+
+    def edited_rigs(self, clips: Sequence[ItemInput | CollectionInput]) -> tuple[ItemInput, ...]:
+        """The skeletons of clips that have more than their first revision: their mapping may have been edited."""
         used: set[str] = set()
         for place in clips:
             found = (

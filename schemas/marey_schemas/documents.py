@@ -12,6 +12,7 @@ from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Request
+from marey_schemas.evaluation import EvaluationDocument, EvaluationRecords, EvaluationReport
 from marey_schemas.names import Digest, Tag
 
 MAX_JOINTS = 4096
@@ -213,6 +214,9 @@ SCHEMAS: dict[str, type[Request]] = {
     "marey/motion@1": Motion,
     "marey/clip-info@1": ClipInfo,
     "marey/annotation@1": Annotation,
+    "marey/evaluation@1": EvaluationDocument,
+    "marey/evaluation-records@1": EvaluationRecords,
+    "marey/evaluation-report@1": EvaluationReport,
     "marey/document@1": OpenDocument,
 }
 """Model by schema name."""

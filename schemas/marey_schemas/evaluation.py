@@ -1,13 +1,16 @@
-"""Evaluations of locomotion clips: what can be asked for. The options are those of `marey_motion.evaluation`."""
+"""Evaluations of locomotion clips: what can be asked for, and the documents of an item of the kind `evaluation`.
+
+The options are those of `marey_motion.evaluation`.
+"""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, StringConstraints, model_validator
+from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from marey_schemas.base import Request
-from marey_schemas.names import ItemName, Tag
+from marey_schemas.names import Digest, ItemName, Tag
 
 MOST_TRIALS = 2000
 MOST_SIMULATED_S = 100_000.0
@@ -20,6 +23,7 @@ Speed = Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)]
 TurnRate = Annotated[float, Field(ge=-720, le=720, allow_inf_nan=False)]
 Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 ItemId = Annotated[str, StringConstraints(min_length=1, max_length=64)]
+FigureName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
 
 DEFAULT_SPEEDS_M_S = tuple(1.0 + 0.25 * step for step in range(9))
 DEFAULT_TURN_RATES_DEG_S = tuple(-100.0 + 25.0 * step for step in range(9))
@@ -151,3 +155,58 @@ def count_evaluation_tasks(params: EvaluateParams) -> int:
     """How many tasks the trials are spread over: a few trials each, so that a lost task loses little."""
     per_task = max(TRIALS_PER_TASK, -(-params.trial_count // MOST_EVALUATION_TASKS))
     return -(-params.trial_count // per_task)
+
+
+# --- the parts of an evaluation --------------------------------------------------------------------------------------
+
+
+class EvaluationDocument(Request):
+    """Part `evaluation`: options, provenance, metrics of every trial, usage, coverage, baseline.
+
+    Its members are those of `marey_motion.evaluation.result.EvaluationResult`, with arrays as leaves; what is fixed
+    here is what lists and summaries show.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    schema_: Literal["marey/evaluation@1"] = Field("marey/evaluation@1", alias="schema")
+    verdict: str = Field(max_length=2000, description="How good the clips are, in a sentence or two.")
+    headline: dict[str, float | int | None] = Field(max_length=64, description="The numbers that lists show, by name.")
+
+
+class EvaluationRecords(Request):
+    """Part `records`: every tick of every trial, joined over the trials."""
+
+    model_config = ConfigDict(extra="allow")
+
+    schema_: Literal["marey/evaluation-records@1"] = Field("marey/evaluation-records@1", alias="schema")
+
+
+class StoredFile(Request):
+    """A file that a document names."""
+
+    blob: Digest
+    size_bytes: int = Field(ge=0)
+
+
+class StoredFigure(Request):
+    """A figure in each of its forms: picture, drawing, and what is plotted, as one JSON and as tables of CSV."""
+
+    name: FigureName
+    number: str = Field("", description="The published figure it corresponds to.")
+    title: str
+    caption: str
+    trial: str | None = Field(None, description="The trial it shows, where it shows one.")
+    png: StoredFile
+    svg: StoredFile
+    json_: StoredFile = Field(alias="json")
+    csv: dict[str, StoredFile] = Field(default_factory=dict, max_length=64, description="By name of the table.")
+
+
+class EvaluationReport(Request):
+    """Part `report` of an evaluation: one page for people, and its figures."""
+
+    schema_: Literal["marey/evaluation-report@1"] = Field("marey/evaluation-report@1", alias="schema")
+    title: str
+    html: StoredFile
+    figures: tuple[StoredFigure, ...] = Field((), max_length=10_000)

@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from marey_schemas.base import Request
+from marey_schemas.evaluation import EvaluateParams, count_evaluation_tasks
 from marey_schemas.jobs import ExportParams, ImportParams, InputSpec, JobKind, RetargetParams
 from marey_schemas.kinds import Kind
 
@@ -123,7 +124,31 @@ EXPORT = KindDeclaration(
     outputs={"archive": "file"},
 )
 
-BUILT_IN = (IMPORT, RETARGET, EXPORT)
+EVALUATE = KindDeclaration(
+    name="evaluate",
+    description="Measures how good a set of locomotion clips is, by simulated motion matching.",
+    params=EvaluateParams,
+    implementation="marey_worker.kinds.evaluate:run",
+    gathering="marey_worker.kinds.evaluate:gather",
+    task_count=count_evaluation_tasks,
+    version=1,
+    inputs={
+        "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to evaluate, all of one skeleton."),
+        "rig": InputSpec(
+            kind=Kind.SKELETON,
+            required=False,
+            description="The clips' skeleton at the revision whose mapping to go by, where that was edited since.",
+        ),
+        "normaliser": InputSpec(
+            kind=Kind.EVALUATION,
+            required=False,
+            description="The evaluation whose normaliser is used, so that the results may be compared.",
+        ),
+    },
+    outputs={"evaluation": Kind.EVALUATION},
+)
+
+BUILT_IN = (IMPORT, RETARGET, EXPORT, EVALUATE)
 
 
 class UnknownKindError(LookupError):

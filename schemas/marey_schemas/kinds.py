@@ -53,7 +53,11 @@ PARTS: dict[Kind, dict[str, PartSpec]] = {
     Kind.GRAPH: {"graph": PartSpec("marey/document@1", True)},
     Kind.CHARACTER: {"character": PartSpec("marey/document@1", True)},
     Kind.EDIT: {"edit": PartSpec("marey/document@1", True)},
-    Kind.EVALUATION: {"evaluation": PartSpec("marey/document@1", True), "report": PartSpec("marey/document@1", False)},
+    Kind.EVALUATION: {
+        "evaluation": PartSpec("marey/evaluation@1", True),
+        "records": PartSpec("marey/evaluation-records@1", False),
+        "report": PartSpec("marey/evaluation-report@1", False),
+    },
     Kind.METRIC: {"metric": PartSpec("marey/document@1", True)},
     Kind.STUDY: {"study": PartSpec("marey/document@1", True)},
 }

@@ -106,7 +106,7 @@ def house(server: Server) -> House:
     variables = {
         "project": "lab", "collection": collection, "kind": "clips", "item": made.json()["id"], "part": "info",
         "revision": "1", "user": "reader", "job": lease["job"], "fence": str(lease["fence"]), "digest": SECRET_DIGEST,
-        "job_kind": "import", "token": "token_of_nobody", "upload": "upload_of_nobody",
+        "job_kind": "import", "figure": "offsets", "token": "token_of_nobody", "upload": "upload_of_nobody",
     }  # fmt: skip
     return House(server, tokens, variables)
 

@@ -51,17 +51,18 @@ def retarget(
         {name: value for name, value in given.items() if value not in (None, "", ())}
     )
     with connect(context) as marey:
-        clips = tuple(_clips_at(marey, address) for address in addresses)
+        clips = tuple(clips_at(marey, address) for address in addresses)
         target = require_item(marey, target_address, [Kind.SKELETON])
         project = marey.project(target_address.project)
         submitted = project.retarget(clips, target.id, into=into.strip("/"), params=params, priority=priority)
         if not wait:
             return print_json(submitted) if as_json else typer.echo(submitted.id)
-        ended = _follow(marey, submitted)
+        ended = follow(marey, submitted)
     return _print_ended(ended, as_json)
 
 
-def _clips_at(marey: Marey, address: Address) -> ItemInput | CollectionInput:
+def clips_at(marey: Marey, address: Address) -> ItemInput | CollectionInput:
+    """What an address names as the input of a job: a clip, else a folder."""
     from marey_schemas.jobs import CollectionInput, ItemInput
     from marey_schemas.kinds import Kind
 
@@ -69,18 +70,20 @@ def _clips_at(marey: Marey, address: Address) -> ItemInput | CollectionInput:
     return CollectionInput(collection=address.path) if clip is None else ItemInput(item=clip.id)
 
 
-def _follow(marey: Marey, submitted: Job) -> Job:
+def follow(marey: Marey, submitted: Job, *, count: int | None = None, unit: str = "") -> Job:
+    """Wait until a job has ended, with a bar; of `count` units if it is spread over tasks and they are told."""
     with progress() as advance:
-        return marey.jobs.wait(submitted.id, on_progress=lambda now: _show_progress(now, advance))
+        return marey.jobs.wait(submitted.id, on_progress=lambda now: show_progress(now, advance, count, unit))
 
 
-def _show_progress(now: Job, advance: Advance) -> None:
-    if now.size:
-        advance(f"{now.kind} {now.state}", now.children.get("succeeded", 0), now.size)
-    elif now.progress is not None:
-        advance(now.progress.note or f"{now.kind} {now.state}", now.progress.done, now.progress.total)
-    else:
-        advance(f"{now.kind} {now.state}", 0, None)
+def show_progress(now: Job, advance: Advance, count: int | None = None, unit: str = "") -> None:
+    """How far a job is; the progress of one that gathers tasks is counted in tasks, or in what they count."""
+    what = f"{now.kind} {now.state}"
+    if now.progress is None:
+        return advance(what, 0, None)
+    if now.size and count and now.progress.total == now.size:
+        return advance(unit or what, round(now.progress.done / now.size * count), count)
+    return advance(what if now.size else now.progress.note or what, now.progress.done, now.progress.total)
 
 
 def _print_ended(ended: Job, as_json: bool) -> None:
@@ -161,7 +164,7 @@ def submit_job(
         submitted = marey.project(project).submit(wanted)
         if not wait:
             return print_json(submitted) if as_json else typer.echo(submitted.id)
-        ended = _follow(marey, submitted)
+        ended = follow(marey, submitted)
     tell(f"{ended.id} {ended.state}")
     return print_json(ended if as_json else ended.result)
 
@@ -264,7 +267,7 @@ def retry_job(
         again = marey.jobs.retry(job_id)
         if not wait:
             return print_json(again) if as_json else typer.echo(again.id)
-        ended = _follow(marey, again)
+        ended = follow(marey, again)
     return _print_ended(ended, as_json)
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from urllib.parse import quote
 
 from marey_server.errors import Unavailable
@@ -16,6 +18,7 @@ from marey_server.store import blobs
 from marey_server.store.transaction import Transaction
 
 PIECE_BYTES = MIB
+IMMUTABLE = "private, max-age=31536000, immutable"
 WRITE_TIMEOUT_S = 60
 """A caller who takes longer for one piece has gone, or wants to hold us up."""
 
@@ -47,24 +50,35 @@ def attachment(file_name: str) -> str:
 class BlobSender(Resource):
     """Resources that answer with the bytes of a blob."""
 
-    async def send_blob(self, digest: str, *, disposition: str = "attachment") -> Rendered | None:
-        """Answer with the blob, as far as Range, If-Range and If-None-Match ask for it. Raises `NotFound`."""
+    async def send_blob(
+        self,
+        digest: str,
+        *,
+        disposition: str = "attachment",
+        media_type: str = "application/octet-stream",
+        cache_control: str = IMMUTABLE,
+        headers: Mapping[str, str] = MappingProxyType({}),
+    ) -> Rendered | None:
+        """Answer with the blob, as far as Range, If-Range and If-None-Match ask for it. Raises `NotFound`.
+
+        `cache_control` is for addresses that do not name the blob itself; `headers` go with the bytes.
+        """
         etag = entity_tag(digest.removeprefix("sha256:"), "bytes")
         wanted = parse_range(self.request.headers.get("Range"), self.request.headers.get("If-Range"), etag)
         opened = await self.look_up(_open_blob, digest, wanted, head=self.request.method == "HEAD")
-        headers = {
+        told = {
             "ETag": etag,
-            "Cache-Control": "private, max-age=31536000, immutable",
+            "Cache-Control": cache_control,
             "Repr-Digest": f"sha-256=:{base64.b64encode(bytes.fromhex(digest[7:])).decode()}:",
             "Accept-Ranges": "bytes",
             "Vary": "Accept, Accept-Encoding, Authorization",
         }
         if matches(self.request.headers.get("If-None-Match"), etag):
-            return Rendered(304, headers, b"")
+            return Rendered(304, told, b"")
         if wanted is not None:
-            headers["Content-Range"] = f"bytes {opened.start}-{opened.stop - 1}/{opened.size}"
-        headers |= {"Content-Type": "application/octet-stream", "Content-Disposition": disposition}
-        await self._send_pieces(digest, opened, Rendered(200 if wanted is None else 206, headers, opened.first))
+            told["Content-Range"] = f"bytes {opened.start}-{opened.stop - 1}/{opened.size}"
+        told |= {"Content-Type": media_type, "Content-Disposition": disposition, **headers}
+        await self._send_pieces(digest, opened, Rendered(200 if wanted is None else 206, told, opened.first))
         return None
 
     async def _send_pieces(self, digest: str, opened: _Opened, first: Rendered) -> None:

@@ -49,6 +49,15 @@ def test_every_kind_describes_itself_with_a_json_schema() -> None:
     assert find_kind("retarget").fan_out == "clips"
 
 
+def test_a_kind_that_counts_its_tasks_says_who_gathers_them_and_spreads_no_input() -> None:
+    with pytest.raises(ValueError, match="go together"):
+        declare(task_count=lambda _params: 2)
+    clips = {"clips": InputSpec(kind=Kind.CLIP, many=True)}
+    with pytest.raises(ValueError, match="not from both"):
+        declare(task_count=lambda _params: 2, gathering="tidy:gather", inputs=clips, fan_out="clips")
+    assert declare(task_count=lambda _params: 2, gathering="tidy:gather").document().gathers
+
+
 def test_an_unknown_kind_is_refused_with_the_known_ones() -> None:
     with pytest.raises(UnknownKindError, match="retarget"):
         find_kind("levitate")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Mapping
-from typing import Generic, NamedTuple, TypeVar
+from collections.abc import Mapping
+from typing import NamedTuple
 
 from marey_motion import documents
 from marey_motion.errors import MappingError
@@ -14,9 +13,7 @@ from marey_motion.skeleton import Skeleton
 from marey_schemas.documents import RevisionRef, SkeletonHierarchy, SkeletonMapping
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, NoSuchThing
-
-Key = TypeVar("Key")
-Value = TypeVar("Value")
+from marey_worker.kept import Kept
 
 MOST_KEPT = 512
 LEAST_CONFIDENCE = 0.3
@@ -28,22 +25,6 @@ class Rigged(NamedTuple):
     skeleton: Skeleton
     mapping: JointMapping
     axes: Mapping[str, JointAxes]
-
-
-class _Kept(Generic[Key, Value]):
-    """The values used last."""
-
-    def __init__(self) -> None:
-        self._values: OrderedDict[Key, Value] = OrderedDict()
-
-    def get(self, key: Key, make: Callable[[], Value]) -> Value:
-        """The value of `key`, made if it is not kept."""
-        if key not in self._values:
-            self._values[key] = make()
-        self._values.move_to_end(key)
-        if len(self._values) > MOST_KEPT:
-            self._values.popitem(last=False)
-        return self._values[key]
 
 
 class Rig(NamedTuple):
@@ -58,8 +39,8 @@ class Rig(NamedTuple):
         return cls(ref, ref)
 
 
-_skeletons: _Kept[Rig, Rigged] = _Kept()
-_plans: _Kept[tuple[Rig, Rig, float | None], RetargetPlan] = _Kept()
+_skeletons: Kept[Rig, Rigged] = Kept(MOST_KEPT)
+_plans: Kept[tuple[Rig, Rig, float | None], RetargetPlan] = Kept(MOST_KEPT)
 
 
 def read_rigged(context: Context, rig: Rig) -> Rigged:

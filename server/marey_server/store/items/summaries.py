@@ -22,6 +22,8 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
     """Summary of a revision from its parts' bodies (arrays as references)."""
     if kind is Kind.SKELETON:
         return Summary({"joints": len(bodies["hierarchy"]["joints"])})
+    if kind is Kind.EVALUATION:
+        return Summary({"verdict": bodies["evaluation"]["verdict"], **bodies["evaluation"]["headline"]})
     if kind is not Kind.CLIP:
         return Summary({})
     motion, info = bodies["motion"], bodies.get("info", {})

@@ -1,0 +1,170 @@
+"""`evaluate` and `report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marey_client.cli.addresses import Address, require_item
+from marey_client.cli.failures import WrongUsage
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.jobs import clips_at, follow
+from marey_client.cli.output import print_json, print_table, tell
+
+if TYPE_CHECKING:
+    from marey_client.evaluations import EvaluationHandle
+    from marey_client.marey import Marey
+    from marey_schemas.evaluation import EvaluateParams
+
+WORST_SHOWN = 5
+MOST_VALUES = 200
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    app.command()(evaluate)
+    app.command()(report)
+
+
+def evaluate(
+    context: typer.Context,
+    sources: Annotated[list[str], typer.Argument(help="Clips or folders of clips, of one skeleton: project/folder.")],
+    name: Annotated[str | None, typer.Option(help="Name of the result; default: that of the folder and -eval.")] = None,
+    into: Annotated[str | None, typer.Option(help="Its folder in the project; default: beside the clips'.")] = None,
+    speeds: Annotated[str | None, typer.Option(help="m/s: first:last:step or a,b,c; default 1:3:0.25.")] = None,
+    turns: Annotated[
+        str | None, typer.Option(help="degrees/s, positive to the left: first:last:step or a,b,c; default -100:100:25.")
+    ] = None,
+    families: Annotated[str | None, typer.Option(help="circle, switching, or both; default circle,switching.")] = None,
+    approach: Annotated[float | None, typer.Option(help="Seconds straight ahead before the circle; default 3.")] = None,
+    duration: Annotated[float | None, typer.Option(help="Seconds of the circle; default 30.")] = None,
+    mirror: Annotated[str | None, typer.Option(help="none, add (mirrored twins beside the clips) or only.")] = None,
+    follow_mode: Annotated[str | None, typer.Option("--follow", help="time, path or open_loop; default time.")] = None,
+    end_policy: Annotated[str | None, typer.Option(help="What clips' ends look ahead to: clamp, trim or loop.")] = None,
+    normaliser: Annotated[
+        str | None, typer.Option(help="Use the scales of this evaluation, to be comparable: project/folder/name.")
+    ] = None,
+    baseline: Annotated[bool, typer.Option("--baseline/--no-baseline", help="Measure generated clips, too.")] = True,
+    tag: Annotated[list[str] | None, typer.Option(help="Tag of the result; may be repeated.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the report to this file.")] = None,
+    priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
+    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Measure how good locomotion clips are: accuracy, coverage and use, by simulated motion matching."""
+    addresses = [Address.parse(source) for source in sources]
+    if len({address.project for address in addresses}) > 1:
+        raise WrongUsage("the clips must be in one project")
+    if out is not None and not wait:
+        raise WrongUsage("--out needs the result; leave --no-wait out")
+    folder, _, last = addresses[0].path.rpartition("/")
+    params = _params(
+        name=name or (f"{last}-eval" if last else "evaluation"),
+        tags=tuple(tag or ()) or None,
+        speeds_m_s=_values(speeds),
+        turn_rates_deg_s=_values(turns),
+        families=tuple(families.split(",")) if families else None,
+        approach_s=approach,
+        duration_s=duration,
+        baseline=baseline,
+        database={"mirroring": mirror, "end_policy": end_policy},
+        controller={"follow": follow_mode},
+    )
+    with connect(context) as marey:
+        project = marey.project(addresses[0].project)
+        pinned = _evaluation_at(marey, normaliser).id if normaliser else None
+        submitted = project.evaluate(
+            [clips_at(marey, address) for address in addresses],
+            into=folder if into is None else into.strip("/"),
+            normaliser=pinned,
+            priority=priority,
+            **params.model_dump(exclude_unset=True),
+        )
+        if not wait:
+            return print_json(submitted) if as_json else typer.echo(submitted.id)
+        follow(marey, submitted, count=params.trial_count, unit="trials")
+        found = project.evaluation(submitted)
+        if out is not None:
+            found.save_report(out)
+        _print_evaluation(found, as_json)
+    if out is not None:
+        tell(f"report: {out}")
+    return None
+
+
+def report(
+    context: typer.Context,
+    place: Annotated[str, typer.Argument(help="An evaluation: project/folder/name, or project/id.")],
+    out: Annotated[Path, typer.Option(help="The file to write.")] = Path("report.html"),
+    figures: Annotated[
+        Path | None, typer.Option(help="Write every figure to this folder: PNG, SVG, JSON, CSV.")
+    ] = None,
+    open_it: Annotated[bool, typer.Option("--open", help="Show it in a browser.")] = False,
+) -> None:
+    """Write the report of an evaluation to a file."""
+    with connect(context) as marey:
+        found = _evaluation_at(marey, place)
+        found.save_report(out)
+        drawn = found.save_figures(figures) if figures is not None else []
+    typer.echo(out)
+    if figures is not None:
+        tell(f"{len(drawn)} files of figures in {figures}")
+    if open_it:
+        import webbrowser
+
+        webbrowser.open(out.absolute().as_uri())
+
+
+def _evaluation_at(marey: Marey, place: str) -> EvaluationHandle:
+    from marey_schemas.kinds import Kind
+
+    found: EvaluationHandle = require_item(marey, Address.parse(place), [Kind.EVALUATION])
+    return found
+
+
+def _params(**given: Any) -> EvaluateParams:
+    """The options that were given; defaults stay those of the declaration."""
+    from marey_schemas.evaluation import EvaluateParams
+
+    for group in ("database", "controller"):
+        given[group] = {name: value for name, value in given[group].items() if value is not None} or None
+    return EvaluateParams.model_validate({name: value for name, value in given.items() if value is not None})
+
+
+def _values(text: str | None) -> tuple[float, ...] | None:
+    """`1:3:0.25` as all its values with the last one, or `1,2,3` as they stand."""
+    if text is None:
+        return None
+    try:
+        numbers = [float(part) for part in text.replace(",", ":").split(":")]
+    except ValueError:
+        raise WrongUsage(f"{text!r}: write first:last:step, as in 1:3:0.25, or values, as in 1,1.5,2") from None
+    if ":" not in text:
+        return tuple(numbers)
+    if "," in text or len(numbers) != 3:
+        raise WrongUsage(f"{text!r}: a range is first:last:step, as in 1:3:0.25")
+    first, last, step = numbers
+    if not (step > 0 and last >= first):
+        raise WrongUsage(f"{text!r}: a range goes up in steps above 0")
+    count = int((last - first) / step + 1e-9) + 1
+    if count > MOST_VALUES:
+        raise WrongUsage(f"{text!r}: these are {count} values; at most {MOST_VALUES} are possible")
+    return tuple(first + index * step for index in range(count))
+
+
+def _print_evaluation(found: EvaluationHandle, as_json: bool) -> None:
+    if as_json:
+        return print_json({"evaluation": found.item, "summary": found.summary(), "trials": found.trials()})
+    typer.echo(found.verdict)
+    worst = sorted(found.trials(), key=lambda row: -(row["offset_mean"] or 0.0))[:WORST_SHOWN]
+    rows = [(row["trial"], _number(row["offset_mean"], 2), _number(row["se_v"], 2), _number(row["se_omega_deg"], 1))
+            for row in worst]  # fmt: skip
+    columns = ("worst trials", "offset m", "speed error m/s", "turn error deg/s")
+    print_table(columns, rows, right=columns[1:])
+    return tell(f"{found.path}: marey report {found.project}/{found.path} --out report.html")
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"

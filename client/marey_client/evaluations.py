@@ -1,0 +1,188 @@
+"""Evaluations of locomotion clips: ask for one, and read what it found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_client.downloads import saved_atomically
+from marey_client.items import ItemHandle
+from marey_schemas.evaluation import EvaluateParams, EvaluationReport, StoredFigure
+from marey_schemas.items import Item
+from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
+
+if TYPE_CHECKING:
+    from marey_client.project import ProjectHandle
+
+LOOP_TAG = "loop"
+COSTS = ("match_cost", "continuing_cost", "pose_cost")
+
+Places = str | CollectionInput | ItemInput | Sequence[str | CollectionInput | ItemInput]
+"""Folders by path, or folders and clips as inputs of jobs."""
+
+
+class EvaluationHandle(ItemHandle):
+    """One evaluation."""
+
+    @property
+    def verdict(self) -> str:
+        """How good the clips are, in a sentence."""
+        return str(self.item.summary["verdict"])
+
+    def summary(self) -> dict[str, Any]:
+        """The verdict and the headline numbers; units stand at the ends of the names."""
+        return dict(self.item.summary)
+
+    def document(self, *, revision: int | None = None) -> dict[str, Any]:
+        """Everything but the ticks: options, provenance, metrics, usage, coverage; arrays are numpy arrays."""
+        return self.part("evaluation", revision=revision)
+
+    def trials(self) -> list[dict[str, Any]]:
+        """One row per trial: name, what it asked for, and its metrics."""
+        return list(trial_rows(self.document()))
+
+    def clips(self) -> list[dict[str, Any]]:
+        """One row per clip: name, frames, and how much the trials used it."""
+        return list(clip_rows(self.document()))
+
+    def records(self) -> dict[str, dict[str, NDArray[Any]]]:
+        """Every tick of every trial, by the trial's name: arrays by what they hold, see `record_arrays`."""
+        return record_arrays(self.part("records"))
+
+    def figures(self) -> tuple[StoredFigure, ...]:
+        """The figures that the report has."""
+        return EvaluationReport.model_validate(self.part("report")).figures
+
+    def report(self) -> bytes:
+        """The report: one page of HTML that needs nothing else."""
+        return self._fetch(f"{self.url}/report", "text/html")
+
+    def figure(
+        self,
+        name: str,
+        format: str = "png",  # noqa: A002
+        *,
+        trial: str | None = None,
+        table: str | None = None,
+    ) -> bytes:
+        """A figure as png or svg, or what it plots as json, or one table of that as csv."""
+        params = {"format": format, "trial": trial, "table": table}
+        return self._fetch(f"{self.url}/figures/{name}", "*/*", params)
+
+    def save_report(self, path: Path) -> Path:
+        """Write the report to a file."""
+        return _saved(path, self.report())
+
+    def save_figures(self, folder: Path) -> list[Path]:
+        """Write every figure to a folder, in every form."""
+        return [_saved(folder / name, data) for figure in self.figures() for name, data in self._files_of(figure)]
+
+    def _files_of(self, figure: StoredFigure) -> Iterator[tuple[str, bytes]]:
+        name = figure.name if figure.trial is None else f"{figure.name} {figure.trial}"
+        for form in ("png", "svg", "json"):
+            yield f"{name}.{form}", self.figure(figure.name, form, trial=figure.trial)
+        for table in figure.csv:
+            yield f"{name} {table}.csv", self.figure(figure.name, "csv", trial=figure.trial, table=table)
+
+    def _fetch(self, path: str, accept: str, params: Mapping[str, str | None] | None = None) -> bytes:
+        given = {name: value for name, value in (params or {}).items() if value is not None}
+        return self.transport.send("GET", path, params=given, headers={"Accept": accept}).content
+
+
+def evaluate_request(
+    project: ProjectHandle,
+    clips: Places,
+    params: EvaluateParams,
+    *,
+    into: str,
+    normaliser: str | Item | None,
+    priority: int,
+) -> JobCreate:
+    """The job that evaluates `clips`: loops that are tagged so, and the mapping of a skeleton that was edited since."""
+    places = _places(clips)
+    inputs: dict[str, Any] = {"clips": places}
+    if normaliser is not None:
+        inputs["normaliser"] = ItemInput(item=normaliser if isinstance(normaliser, str) else normaliser.id)
+    if (edited := project.edited_rigs(places)) and len(edited) == 1:
+        inputs["rig"] = edited[0]
+    loops = tuple(dict.fromkeys((*params.loops, *_tagged_loops(project, places))))
+    given = params.model_copy(update={"loops": loops}).model_dump(mode="json", exclude_defaults=True)
+    return JobCreate(kind="evaluate", inputs=inputs, params=given, into=into, priority=priority)
+
+
+def _places(clips: Places) -> tuple[CollectionInput | ItemInput, ...]:
+    several = [clips] if isinstance(clips, str | CollectionInput | ItemInput) else clips
+    return tuple(CollectionInput(collection=one.strip("/")) if isinstance(one, str) else one for one in several)
+
+
+def _tagged_loops(project: ProjectHandle, places: Sequence[CollectionInput | ItemInput]) -> Iterator[str]:
+    for place in places:
+        if isinstance(place, CollectionInput):
+            found = project.clips.list(collection=place.collection, filters={"tag.in": LOOP_TAG})
+            yield from (clip.id for clip in found)
+        elif LOOP_TAG in project.clips.get(place.item).item.tags:
+            yield place.item
+
+
+# -- documents as tables -----------------------------------------------------------------------------------------------
+
+
+def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """One row per trial of an evaluation's document: what it asked for and its metrics, flat."""
+    for one in document["trials"]:
+        asked = one["trial"]
+        turn_rate_deg_s = math.degrees(asked["turn_rate_rad_s"])
+        yield {
+            "trial": f"{asked['family']} v={asked['speed_m_s']:g} w={turn_rate_deg_s:g}",
+            "family": asked["family"],
+            "speed_m_s": asked["speed_m_s"],
+            "turn_rate_deg_s": turn_rate_deg_s,
+            **one["metrics"],
+        }
+
+
+def clip_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """One row per clip of an evaluation's document: its frames at the rate of the trials, and how much it was used."""
+    usage = document["usage"]
+    columns = zip(*(usage[name].tolist() for name in ("ticks", "share", "entries", "trials")), strict=True)
+    for clip, (ticks, share, entries, trials) in zip(document["clips"], columns, strict=True):
+        yield {
+            "clip": clip["name"],
+            "uid": clip["uid"],
+            "mirrored": clip["mirrored_from"] is not None,
+            "loop": clip["loop"],
+            "frames": clip["stop"] - clip["start"],
+            "ticks": ticks,
+            "share": share,
+            "entries": entries,
+            "trials": trials,
+        }
+
+
+def record_arrays(document: Mapping[str, Any]) -> dict[str, dict[str, NDArray[Any]]]:
+    """The ticks of each trial by its name, T of them at `rate_hz` of the document.
+
+    rows (T,): row of the database that is shown; positions (T, 2): root on the ground, metres; headings (T,): radians;
+    status (T,): 0 kept, 1 replacing, 2 replaced, 3 forced; match_cost, continuing_cost, pose_cost (T,): NaN where one
+    is not defined.
+    """
+    starts = document["starts"].tolist()
+    columns = {name: document[name] for name in ("rows", "positions", "headings", "status")}
+    for name in COSTS:
+        columns[name] = np.full(starts[-1], np.nan)
+        columns[name][document[name]["ticks"]] = document[name]["values"]
+    return {
+        trial: {name: column[start:stop] for name, column in columns.items()}
+        for trial, start, stop in zip(document["trials"], starts, starts[1:], strict=False)
+    }
+
+
+def _saved(path: Path, data: bytes) -> Path:
+    with saved_atomically(path) as file:
+        file.write(data)
+    return path

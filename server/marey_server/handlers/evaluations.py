@@ -1,0 +1,137 @@
+"""The reports of evaluations and their figures, as they were written when the evaluation was made."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from marey_schemas.base import Request
+from marey_schemas.evaluation import EvaluationReport, StoredFigure, StoredFile
+from marey_schemas.kinds import Kind
+from marey_server.errors import NotFound
+from marey_server.handlers.declarations import Access, Bytes, reads
+from marey_server.handlers.items import kind_of
+from marey_server.handlers.queries import MAX_INTEGER
+from marey_server.handlers.reply import Rendered
+from marey_server.handlers.resource import Resource
+from marey_server.handlers.streaming import IMMUTABLE, BlobSender
+from marey_server.store import items
+from marey_server.store.transaction import Transaction
+
+FIGURE_TYPES = {
+    "png": "image/png",
+    "svg": "image/svg+xml",
+    "csv": "text/csv; charset=utf-8",
+    "json": "application/json",
+}
+ALONE = "default-src 'none'; base-uri 'none'; form-action 'none'"
+REPORT_POLICY = f"{ALONE}; style-src 'unsafe-inline'; img-src data:; font-src data:; sandbox"
+"""A report shows itself and nothing else: no scripts, no requests, no access to what the browser keeps for the site."""
+
+FIGURE_POLICY = f"{ALONE}; style-src 'unsafe-inline'; img-src data:; sandbox"
+
+
+class ReportQuery(Request):
+    """Of which revision."""
+
+    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Absent: the newest.")
+
+
+class FigureQuery(ReportQuery):
+    """Which form of a figure."""
+
+    format: Literal["png", "svg", "csv", "json"] = Field("png", description="Picture, drawing, or what is plotted.")
+    trial: str | None = Field(None, max_length=100, description="Name of a trial, for figures of one trial.")
+    table: str | None = Field(None, max_length=100, description="Which table, as CSV; absent: the first.")
+
+
+class StoredFileSender(BlobSender):
+    """Resources that answer with a file which a document names."""
+
+    async def send_file(self, file: StoredFile, query: ReportQuery, media_type: str, policy: str) -> Rendered | None:
+        """Answer with the file, to be shown where it is asked for and trusted nowhere."""
+        return await self.send_blob(
+            file.blob,
+            disposition="inline",
+            media_type=media_type,
+            cache_control=IMMUTABLE if query.revision is not None else "private, no-cache",
+            headers={"Content-Security-Policy": policy},
+        )
+
+
+class Report(StoredFileSender):
+    """The report of an evaluation."""
+
+    path = "/projects/{project}/{kind}/{item}/report"
+    tag = "Evaluations"
+
+    @reads(
+        access=Access.READER,
+        query=ReportQuery,
+        answer=Bytes,
+        answer_types=("text/html",),
+        etag=True,
+        also=((206, None), (416, None)),
+        headers=("Range", "If-Range"),
+    )
+    async def get(self, project: str, kind: str, item: str, query: ReportQuery) -> Rendered | None:
+        """The report of an evaluation (kind `evaluations`): one page that needs nothing else."""
+        report = await self.look_up(read_report, project, kind_of(kind), item, query.revision)
+        return await self.send_file(report.html, query, "text/html; charset=utf-8", REPORT_POLICY)
+
+
+class Figure(StoredFileSender):
+    """A figure of an evaluation."""
+
+    path = "/projects/{project}/{kind}/{item}/figures/{figure}"
+    tag = "Evaluations"
+
+    @reads(
+        access=Access.READER,
+        query=FigureQuery,
+        answer=Bytes,
+        answer_types=("image/png", "image/svg+xml", "text/csv", "application/json"),
+        etag=True,
+        also=((206, None), (416, None)),
+        headers=("Range", "If-Range"),
+    )
+    async def get(self, project: str, kind: str, item: str, figure: str, query: FigureQuery) -> Rendered | None:
+        """A figure of an evaluation's report (kind `evaluations`): as a picture, a drawing, or the numbers in it."""
+        report = await self.look_up(read_report, project, kind_of(kind), item, query.revision)
+        file = file_of(find_figure(report, figure, query.trial), query)
+        return await self.send_file(file, query, FIGURE_TYPES[query.format], FIGURE_POLICY)
+
+
+def read_report(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> EvaluationReport:
+    """The report of an evaluation. Raises `NotFound`."""
+    part: dict[str, Any] = items.read_part(tx, project, kind, item_id, "report", revision=revision, arrays="none").tree
+    return EvaluationReport.model_validate(part)
+
+
+def find_figure(report: EvaluationReport, name: str, trial: str | None) -> StoredFigure:
+    """A figure of a report. Raises `NotFound`, and says what there is."""
+    named = [figure for figure in report.figures if figure.name == name]
+    for figure in named:
+        if figure.trial == trial:
+            return figure
+    if not named:
+        known = ", ".join(dict.fromkeys(figure.name for figure in report.figures))
+        raise NotFound(f"The report has no figure {name!r}; it has {known or 'none'}.", code="no-figure")
+    trials = ", ".join(str(figure.trial) for figure in named if figure.trial is not None)
+    told = f"for the trials {trials}" if trials else "for the whole, without a trial"
+    raise NotFound(f"The report has the figure {name!r} {told}.", code="no-figure")
+
+
+def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:
+    """The form of a figure that is asked for. Raises `NotFound`."""
+    if query.format != "csv":
+        return {"png": figure.png, "svg": figure.svg, "json": figure.json_}[query.format]
+    table = query.table or next(iter(figure.csv), None)
+    if table not in figure.csv:
+        tables = ", ".join(figure.csv) or "none"
+        raise NotFound(f"The figure has no table {query.table!r}; it has {tables}.", code="no-table")
+    return figure.csv[table]
+
+
+RESOURCES: tuple[type[Resource], ...] = (Report, Figure)

@@ -1,0 +1,107 @@
+"""Reports and figures of evaluations over HTTP: served as they were stored, to be shown and trusted nowhere."""
+
+import hashlib
+
+import httpx
+import pytest
+
+from rest_server import Server
+
+PAGE = b"<!doctype html><title>Report</title><p>All is well."
+FILES = {"png": b"\x89PNG drawn", "svg": b"<svg/>", "json": b'{"tables": {}}', "csv": b"speed\n1.0\n"}
+TYPES = {"png": "image/png", "svg": "image/svg+xml", "json": "application/json", "csv": "text/csv; charset=utf-8"}
+
+
+def stored(client: httpx.Client, data: bytes) -> dict:
+    digest = f"sha256:{hashlib.sha256(data).hexdigest()}"
+    assert client.put(f"/blobs/{digest}", content=data).is_success
+    return {"blob": digest, "size_bytes": len(data)}
+
+
+@pytest.fixture
+def evaluation(owner: httpx.Client) -> str:
+    """The path of an evaluation with a report of two figures."""
+    forms = {form: stored(owner, data) for form, data in FILES.items()}
+    figure = {"title": "Offsets", "caption": "How far off.", **forms, "csv": {"cells": forms["csv"]}}
+    report = {
+        "schema": "marey/evaluation-report@1",
+        "title": "walks",
+        "html": stored(owner, PAGE),
+        "figures": [{"name": "offsets", **figure}, {"name": "errors", "trial": "circle v=1 w=0", **figure}],
+    }
+    parts = {
+        "evaluation": {"schema": "marey/evaluation@1", "verdict": "Good.", "headline": {"offset_mean_m": 0.3}},
+        "report": report,
+    }
+    made = owner.post("/projects/lab/evaluations", json={"name": "walks-eval", "parts": parts})
+    assert made.status_code == 201, made.text
+    return f"/projects/lab/evaluations/{made.json()['id']}"
+
+
+def test_lists_show_the_verdict_and_the_headline_numbers(owner: httpx.Client, evaluation: str) -> None:
+    (shown,) = owner.get("/projects/lab/evaluations").json()["items"]
+    assert shown["summary"] == {"verdict": "Good.", "offset_mean_m": 0.3}
+
+
+def test_a_report_is_a_page_that_may_do_nothing(owner: httpx.Client, evaluation: str) -> None:
+    answer = owner.get(f"{evaluation}/report")
+    assert (answer.status_code, answer.content) == (200, PAGE)
+    assert answer.headers["Content-Type"] == "text/html; charset=utf-8"
+    assert answer.headers["X-Content-Type-Options"] == "nosniff"
+    policy = answer.headers["Content-Security-Policy"].split("; ")
+    assert "default-src 'none'" in policy
+    assert "sandbox" in policy
+    assert not any(rule.startswith(("script-src", "connect-src")) for rule in policy)
+
+
+def test_a_report_that_is_held_already_is_not_sent_again(owner: httpx.Client, evaluation: str) -> None:
+    etag = owner.get(f"{evaluation}/report").headers["ETag"]
+    again = owner.get(f"{evaluation}/report", headers={"If-None-Match": etag})
+    assert (again.status_code, again.content) == (304, b"")
+    part = owner.get(f"{evaluation}/report", headers={"Range": "bytes=0-4"})
+    assert (part.status_code, part.content) == (206, PAGE[:5])
+
+
+def test_what_a_revision_reports_never_changes_and_what_an_item_reports_may(
+    owner: httpx.Client, evaluation: str
+) -> None:
+    assert "immutable" in owner.get(f"{evaluation}/report?revision=1").headers["Cache-Control"]
+    assert owner.get(f"{evaluation}/report").headers["Cache-Control"] == "private, no-cache"
+
+
+@pytest.mark.parametrize("form", list(FILES))
+def test_a_figure_comes_in_every_form(owner: httpx.Client, evaluation: str, form: str) -> None:
+    answer = owner.get(f"{evaluation}/figures/offsets?format={form}")
+    assert (answer.status_code, answer.content) == (200, FILES[form])
+    assert answer.headers["Content-Type"] == TYPES[form]
+    assert "sandbox" in answer.headers["Content-Security-Policy"]
+
+
+def test_figures_of_one_trial_are_asked_for_by_its_name(owner: httpx.Client, evaluation: str) -> None:
+    assert owner.get(f"{evaluation}/figures/errors", params={"trial": "circle v=1 w=0"}).content == FILES["png"]
+    missing = owner.get(f"{evaluation}/figures/errors", params={"trial": "circle v=9 w=0"})
+    assert (missing.status_code, missing.json()["code"]) == (404, "no-figure")
+    assert "circle v=1 w=0" in missing.json()["detail"]
+
+
+def test_what_is_not_there_is_said_to_be_missing_with_what_there_is(owner: httpx.Client, evaluation: str) -> None:
+    unknown = owner.get(f"{evaluation}/figures/portrait").json()
+    assert (unknown["code"], "offsets, errors" in unknown["detail"]) == ("no-figure", True)
+    table = owner.get(f"{evaluation}/figures/offsets?format=csv&table=rows").json()
+    assert (table["code"], "cells" in table["detail"]) == ("no-table", True)
+    assert owner.get(f"{evaluation}/report?revision=2").status_code == 404
+
+
+def test_other_items_have_no_report(owner: httpx.Client) -> None:
+    joints = [{"name": "hips", "parent": -1, "offset": [0, 1, 0]}]
+    parts = {"hierarchy": {"schema": "marey/skeleton@1", "joints": joints}}
+    made = owner.post("/projects/lab/skeletons", json={"name": "s", "parts": parts}).json()
+    answer = owner.get(f"/projects/lab/skeletons/{made['id']}/report")
+    assert answer.status_code == 404
+
+
+def test_strangers_learn_nothing_of_an_evaluation(server: Server, evaluation: str) -> None:
+    stranger = server.client(server.make_user("mallory"))
+    for path in ("report", "figures/offsets"):
+        answer = stranger.get(f"{evaluation}/{path}")
+        assert (answer.status_code, answer.json()["code"]) == (404, "no-project")

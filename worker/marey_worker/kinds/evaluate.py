@@ -1,0 +1,92 @@
+"""How good a set of locomotion clips is: trials spread over tasks, and one evaluation made of their records."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.result import EvaluationResult
+from marey_motion.evaluation.result_documents import records_from_tree, records_to_tree, result_to_tree
+from marey_motion.evaluation.scenario import suite_trials
+from marey_motion.evaluation.suite import assemble, evaluate_baseline, run_suite
+from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.record import TrialRecord
+from marey_schemas.codecs import MSGPACK, decode_tree, encode_tree
+from marey_schemas.evaluation import EvaluateParams
+from marey_schemas.jobs import StagedOutput
+from marey_schemas.kinds import Kind
+from marey_worker.context import Context, JobRefused
+from marey_worker.kinds.evaluation_options import options_of
+from marey_worker.kinds.evaluation_report import write_report
+from marey_worker.kinds.evaluation_verdict import headline_of, verdict_on
+from marey_worker.kinds.matching_clips import read_database
+
+GATHERING_STEPS = 4
+
+
+def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
+    """Let motion matching follow this task's share of the trials; the result names the file of their records."""
+    options = options_of(params)
+    database = read_database(context, params, options.database)
+    trials = suite_trials(options)[context.task.position :: context.task.size]
+    started = time.monotonic()
+    records = run_suite(database, options, trials=trials, threads=context.threads, progress=context.progress)
+    file = context.scratch / "records.msgpack"
+    file.write_bytes(encode_tree(records_to_tree(trials, records), MSGPACK, arrays="blocks"))
+    return {
+        "trials": len(trials),
+        "simulated_s": sum(len(record.rows) / record.rate_hz for record in records),
+        "seconds": round(time.monotonic() - started, 4),
+        "records": {"blob": context.put_file(file)},
+    }
+
+
+def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Measure the records of all trials and stage the evaluation, with its report if it is wanted."""
+    options = options_of(params)
+    context.progress(0, GATHERING_STEPS, "reading what the trials recorded")
+    database = read_database(context, params, options.database)
+    trials = suite_trials(options)
+    known = _read_records(context, results)
+    records = [known[trial.name] for trial in trials]
+    try:
+        context.progress(1, GATHERING_STEPS, "measuring generated clips" if params.baseline else "")
+        baseline = evaluate_baseline(options, threads=context.threads) if params.baseline else None
+        context.progress(2, GATHERING_STEPS, "measuring the trials")
+        result = assemble(database, options, trials, records, baseline=baseline)
+    except MotionError as error:
+        raise JobRefused(error.code, str(error)) from error
+    parts = {
+        "evaluation": _evaluation_document(result, database),
+        "records": records_to_tree(trials, records),
+    }
+    if params.report:
+        context.progress(3, GATHERING_STEPS, "writing the report")
+        parts["report"] = write_report(context, result, params.name)
+    context.stage(
+        [StagedOutput(name=params.name, kind=Kind.EVALUATION, item_name=params.name, tags=params.tags, parts=parts)]
+    )
+    return {
+        "verdict": parts["evaluation"]["verdict"],
+        **parts["evaluation"]["headline"],
+        "seconds": round(sum(one["seconds"] for one in results), 4),
+    }
+
+
+def _read_records(context: Context, results: Sequence[Mapping[str, Any]]) -> dict[str, TrialRecord]:
+    known: dict[str, TrialRecord] = {}
+    for result in results:
+        known |= records_from_tree(decode_tree(context.blob(result["records"]["blob"]), MSGPACK))
+    return known
+
+
+def _evaluation_document(result: EvaluationResult, database: MatchingDatabase) -> dict[str, Any]:
+    headline = headline_of(result)
+    return {
+        **result_to_tree(result),
+        "normaliser": database.normaliser.as_tree(),
+        "verdict": verdict_on(result, headline),
+        "headline": headline,
+    }
