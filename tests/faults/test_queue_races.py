@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import pytest
 from sqlalchemy import ColumnElement, func, select, true
@@ -319,9 +320,13 @@ def test_a_worker_that_slept_through_its_lease_is_refused_everywhere(desk: Desk,
 def test_without_the_fence_the_stale_worker_gets_through(desk: Desk, act: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The negative control of the test above: it is the fence in the predicate that stops him, and nothing else."""
 
-    def no_fence(*_attempts: tuple[str, int]) -> ColumnElement[bool]:
+    def no_fence(_fence: int) -> ColumnElement[bool]:
         return true()
 
+    def any_fence(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
+        return fencing.held_parameters([(job, fence) for job, _ in attempts for fence in range(10)])
+
     monkeypatch.setattr(fencing, "same_fence", no_fence)
+    monkeypatch.setattr(completion, "held_parameters", any_fence)
     with pytest.raises((pytest.fail.Exception, AssertionError, LookupError, MareyError)):
         stale_worker_story(desk, STALE_ACTS[act])

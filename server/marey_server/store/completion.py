@@ -20,7 +20,7 @@ from marey_schemas.jobs import (
 from marey_server import faults
 from marey_server.errors import MareyError, NotFound
 from marey_server.store import staging
-from marey_server.store.fencing import earlier_answer, held, hold, lease_lost, require_attempt
+from marey_server.store.fencing import HELD, earlier_answer, held, held_parameters, hold, lease_lost, require_attempt
 from marey_server.store.gathering import release_tasks
 from marey_server.store.job_ends import ENDED_COLUMNS, AttemptEnd, Ended, as_ended, end_attempts
 from marey_server.store.queue_policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
@@ -67,26 +67,30 @@ def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> li
     return [_result(tx, one, answers, refused, own) for one in completions]
 
 
+# Built once: building a statement takes longer than running it.
+_WIN = (
+    update(job)
+    .where(HELD)
+    .values(state="succeeded", finished_us=bindparam("now"), lease_expires_us=None, rev=job.c.rev + 1)
+    .returning(
+        *ENDED_COLUMNS,
+        job.c.fence,
+        job.c.into_path,
+        job.c.author_id,
+        job.c.message,
+        job.c.cache_key,
+        job.c.gathers,
+    )
+)
+
+
 def _complete(
     tx: Transaction, requests: Mapping[_Place, CompleteRequest]
 ) -> dict[_Place, tuple[Ended, CompleteAnswer]]:
     """End those of the jobs that are still held, and record and publish what they brought."""
     if not requests:
         return {}
-    won = tx.execute(
-        update(job)
-        .where(held(*requests))
-        .values(state="succeeded", finished_us=tx.now_us, lease_expires_us=None, rev=job.c.rev + 1)
-        .returning(
-            *ENDED_COLUMNS,
-            job.c.fence,
-            job.c.into_path,
-            job.c.author_id,
-            job.c.message,
-            job.c.cache_key,
-            job.c.gathers,
-        )
-    ).all()
+    won = tx.execute(_WIN, {"now": tx.now_us, **held_parameters(requests)}).all()
     staged = staging.staged_drafts(tx, [(row.id, row.fence) for row in won]) if won else {}
     done: dict[_Place, tuple[Ended, CompleteAnswer]] = {}
     records = []
@@ -230,7 +234,7 @@ def fail(
         request.write_id,
         answer.model_dump(mode="json"),
     )
-    carry_out(tx, row, held((job_id, fence)), verdict, end)
+    carry_out(tx, row, held(job_id, fence), verdict, end)
     faults.point("fail.before_commit")
     return answer
 

@@ -6,9 +6,10 @@ attempt repeats this predicate in the transaction of the write, since a check of
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, and_, case, literal_column, select, tuple_
+from sqlalchemy import ColumnElement, Row, and_, bindparam, case, literal_column, select, tuple_
 
 from marey_server.access.principal import Principal
 from marey_server.errors import LeaseLost, NotFound
@@ -21,18 +22,27 @@ QUEUED: ColumnElement[str] = literal_column("'queued'")
 WAITING: ColumnElement[str] = literal_column("'waiting'")
 
 
-def same_fence(*attempts: tuple[str, int]) -> ColumnElement[bool]:
-    """Nobody has claimed the job since this attempt did; of several attempts, each for its own job."""
-    if len(attempts) == 1:
-        return job.c.fence == attempts[0][1]
-    return tuple_(job.c.id, job.c.fence).in_(attempts)
+def same_fence(fence: int) -> ColumnElement[bool]:
+    """Nobody has claimed the job since this attempt did."""
+    return job.c.fence == fence
 
 
-def held(*attempts: tuple[str, int]) -> ColumnElement[bool]:
-    """These attempts, each a job's id and a fence, still hold their jobs: the predicate of every write of a worker."""
-    ids = [job_id for job_id, _ in attempts]
-    of_these = job.c.id == ids[0] if len(ids) == 1 else job.c.id.in_(ids)
-    return and_(of_these, job.c.state == RUNNING, same_fence(*attempts))
+def held(job_id: str, fence: int) -> ColumnElement[bool]:
+    """The attempt still holds its job: the predicate of every write of a worker."""
+    return and_(job.c.id == job_id, job.c.state == RUNNING, same_fence(fence))
+
+
+HELD = and_(
+    job.c.id.in_(bindparam("held_ids", expanding=True)),
+    job.c.state == RUNNING,
+    tuple_(job.c.id, job.c.fence).in_(bindparam("held_attempts", expanding=True)),
+)
+"""The same of several attempts, for statements that are built once; `held_parameters` gives the attempts."""
+
+
+def held_parameters(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
+    """The parameters of `HELD`."""
+    return {"held_ids": [job_id for job_id, _ in attempts], "held_attempts": list(attempts)}
 
 
 def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
@@ -53,7 +63,7 @@ def hold(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any])
 
     Raises `LeaseLost` if the attempt does not hold it any more.
     """
-    statement = select(job.c.project_id, *columns).where(held((job_id, fence))).with_for_update()
+    statement = select(job.c.project_id, *columns).where(held(job_id, fence)).with_for_update()
     row = tx.execute(statement).one_or_none()
     if row is None:
         raise lease_lost(job_id, fence)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import Row, Select, func, select
+from sqlalchemy import Row, Select, bindparam, func, select
 
 from marey_schemas.jobs import Job, JobState, Progress
 from marey_server.store.clock import datetime_of
@@ -24,11 +24,14 @@ def select_jobs() -> Select[Any]:
     )
 
 
+_JOBS_BY_ID = select_jobs().where(job.c.id.in_(bindparam("ids", expanding=True)))
+
+
 def job_documents(tx: Transaction, ids: Sequence[str]) -> list[Job]:
     """The documents of these jobs, in this order."""
     found: dict[str, Job] = {}
     for start in range(0, len(ids), IN_LIST):
-        rows = tx.execute(select_jobs().where(job.c.id.in_(ids[start : start + IN_LIST]))).all()
+        rows = tx.execute(_JOBS_BY_ID, {"ids": list(ids[start : start + IN_LIST])}).all()
         found |= {document.id: document for document in as_documents(tx, rows)}
     return [found[one] for one in ids]
 

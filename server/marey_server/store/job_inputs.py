@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-from sqlalchemy import ColumnElement, Select, func, or_, select
+from sqlalchemy import ColumnElement, bindparam, func, or_, select
 
 from marey_schemas.job_kinds import KindDeclaration
 from marey_schemas.jobs import CollectionInput, InputSpec, ItemInput, JobCreate
@@ -34,6 +34,15 @@ class FoundItem(NamedTuple):
     path: str
 
 
+# Built once: building a statement takes longer than running it.
+_ITEMS = (
+    select(item.c.id, item.c.kind, item.c.name, item.c.head, collection.c.path)
+    .join(collection, collection.c.id == item.c.collection_id)
+    .where(item.c.project_id == bindparam("project_id"), item.c.deleted_us.is_(None))
+)
+_ITEMS_BY_ID = _ITEMS.where(item.c.id.in_(bindparam("ids", expanding=True)))
+
+
 def find_items(tx: Transaction, project: ProjectRow, requests: Iterable[JobCreate]) -> dict[str, FoundItem]:
     """Those items of the project that the requests name one by one, by id."""
     choices = (choice for request in requests for many in request.inputs.values() for choice in _as_many(many))
@@ -41,7 +50,7 @@ def find_items(tx: Transaction, project: ProjectRow, requests: Iterable[JobCreat
     rows = [
         FoundItem(row.id, row.kind, row.name, row.head, row.path)
         for start in range(0, len(wanted), IN_LIST)
-        for row in tx.execute(_items(project).where(item.c.id.in_(wanted[start : start + IN_LIST])))
+        for row in tx.execute(_ITEMS_BY_ID, {"project_id": project.id, "ids": wanted[start : start + IN_LIST]})
     ]
     return {row.id: row for row in rows}
 
@@ -138,10 +147,10 @@ def _pin(found: FoundItem, number: int) -> Pin:
 
 def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: str) -> list[FoundItem]:
     """The items of the input's kind in a collection and below it, by place and name."""
-    statement = _items(project).where(item.c.kind == spec.kind.value).limit(MOST_INPUTS + 1)
+    statement = _ITEMS.where(item.c.kind == spec.kind.value).limit(MOST_INPUTS + 1)
     if path:
         statement = statement.where(_within(path))
-    rows = tx.execute(statement.order_by(collection.c.path, item.c.name, item.c.id))
+    rows = tx.execute(statement.order_by(collection.c.path, item.c.name, item.c.id), {"project_id": project.id})
     return [FoundItem(row.id, row.kind, row.name, row.head, row.path) for row in rows]
 
 
@@ -149,14 +158,6 @@ def _within(path: str) -> ColumnElement[bool]:
     """Compared as text, not with LIKE, which on SQLite takes `A` for `a`."""
     below = f"{path}/"
     return or_(collection.c.path == path, func.substr(collection.c.path, 1, len(below)) == below)
-
-
-def _items(project: ProjectRow) -> Select[Any]:
-    return (
-        select(item.c.id, item.c.kind, item.c.name, item.c.head, collection.c.path)
-        .join(collection, collection.c.id == item.c.collection_id)
-        .where(item.c.project_id == project.id, item.c.deleted_us.is_(None))
-    )
 
 
 def _missing_revisions(request: JobCreate, known: dict[str, FoundItem], at: str) -> list[FieldError]:

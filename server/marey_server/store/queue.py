@@ -94,7 +94,7 @@ def heartbeat(
     if request.progress is not None:
         values["progress"] = request.progress.model_dump(mode="json")
     columns = (job.c.lease_expires_us, job.c.cancel_requested_us, job.c.deadline_us)
-    row = tx.execute(update(job).where(held((job_id, fence))).values(**values).returning(*columns)).one_or_none()
+    row = tx.execute(update(job).where(held(job_id, fence)).values(**values).returning(*columns)).one_or_none()
     if row is None:
         raise lease_lost(job_id, fence)
     return HeartbeatAnswer(

@@ -79,7 +79,7 @@ def reap_page(
     rows = tx.execute(statement).all()
     for row in rows:
         verdict = judge_expired(row, policy)
-        condition = and_(held((row.id, row.fence)), job.c.lease_expires_us <= tx.now_us)
+        condition = and_(held(row.id, row.fence), job.c.lease_expires_us <= tx.now_us)
         end = AttemptEnd(row.id, row.fence, verdict.outcome, "The lease ran out.")
         carry_out(tx, row, condition, verdict, end, fence=job.c.fence + 1)
     last = rows[-1] if len(rows) == limit else None

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, delete, func, insert, select, tuple_, update
+from sqlalchemy import bindparam, delete, func, insert, select, tuple_, update
 
 from marey_schemas.jobs import ItemInput, StagedOutput
 from marey_schemas.kinds import PARTS, Kind
@@ -127,15 +127,17 @@ def _pinned_source(role: str, source: ItemInput, pins: PinnedInputs) -> list[Any
 # -- publishing -------------------------------------------------------------------------------------------------------
 
 
+_BY_ATTEMPTS = tuple_(staged_output.c.job_id, staged_output.c.fence).in_(bindparam("attempts", expanding=True))
+_STAGED = select(staged_output).where(_BY_ATTEMPTS).order_by(staged_output.c.job_id, staged_output.c.position)
+_DROP_STAGED = delete(staged_output).where(_BY_ATTEMPTS)
+
+
 def staged_drafts(
     tx: Transaction, attempts: Collection[tuple[str, int]]
 ) -> dict[tuple[str, int], dict[str, StagedDraft]]:
     """What attempts (job id and fence) staged: drafts by name, in the order staged."""
-    statement = (
-        select(staged_output).where(_staged_by(attempts)).order_by(staged_output.c.job_id, staged_output.c.position)
-    )
     drafts: dict[tuple[str, int], dict[str, StagedDraft]] = {}
-    for row in tx.execute(statement):
+    for row in tx.execute(_STAGED, {"attempts": list(attempts)}):
         drafts.setdefault((row.job_id, row.fence), {})[row.name] = row.draft
     return drafts
 
@@ -152,14 +154,7 @@ def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> boo
 
 def drop_staged(tx: Transaction, attempts: Collection[tuple[str, int]]) -> None:
     """Forget what attempts (job id and fence) staged: they ended without success, or no identical job can use it."""
-    tx.execute(delete(staged_output).where(_staged_by(attempts)))
-
-
-def _staged_by(attempts: Collection[tuple[str, int]]) -> ColumnElement[bool]:
-    if len(attempts) == 1:
-        ((job_id, fence),) = attempts
-        return and_(staged_output.c.job_id == job_id, staged_output.c.fence == fence)
-    return tuple_(staged_output.c.job_id, staged_output.c.fence).in_(list(attempts))
+    tx.execute(_DROP_STAGED, {"attempts": list(attempts)})
 
 
 def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: PinnedInputs) -> dict[str, StagedDraft]:

@@ -30,12 +30,18 @@ NOTE_USE_EVERY_S = 3600
 
 _ATTEMPT_SCOPES = ("read",)
 
-# Every request runs this, so it is built once.
+# Every request runs one of these, so they are built once.
 _USER_TOKEN = (
     select(token.c.id, token.c.secret_hash, token.c.scopes, token.c.expires_us)
     .add_columns(user.c.id.label("user_id"), user.c.name, user.c.administrator, user.c.disabled)
     .join(user, user.c.id == token.c.user_id)
     .where(token.c.prefix == bindparam("prefix"))
+)
+_ATTEMPT_TOKEN = (
+    select(job.c.id, job.c.project_id, job.c.author_id, job.c.state, attempt.c.fence, user.c.name)
+    .add_columns(job.c.fence.label("current_fence"))
+    .select_from(attempt.join(job, job.c.id == attempt.c.job_id).outerjoin(user, user.c.id == job.c.author_id))
+    .where(attempt.c.token_hash == bindparam("hash"))
 )
 
 
@@ -65,13 +71,7 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
     """An attempt lives while its fence is the job's. Once the job has ended, the token only serves to hear again what
     `complete` or `fail` answered: it reads nothing any more. Raises `LeaseLost` once the fence has moved on.
     """
-    statement = (
-        select(job.c.id, job.c.project_id, job.c.author_id, job.c.state, attempt.c.fence, user.c.name)
-        .add_columns(job.c.fence.label("current_fence"))
-        .select_from(attempt.join(job, job.c.id == attempt.c.job_id).outerjoin(user, user.c.id == job.c.author_id))
-        .where(attempt.c.token_hash == hash_secret(secret))
-    )
-    row = tx.execute(statement).first()
+    row = tx.execute(_ATTEMPT_TOKEN, {"hash": hash_secret(secret)}).first()
     if row is None:
         raise _unknown()
     if row.fence != row.current_fence:
