@@ -23,7 +23,8 @@ def as_rotations(
     FormatError    with the joint whose quaternion is zero or not finite, and its frame
     """
     values = np.asarray(values, np.float64)
-    norms = np.linalg.norm(values, axis=2)
+    with np.errstate(over="ignore"):  # a length beyond all numbers is refused below
+        norms = np.linalg.norm(values, axis=2)
     wrong = ~(np.isfinite(norms) & (norms > 1e-6))
     if wrong.any():
         frame, joint = (int(index) for index in np.argwhere(wrong)[0])

@@ -1,0 +1,206 @@
+"""Two evaluations of the same trials, trial by trial: what changed, by how much, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.provenance import require_comparable
+from marey_motion.evaluation.result import EvaluationResult
+from marey_motion.matching.record import TrialRecord
+
+CONFIDENCE = 0.95
+RESAMPLES = 9_999
+SEED = 0
+
+LESS_IS_BETTER = (
+    "abs_se_v",
+    "abs_se_omega_deg",
+    "dse_v",
+    "dse_omega_deg",
+    "offset_mean",
+    "offset_rms",
+    "offset_max",
+    "offset_final",
+    "pose_cost_mean",
+    "pose_cost_p95",
+    "response_s",
+)
+"""Metrics with a direction; of the others only the change is told."""
+
+
+@dataclass(frozen=True)
+class MetricChange:
+    """How one metric of the suite changed.
+
+    Parameters
+    ----------
+    before, after : means over the trials in which both sides define the metric, in the metric's own unit
+    change : mean of after - before over these trials
+    low, high : bounds of the mean change at `CONFIDENCE`, by bootstrap over trials (bias corrected and accelerated)
+    trials : how many trials that is
+    """
+
+    metric: str
+    before: float
+    after: float
+    change: float
+    low: float
+    high: float
+    trials: int
+
+    @property
+    def verdict(self) -> str:
+        """better, worse, changed (a metric without direction) or unclear (the interval holds 0)."""
+        if self.low <= 0.0 <= self.high:
+            return "unclear" if self.low != self.high else "same"
+        if self.metric not in LESS_IS_BETTER:
+            return "changed"
+        return "better" if self.change < 0.0 else "worse"
+
+
+@dataclass(frozen=True)
+class TrialChange:
+    """A trial that went another way: from which tick on, and its headline metrics on both sides."""
+
+    trial: str
+    first_tick: int
+    offset_mean_before: float | None
+    offset_mean_after: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two results of the same trials.
+
+    Parameters
+    ----------
+    metrics : one per metric both sides know, in alphabetical order
+    changed : the trials whose records differ at all, in the suite's order
+    removed, added : uids of the clips that only one side has
+    newly_unused : uids of the clips both have that only the first one used
+    coverage_change_s : (V, O) float64    seconds of data gained per cell of the coverage map
+    """
+
+    before: EvaluationResult
+    after: EvaluationResult
+    metrics: tuple[MetricChange, ...]
+    changed: tuple[TrialChange, ...]
+    removed: tuple[str, ...]
+    added: tuple[str, ...]
+    newly_unused: tuple[str, ...]
+    coverage_change_s: NDArray[np.float64]
+
+
+def compare_results(before: EvaluationResult, after: EvaluationResult) -> Comparison:
+    """Compare two evaluations with the same normaliser, options and scenarios.
+
+    Raises `MotionError` that names what differs, or when a side was read without its records.
+    """
+    require_comparable(before.provenance, after.provenance)
+    if not (len(before.records) == len(before.trials) == len(after.trials) == len(after.records)):
+        raise MotionError("both evaluations are needed with the records of all their trials", code="records-missing")
+    uids = {clip.uid for clip in before.clips}, {clip.uid for clip in after.clips}
+    used = _used(before), _used(after)
+    return Comparison(
+        before=before,
+        after=after,
+        metrics=_metric_changes(before, after),
+        changed=_trial_changes(before, after),
+        removed=tuple(sorted(uids[0] - uids[1])),
+        added=tuple(sorted(uids[1] - uids[0])),
+        newly_unused=tuple(sorted((used[0] - used[1]) & uids[1])),
+        coverage_change_s=after.coverage.seconds - before.coverage.seconds,
+    )
+
+
+def paired_change(metric: str, before: Sequence[float], after: Sequence[float]) -> MetricChange:
+    """The change of one metric over trials paired by index, with its bootstrap interval."""
+    first, second = np.asarray(before, dtype=np.float64), np.asarray(after, dtype=np.float64)
+    change = second - first
+    low, high = _interval(change)
+    return MetricChange(metric, float(first.mean()), float(second.mean()), float(change.mean()), low, high, len(change))
+
+
+def _interval(change: NDArray[np.float64]) -> tuple[float, float]:
+    from scipy.stats import bootstrap
+
+    mean = float(change.mean())
+    if np.all(change == change[0]):  # nothing to resample
+        return mean, mean
+    found = bootstrap(
+        (change,),
+        np.mean,
+        confidence_level=CONFIDENCE,
+        n_resamples=RESAMPLES,
+        method="BCa",
+        rng=np.random.Generator(np.random.PCG64(SEED)),
+    ).confidence_interval
+    return float(found.low), float(found.high)
+
+
+def _metric_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[MetricChange, ...]:
+    changes = []
+    for metric in sorted(_names(before) & _names(after)):
+        pairs = [
+            (first, second)
+            for first, second in zip(_values(before, metric), _values(after, metric), strict=True)
+            if first is not None and second is not None
+        ]
+        if pairs:
+            changes.append(paired_change(metric, *zip(*pairs, strict=True)))
+    return tuple(changes)
+
+
+def _names(result: EvaluationResult) -> set[str]:
+    return {name for trial in result.trials for name in trial.metrics}
+
+
+def _values(result: EvaluationResult, metric: str) -> list[float | None]:
+    return [trial.metrics.get(metric) for trial in result.trials]
+
+
+def _trial_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[TrialChange, ...]:
+    places = _places((before, after))
+    changes = []
+    for index, trial in enumerate(before.trials):
+        tick = _first_difference((before.records[index], after.records[index]), (places[0][index], places[1][index]))
+        if tick is not None:
+            metrics = trial.metrics, after.trials[index].metrics
+            changes.append(
+                TrialChange(trial.trial.name, tick, metrics[0].get("offset_mean"), metrics[1].get("offset_mean"))
+            )
+    return tuple(changes)
+
+
+def _places(results: Iterable[EvaluationResult]) -> list[list[NDArray[np.int64]]]:
+    """Per result and trial (T, 2): which clip, numbered alike for all results, and which frame of it was displayed."""
+    numbers: dict[str, int] = {}
+    return [[_clip_frames(result, record, numbers) for record in result.records] for result in results]
+
+
+def _clip_frames(result: EvaluationResult, record: TrialRecord, numbers: dict[str, int]) -> NDArray[np.int64]:
+    starts = np.array([clip.start for clip in result.clips], dtype=np.int64)
+    clips = np.searchsorted(starts, record.rows, side="right") - 1
+    known = np.array([numbers.setdefault(clip.uid, len(numbers)) for clip in result.clips], dtype=np.int64)
+    return np.stack((known[clips], record.rows - starts[clips]), axis=1)
+
+
+def _first_difference(
+    records: tuple[TrialRecord, TrialRecord], places: tuple[NDArray[np.int64], NDArray[np.int64]]
+) -> int | None:
+    first, second = records
+    differs = (
+        np.any(places[0] != places[1], axis=1)
+        | np.any(first.positions != second.positions, axis=1)
+        | (first.headings != second.headings)
+    )
+    return int(np.argmax(differs)) if differs.any() else None
+
+
+def _used(result: EvaluationResult) -> set[str]:
+    return {result.clips[usage.clip].uid for usage in result.usage if usage.ticks > 0}
