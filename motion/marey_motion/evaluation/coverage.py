@@ -68,8 +68,8 @@ def measure_coverage(
 ) -> Coverage:
     """Windows of all clips but the excluded ones (indices), and how long the cells of the trial grid are covered."""
     rate = database.options.rate_hz
-    parts: list[Windows] = []
-    owners: list[NDArray[np.int32]] = []
+    parts = [Windows(*np.empty((4, 0)))]
+    owners = [np.empty(0, dtype=np.int32)]
     too_short: list[int] = []
     for index, clip in enumerate(database.clips):
         if index in excluded:
@@ -81,10 +81,8 @@ def measure_coverage(
             continue
         parts.append(windows)
         owners.append(np.full(len(windows.speed_m_s), index, dtype=np.int32))
-    joined = Windows(*(np.concatenate([np.empty(0), *columns]) for columns in zip(*parts, strict=True)))
-    return coverage_of(
-        joined, np.concatenate([np.empty(0, np.int32), *owners]), tuple(too_short), options, window_s=1.0 / rate
-    )
+    joined = Windows(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    return coverage_of(joined, np.concatenate(owners), tuple(too_short), options, window_s=1.0 / rate)
 
 
 def coverage_of(
@@ -136,7 +134,7 @@ def symmetry(speeds: Floats, turn_rates_deg_s: Floats, speed_edges: Floats, turn
 
     The cells are those of the map and, where the grid itself is one-sided, their mirror images.
     """
-    sizes = np.unique(np.round(np.abs(turn_edges), EDGE_DECIMALS))
+    sizes: Floats = np.unique(np.round(np.abs(turn_edges), EDGE_DECIMALS))
     bounds = sizes if turn_edges[0] > 0.0 or turn_edges[-1] < 0.0 else np.concatenate(([0.0], sizes[sizes > 0.0]))
     sides = [
         _histogram(speeds[side], speed_edges, np.abs(turn_rates_deg_s[side]), bounds)

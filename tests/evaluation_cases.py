@@ -1,0 +1,109 @@
+"""Trials, records and databases made by hand, for tests of what is measured on them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.evaluation.scenario import Reference, Trial, reference
+from marey_motion.gait import studio_skeleton
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.database import DatabaseClip, MatchingDatabase
+from marey_motion.matching.normaliser import Normaliser
+from marey_motion.matching.options import DatabaseOptions
+from marey_motion.matching.record import Status, TrialRecord
+from marey_motion.rigs import map_joints
+
+RATE_HZ = 60.0
+
+
+def closed_reference(trial: Trial) -> Reference:
+    """The trial's reference with the tick that ends it, so that the circle has a whole number of seconds."""
+    asked = reference(trial, RATE_HZ)
+    return replace(asked, tick_count=asked.tick_count + 1)
+
+
+def record_of(
+    asked: Reference,
+    *,
+    positions: NDArray[np.float64] | None = None,
+    headings: NDArray[np.float64] | None = None,
+    **given: NDArray[np.generic],
+) -> TrialRecord:
+    """A record that follows the reference exactly on one clip, but for what is given."""
+    ticks = asked.tick_count
+    columns = {
+        "rows": np.arange(ticks, dtype=np.int32),
+        "positions": asked.positions[:ticks] if positions is None else positions,
+        "headings": asked.headings[:ticks] if headings is None else headings,
+        "status": np.full(ticks, Status.KEPT, dtype=np.int8),
+        "match_cost": np.full(ticks, np.nan),
+        "continuing_cost": np.full(ticks, np.nan),
+        "pose_cost": np.zeros(ticks),
+    }
+    return TrialRecord(rate_hz=asked.rate_hz, **(columns | given))
+
+
+def straight_record(asked: Reference, speeds_m_s: NDArray[np.float64]) -> TrialRecord:
+    """A record that goes along +z; step k has speed `speeds_m_s[k - 1]`."""
+    z = np.concatenate(([0.0], np.cumsum(speeds_m_s) / asked.rate_hz))
+    return record_of(asked, positions=np.stack((np.zeros_like(z), z), axis=1), headings=np.zeros_like(z))
+
+
+def walked_record(rows: Sequence[int], status: Sequence[Status] | None = None) -> TrialRecord:
+    """A record of which only the displayed rows matter; jumps are chosen unless `status` says otherwise."""
+    shown = np.array(rows, dtype=np.int32)
+    jumped = np.concatenate(([False], np.diff(shown) != 1))
+    chosen = np.where(jumped, Status.REPLACING, Status.KEPT) if status is None else np.array(status)
+    ticks = len(shown)
+    nothing = np.full(ticks, np.nan)
+    return TrialRecord(
+        RATE_HZ,
+        shown,
+        np.zeros((ticks, 2)),
+        np.zeros(ticks),
+        chosen.astype(np.int8),
+        nothing,
+        nothing,
+        np.zeros(ticks),
+    )
+
+
+def clips_of(*frame_counts: int, loop: bool = False) -> tuple[DatabaseClip, ...]:
+    """Clips a, b, c… one after the other."""
+    stops = np.cumsum(frame_counts).tolist()
+    return tuple(
+        DatabaseClip(chr(97 + index), f"clip {index}", "", stop - frames, stop, loop)
+        for index, (frames, stop) in enumerate(zip(frame_counts, stops, strict=True))
+    )
+
+
+def arc(speed_m_s: float, turn_rate_deg_s: float, duration_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Positions (F, 2) and headings (F,) of a circle from the origin, its end included."""
+    trial = Trial("circle", speed_m_s, np.radians(turn_rate_deg_s), approach_s=0.0, duration_s=duration_s)
+    asked = closed_reference(trial)
+    return asked.positions[: asked.tick_count], asked.headings[: asked.tick_count]
+
+
+def root_database(
+    *roots: tuple[NDArray[np.float64], NDArray[np.float64]], options: DatabaseOptions | None = None
+) -> MatchingDatabase:
+    """A database that knows where the roots of its clips go and nothing else: no features, no poses."""
+    clips = clips_of(*(len(headings) for _, headings in roots))
+    rows = clips[-1].stop
+    skeleton = studio_skeleton()
+    rest = np.tile((1.0, 0.0, 0.0, 0.0), skeleton.joint_count)
+    return MatchingDatabase(
+        body=MatchingBody.from_mapping(skeleton, map_joints(skeleton)),
+        clips=clips,
+        options=options or DatabaseOptions(),
+        features=np.zeros((rows, 27)),
+        normaliser=Normaliser(np.zeros(27), np.ones(27), ""),
+        selectable=np.full(rows, True),
+        root_positions=np.concatenate([positions for positions, _ in roots]),
+        root_headings=np.concatenate([headings for _, headings in roots]),
+        pose_points=np.zeros((rows, 7, 3), np.float32),
+        poses=np.tile(np.concatenate((np.zeros(3), rest)).astype(np.float32), (rows, 1)),
+        contacts=np.full((rows, 2), True),
+    )
