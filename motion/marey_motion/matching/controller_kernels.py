@@ -158,7 +158,7 @@ def _search(index, playback, rules, row, query, skip_start, skip_stop):  # type:
 
 
 @_compiled
-def _choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
+def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
     """The row to go on from, its cost, and that of going on from `row` itself; NaN where its clip has ended.
 
     The pose of the query is that of `row`, so that going on costs what its trajectory costs.
@@ -180,7 +180,7 @@ def _choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-untyped-def]
+def first_row(index, playback, rules, wish, root, query):  # type: ignore[no-untyped-def]
     """The row a trial starts with: nearest to the wished trajectory whatever its pose."""
     fill_query(index, playback, rules, wish, 0, 0.0, root[0], root[1], root[2], query)
     weights = np.ones(query.shape[0])
@@ -236,7 +236,7 @@ def run(index, playback, wish, rules, record):  # type: ignore[no-untyped-def]
     query = np.empty(index.rows.shape[1])
     offsets = np.zeros((2, 3))
     root = np.array([wish.positions[0, 0], wish.positions[0, 1], wish.headings[0]])
-    row, first_cost = _first_row(index, playback, rules, wish, root, query)
+    row, first_cost = first_row(index, playback, rules, wish, root, query)
     status = FORCED
     before = when = 0.0
     forced_at = -rules.period
@@ -254,7 +254,7 @@ def run(index, playback, wish, rules, record):  # type: ignore[no-untyped-def]
             record.match_cost[0] = first_cost
         elif due:
             fill_query(index, playback, rules, wish, row, when, root[0], root[1], root[2], query)
-            chosen, record.match_cost[tick], record.continuing_cost[tick] = _choose(index, playback, rules, row, query)
+            chosen, record.match_cost[tick], record.continuing_cost[tick] = choose(index, playback, rules, row, query)
         following = playback.successors[chosen]
         status = FORCED if ended or following != chosen + 1 else KEPT
         if chosen != row:
