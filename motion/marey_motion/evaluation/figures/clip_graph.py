@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.evaluation.figures.clip_graph_layout import Circle, arrange
+from marey_motion.evaluation.figures.clip_graph_layout import OPEN, Circle, arrange
 from marey_motion.evaluation.figures.drawn import Sketch
 from marey_motion.evaluation.figures.paper import (
     COLOURS,
-    HAIRLINE,
+    HEADING,
     QUIET,
+    REFERENCE,
     Place,
     add_panel,
     new_figure,
     shortened,
     write,
 )
-from marey_motion.evaluation.figures.subjects import FigureOptions, Subject, view_trial
-from marey_motion.matching.record import Status
+from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
+from marey_motion.evaluation.relevance import clips_of_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,109 +31,102 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 MOST_CLIPS = 24
-MOST_LINES = 500
+MOST_LINES = 400
 BOW = 0.45  # how far a line is drawn towards the middle of the ring
-SMALLEST_DOT, LARGEST_DOT = 1.5, 90.0  # area in square points
-
-
-class _Walk(NamedTuple):
-    """What a subject displayed: ticks of every frame by clip, and (S, 3) rows left and entered and how often."""
-
-    popularity: dict[str, Ints]
-    names: dict[str, str]
-    switches: Ints
+SIZES, LARGEST_DOT = 8, 90.0  # number of sizes of dots; area in square points
+RADIAL_NAMES = 8  # more names than this run outwards, lest they meet
 
 
 class _Line(NamedTuple):
-    """Transitions from a dot to a dot: uids, dots, how many."""
+    """Transitions from one stretch of a clip to another: uids, frames at the middle of each stretch, how many."""
 
     source: str
-    source_dot: int
+    left: int
     target: str
-    target_dot: int
+    entered: int
     count: int
 
 
 def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: FigureOptions) -> Sketch:
     """Of the suite, or of one trial; two subjects have the same clips in the same places."""
-    walks = [_walk(subject, trial) for subject in subjects]
-    uids = _most_used(walks, min(options.most_clips, MOST_CLIPS))
-    frames = {uid: max(len(walk.popularity.get(uid, ())) for walk in walks) for uid in uids}
-    links: dict[tuple[str, str], int] = {}
-    for subject, walk in zip(subjects, walks, strict=True):
-        _count_links(links, subject, walk)
-    circles = arrange(frames, links)
-    lines = [_lines(subject, walk, circles) for subject, walk in zip(subjects, walks, strict=True)]
-    totals = [{uid: _per_dot(walk.popularity[uid], circle) for uid, circle in circles.items() if uid in walk.popularity}
-              for walk in walks]  # fmt: skip
-    most = max([1, *(int(total.max()) for each in totals for total in each.values())])
-    side = 6.4 if len(subjects) == 1 else 4.6
-    width = 8.2 if len(subjects) == 1 else 9.6
-    figure = new_figure(width, side + 0.5)
-    for number, subject in enumerate(subjects):
-        share = width / len(subjects)
-        panel = add_panel(figure, Place(number * share, 0.1, share, side), title="", grid=False)
-        panel.axis("off")
-        write(panel, (0.02, 1.02), subject.label, transform=panel.transAxes, fontsize=10.5, fontweight="bold")
-        _frame(panel, circles, share / side)
-        _draw_lines(panel, circles, lines[number])
-        _draw_circles(panel, circles, totals[number], walks[number].names, most, options.logarithmic)
-    tables = {"frames": _frame_table(subjects, totals, circles), "transitions": _line_table(subjects, lines, circles)}
-    return Sketch(figure, tables, _caption(subjects, walks, circles, lines))
-
-
-def _walk(subject: Subject, trial: str | None) -> _Walk:
-    result = subject.result
-    names = {clip.uid: clip.name for clip in result.clips}
-    if trial is None:
-        popularity = {result.clips[usage.clip].uid: usage.popularity for usage in result.usage}
-        return _Walk(popularity, names, result.switches.reshape(-1, 3))
-    record = view_trial(subject, trial).record
-    ticks = np.bincount(record.rows, minlength=result.clips[-1].stop)
-    entered = np.flatnonzero(record.status == Status.REPLACING)
-    entered = entered[entered > 0]
-    pairs = np.stack((record.rows[entered - 1], record.rows[entered]), axis=1).astype(np.int64)
-    rows, counts = np.unique(pairs, axis=0, return_counts=True)
-    return _Walk(
-        {clip.uid: ticks[clip.start : clip.stop] for clip in result.clips},
-        names,
-        np.concatenate((rows, counts[:, None]), axis=1).reshape(-1, 3),
+    popularity = [_popularity(subject, trial) for subject in subjects]
+    switches = [subject.switches(trial) for subject in subjects]
+    uids = _most_used(popularity, min(options.most_clips, MOST_CLIPS))
+    circles = arrange(
+        {uid: max(len(each.get(uid, ())) for each in popularity) for uid in uids}, _links(subjects, switches)
     )
+    lines = [_lines(subject, each, circles) for subject, each in zip(subjects, switches, strict=True)]
+    dots = [{uid: _per_dot(each[uid], circles[uid]) for uid in uids if uid in each} for each in popularity]
+    most = max([1, *(int(total.max()) for each in dots for total in each.values())])
+    width, height = (8.6, 6.6) if len(subjects) == 1 else (9.6, 4.7)
+    figure = new_figure(width, height + 0.3)
+    across = width / len(subjects)
+    for number, subject in enumerate(subjects):
+        panel = add_panel(figure, Place(number * across, 0.0, across, height), grid=False)
+        panel.axis("off")
+        write(panel, (0.03, 1.01), subject.label, transform=panel.transAxes, fontsize=HEADING, fontweight="bold")
+        _fit(panel, circles, across / height)
+        _draw_lines(panel, circles, lines[number])
+        _draw_dots(panel, circles, dots[number], most, options.logarithmic)
+        _draw_rings(panel, circles, {clip.uid: clip.name for clip in subject.result.clips})
+    tables = {"frames": _frame_table(subjects, dots, circles), "transitions": _line_table(subjects, lines)}
+    return Sketch(figure, tables, _caption(subjects, popularity, switches, circles, lines))
 
 
-def _most_used(walks: Sequence[_Walk], most: int) -> list[str]:
+def _popularity(subject: Subject, trial: str | None) -> dict[str, Ints]:
+    """Ticks of every frame, by clip."""
+    return {subject.result.clips[usage.clip].uid: usage.popularity for usage in subject.usage(trial)}
+
+
+def _most_used(popularity: Sequence[dict[str, Ints]], most: int) -> list[str]:
     totals: dict[str, int] = {}
-    for walk in walks:
-        for uid, popularity in walk.popularity.items():
-            totals[uid] = totals.get(uid, 0) + int(popularity.sum())
+    for each in popularity:
+        for uid, ticks in each.items():
+            totals[uid] = totals.get(uid, 0) + int(ticks.sum())
     return sorted((uid for uid, total in totals.items() if total), key=lambda uid: (-totals[uid], uid))[:most]
 
 
-def _count_links(links: dict[tuple[str, str], int], subject: Subject, walk: _Walk) -> None:
-    if not len(walk.switches):
-        return
-    clips = subject.clips_of(walk.switches[:, :2])
-    pairs, inverse = np.unique(clips, axis=0, return_inverse=True)
-    counts = np.bincount(inverse.ravel(), weights=walk.switches[:, 2])
-    for (source, target), count in zip(pairs.tolist(), counts, strict=True):
-        key = subject.result.clips[source].uid, subject.result.clips[target].uid
-        links[key] = links.get(key, 0) + int(count)
+def _links(subjects: Sequence[Subject], switches: Sequence[Ints]) -> dict[tuple[str, str], int]:
+    """How often the character went from clip to clip, by both uids."""
+    links: dict[tuple[str, str], int] = {}
+    for subject, each in zip(subjects, switches, strict=True):
+        clips = subject.result.clips
+        pairs, inverse = np.unique(clips_of_rows(clips, each[:, :2]), axis=0, return_inverse=True)
+        counts = np.bincount(inverse.ravel(), weights=each[:, 2], minlength=len(pairs))
+        for (source, target), count in zip(pairs.tolist(), counts.tolist(), strict=True):
+            key = clips[source].uid, clips[target].uid
+            links[key] = links.get(key, 0) + int(count)
+    return links
 
 
-def _lines(subject: Subject, walk: _Walk, circles: dict[str, Circle]) -> list[_Line]:
-    """The transitions between the circles, those from dot to dot as one; the most frequent `MOST_LINES`."""
-    clips = subject.clips_of(walk.switches[:, :2])
-    found: dict[tuple[str, int, str, int], int] = {}
-    for (left, entered, count), (source, target) in zip(walk.switches.tolist(), clips.tolist(), strict=True):
-        first, second = subject.result.clips[source], subject.result.clips[target]
-        if first.uid in circles and second.uid in circles:
-            key = (
-                first.uid, int(circles[first.uid].dot_of(np.int64(left - first.start))),
-                second.uid, int(circles[second.uid].dot_of(np.int64(entered - second.start))),
-            )  # fmt: skip
-            found[key] = found.get(key, 0) + count
-    order = sorted(found.items(), key=lambda item: (-item[1], item[0]))
-    return [_Line(*key, count) for key, count in order[:MOST_LINES]]
+def _lines(subject: Subject, switches: Ints, circles: dict[str, Circle]) -> list[_Line]:
+    """All transitions between the circles, those between the same stretches as one, the most frequent first.
+
+    The stretches are dots of the circles, or so many dots taken together that no more than `MOST_LINES` lines remain.
+    """
+    clips = subject.result.clips
+    owners = clips_of_rows(clips, switches[:, :2])
+    shown = np.array([clip.uid in circles for clip in clips], dtype=np.bool_)
+    kept = shown[owners].all(axis=1)
+    starts = np.array([clip.start for clip in clips], dtype=np.int64)
+    owners, frames, counts = owners[kept], (switches[:, :2] - starts[owners])[kept], switches[kept, 2]
+    factor = 1
+    while True:
+        coarse = {index: circles[clip.uid].coarser(factor) for index, clip in enumerate(clips) if shown[index]}
+        dots = np.zeros_like(frames)
+        for index, circle in coarse.items():
+            mine = owners == index
+            dots[mine] = circle.dot_of(frames[mine])
+        keys, inverse = np.unique(np.concatenate((owners, dots), axis=1), axis=0, return_inverse=True)
+        if len(keys) <= MOST_LINES or all(circle.dots == 1 for circle in coarse.values()):
+            break
+        factor *= 2
+    totals = np.bincount(inverse.ravel(), weights=counts, minlength=len(keys)).astype(np.int64)
+    order = np.lexsort((*keys.T[::-1], -totals))[:MOST_LINES]
+    return [
+        _Line(clips[a].uid, coarse[a].middle_of(p), clips[b].uid, coarse[b].middle_of(q), int(totals[index]))
+        for index, (a, b, p, q) in zip(order, keys[order].tolist(), strict=True)
+    ]
 
 
 def _per_dot(popularity: Ints, circle: Circle) -> Ints:
@@ -140,14 +134,11 @@ def _per_dot(popularity: Ints, circle: Circle) -> Ints:
     return np.bincount(dots, weights=popularity, minlength=circle.dots).astype(np.int64)
 
 
-def _frame(panel: Axes, circles: dict[str, Circle], aspect: float) -> None:
+def _fit(panel: Axes, circles: dict[str, Circle], aspect: float) -> None:
     """Limits that hold all circles and their names, at one scale in both directions."""
     reach = max([1.0, *(float(np.linalg.norm(circle.centre)) + circle.radius for circle in circles.values())])
-    high = 1.22 * reach
-    across = max(high * aspect, 1.0)
-    if aspect < 1.25:
-        across, high = 1.55 * reach, 1.55 * reach / aspect
-    panel.set(xlim=(-across, across), ylim=(-high, high))
+    high = max((1.30 if len(circles) > RADIAL_NAMES else 1.16) * reach, 1.45 * reach / aspect)
+    panel.set(xlim=(-high * aspect, high * aspect), ylim=(-high, high))
 
 
 def _draw_lines(panel: Axes, circles: dict[str, Circle], lines: Sequence[_Line]) -> None:
@@ -155,106 +146,100 @@ def _draw_lines(panel: Axes, circles: dict[str, Circle], lines: Sequence[_Line])
     from matplotlib.collections import PathCollection
     from matplotlib.path import Path
 
-    if not lines:
-        return
-    colour_of = {uid: COLOURS[number % len(COLOURS)] for number, uid in enumerate(circles)}
-    most = max(line.count for line in lines)
+    colours = _colours(circles)
+    most = max([1, *(line.count for line in lines)])
     codes = [Path.MOVETO, Path.CURVE3, Path.CURVE3]
-    paths, colours, widths = [], [], []
+    paths, edges, widths = [], [], []
     for line in reversed(lines):
-        first = circles[line.source].place_of(np.int64(line.source_dot))
-        last = circles[line.target].place_of(np.int64(line.target_dot))
-        same = line.source == line.target
-        middle = circles[line.source].centre if same else np.zeros(2)
-        bend = (1.0 - BOW) * 0.5 * (first + last) + BOW * middle
-        paths.append(Path(np.stack((first, bend, last)), codes))
+        first, last = circles[line.source].place_of(line.left), circles[line.target].place_of(line.entered)
+        middle = circles[line.source].centre if line.source == line.target else np.zeros(2)
+        paths.append(Path(np.stack((first, (1.0 - BOW) * 0.5 * (first + last) + BOW * middle, last)), codes))
         strength = (line.count / most) ** 0.5
-        colours.append((colour_of[line.source], 0.15 + 0.65 * strength))
-        widths.append(0.5 + 1.6 * strength)
-    panel.add_collection(PathCollection(paths, facecolors="none", edgecolors=colours, linewidths=widths, zorder=2))
+        edges.append((colours[line.source], round(0.15 + 0.65 * strength, 2)))
+        widths.append(round(0.4 + 2.2 * strength, 1))
+    panel.add_collection(PathCollection(paths, facecolors="none", edgecolors=edges, linewidths=widths, zorder=2))
 
 
-def _draw_circles(
-    panel: Axes,
-    circles: dict[str, Circle],
-    totals: dict[str, Ints],
-    names: dict[str, str],
-    most: int,
-    logarithmic: bool,
-) -> None:
+def _draw_dots(panel: Axes, circles: dict[str, Circle], dots: dict[str, Ints], most: int, logarithmic: bool) -> None:
+    """One dot per stretch that was shown, in one of a few sizes: an SVG keeps one shape per size."""
+    colours = _colours(circles)
+    places, levels, looks = [np.empty((0, 2))], [np.empty(0, np.int64)], []
+    for uid, total in dots.items():
+        used = np.flatnonzero(total)
+        share = np.log1p(total[used]) / np.log1p(most) if logarithmic else total[used] / most
+        places.append(circles[uid].place_of(circles[uid].middle_of(used)))
+        levels.append(np.ceil(SIZES * share).astype(np.int64))
+        looks += [colours[uid]] * len(used)
+    place, level, look = np.concatenate(places), np.concatenate(levels), np.array(looks)
+    for size in range(1, SIZES + 1):
+        mine = level == size
+        if mine.any():
+            area = LARGEST_DOT * size / SIZES
+            panel.scatter(*place[mine].T, s=area, c=look[mine], lw=0, alpha=0.9, zorder=3)
+
+
+def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str]) -> None:
+    """The outline of each clip, open above, and its name outside; dotted where this subject has no such clip."""
     from matplotlib.patches import Arc
 
-    many = len(circles) > 1
-    for number, (uid, circle) in enumerate(circles.items()):
-        start = 90 - 360 * (1 - 0.035)
-        size = 2 * circle.radius
-        known = uid in totals
-        outline = Arc(circle.centre, size, size, theta1=start, theta2=90 - 360 * 0.035, color=HAIRLINE, lw=1.2)
-        outline.set_linestyle("-" if known else (0, (2, 3)))
-        panel.add_patch(outline)
-        if known:
-            total = totals[uid]
-            used = np.flatnonzero(total)
-            share = np.log1p(total[used]) / np.log1p(most) if logarithmic else total[used] / most
-            sizes = SMALLEST_DOT + (LARGEST_DOT - SMALLEST_DOT) * share
-            colour = COLOURS[number % len(COLOURS)]
-            panel.scatter(*circle.place_of(used).T, s=sizes, color=colour, lw=0, alpha=0.9, zorder=3)
-        away = circle.centre / np.linalg.norm(circle.centre) if many else np.array([0.0, 1.0])
-        place = circle.centre + (circle.radius + 0.16) * away
-        side = "left" if away[0] > 0.25 else "right" if away[0] < -0.25 else "center"
-        level = "bottom" if away[1] > 0.7 else "top" if away[1] < -0.7 else "center"
-        name = shortened(names.get(uid, "not in this one"), 20)
-        write(panel, (float(place[0]), float(place[1])), name, ha=side, va=level, color=QUIET, zorder=5)
+    for uid, circle in circles.items():
+        ends = 90 - 180 * OPEN
+        ring = Arc(circle.centre, 2 * circle.radius, 2 * circle.radius, theta1=ends + 360 * OPEN, theta2=ends + 360,
+                   color=REFERENCE, lw=0.7, ls="-" if uid in names else (0, (1, 3)))  # fmt: skip
+        panel.add_patch(ring)
+        distance = float(np.linalg.norm(circle.centre))
+        away = circle.centre / distance if distance else np.array([0.0, 1.0])
+        x, y = circle.centre + (circle.radius + 0.16) * away
+        look: dict[str, Any] = {"color": QUIET, "zorder": 5}
+        if len(circles) > RADIAL_NAMES:
+            angle = float(np.degrees(np.arctan2(away[1], away[0])))
+            left = abs(angle) > 90
+            look |= {"rotation": angle + 180 * left, "rotation_mode": "anchor", "ha": "right" if left else "left"}
+        else:
+            look["ha"] = "left" if away[0] > 0.3 else "right" if away[0] < -0.3 else "center"
+            look["va"] = "bottom" if away[1] > 0.3 else "top" if away[1] < -0.3 else "center"
+        write(panel, (float(x), float(y)), shortened(names.get(uid, "(not in this one)"), 20), **look)
+
+
+def _colours(circles: dict[str, Circle]) -> dict[str, str]:
+    return {uid: COLOURS[number % len(COLOURS)] for number, uid in enumerate(circles)}
 
 
 def _frame_table(
-    subjects: Sequence[Subject], totals: Sequence[dict[str, Ints]], circles: dict[str, Circle]
+    subjects: Sequence[Subject], dots: Sequence[dict[str, Ints]], circles: dict[str, Circle]
 ) -> dict[str, list[object]]:
     table: dict[str, list[object]] = {name: [] for name in ("dataset", "clip", "first_frame", "stop_frame", "ticks")}
-    for subject, each in zip(subjects, totals, strict=True):
+    for subject, each in zip(subjects, dots, strict=True):
         for uid, total in each.items():
-            first = _first_frames(circles[uid])
+            bounds = circles[uid].bounds
             table["dataset"] += [subject.label] * len(total)
             table["clip"] += [uid] * len(total)
-            table["first_frame"] += first[:-1].tolist()
-            table["stop_frame"] += first[1:].tolist()
+            table["first_frame"] += bounds[:-1].tolist()
+            table["stop_frame"] += bounds[1:].tolist()
             table["ticks"] += total.tolist()
     return table
 
 
-def _first_frames(circle: Circle) -> Ints:
-    """(dots + 1,) first frame of each dot, and the number of frames."""
-    return np.asarray(-(-np.arange(circle.dots + 1) * circle.frames // circle.dots), dtype=np.int64)
-
-
-def _line_table(
-    subjects: Sequence[Subject], lines: Sequence[Sequence[_Line]], circles: dict[str, Circle]
-) -> dict[str, list[object]]:
+def _line_table(subjects: Sequence[Subject], lines: Sequence[Sequence[_Line]]) -> dict[str, list[object]]:
     names = ("dataset", "from_clip", "from_frame", "to_clip", "to_frame", "count")
-    table: dict[str, list[object]] = {name: [] for name in names}
-    for subject, each in zip(subjects, lines, strict=True):
-        for line in each:
-            left = int(_first_frames(circles[line.source])[line.source_dot])
-            entered = int(_first_frames(circles[line.target])[line.target_dot])
-            row = (subject.label, line.source, left, line.target, entered, line.count)
-            for name, value in zip(names, row, strict=True):
-                table[name].append(value)
-    return table
+    rows = [(subject.label, *line) for subject, each in zip(subjects, lines, strict=True) for line in each]
+    return {name: [row[column] for row in rows] for column, name in enumerate(names)}
 
 
 def _caption(
     subjects: Sequence[Subject],
-    walks: Sequence[_Walk],
+    popularity: Sequence[dict[str, Ints]],
+    switches: Sequence[Ints],
     circles: dict[str, Circle],
     lines: Sequence[Sequence[_Line]],
 ) -> str:
     parts = []
-    for subject, walk, each in zip(subjects, walks, lines, strict=True):
-        made, drawn = int(walk.switches[:, 2].sum()), sum(line.count for line in each)
-        used = sum(1 for popularity in walk.popularity.values() if popularity.any())
-        name = f"{subject.label}: " if subject.label else ""
-        parts.append(f"{name}{min(len(circles), used)} of {used} used clips, {drawn:,} of {made:,} transitions drawn.")
+    for subject, ticks, each, drawn in zip(subjects, popularity, switches, lines, strict=True):
+        used = [uid for uid, own in ticks.items() if own.any()]
+        shown = sum(1 for uid in used if uid in circles)
+        jumps = f"{sum(line.count for line in drawn):,} of {int(each[:, 2].sum()):,} jumps"
+        parts.append(f"{subject.prefix}{shown} of {len(used)} used clips and {jumps} between frames drawn.")
     return (
         "Each circle is a clip that runs clockwise from the gap above; a dot is larger the more its frames were shown. "
-        f"A line is a transition, in the colour of the clip it leaves. {' '.join(parts)}"
+        f"A line is a jump to another place, in the colour of the clip it leaves. {' '.join(parts)}"
     )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,8 @@ Ints = NDArray[np.int64]
 SMALLEST, LARGEST = 0.45, 1.0  # radius of a circle; the square root of its frames decides between
 BETWEEN = 0.28  # room between circles
 OPEN = 0.07  # of a turn is left open above, where a clip begins and ends
-MOST_DOTS = 1_200
-FEWEST_DOTS, FULLEST = 12, 120  # dots on one circle
+MOST_DOTS = 720
+FEWEST_DOTS, FULLEST = 12, 72  # dots on one circle
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +32,23 @@ class Circle:
         """Which dot holds each frame."""
         return np.asarray(np.minimum(frames * self.dots // max(self.frames, 1), self.dots - 1), dtype=np.int64)
 
-    def place_of(self, dots: Ints) -> Floats:
-        """(..., 2) of each dot: clockwise from above."""
-        turn = OPEN / 2 + (1.0 - OPEN) * (np.asarray(dots) + 0.5) / self.dots
+    def coarser(self, factor: int) -> Circle:
+        """The same circle with fewer dots."""
+        return replace(self, dots=max(1, self.dots // factor))
+
+    @property
+    def bounds(self) -> Ints:
+        """(dots + 1,) first frame of each dot, and the number of frames."""
+        return np.asarray(-(-np.arange(self.dots + 1) * self.frames // self.dots), dtype=np.int64)
+
+    def middle_of(self, dots: Any) -> Any:
+        """The frame in the middle of each dot."""
+        bounds = self.bounds
+        return (bounds[dots] + bounds[np.asarray(dots) + 1]) // 2
+
+    def place_of(self, frames: Any) -> Floats:
+        """(..., 2) of each frame: clockwise from above."""
+        turn = OPEN / 2 + (1.0 - OPEN) * (np.asarray(frames) + 0.5) / max(self.frames, 1)
         return self.centre + self.radius * np.stack((np.sin(2 * np.pi * turn), np.cos(2 * np.pi * turn)), axis=-1)
 
 

@@ -15,10 +15,10 @@ from marey_motion.evaluation.figures.paper import (
     MARKERS,
     QUIET,
     REFERENCE,
-    SMALL,
     SPEED,
     TURN_RATE,
     Place,
+    add_keys,
     add_panel,
     mark_sides,
     new_figure,
@@ -123,12 +123,7 @@ def _draw_keys(panel: Axes, subjects: Sequence[Subject], chosen: Sequence[_Point
     if not keys:
         panel.text(0.5, 0.5, "no clip of a second or longer", transform=panel.transAxes, ha="center", color=QUIET)
         return
-    legend = panel.legend(
-        keys, labels, loc="upper left", bbox_to_anchor=(1.01, 1.03), frameon=False, fontsize=SMALL, handletextpad=0.2
-    )
-    for text in legend.get_texts():
-        text.set_color(INK)
-        text.set_parse_math(False)
+    add_keys(panel, handles=keys, labels=labels, loc="upper left", bbox_to_anchor=(1.01, 1.03), handletextpad=0.2)
 
 
 def _other_clips(subject: Subject, points: _Points) -> int:
@@ -153,6 +148,5 @@ def _caption(subjects: Sequence[Subject], chosen: Sequence[_Points]) -> str:
     for subject, points in zip(subjects, chosen, strict=True):
         held, total = len(np.unique(subject.result.coverage.clip)), len(subject.result.coverage.clip)
         drawn = "all of them" if len(points.windows) == total else f"{len(points.windows)} of them, evenly spaced"
-        start = f"{subject.label}: " if subject.label else ""
-        parts.append(f"{start}{total} windows of one second from {held} clips, {drawn} drawn.")
+        parts.append(f"{subject.prefix}{total} windows of one second from {held} clips, {drawn} drawn.")
     return "What the clips hold: each point is the mean speed and turn rate of one second. " + " ".join(parts)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-FINE = 96  # cells of the drawn map per axis
+FINE = 144  # cells of the drawn map per axis
 BANDWIDTH = 0.35  # standard deviation of the smoothing, in cells of the trial grid
 DIRECTION_CELL_M_S = 0.25
 
@@ -189,7 +189,7 @@ def _table(
     x, y = (0.5 * (each[:-1] + each[1:]) for each in edges)
     table: dict[str, object] = {plane.names[0]: np.tile(x, len(y)), plane.names[1]: np.repeat(y, len(x))}
     for subject, each in zip(subjects, maps, strict=True):
-        table[f"{subject.label}_seconds_s" if subject.label else "seconds_s"] = each.ravel()
+        table[subject.column("seconds_s")] = each.ravel()
     return table
 
 
@@ -197,15 +197,16 @@ def _caption(subjects: Sequence[Subject], plane: _Plane) -> str:
     parts = []
     for subject in subjects:
         coverage = subject.result.coverage
-        name = f"{subject.label}: " if subject.label else ""
         held = len(coverage.clip) * subject.seconds_per_row
         if plane is SPEEDS:
             parts.append(
-                f"{name}{held:.0f} s of data, {100 * coverage.index:.0f} % of the trials have enough of it, "
+                f"{subject.prefix}{held:.0f} s of data, {100 * coverage.index:.0f} % of the trials have enough of it, "
                 f"left-right symmetry {coverage.symmetry:.2f}."
             )
         else:
             backward = float(np.mean(coverage.forward_m_s < -0.1)) if len(coverage.clip) else 0.0
             sideways = float(np.mean(np.abs(coverage.strafe_m_s) > np.abs(coverage.forward_m_s))) if held else 0.0
-            parts.append(f"{name}{100 * backward:.0f} % of the time backward, {100 * sideways:.0f} % mainly sideways.")
+            parts.append(
+                f"{subject.prefix}{100 * backward:.0f} % of the time backward, {100 * sideways:.0f} % mainly sideways."
+            )
     return f"{plane.about} {' '.join(parts)}"

@@ -13,11 +13,10 @@ from marey_motion.evaluation.figures.drawn import Sketch
 from marey_motion.evaluation.figures.mixtures import Normals, fit_one, fit_two
 from marey_motion.evaluation.figures.paper import (
     COLOURS,
-    INK,
     QUIET,
     REFERENCE,
-    SMALL,
     Place,
+    add_keys,
     add_panel,
     new_figure,
 )
@@ -43,7 +42,7 @@ class _Errors(NamedTuple):
 def draw_errors(subjects: Sequence[Subject], trial: str | None, options: FigureOptions) -> Sketch:
     """Speed to the left, turn rate to the right; a row per subject on shared scales."""
     chosen = choose_trial(subjects, trial, ("switching", "circle"))
-    views = [view_trial(subject, chosen.name) for subject in subjects]
+    views = [view_trial(subject, chosen) for subject in subjects]
     errors = [_errors(view, options.negate_errors) for view in views]
     meaning = "wished minus recorded" if options.negate_errors else "recorded minus wished"
     quantities = (
@@ -82,18 +81,18 @@ def draw_errors(subjects: Sequence[Subject], trial: str | None, options: FigureO
 
 
 def _errors(view: TrialView, negate: bool) -> tuple[_Errors, _Errors]:
-    kept = view.evaluated
+    series, kept = view.series, view.evaluated
     if not kept.any():
-        raise MotionError("no tick of the trial is evaluated", code="nothing-to-draw", where=view.outcome.trial.name)
+        raise MotionError("no step of the trial is evaluated", code="nothing-to-draw", where=view.trial.name)
     sign = -1.0 if negate else 1.0
     speeds, turn_rates = (
         sign * (recorded - wished)[kept]
         for recorded, wished in (
-            (view.speeds_m_s, view.wished_speeds_m_s),
-            (view.turn_rates_deg_s, view.wished_turn_rates_deg_s),
+            (series.speeds_m_s, series.wanted_speeds_m_s),
+            (np.degrees(series.turn_rates_rad_s), np.degrees(series.wanted_turn_rates_rad_s)),
         )
     )
-    switched = (view.wished_speeds_m_s != view.outcome.trial.speed_m_s)[kept]
+    switched = (series.wanted_speeds_m_s != view.trial.speed_m_s)[kept]
     return (
         _Errors(speeds, fit_one(speeds), fit_two(speeds, switched)),
         _Errors(turn_rates, fit_one(turn_rates), fit_two(turn_rates, switched)),
@@ -127,9 +126,7 @@ def _draw(
         panel.plot(fine, curve, label=f"{name}: {moments} {unit}", **look)
     panel.axvline(0.0, color=REFERENCE, lw=0.8, zorder=1)
     panel.set_xlim(edges[0], edges[-1])
-    legend = panel.legend(loc="upper right", frameon=False, fontsize=SMALL, borderaxespad=0.1)
-    for text in legend.get_texts():
-        text.set_color(INK)
+    add_keys(panel, loc="upper right", borderaxespad=0.1)
 
 
 def _tabulate(
@@ -155,10 +152,9 @@ def _append(table: dict[str, list[object]], row: tuple[object, ...]) -> None:
 def _caption(trial: str, views: Sequence[TrialView], errors: Sequence[tuple[_Errors, _Errors]]) -> str:
     parts = []
     for view, (speed, turn) in zip(views, errors, strict=True):
-        name = f"{view.subject.label}: " if view.subject.label else ""
         parts.append(
-            f"{name}speed {speed.one.means[0]:+.2f} ± {speed.one.deviations[0]:.2f} m/s, "
+            f"{view.subject.prefix}speed {speed.one.means[0]:+.2f} ± {speed.one.deviations[0]:.2f} m/s, "
             f"turn rate {turn.one.means[0]:+.1f} ± {turn.one.deviations[0]:.1f} deg/s"
         )
-    text = f"Errors at every tick of {trial}: the place of a peak is the static error, its width the dynamic one. "
+    text = f"Errors at every step of {trial}: the place of a peak is the static error, its width the dynamic one. "
     return f"{text}{'; '.join(parts)}."

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.evaluation.figures.drawn import Sketch
 from marey_motion.evaluation.figures.paper import (
-    MORE_IS_WORSE,
+    MISSING,
     QUIET,
     SMALL,
     Place,
@@ -20,7 +20,11 @@ from marey_motion.evaluation.figures.paper import (
     new_figure,
     nice_ceiling,
 )
-from marey_motion.evaluation.figures.subjects import FigureOptions, Subject, view_trial
+from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -43,12 +47,12 @@ def draw_frame_use(subjects: Sequence[Subject], trial: str | None, options: Figu
     """One strip per clip from its beginning to its end, the most used first; two subjects side by side."""
     strips = [_strips(subject, trial, options.most_clips) for subject in subjects]
     rows = max([1, *(len(each) for each in strips)])
-    width = 5.4 if len(subjects) == 1 else 2.3
+    width = 5.0 if len(subjects) == 1 else 1.55
     figure = new_figure(9.0 if len(subjects) == 1 else 9.6, ROW * rows + 1.55)
     ceiling = nice_ceiling(max([0.0, *(float(strip.ticks_per_frame.max()) for each in strips for strip in each)]))
     drawn = None
     for number, (subject, each) in enumerate(zip(subjects, strips, strict=True)):
-        left = 2.45 + number * (width + 2.5)
+        left = 2.45 + number * (width + 3.2)
         title = subject.label or trial or ""
         panel = add_panel(
             figure, Place(left, 1.2, width, ROW * rows), title=title, x="time in the clip (% of its length)", grid=False
@@ -61,24 +65,16 @@ def draw_frame_use(subjects: Sequence[Subject], trial: str | None, options: Figu
 
 
 def _strips(subject: Subject, trial: str | None, most: int) -> list[_Strip]:
-    result = subject.result
-    if trial is None:
-        popularity: dict[int, Ints] = {usage.clip: usage.popularity for usage in result.usage}
-    else:
-        ticks = np.bincount(view_trial(subject, trial).record.rows, minlength=result.clips[-1].stop)
-        popularity = {index: ticks[clip.start : clip.stop] for index, clip in enumerate(result.clips)}
-    used = sorted(
-        (clip for clip, each in popularity.items() if each.any()), key=lambda clip: -int(popularity[clip].sum())
-    )
+    used = sorted((each for each in subject.usage(trial) if each.ticks), key=lambda each: -each.ticks)
     return [
         _Strip(
-            result.clips[clip].uid,
-            result.clips[clip].name,
-            len(popularity[clip]) * subject.seconds_per_row,
-            _averaged(popularity[clip]),
-            float(np.mean(popularity[clip] > 0)),
+            subject.result.clips[each.clip].uid,
+            subject.result.clips[each.clip].name,
+            len(each.popularity) * subject.seconds_per_row,
+            _averaged(each.popularity),
+            float(np.mean(each.popularity > 0)),
         )
-        for clip in used[:most]
+        for each in used[:most]
     ]
 
 
@@ -89,12 +85,10 @@ def _averaged(popularity: Ints) -> Floats:
     return np.asarray(np.add.reduceat(popularity, starts) / sizes, dtype=np.float64)
 
 
-def _draw(panel: object, strips: Sequence[_Strip], rows: int, ceiling: float) -> object:
-    from matplotlib.axes import Axes
+def _draw(panel: Axes, strips: Sequence[_Strip], rows: int, ceiling: float) -> ScalarMappable | None:
     from matplotlib.colors import PowerNorm
 
-    assert isinstance(panel, Axes)
-    drawn = None
+    drawn: ScalarMappable | None = None
     for row, strip in enumerate(strips):
         edges = np.linspace(0.0, 100.0, len(strip.ticks_per_frame) + 1)
         values = np.ma.masked_equal(strip.ticks_per_frame[None], 0.0)
@@ -102,7 +96,7 @@ def _draw(panel: object, strips: Sequence[_Strip], rows: int, ceiling: float) ->
             edges,
             [row - 0.42, row + 0.42],
             values,
-            cmap=MORE_IS_WORSE,
+            cmap=MISSING,
             norm=PowerNorm(0.5, 0.0, ceiling),
             rasterized=True,
         )
@@ -137,7 +131,8 @@ def _caption(subjects: Sequence[Subject], strips: Sequence[Sequence[_Strip]]) ->
     for subject, each in zip(subjects, strips, strict=True):
         frames = sum(len(usage.popularity) for usage in subject.result.usage)
         shown = sum(int(np.count_nonzero(usage.popularity)) for usage in subject.result.usage)
-        name = f"{subject.label}: " if subject.label else ""
         share = f"{100 * shown / frames:.0f} %" if frames else "none"
-        parts.append(f"{name}{share} of all frames were displayed at least once in the suite; {len(each)} clips drawn.")
+        parts.append(
+            f"{subject.prefix}{share} of all frames were displayed at least once in the suite; {len(each)} clips drawn."
+        )
     return "Which stretches of the clips are used, from beginning to end; blank stretches never. " + " ".join(parts)

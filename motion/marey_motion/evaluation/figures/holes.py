@@ -13,7 +13,7 @@ from marey_motion.evaluation.figures.paper import (
     DARK,
     INK,
     LIGHT,
-    MORE_IS_WORSE,
+    MISSING,
     QUIET,
     SMALL,
     SPEED,
@@ -31,6 +31,7 @@ from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
 
 Floats = NDArray[np.float64]
 
@@ -54,11 +55,11 @@ def draw_holes(subjects: Sequence[Subject], _trial: str | None, _options: Figure
     return Sketch(figure, {"holes": _table(subjects)}, _caption(subjects))
 
 
-def _draw(panel: Axes, subject: Subject, least: float, size: float) -> object:
+def _draw(panel: Axes, subject: Subject, least: float, size: float) -> ScalarMappable:
     coverage = subject.result.coverage
     missing = np.ma.masked_less_equal(coverage.deficit_s, 0.0)
     edges = coverage.turn_rate_edges_deg_s, coverage.speed_edges_m_s
-    drawn = panel.pcolormesh(*edges, missing, cmap=MORE_IS_WORSE, vmin=0.0, vmax=least, edgecolors="none")
+    drawn = panel.pcolormesh(*edges, missing, cmap=MISSING, vmin=0.0, vmax=least, edgecolors="none")
     turn, speed = (0.5 * (each[:-1] + each[1:]) for each in edges)
     for row, column in np.argwhere(coverage.deficit_s > 0.0):
         value = float(coverage.deficit_s[row, column])
@@ -96,8 +97,7 @@ def _caption(subjects: Sequence[Subject]) -> str:
     parts = []
     for subject in subjects:
         missing = subject.result.coverage.deficit_s
-        name = f"{subject.label}: " if subject.label else ""
         parts.append(
-            f"{name}{np.count_nonzero(missing > 0)} of {missing.size} cells lack data, {missing.sum():.1f} s in all."
+            f"{subject.prefix}{np.count_nonzero(missing > 0)} of {missing.size} cells lack data, {missing.sum():.1f} s in all."
         )
     return f"What to record: seconds that each cell lacks; a dot stands where there is enough. {' '.join(parts)}"

@@ -22,7 +22,7 @@ from marey_motion.evaluation.figures.paper import (
     add_panel,
     luminance,
     new_figure,
-    nice_ceiling,
+    nice_levels,
     write,
 )
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 FAMILY_TITLES = {"circle": "constant speed", "switching": "switching speed"}
-LEVELS = 12
 
 
 class _Field(NamedTuple):
@@ -50,9 +49,11 @@ def draw_offsets(subjects: Sequence[Subject], _trial: str | None, _options: Figu
     fields = [[_field(subject, family) for subject in subjects] for family in families]
     if not fields or not any(np.isfinite(field.offset_m).any() for row in fields for field in row):
         raise MotionError("the evaluation has no trial with an offset", code="nothing-to-draw")
-    ceiling = nice_ceiling(max(float(np.nanmax(field.offset_m, initial=0.0)) for row in fields for field in row))
-    sketch = _draw_one if len(subjects) == 1 else _draw_two
-    figure = sketch(subjects, families, fields, ceiling)
+    levels = nice_levels(max(float(np.nanmax(field.offset_m, initial=0.0)) for row in fields for field in row))
+    if len(subjects) == 1:
+        figure = _draw_one(families, [row[0] for row in fields], levels)
+    else:
+        figure = _draw_two(subjects, families, fields, levels)
     return Sketch(figure, {"offsets": _table(subjects, families, fields)}, _caption(subjects, families, fields))
 
 
@@ -69,31 +70,28 @@ def _field(subject: Subject, family: str) -> _Field:
     return _Field(turn_rates, speeds, offset)
 
 
-def _draw_one(
-    subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]], ceiling: float
-) -> Figure:
+def _draw_one(families: Sequence[str], fields: Sequence[_Field], levels: Floats) -> Figure:
     width, height = 3.75, 3.3
     figure = new_figure(0.7 + len(families) * (width + 0.35) + 0.75, height + 1.05)
     drawn = None
-    for number, (family, row) in enumerate(zip(families, fields, strict=True)):
+    for number, (family, field) in enumerate(zip(families, fields, strict=True)):
         place = Place(0.62 + number * (width + 0.35), 0.58, width, height)
         labels = {"x": TURN_RATE, "y": SPEED if number == 0 else ""}
-        drawn = (
-            _draw_field(figure, place, row[0], FAMILY_TITLES[family], labels, (0.0, ceiling), MORE_IS_WORSE) or drawn
-        )
+        drawn = _draw_field(figure, place, field, FAMILY_TITLES[family], labels, levels, MORE_IS_WORSE) or drawn
     if drawn is not None:
         bar = Place(0.62 + len(families) * (width + 0.35) - 0.12, 0.58, 0.14, height)
-        add_colour_bar(figure, drawn, bar, "mean offset (m)")
+        add_colour_bar(figure, drawn, bar, "mean offset (m)", levels)
     return figure
 
 
 def _draw_two(
-    subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]], ceiling: float
+    subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]], levels: Floats
 ) -> Figure:
     width, height, gap = 2.62, 2.3, 0.3
     figure = new_figure(9.6, len(families) * (height + 0.85) + 0.95)
     changes = [_change(*row) for row in fields]
-    largest = nice_ceiling(max(float(np.nanmax(np.abs(change.offset_m), initial=0.0)) for change in changes))
+    upward = nice_levels(max(float(np.nanmax(np.abs(change.offset_m), initial=0.0)) for change in changes))
+    both_ways = np.concatenate((-upward[:0:-1], upward))
     shared, changed = None, None
     for number, (family, row, change) in enumerate(zip(families, fields, changes, strict=True)):
         bottom = 1.3 + (len(families) - 1 - number) * (height + 0.85)
@@ -102,16 +100,16 @@ def _draw_two(
         for column, field in enumerate(row):
             place = Place(0.85 + column * (width + gap), bottom, width, height)
             labels = {"x": TURN_RATE if last else "", "y": f"{FAMILY_TITLES[family]}\n{SPEED}" if column == 0 else ""}
-            shared = _draw_field(figure, place, field, titles[column], labels, (0.0, ceiling), MORE_IS_WORSE) or shared
+            shared = _draw_field(figure, place, field, titles[column], labels, levels, MORE_IS_WORSE) or shared
         place = Place(0.85 + 2 * (width + gap), bottom, width, height)
         labels = {"x": TURN_RATE if last else "", "y": ""}
         title = "change" if number == 0 else ""
-        changed = _draw_field(figure, place, change, title, labels, (-largest, largest), CHANGE) or changed
+        changed = _draw_field(figure, place, change, title, labels, both_ways, CHANGE) or changed
     if shared is not None:
-        add_colour_bar(figure, shared, Place(0.85, 0.52, 2 * width + gap, 0.12), "mean offset (m)")
+        add_colour_bar(figure, shared, Place(0.85, 0.52, 2 * width + gap, 0.12), "mean offset (m)", levels)
     if changed is not None:
         place = Place(0.85 + 2 * (width + gap), 0.52, width, 0.12)
-        add_colour_bar(figure, changed, place, "change of the mean offset (m), blue is better")
+        add_colour_bar(figure, changed, place, "change of the mean offset (m), blue is better", both_ways[::2])
     return figure
 
 
@@ -132,7 +130,7 @@ def _draw_field(
     field: _Field,
     title: str,
     labels: dict[str, str],
-    limits: tuple[float, float],
+    levels: Floats,
     colours: str,
 ) -> Any:
     """Filled contours and one dot per trial; dots alone where trials span no area. None for no trials."""
@@ -144,16 +142,17 @@ def _draw_field(
     turn, speed = np.meshgrid(field.turn_rates_deg_s, field.speeds_m_s)
     drawn: Any = None
     if min(field.offset_m.shape) > 1 and np.all(known):
-        levels = np.linspace(*limits, LEVELS * (2 if limits[0] < 0 else 1) + 1)
         drawn = panel.contourf(turn, speed, field.offset_m, levels=levels, cmap=colours, extend="neither")
     dots = panel.scatter(
-        turn[known], speed[known], c=field.offset_m[known], s=16, cmap=colours, vmin=limits[0], vmax=limits[1], lw=0.6,
+        turn[known], speed[known], c=field.offset_m[known], s=16, cmap=colours, vmin=levels[0], vmax=levels[-1], lw=0.6,
         zorder=4, clip_on=False,
     )  # fmt: skip
     colours_of_dots = dots.cmap(dots.norm(field.offset_m[known]))
     dots.set_edgecolor([DARK if light else LIGHT for light in luminance(colours_of_dots) > 0.3])
     _mark_extreme(panel, field, dots)
     panel.set_xticks(field.turn_rates_deg_s[:: max(1, len(field.turn_rates_deg_s) // 4)])
+    if not labels["y"]:
+        panel.tick_params(labelleft=False)
     panel.margins(0.02)
     return drawn or dots
 

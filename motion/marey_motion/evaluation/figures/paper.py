@@ -32,6 +32,7 @@ MARKERS = "os^DvPX*"
 
 # Lightness runs one way in each, so that they read in grey, too.
 MORE_IS_WORSE = "magma_r"
+MISSING = "YlOrBr"
 MORE_IS_DENSER = "viridis"
 CHANGE = "RdBu_r"
 
@@ -79,7 +80,9 @@ def add_panel(figure: Figure, place: Place, *, title: str = "", x: str = "", y: 
     return axes
 
 
-def add_colour_bar(figure: Figure, mappable: ScalarMappable, place: Place, label: str) -> Axes:
+def add_colour_bar(
+    figure: Figure, mappable: ScalarMappable, place: Place, label: str, ticks: NDArray[np.float64] | None = None
+) -> Axes:
     """A colour bar at a place, upright when it is higher than wide."""
     width, height = figure.get_size_inches()
     left, bottom, across, up = place
@@ -89,6 +92,8 @@ def add_colour_bar(figure: Figure, mappable: ScalarMappable, place: Place, label
     bar.outline.set_visible(False)  # type: ignore[operator]
     axes.tick_params(colors=QUIET, labelsize=SMALL, length=3, width=0.6)
     bar.set_label(label, fontsize=TEXT, color=INK)
+    if ticks is not None:
+        bar.set_ticks(ticks.tolist(), labels=[f"{tick:.6g}" for tick in ticks])
     return axes
 
 
@@ -96,6 +101,14 @@ def write(axes: Axes, place: tuple[float, float], text: str, **options: Any) -> 
     """Text as it is: dollar signs in a name are not mathematics."""
     look: dict[str, Any] = {"fontsize": SMALL, "color": INK, "parse_math": False, "va": "center", **options}
     axes.text(*place, plain(text), **look)
+
+
+def add_keys(axes: Axes, **options: Any) -> None:
+    """A legend without a frame, names as they are."""
+    legend = axes.legend(frameon=False, fontsize=SMALL, **options)
+    for text in legend.get_texts():
+        text.set_color(INK)
+        text.set_parse_math(False)
 
 
 def name_ticks(axes: Axes, places: Sequence[float], names: Sequence[str]) -> None:
@@ -130,6 +143,14 @@ def nice_ceiling(value: float) -> float:
         return 1.0
     scale = 10.0 ** np.floor(np.log10(value))
     return float(next(step * scale for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if value <= step * scale * (1 + 1e-9)))
+
+
+def nice_levels(largest: float) -> NDArray[np.float64]:
+    """At most 11 levels from 0 to the first at or above `largest`, at steps of 1, 2 or 5 times a power of ten."""
+    reach = largest if largest > 0.0 and np.isfinite(largest) else 1.0
+    scale = 10.0 ** np.floor(np.log10(reach / 10.0))
+    step = next(factor * scale for factor in (1, 2, 5, 10, 20) if reach <= 10 * factor * scale * (1 + 1e-9))
+    return np.arange(round(np.ceil(reach / step * (1 - 1e-9))) + 1) * step
 
 
 def luminance(colours: NDArray[np.floating[Any]]) -> NDArray[np.float64]:

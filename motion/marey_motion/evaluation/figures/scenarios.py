@@ -16,11 +16,12 @@ from marey_motion.evaluation.figures.paper import (
     REFERENCE,
     SMALL,
     Place,
+    add_keys,
     add_panel,
     new_figure,
 )
-from marey_motion.evaluation.figures.subjects import FigureOptions, Subject, choose_trial, view_trial
-from marey_motion.evaluation.scenario import Family, Trial, reference
+from marey_motion.evaluation.figures.subjects import FigureOptions, Subject, choose_trial, find_record
+from marey_motion.evaluation.scenario import Family, Reference, Trial, reference
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,16 +61,14 @@ def _draw(subjects: Sequence[Subject], name: str | None, family: Family) -> Sket
         panel.plot(0.0, 0.0, "o", color=INK, ms=5, zorder=4)
         _number_sections(panel, guide.positions, sections, limits)
         panel.set(xlim=limits[0][::-1], ylim=limits[1])
-        legend = panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.115), ncols=2, frameon=False, fontsize=SMALL)
-        for text in legend.get_texts():
-            text.set_color(INK)
+        add_keys(panel, loc="upper center", bbox_to_anchor=(0.5, -0.115), ncols=2)
     tables = {"sections": _section_table(trial, sections, guide.rate_hz), "paths": _paths(guide, subjects, followed)}
     return Sketch(figure, tables, _caption(trial, sections, guide.rate_hz))
 
 
 def _followed(subject: Subject, trial: Trial) -> Floats | None:
     """Where the character went, when the record was kept."""
-    return view_trial(subject, trial.name).record.positions if subject.result.records else None
+    return find_record(subject, trial.name).positions if subject.result.records else None
 
 
 def _sections(trial: Trial, ticks: int, rate_hz: float) -> list[tuple[int, int, float]]:
@@ -132,18 +131,15 @@ def _section_table(trial: Trial, sections: Sequence[tuple[int, int, float]], rat
     }
 
 
-def _paths(guide: object, subjects: Sequence[Subject], followed: Sequence[Floats | None]) -> dict[str, object]:
-    positions: Floats = guide.positions  # type: ignore[attr-defined]
-    rate_hz: float = guide.rate_hz  # type: ignore[attr-defined]
+def _paths(guide: Reference, subjects: Sequence[Subject], followed: Sequence[Floats | None]) -> dict[str, object]:
     table: dict[str, object] = {
-        "time_s": np.arange(len(positions)) / rate_hz,
-        "reference_x_m": positions[:, 0],
-        "reference_z_m": positions[:, 1],
+        "time_s": np.arange(len(guide.positions)) / guide.rate_hz,
+        "reference_x_m": guide.positions[:, 0],
+        "reference_z_m": guide.positions[:, 1],
     }
     for subject, path in zip(subjects, followed, strict=True):
         if path is not None:
-            start = f"{subject.label}_" if subject.label else ""
-            table[f"{start}x_m"], table[f"{start}z_m"] = path[:, 0], path[:, 1]
+            table[subject.column("x_m")], table[subject.column("z_m")] = path[:, 0], path[:, 1]
     return table
 
 

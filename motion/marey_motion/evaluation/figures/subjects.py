@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.result import EvaluationResult, TrialResult
-from marey_motion.evaluation.scenario import Family, Reference, Trial, reference
-from marey_motion.matching.record import TrialRecord
-
-Floats = NDArray[np.float64]
+from marey_motion.evaluation.metrics import TrialSeries, trial_series
+from marey_motion.evaluation.relevance import count_switches, measure_usage
+from marey_motion.evaluation.result import ClipUsage, EvaluationResult
+from marey_motion.evaluation.scenario import Family, Trial, reference
+from marey_motion.matching.record import Status, TrialRecord
 
 
 @dataclass(frozen=True)
@@ -40,80 +39,70 @@ class Subject:
     label: str
     result: EvaluationResult
 
-    @cached_property
-    def starts(self) -> NDArray[np.int64]:
-        """First row of each clip."""
-        return np.array([clip.start for clip in self.result.clips], dtype=np.int64)
-
-    def clips_of(self, rows: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Index of the clip that holds each row."""
-        return np.asarray(np.searchsorted(self.starts, rows, side="right") - 1, dtype=np.int64)
-
     @property
     def seconds_per_row(self) -> float:
         """Of the database."""
         return 1.0 / self.result.options.database.rate_hz
 
+    @property
+    def prefix(self) -> str:
+        """What a sentence about one of two subjects begins with."""
+        return f"{self.label}: " if self.label else ""
+
+    def column(self, name: str) -> str:
+        """Name of a table's column that only this subject fills."""
+        return f"{self.label}_{name}" if self.label else name
+
+    def usage(self, trial: str | None) -> tuple[ClipUsage, ...]:
+        """Use of every clip in one trial, or in the whole suite."""
+        return self.result.usage if trial is None else measure_usage(self.result.clips, [find_record(self, trial)])
+
+    def switches(self, trial: str | None) -> NDArray[np.int64]:
+        """(S, 3) row left, row entered and how often, in one trial or in the whole suite."""
+        return self.result.switches if trial is None else count_switches(self.result.clips, [find_record(self, trial)])
+
 
 @dataclass(frozen=True, eq=False)
 class TrialView:
-    """One trial of a subject: what it asked for and every tick of what happened."""
+    """One trial of a subject: what it asked for and every step of what happened."""
 
     subject: Subject
-    outcome: TrialResult
+    trial: Trial
     record: TrialRecord
-    reference: Reference
-
-    @property
-    def times_s(self) -> Floats:
-        """(T,) of the ticks."""
-        return np.arange(len(self.record.rows)) / self.record.rate_hz
-
-    @property
-    def speeds_m_s(self) -> Floats:
-        """(T,) length of the chord that leads to each tick; the first tick has that of the second."""
-        return self._rates(np.linalg.norm(np.diff(self.record.positions, axis=0), axis=1))
-
-    @property
-    def turn_rates_deg_s(self) -> Floats:
-        """(T,) of where the character faces."""
-        return np.degrees(self._rates(np.diff(self.record.headings)))
-
-    @property
-    def wished_speeds_m_s(self) -> Floats:
-        """(T,)."""
-        return self.reference.speeds_m_s[: len(self.record.rows)]
-
-    @property
-    def wished_turn_rates_deg_s(self) -> Floats:
-        """(T,)."""
-        return np.degrees(self.reference.turn_rates_rad_s[: len(self.record.rows)])
+    series: TrialSeries
 
     @property
     def evaluated(self) -> NDArray[np.bool_]:
-        """(T,) the ticks that the metrics are taken over."""
-        if self.subject.result.options.window == "all":
-            return np.ones(len(self.record.rows), dtype=np.bool_)
-        return np.asarray(self.times_s >= self.outcome.trial.approach_s - 1e-9)
+        """(S,) the steps that the metrics are taken over."""
+        everything = self.subject.result.options.window == "all"
+        return np.asarray(everything | (self.series.pieces >= 0))
 
-    def _rates(self, steps: Floats) -> Floats:
-        return np.concatenate((steps[:1], steps)) * self.record.rate_hz
+    @property
+    def switched(self) -> NDArray[np.bool_]:
+        """(S,) the steps that lead to another place in the clips, by choice."""
+        return np.asarray(self.record.status[1:] == Status.REPLACING)
 
 
-def view_trial(subject: Subject, name: str) -> TrialView:
-    """One trial by name, with its record. Raises `MotionError` when there is none."""
-    index = next((index for index, each in enumerate(subject.result.trials) if each.trial.name == name), None)
-    if index is None:
+def view_trial(subject: Subject, trial: Trial) -> TrialView:
+    """One trial with its record. Raises `MotionError` when it was not kept."""
+    record = find_record(subject, trial.name)
+    return TrialView(subject, trial, record, trial_series(trial, reference(trial, record.rate_hz), record))
+
+
+def find_record(subject: Subject, name: str) -> TrialRecord:
+    """The record of a trial by its name. Raises `MotionError` when there is none."""
+    names = [each.trial.name for each in subject.result.trials]
+    if name not in names:
         raise MotionError(f"the evaluation has no trial {name!r}", code="unknown-trial")
-    if len(subject.result.records) != len(subject.result.trials):
+    if len(subject.result.records) != len(names):
         raise MotionError("this figure needs the records of the trials", code="records-missing", where=name)
-    outcome, record = subject.result.trials[index], subject.result.records[index]
-    return TrialView(subject, outcome, record, reference(outcome.trial, record.rate_hz))
+    return subject.result.records[names.index(name)]
 
 
 def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequence[Family]) -> Trial:
-    """The trial of a name that all subjects have; without a name that with the largest mean offset of the first subject,
-    from the first of the families that has any.
+    """The trial of a name that all subjects have, from the first of the families that has it.
+
+    Without a name it is the one with the largest mean offset of the first subject.
 
     Raises `MotionError` when there is none.
     """

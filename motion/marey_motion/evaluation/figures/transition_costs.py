@@ -7,72 +7,69 @@ from collections.abc import Sequence
 import numpy as np
 
 from marey_motion.evaluation.figures.drawn import Sketch
-from marey_motion.evaluation.figures.paper import COLOURS, INK, REFERENCE, SMALL, Place, add_panel, new_figure, write
+from marey_motion.evaluation.figures.paper import (
+    COLOURS,
+    REFERENCE,
+    Place,
+    add_keys,
+    add_panel,
+    new_figure,
+    write,
+)
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject, TrialView, choose_trial, view_trial
-from marey_motion.matching.record import Status
 
 
 def draw_transition_costs(subjects: Sequence[Subject], trial: str | None, _options: FigureOptions) -> Sketch:
     """Speeds above, cost below, one line per subject; a tick under the cost is a switch to another place."""
     chosen = choose_trial(subjects, trial, ("switching", "circle"))
-    views = [view_trial(subject, chosen.name) for subject in subjects]
+    views = [view_trial(subject, chosen) for subject in subjects]
+    first = views[0].series
     figure = new_figure(9.0, 4.6)
     above = add_panel(figure, Place(0.7, 3.05, 8.1, 1.2), title=chosen.name, y="speed (m/s)")
     below = add_panel(figure, Place(0.7, 0.55, 8.1, 2.2), x="time (s)", y="transition cost (m)")
-    first = views[0]
-    above.step(first.times_s, first.wished_speeds_m_s, where="post", color=REFERENCE, lw=1.8, label="wished")
-    top = max(float(view.record.pose_cost.max(initial=0.0)) for view in views) or 1.0
-    for number, view in enumerate(views):
-        name = view.subject.label or "recorded"
-        above.plot(view.times_s, view.speeds_m_s, color=COLOURS[number], lw=0.9, alpha=0.9, label=name)
-        below.plot(view.times_s, view.record.pose_cost, color=COLOURS[number], lw=0.8, alpha=0.85)
-        level = -(0.045 + 0.05 * number) * top
-        switches = view.times_s[_switched(view)]
-        below.plot(switches, np.full(len(switches), level), "|", color=COLOURS[number], ms=5, mew=0.8)
+    above.step(first.times_s, first.wanted_speeds_m_s, where="post", color=REFERENCE, lw=1.8, label="wished")
+    costs = [view.record.pose_cost[1:] for view in views]
+    top = max([0.0, *(float(np.nanmax(cost, initial=0.0)) for cost in costs)]) or 1.0
+    for number, (view, cost) in enumerate(zip(views, costs, strict=True)):
+        look = {"color": COLOURS[number], "lw": 0.9, "alpha": 0.85}
+        above.plot(view.series.times_s, view.series.speeds_m_s, label=view.subject.label or "recorded", **look)
+        below.plot(view.series.times_s, cost, **look)
+        switches = view.series.times_s[view.switched]
+        level = np.full(len(switches), -(0.045 + 0.05 * number) * top)
+        below.plot(switches, level, "|", color=COLOURS[number], ms=5, mew=0.8)
     write(below, (0.0, 1.02), "ticks below: switches to another place", transform=below.transAxes, va="bottom")
+    changes = first.times_s[1:][(np.diff(first.wanted_speeds_m_s) != 0) | (np.diff(first.wanted_turn_rates_rad_s) != 0)]
     for panel in (above, below):
-        panel.set_xlim(0.0, float(first.times_s[-1]) if len(first.times_s) > 1 else 1.0)
-        for change in _changes(first):
+        panel.set_xlim(0.0, float(first.times_s[-1]) if len(first.times_s) else 1.0)
+        for change in changes:
             panel.axvline(change, color=REFERENCE, lw=0.7, ls=(0, (3, 3)), zorder=1)
     above.set_ylim(0.0, None)
     above.tick_params(labelbottom=False)
     below.set_ylim(-0.05 * top * (len(views) + 1), 1.08 * top)
-    legend = above.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, fontsize=SMALL)
-    for text in legend.get_texts():
-        text.set(color=INK, parse_math=False)
+    add_keys(above, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
     return Sketch(figure, {"costs": _table(views)}, _caption(views))
 
 
-def _switched(view: TrialView) -> np.ndarray:
-    return np.flatnonzero(view.record.status == Status.REPLACING)
-
-
-def _changes(view: TrialView) -> list[float]:
-    """When the wished speed or turn rate changes, in seconds."""
-    speeds, turns = view.wished_speeds_m_s, view.wished_turn_rates_deg_s
-    return [float(view.times_s[tick + 1]) for tick in np.flatnonzero((np.diff(speeds) != 0) | (np.diff(turns) != 0))]
-
-
 def _table(views: Sequence[TrialView]) -> dict[str, object]:
-    table: dict[str, object] = {"time_s": views[0].times_s, "wished_speed_m_s": views[0].wished_speeds_m_s}
+    first = views[0].series
+    table: dict[str, object] = {"time_s": first.times_s, "wished_speed_m_s": first.wanted_speeds_m_s}
     for view in views:
-        start = f"{view.subject.label}_" if view.subject.label else ""
-        table[f"{start}speed_m_s"] = view.speeds_m_s
-        table[f"{start}pose_cost_m"] = view.record.pose_cost
-        table[f"{start}switched"] = (view.record.status == Status.REPLACING).astype(int)
+        column = view.subject.column
+        table[column("speed_m_s")] = view.series.speeds_m_s
+        table[column("pose_cost_m")] = view.record.pose_cost[1:]
+        table[column("switched")] = view.switched.astype(int)
     return table
 
 
 def _caption(views: Sequence[TrialView]) -> str:
     parts = []
     for view in views:
-        cost = view.record.pose_cost[np.isfinite(view.record.pose_cost)]
-        name = f"{view.subject.label}: " if view.subject.label else ""
-        switches = len(_switched(view))
-        if len(cost):
-            parts.append(
-                f"{name}mean {cost.mean():.3f} m, 95 % below {np.quantile(cost, 0.95):.3f} m, {switches} switches"
-            )
+        costs = view.record.pose_cost[1:]
+        costs = costs[np.isfinite(costs)]
+        switches = int(np.count_nonzero(view.switched))
+        if len(costs):
+            spread = f"mean {costs.mean():.3f} m, 95 % below {np.quantile(costs, 0.95):.3f} m"
+            parts.append(f"{view.subject.prefix}{spread}, {switches} switches")
     text = (
         "Distance over the joints from each displayed pose to the next; peaks are switches between poses that differ. "
     )
