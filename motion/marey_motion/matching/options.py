@@ -28,6 +28,7 @@ class FeatureWeights:
     hip_velocity: float = 1.0
     trajectory_positions: float = 1.0
     trajectory_directions: float = 1.5
+    extra_joints: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,9 @@ class ControllerOptions:
     root_inertialisation : whether the root's velocity is blended, too
     selection : "features", or "pose_distance": the paper's literal cost, the summed distance of the pose joints in
         metres, beside the trajectory features
-    root_adjustment, root_clamp_m : pull the character towards the reference, or hold it within so many metres; off in
-        evaluations, since they hide what is measured
+    root_adjustment : pull the character towards the reference, by this share of its distance per second; off (0) in
+        evaluations, since it hides what is measured
+    root_clamp_m : hold it within so many metres; off (None) in evaluations for the same reason
     """
 
     follow: Follow = "time"

@@ -17,9 +17,9 @@ class Status(IntEnum):
     REPLACING = 1
     """A search chose another frame: the displayed row is the first after a switch."""
     REPLACED = 2
-    """The last row before a switch."""
+    """The last row before a switch, unless that row was itself the first after one, or forced."""
     FORCED = 3
-    """The clip ended or looped: there was nothing to continue."""
+    """The first row of the trial, after the end of a clip, or of another round of a loop: nothing was chosen over it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,13 +29,14 @@ class TrialRecord:
     Parameters
     ----------
     rate_hz : ticks per second
-    rows : (T,) int32    database row displayed
+    rows : (T,) int32    database row displayed; what a search at a tick chose shows in the next tick's row
     positions : (T, 2) float64    root on the ground, metres
     headings : (T,) float64    radians, continuous
     status : (T,) int8    `Status`
     match_cost : (T,) float64    normalised squared cost of the row that was chosen; NaN where nothing was searched
     continuing_cost : (T,) float64    the same of going on; NaN where nothing was searched or nothing was there to go on
-    pose_cost : (T,) float64    metres: distance over the pose joints between the displayed pose and the next one
+    pose_cost : (T,) float64    metres: distance over the pose joints between the displayed pose, with what is left of
+        earlier switches, and the row displayed next; at the last tick, the row that would follow
     """
 
     rate_hz: float
