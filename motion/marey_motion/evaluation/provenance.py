@@ -18,11 +18,15 @@ from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 
 
 def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials: Sequence[Trial]) -> Provenance:
-    """Digests of the data, of what decides its costs and of what was asked of it."""
-    clips = {clip.uid: _clip_content(database, clip) for clip in database.clips}
+    """Digests of the data, of what decides its costs and of what was asked of it.
+
+    `dataset` names the motion that was played, whatever its clips are called; `clips` the documents it came from, or
+    the motion of a clip whose document is not known.
+    """
+    rows = [_rows_digest(database, clip) for clip in database.clips]
     return Provenance(
-        dataset=_digest(sorted(clips.values())),
-        clips=clips,
+        dataset=_digest(sorted(rows)),
+        clips={clip.uid: clip.content or own for clip, own in zip(database.clips, rows, strict=True)},
         normaliser=_digest(
             {"offset": database.normaliser.offset.tolist(), "scale": database.normaliser.scale.tolist()}
         ),
@@ -34,27 +38,28 @@ def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials
 
 def require_comparable(before: Provenance, after: Provenance) -> None:
     """Raise `MotionError`, naming all that differs, unless costs, options and scenarios of two evaluations agree."""
-    remedies = {
-        "normaliser": "evaluate both with one pinned normaliser, or with their union's",
-        "options": "evaluate both with the same options for database, controller and window",
-        "scenarios": "evaluate both over the same trials",
+    different = {
+        name: f"their {plural} differ ({_short(first)} and {_short(second)}): {remedy}"
+        for name, (plural, remedy) in _CONDITIONS.items()
+        if (first := getattr(before, name)) != (second := getattr(after, name))
     }
-    different = [name for name in remedies if getattr(before, name) != getattr(after, name)]
     if different:
         raise MotionError(
-            "these evaluations cannot be compared: "
-            + "; ".join(
-                f"their {name} {'differ' if name.endswith('s') else 'differs'} "
-                f"({_short(getattr(before, name))} and {_short(getattr(after, name))}): {remedies[name]}"
-                for name in different
-            ),
+            f"these evaluations cannot be compared: {'; '.join(different.values())}",
             code="not-comparable",
             where=", ".join(different),
         )
 
 
-def _clip_content(database: MatchingDatabase, clip: DatabaseClip) -> str:
-    """Digest of what a clip contributes: its rows as they are played, however its file came about."""
+_CONDITIONS = {
+    "normaliser": ("normalisers", "evaluate both with one pinned normaliser, or with one fitted on both"),
+    "options": ("options", "evaluate both with the same database, controller and window"),
+    "scenarios": ("scenarios", "evaluate both over the same trials"),
+}
+
+
+def _rows_digest(database: MatchingDatabase, clip: DatabaseClip) -> str:
+    """Digest of what a clip contributes: its rows as they are matched and played."""
     rows = slice(clip.start, clip.stop)
     digest = hashlib.sha256()
     for array in (

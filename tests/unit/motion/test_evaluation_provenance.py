@@ -1,0 +1,86 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evaluation_cases import arc, root_database
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.provenance import provenance_of, require_comparable
+from marey_motion.evaluation.result import EvaluationOptions, Grid
+from marey_motion.evaluation.scenario import suite_trials
+from marey_motion.matching.options import ControllerOptions, DatabaseOptions, FeatureWeights
+
+OPTIONS = EvaluationOptions(grid=Grid((1.0, 2.0), (-50.0, 50.0)))
+LEFT, RIGHT = arc(1.0, 50.0, 2.0), arc(2.0, -50.0, 2.0)
+
+
+def traced(*roots, options=OPTIONS, **changes):
+    database = root_database(*roots, options=options.database)
+    return provenance_of(replace(database, **changes), options, suite_trials(options))
+
+
+def test_equal_data_and_options_have_equal_digests():
+    assert traced(LEFT, RIGHT) == traced(LEFT, RIGHT)
+
+
+def test_a_data_set_is_named_by_its_motion_not_by_the_ids_of_its_clips():
+    here = traced(LEFT, RIGHT)
+    clips = root_database(LEFT, RIGHT).clips
+    renamed = tuple(replace(clip, uid=f"other-{clip.uid}", name="other") for clip in clips)
+
+    assert traced(LEFT, RIGHT, clips=renamed).dataset == here.dataset
+    assert traced(RIGHT, LEFT).dataset == here.dataset
+    assert traced(LEFT, arc(2.0, -50.0, 2.1)).dataset != here.dataset
+    assert traced(LEFT).dataset != here.dataset
+    assert traced(LEFT, LEFT).dataset != traced(LEFT).dataset
+
+
+def test_clips_are_traced_to_the_documents_they_came_from_where_these_are_known():
+    first, second = root_database(LEFT, RIGHT).clips
+    found = traced(LEFT, RIGHT, clips=(replace(first, content="sha256:abc"), second)).clips
+
+    assert found["a"] == "sha256:abc"
+    assert found["b"].startswith("sha256:")
+    assert len(found["b"]) == len("sha256:") + 64
+
+
+def test_a_whole_number_is_the_same_option_however_it_is_written():
+    whole = replace(OPTIONS, approach_s=3, grid=Grid((1, 2), (-50, 50)), controller=ControllerOptions(switch_margin=0))
+    decimal = replace(OPTIONS, controller=ControllerOptions(switch_margin=-0.0))
+
+    assert traced(LEFT, options=whole) == traced(LEFT, options=decimal)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (replace(OPTIONS, controller=ControllerOptions(follow="path")), "options"),
+        (replace(OPTIONS, database=DatabaseOptions(weights=FeatureWeights(hip_velocity=2.0))), "options"),
+        (replace(OPTIONS, window="all"), "options"),
+        (replace(OPTIONS, duration_s=10.0), "scenarios"),
+        (replace(OPTIONS, grid=Grid((1.0,), (50.0,))), "scenarios"),
+        (replace(OPTIONS, families=("circle",)), "scenarios"),
+    ],
+)
+def test_evaluations_under_other_conditions_are_not_compared(options, named):
+    with pytest.raises(MotionError, match=f"their {named} differ") as refused:
+        require_comparable(traced(LEFT), traced(LEFT, options=options))
+    assert refused.value.code == "not-comparable"
+    assert refused.value.where == named
+
+
+def test_evaluations_with_other_normalisers_are_not_compared_and_the_message_says_what_to_do():
+    plain = root_database(LEFT)
+    other = replace(plain.normaliser, scale=np.full(27, 2.0))
+    with pytest.raises(MotionError, match=r"their normalisers differ .*pinned"):
+        require_comparable(traced(LEFT), traced(LEFT, normaliser=other))
+
+
+def test_all_that_differs_is_named_at_once():
+    with pytest.raises(MotionError, match=r"options differ.*scenarios differ"):
+        require_comparable(traced(LEFT), traced(LEFT, options=replace(OPTIONS, window="all", duration_s=10.0)))
+
+
+@pytest.mark.parametrize("options", [replace(OPTIONS, coverage_least_s=5.0), replace(OPTIONS, literal_formulas=True)])
+def test_other_data_and_what_no_trial_depends_on_may_differ(options):
+    require_comparable(traced(LEFT), traced(RIGHT, options=options))
