@@ -61,24 +61,24 @@ class LocalServer:
 
 
 @contextmanager
-def local_server(prepare: Callable[[Path], None] | None = None) -> Iterator[LocalServer]:
+def local_server(prepare: Callable[[Path], None] | None = None, **settings: str) -> Iterator[LocalServer]:
     """Run a server while the block runs; `prepare` fills its data folder before it starts."""
     with tempfile.TemporaryDirectory(prefix="marey-bench-") as folder:
         data = Path(folder, "data")
         if prepare is not None:
             prepare(data)
-        with running(data) as server:
+        with running(data, **settings) as server:
             yield server
 
 
 @contextmanager
-def running(data: Path) -> Iterator[LocalServer]:
-    """Run a server over a data folder while the block runs."""
+def running(data: Path, **settings: str) -> Iterator[LocalServer]:
+    """Run a server over a data folder while the block runs; `settings` are variables of its environment."""
     port = free_port()
     with Path(data.parent, "server.log").open("ab") as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "marey_client.cli", "serve", "--workers", "0"],
-            env=clean_environment() | {"MAREY_DATA": str(data), "MAREY_PORT": str(port)},
+            env=clean_environment() | {"MAREY_DATA": str(data), "MAREY_PORT": str(port), **settings},
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,

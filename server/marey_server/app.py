@@ -32,6 +32,7 @@ from marey_server.handlers.resource import Resource
 from marey_server.handlers.routes import RouteTable
 from marey_server.housekeeping import keeping_house
 from marey_server.launchers.local import local_workers
+from marey_server.memory import keep_freed_memory
 from marey_server.observe import access_log, configure_logging
 from marey_server.openapi import build_document
 from marey_server.services import Description, Services
@@ -186,6 +187,7 @@ async def serve(settings: Settings) -> None:
     """Run a server until SIGTERM or SIGINT."""
     configure_logging(settings.log_form, settings.log_level)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
+    keep_freed_memory()
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
