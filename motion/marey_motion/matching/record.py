@@ -19,7 +19,7 @@ class Status(IntEnum):
     REPLACED = 2
     """The last row before a switch, unless that row was itself the first after one, or forced."""
     FORCED = 3
-    """The first row of the trial, after the end of a clip, or of another round of a loop: nothing was chosen over it."""
+    """The first row of the trial, after the end of a clip, or of a loop's next round: there was nothing to go on."""
 
 
 @dataclass(frozen=True, eq=False)
