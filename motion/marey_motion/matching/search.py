@@ -1,4 +1,8 @@
-"""Exact nearest neighbours among the rows of a matching database."""
+"""Exact nearest neighbours among the rows of a matching database.
+
+Consecutive rows of a clip are near each other, so sixteen of them fit into a small box; sixteen boxes of a clip make a
+group with a box of its own. A search passes over every group and box that is farther away than the best row so far.
+"""
 
 from __future__ import annotations
 
@@ -11,18 +15,45 @@ from marey_motion.errors import MotionError
 
 Method = Literal["auto", "boxes", "scan"]
 
+LARGEST = 1e18
+"""Values and queries may not be larger, or their squares would leave float32."""
+
+_SIXTEEN = 16
+_PROBES = 32
+# Above this share of blocks to look at, going through all of them in order is quicker (measured).
+_SCAN_ABOVE = 0.7
+
 
 class SearchIndex(NamedTuple):
     """A database made ready for search: a tuple of arrays, so that compiled code takes it as it is.
+
+    B blocks of up to 16 selectable rows of one clip, G groups of up to 16 blocks of one clip; D' is D made even. What
+    is missing of sixteen is filled with repetitions of the last.
 
     Parameters
     ----------
     rows : (N, D) float64    normalised features
     selectable : (N,) bool    rows a search may choose
+    blocks : (B, D', 16) float32    the blocks' rows, one dimension after the other
+    block_rows : (B, 16) int32    which rows they are
+    block_of_row : (N,) int32    the block of a row, or of the selectable one before it
+    boxes : (G, D', 2, 16) float32    low and high sides of the boxes about a group's blocks
+    group_blocks : (G + 1,) int32    first block of each group, and B
+    group_boxes : (⌈G / 16⌉, D', 2, 16) float32    sides of the boxes about groups
+    radius : the largest norm of a row
+    boxed : whether a search uses the boxes, or goes through all blocks; the answer is the same
     """
 
     rows: NDArray[np.float64]
     selectable: NDArray[np.bool_]
+    blocks: NDArray[np.float32]
+    block_rows: NDArray[np.int32]
+    block_of_row: NDArray[np.int32]
+    boxes: NDArray[np.float32]
+    group_blocks: NDArray[np.int32]
+    group_boxes: NDArray[np.float32]
+    radius: float
+    boxed: bool
 
 
 def build_index(
@@ -39,34 +70,179 @@ def build_index(
     normalised : (N, D) float64    features divided by their scales
     starts : (C + 1,) int64    first row of each clip, and N
     selectable : (N,) bool    rows a search may choose
+    method : "auto" decides between boxes and scan by how much of the database a few mixtures of its own rows would look
+        at; it depends on the data alone, and changes the time a search takes, not what it finds
 
-    Raises `MotionError` when no row is selectable or a value is not finite.
+    Raises `MotionError` when no row is selectable or a value is not finite or larger than `LARGEST`.
     """
     rows = np.ascontiguousarray(normalised, dtype=np.float64)
+    mask = np.ascontiguousarray(selectable, dtype=np.bool_)
+    clip_starts = np.asarray(starts, dtype=np.int64)
+    _check(rows, clip_starts, mask)
+
+    block_rows, block_of_row, group_blocks = _arranged(clip_starts, mask)
+    padded = np.zeros((len(rows), rows.shape[1] + rows.shape[1] % 2), np.float32)
+    padded[:, : rows.shape[1]] = rows
+    blocks = padded[block_rows]
+    low, high = blocks.min(axis=1), blocks.max(axis=1)
+    group_low, group_high = (
+        edge.reduceat(sides, group_blocks[:-1], axis=0) for edge, sides in ((np.minimum, low), (np.maximum, high))
+    )
+    index = SearchIndex(
+        rows=rows,
+        selectable=mask,
+        blocks=np.ascontiguousarray(blocks.transpose(0, 2, 1)),
+        block_rows=block_rows,
+        block_of_row=block_of_row,
+        boxes=_boxes(low, high, group_blocks),
+        group_blocks=group_blocks,
+        group_boxes=_boxes(group_low, group_high, _by_sixteen(len(group_low))),
+        radius=float(np.sqrt(np.square(rows).sum(axis=1).max())),
+        boxed=True,
+    )
+    boxed = _boxes_pay(index) if method == "auto" else method == "boxes"
+    return index._replace(boxed=boxed)
+
+
+def _check(rows: NDArray[np.float64], starts: NDArray[np.int64], selectable: NDArray[np.bool_]) -> None:
+    if rows.ndim != 2 or rows.shape[1] == 0 or selectable.shape != rows.shape[:1]:
+        raise MotionError(
+            f"features must be (rows, dimensions) with one mark per row, not {rows.shape} with {selectable.shape}"
+        )
+    if len(starts) < 2 or starts[0] != 0 or starts[-1] != len(rows) or (np.diff(starts) < 0).any():
+        raise MotionError(f"the first rows of the clips must ascend from 0 to the number of rows, {len(rows)}")
     if not selectable.any():
-        raise MotionError("no row can be chosen: every clip is shorter than the time it must look ahead")
-    return SearchIndex(rows, np.ascontiguousarray(selectable, dtype=np.bool_))
+        raise MotionError(
+            "no row can be chosen: every clip is shorter than what its last rows need to look ahead; add longer clips",
+            code="nothing-selectable",
+        )
+    unusable = np.argwhere(~(np.abs(rows) <= LARGEST))
+    if len(unusable):
+        row, dimension = unusable[0]
+        raise MotionError(
+            f"the value is {rows[row, dimension]}; normalised features are finite and at most {LARGEST:g}",
+            where=f"row {row}, dimension {dimension}",
+        )
 
 
-def find_nearest(index: SearchIndex, queries: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The nearest selectable row of each query (Q, D), lowest row first among equals, and its squared distance."""
+def _arranged(
+    starts: NDArray[np.int64], selectable: NDArray[np.bool_]
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+    """Rows of each block (B, 16), block of each row (N,), and first block of each group (G + 1,)."""
+    chosen = np.flatnonzero(selectable)
+    bounds = np.searchsorted(chosen, starts)
+    blocks_per_clip = -(-np.diff(bounds) // _SIXTEEN)
+    first_blocks = np.concatenate([[0], np.cumsum(blocks_per_clip)])
+    clips = np.searchsorted(bounds, np.arange(len(chosen)), side="right") - 1
+    ranks = np.arange(len(chosen)) - bounds[clips]
+    block_of_chosen = first_blocks[clips] + ranks // _SIXTEEN
+
+    last_of_block = np.append(np.flatnonzero(np.diff(block_of_chosen)), len(chosen) - 1)
+    block_rows = np.repeat(chosen[last_of_block, None], _SIXTEEN, axis=1)
+    block_rows[block_of_chosen, ranks % _SIXTEEN] = chosen
+    before = np.maximum(np.cumsum(selectable) - 1, 0)
+
+    groups_per_clip = -(-blocks_per_clip // _SIXTEEN)
+    first_groups = np.concatenate([[0], np.cumsum(groups_per_clip)])
+    clip_of_group = np.repeat(np.arange(len(groups_per_clip)), groups_per_clip)
+    within = np.arange(first_groups[-1]) - first_groups[clip_of_group]
+    group_blocks = np.append(first_blocks[clip_of_group] + _SIXTEEN * within, first_blocks[-1])
+    return block_rows.astype(np.int32), block_of_chosen[before].astype(np.int32), group_blocks.astype(np.int32)
+
+
+def _by_sixteen(count: int) -> NDArray[np.int32]:
+    return np.append(np.arange(0, count, _SIXTEEN), count).astype(np.int32)
+
+
+def _boxes(low: NDArray[np.float32], high: NDArray[np.float32], starts: NDArray[np.int32]) -> NDArray[np.float32]:
+    """Sides (K, D') as sixteens (M, D', 2, 16), each of which begins at one of starts (M + 1,)."""
+    lanes = np.minimum(starts[:-1, None] + np.arange(_SIXTEEN), starts[1:, None] - 1)
+    return np.ascontiguousarray(np.stack([low[lanes], high[lanes]], axis=2).transpose(0, 3, 2, 1))
+
+
+def _boxes_pay(index: SearchIndex) -> bool:
+    """Whether queries that take their first half from one row and the rest from another leave enough boxes out."""
     from marey_motion.matching import search_kernels as kernels
 
-    queries = np.ascontiguousarray(queries, dtype=np.float64)
-    rows = np.empty(len(queries), np.int64)
-    costs = np.empty(len(queries))
-    kernels.nearest_of_each(index, queries, rows, costs)
+    draws = np.random.default_rng(0).choice(np.flatnonzero(index.selectable), size=(2, _PROBES))
+    queries = index.rows[draws[0]]
+    half = queries.shape[1] // 2
+    queries[:, half:] = index.rows[draws[1], half:]
+    _, costs = find_nearest(index, queries)
+    visited = sum(kernels.boxes_within(index, query, cost) for query, cost in zip(queries, costs, strict=True))
+    return bool(visited <= _SCAN_ABOVE * _PROBES * len(index.blocks))
+
+
+def find_nearest(
+    index: SearchIndex,
+    queries: NDArray[np.float64],
+    *,
+    weights: NDArray[np.float64] | None = None,
+    warm_rows: NDArray[np.int64] | None = None,
+    skips: NDArray[np.int64] | None = None,
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The nearest selectable row of each query, the lowest among equals, and its squared distance.
+
+    Parameters
+    ----------
+    queries : (Q, D) float64    normalised like the rows
+    weights : (D,) float64, at least 0    of each dimension's squared difference; 1 when None
+    warm_rows : (Q,) int64    a row likely to be near each query, or -1; it makes the search quicker, no more
+    skips : (Q, 2) int64    rows [start, stop) that each query may not choose
+
+    Returns
+    -------
+    (Q,) int64 rows, -1 where all are skipped, and (Q,) float64 costs, infinite there
+    """
+    from marey_motion.matching import search_kernels as kernels
+
+    queries = _as_queries(index, queries)
+    count = len(queries)
+    warm = np.full(count, -1, np.int64) if warm_rows is None else np.ascontiguousarray(warm_rows, np.int64)
+    skipped = np.zeros((count, 2), np.int64) if skips is None else np.ascontiguousarray(skips, np.int64)
+    rows, costs = np.empty(count, np.int64), np.empty(count)
+    kernels.nearest_of_each(index, queries, _as_weights(index, weights), warm, skipped, rows, costs)
     return rows, costs
 
 
 def find_best(
-    index: SearchIndex, query: NDArray[np.float64], count: int
+    index: SearchIndex,
+    query: NDArray[np.float64],
+    count: int,
+    *,
+    weights: NDArray[np.float64] | None = None,
+    skip: tuple[int, int] = (0, 0),
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The `count` selectable rows nearest to a query (D,), nearest first, lowest row first among equals."""
-    costs = np.zeros(len(index.rows))
-    for d in range(index.rows.shape[1]):
-        costs += (index.rows[:, d] - query[d]) ** 2
-    costs[~index.selectable] = np.inf
-    order = np.argsort(costs, kind="stable")[:count]
-    order = order[np.isfinite(costs[order])]
-    return order, costs[order]
+    """The `count` selectable rows nearest to a query (D,), nearest first and the lowest first among equals.
+
+    Fewer when there are fewer outside `skip` [start, stop). Costs are those of `find_nearest`, bit for bit.
+    """
+    from marey_motion.matching import search_kernels as kernels
+
+    costs = np.empty(len(index.rows))
+    kernels.all_costs(index, _as_queries(index, query[None])[0], _as_weights(index, weights), costs)
+    allowed = index.selectable.copy()
+    allowed[max(skip[0], 0) : max(skip[1], 0)] = False
+    rows = np.flatnonzero(allowed)
+    if count < len(rows):
+        rows = rows[costs[rows] <= np.partition(costs[rows], count - 1)[count - 1]] if count > 0 else rows[:0]
+    best = rows[np.argsort(costs[rows], kind="stable")][:count]
+    return best, costs[best]
+
+
+def _as_queries(index: SearchIndex, queries: NDArray[np.float64]) -> NDArray[np.float64]:
+    queries = np.ascontiguousarray(queries, dtype=np.float64)
+    if queries.ndim != 2 or queries.shape[1] != index.rows.shape[1]:
+        raise MotionError(f"queries must have {index.rows.shape[1]} dimensions, not the shape {queries.shape}")
+    if not (np.abs(queries) <= LARGEST).all():
+        raise MotionError(f"queries must be finite and at most {LARGEST:g}")
+    return queries
+
+
+def _as_weights(index: SearchIndex, weights: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    if weights is None:
+        return np.ones(index.rows.shape[1])
+    weights = np.ascontiguousarray(weights, dtype=np.float64)
+    if weights.shape != index.rows.shape[1:] or not ((weights >= 0) & (weights <= LARGEST)).all():
+        raise MotionError(f"weights must be {index.rows.shape[1]} numbers from 0 to {LARGEST:g}")
+    return weights

@@ -1,0 +1,97 @@
+"""Sixteen squared distances at a time, written for vector registers.
+
+A compiler cannot keep sixteen running sums in registers when they live in an array that might overlap its inputs, so
+this loop is given to it as vector instructions; they become whatever width the processor has. Each sum is made in
+the same order everywhere, without contraction, so that equal inputs give equal bits on every machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+LANES = 16
+
+_SIXTEEN = ir.VectorType(ir.FloatType(), LANES)
+_ZEROS = ir.Constant(_SIXTEEN, [0.0] * LANES)
+_UNDEFINED = ir.Constant(_SIXTEEN, ir.Undefined)
+_FIRST_LANE = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+
+# Even and odd dimensions are summed apart: two additions can then be under way at once.
+DIMENSIONS_PER_STEP = 2
+
+Values = list[ir.Value]
+Gap = Callable[[ir.IRBuilder, Values, ir.Value], ir.Value]
+
+
+def _spread(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+    first = builder.insert_element(_UNDEFINED, value, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(first, _UNDEFINED, _FIRST_LANE)
+
+
+def _larger(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
+    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
+
+
+def _from_row(builder: ir.IRBuilder, row: Values, query: ir.Value) -> ir.Value:
+    return builder.fsub(row[0], query)
+
+
+def _from_box(builder: ir.IRBuilder, sides: Values, query: ir.Value) -> ir.Value:
+    low, high = sides
+    outside = _larger(builder, builder.fsub(low, query), builder.fsub(query, high))
+    return _larger(builder, outside, _ZEROS)
+
+
+def _summed(gap: Gap, operands: int) -> Any:
+    """An intrinsic that sums weight · gap² over the dimensions, for arrays with `operands` vectors per dimension."""
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Values) -> ir.Value:
+        *arrays, limit = arguments
+        block, query, weights, sums = (
+            context.make_array(kind)(context, builder, array)
+            for kind, array in zip(signature.args, arrays, strict=False)
+        )
+        vectors = builder.bitcast(block.data, _SIXTEEN.as_pointer())
+        dimensions = builder.extract_value(query.shape, 0)
+        running = [cgutils.alloca_once_value(builder, _ZEROS) for _ in range(DIMENSIONS_PER_STEP)]  # type: ignore[no-untyped-call]
+
+        def at(base: ir.Value, scale: int, offset: int) -> ir.Value:
+            size = base.type
+            return builder.add(builder.mul(base, ir.Constant(size, scale)), ir.Constant(size, offset))
+
+        steps = builder.udiv(dimensions, ir.Constant(dimensions.type, DIMENSIONS_PER_STEP))
+        with cgutils.for_range(builder, steps) as loop:
+            for k, total in enumerate(running):
+                d = at(loop.index, DIMENSIONS_PER_STEP, k)
+                values = [builder.load(builder.gep(vectors, [at(d, operands, o)]), align=4) for o in range(operands)]
+                distance = gap(builder, values, _spread(builder, builder.load(builder.gep(query.data, [d]))))
+                weight = _spread(builder, builder.load(builder.gep(weights.data, [d])))
+                term = builder.fmul(builder.fmul(distance, distance), weight)
+                builder.store(builder.fadd(builder.load(total), term), total)
+
+        result = builder.fadd(*(builder.load(total) for total in running))
+        builder.store(result, builder.bitcast(sums.data, _SIXTEEN.as_pointer()), align=4)
+        within = builder.fcmp_ordered("<=", result, _spread(builder, limit))
+        return builder.zext(builder.bitcast(within, ir.IntType(LANES)), ir.IntType(64))
+
+    def typed(_context: Any, block: Any, query: Any, weights: Any, sums: Any, limit: Any) -> Any:
+        arrays = (block, query, weights, sums)
+        if limit != types.float32 or any(a.dtype != types.float32 or a.layout != "C" for a in arrays):
+            return None
+        return types.int64(*arrays, limit), generate
+
+    return intrinsic(typed)
+
+
+row_costs = _summed(_from_row, 1)
+"""row_costs(block (D, 16), query (D,), weights (D,), sums (16,), limit): distances of 16 rows, all float32, D even.
+
+Fills `sums`; returns an integer whose bit l is set where sums[l] <= limit."""
+
+box_costs = _summed(_from_box, 2)
+"""box_costs(boxes (D, 2, 16), …): the same, of the query to the nearest point of 16 boxes (low and high sides)."""
