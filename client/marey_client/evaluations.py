@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from marey_client.downloads import saved_atomically
 from marey_client.items import ItemHandle
 from marey_schemas.evaluation import EvaluateParams, EvaluationReport, StoredFigure
-from marey_schemas.items import Item
 from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
 
 if TYPE_CHECKING:
@@ -95,24 +94,18 @@ class EvaluationHandle(ItemHandle):
 
 
 def evaluate_request(
-    project: ProjectHandle,
-    clips: Places,
-    params: EvaluateParams,
-    *,
-    into: str,
-    normaliser: str | Item | None,
-    priority: int,
+    project: ProjectHandle, clips: Places, params: EvaluateParams, normaliser: str | None
 ) -> JobCreate:
-    """The job that evaluates `clips`: loops that are tagged so, and the mapping of a skeleton that was edited since."""
+    """The job that evaluates `clips`, with loops that are tagged so and the mapping of a skeleton that was edited."""
     places = _places(clips)
     inputs: dict[str, Any] = {"clips": places}
     if normaliser is not None:
-        inputs["normaliser"] = ItemInput(item=normaliser if isinstance(normaliser, str) else normaliser.id)
-    if (edited := project.edited_rigs(places)) and len(edited) == 1:
-        inputs["rig"] = edited[0]
+        inputs["normaliser"] = ItemInput(item=normaliser)
+    if len(edited := project.edited_rigs(places)) == 1:
+        (inputs["rig"],) = edited
     loops = tuple(dict.fromkeys((*params.loops, *_tagged_loops(project, places))))
     given = params.model_copy(update={"loops": loops}).model_dump(mode="json", exclude_defaults=True)
-    return JobCreate(kind="evaluate", inputs=inputs, params=given, into=into, priority=priority)
+    return JobCreate(kind="evaluate", inputs=inputs, params=given)
 
 
 def _places(clips: Places) -> tuple[CollectionInput | ItemInput, ...]:

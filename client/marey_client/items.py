@@ -11,6 +11,7 @@ from marey_client.downloads import download
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.items import Item, ItemChange, ItemCreate, Lineage, Revision, Staleness
+from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import Kind
 
 
@@ -44,6 +45,10 @@ class ItemHandle:
     def url(self) -> str:
         """The path below the API's root."""
         return f"/projects/{self.project}/{self.item.kind.plural}/{self.item.id}"
+
+    def as_input(self) -> ItemInput:
+        """The revision that was read, as an input of jobs."""
+        return ItemInput(item=self.id, revision=self.item.revision)
 
     def part(self, part: str, *, revision: int | None = None, **query: str | None) -> dict[str, Any]:
         """The document of a part; arrays are numpy arrays."""

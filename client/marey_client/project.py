@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 from marey_client.access import Members
 from marey_client.blobs import Blobs
@@ -125,6 +125,7 @@ class ProjectHandle:
         into: str = "",
         normaliser: str | None = None,
         priority: int = 0,
+        cache: Literal["use", "refresh", "off"] = "use",
         **options: Any,
     ) -> Job:
         """Hand in the evaluation of clips of one skeleton: a folder by its path, or folders and clips.
@@ -132,8 +133,8 @@ class ProjectHandle:
         `options` are those of `EvaluateParams`, for example `name="walks-eval"` or `database={"mirroring": "add"}`;
         `normaliser` is the id of an evaluation that the result shall be comparable with.
         """
-        params = EvaluateParams.model_validate(options)
-        return self.submit(evaluate_request(self, clips, params, into=into, normaliser=normaliser, priority=priority))
+        request = evaluate_request(self, clips, EvaluateParams.model_validate(options), normaliser)
+        return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
 
     def evaluation(self, job: Job, *, on_progress: Callable[[Job], None] | None = None) -> EvaluationHandle:
         """The evaluation that a job makes, once it is there. Raises `JobUnsuccessful`."""

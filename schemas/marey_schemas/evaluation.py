@@ -23,6 +23,9 @@ Speed = Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)]
 TurnRate = Annotated[float, Field(ge=-720, le=720, allow_inf_nan=False)]
 Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 ItemId = Annotated[str, StringConstraints(min_length=1, max_length=64)]
+ScriptDigest = Annotated[str, StringConstraints(pattern=r"^sha256-[A-Za-z0-9+/]{43}=$")]
+"""A script by its content, as a Content-Security-Policy names it."""
+
 FigureName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
 
 DEFAULT_SPEEDS_M_S = tuple(1.0 + 0.25 * step for step in range(9))
@@ -209,4 +212,5 @@ class EvaluationReport(Request):
     schema_: Literal["marey/evaluation-report@1"] = Field("marey/evaluation-report@1", alias="schema")
     title: str
     html: StoredFile
+    scripts: tuple[ScriptDigest, ...] = Field((), max_length=16, description="The scripts that the page may run.")
     figures: tuple[StoredFigure, ...] = Field((), max_length=10_000)

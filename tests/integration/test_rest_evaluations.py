@@ -1,5 +1,6 @@
 """Reports and figures of evaluations over HTTP: served as they were stored, to be shown and trusted nowhere."""
 
+import base64
 import hashlib
 
 import httpx
@@ -8,6 +9,7 @@ import pytest
 from rest_server import Server
 
 PAGE = b"<!doctype html><title>Report</title><p>All is well."
+SCRIPT = "sha256-" + base64.b64encode(hashlib.sha256(b"sort()").digest()).decode()
 FILES = {"png": b"\x89PNG drawn", "svg": b"<svg/>", "json": b'{"tables": {}}', "csv": b"speed\n1.0\n"}
 TYPES = {"png": "image/png", "svg": "image/svg+xml", "json": "application/json", "csv": "text/csv; charset=utf-8"}
 
@@ -27,6 +29,7 @@ def evaluation(owner: httpx.Client) -> str:
         "schema": "marey/evaluation-report@1",
         "title": "walks",
         "html": stored(owner, PAGE),
+        "scripts": [SCRIPT],
         "figures": [{"name": "offsets", **figure}, {"name": "errors", "trial": "circle v=1 w=0", **figure}],
     }
     parts = {
@@ -43,15 +46,18 @@ def test_lists_show_the_verdict_and_the_headline_numbers(owner: httpx.Client, ev
     assert shown["summary"] == {"verdict": "Good.", "offset_mean_m": 0.3}
 
 
-def test_a_report_is_a_page_that_may_do_nothing(owner: httpx.Client, evaluation: str) -> None:
+def test_a_report_is_a_page_that_may_run_its_own_script_and_do_nothing_else(
+    owner: httpx.Client, evaluation: str
+) -> None:
     answer = owner.get(f"{evaluation}/report")
     assert (answer.status_code, answer.content) == (200, PAGE)
     assert answer.headers["Content-Type"] == "text/html; charset=utf-8"
     assert answer.headers["X-Content-Type-Options"] == "nosniff"
     policy = answer.headers["Content-Security-Policy"].split("; ")
     assert "default-src 'none'" in policy
-    assert "sandbox" in policy
-    assert not any(rule.startswith(("script-src", "connect-src")) for rule in policy)
+    assert f"script-src '{SCRIPT}'" in policy
+    assert "sandbox allow-scripts" in policy
+    assert not any(rule.startswith("connect-src") for rule in policy)
 
 
 def test_a_report_that_is_held_already_is_not_sent_again(owner: httpx.Client, evaluation: str) -> None:
@@ -74,7 +80,7 @@ def test_a_figure_comes_in_every_form(owner: httpx.Client, evaluation: str, form
     answer = owner.get(f"{evaluation}/figures/offsets?format={form}")
     assert (answer.status_code, answer.content) == (200, FILES[form])
     assert answer.headers["Content-Type"] == TYPES[form]
-    assert "sandbox" in answer.headers["Content-Security-Policy"]
+    assert answer.headers["Content-Security-Policy"].endswith("; sandbox")
 
 
 def test_figures_of_one_trial_are_asked_for_by_its_name(owner: httpx.Client, evaluation: str) -> None:

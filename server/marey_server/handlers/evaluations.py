@@ -25,11 +25,8 @@ FIGURE_TYPES = {
     "csv": "text/csv; charset=utf-8",
     "json": "application/json",
 }
-ALONE = "default-src 'none'; base-uri 'none'; form-action 'none'"
-REPORT_POLICY = f"{ALONE}; style-src 'unsafe-inline'; img-src data:; font-src data:; sandbox"
-"""A report shows itself and nothing else: no scripts, no requests, no access to what the browser keeps for the site."""
-
-FIGURE_POLICY = f"{ALONE}; style-src 'unsafe-inline'; img-src data:; sandbox"
+SHOWN_ONLY = "default-src 'none'; base-uri 'none'; form-action 'none'; style-src 'unsafe-inline'; img-src data:"
+"""What is served shows itself and nothing else: no requests, and no access to what the browser keeps for the site."""
 
 
 class ReportQuery(Request):
@@ -49,14 +46,14 @@ class FigureQuery(ReportQuery):
 class StoredFileSender(BlobSender):
     """Resources that answer with a file which a document names."""
 
-    async def send_file(self, file: StoredFile, query: ReportQuery, media_type: str, policy: str) -> Rendered | None:
+    async def send_file(self, file: StoredFile, query: ReportQuery, media_type: str, sandbox: str) -> Rendered | None:
         """Answer with the file, to be shown where it is asked for and trusted nowhere."""
         return await self.send_blob(
             file.blob,
             disposition="inline",
             media_type=media_type,
             cache_control=IMMUTABLE if query.revision is not None else "private, no-cache",
-            headers={"Content-Security-Policy": policy},
+            headers={"Content-Security-Policy": f"{SHOWN_ONLY}; {sandbox}"},
         )
 
 
@@ -78,7 +75,7 @@ class Report(StoredFileSender):
     async def get(self, project: str, kind: str, item: str, query: ReportQuery) -> Rendered | None:
         """The report of an evaluation (kind `evaluations`): one page that needs nothing else."""
         report = await self.look_up(read_report, project, kind_of(kind), item, query.revision)
-        return await self.send_file(report.html, query, "text/html; charset=utf-8", REPORT_POLICY)
+        return await self.send_file(report.html, query, "text/html; charset=utf-8", _scripts(report))
 
 
 class Figure(StoredFileSender):
@@ -100,7 +97,14 @@ class Figure(StoredFileSender):
         """A figure of an evaluation's report (kind `evaluations`): as a picture, a drawing, or the numbers in it."""
         report = await self.look_up(read_report, project, kind_of(kind), item, query.revision)
         file = file_of(find_figure(report, figure, query.trial), query)
-        return await self.send_file(file, query, FIGURE_TYPES[query.format], FIGURE_POLICY)
+        return await self.send_file(file, query, FIGURE_TYPES[query.format], "sandbox")
+
+
+def _scripts(report: EvaluationReport) -> str:
+    """The part of the policy that lets the page run its own scripts, named by content, and no others."""
+    if not report.scripts:
+        return "sandbox"
+    return f"script-src {' '.join(repr(digest) for digest in report.scripts)}; sandbox allow-scripts"
 
 
 def read_report(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> EvaluationReport:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.report.verdict import verdict
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import records_from_tree, records_to_tree, result_to_tree
 from marey_motion.evaluation.scenario import suite_trials
@@ -18,9 +19,9 @@ from marey_schemas.evaluation import EvaluateParams
 from marey_schemas.jobs import StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused
+from marey_worker.kinds.evaluation_headline import headline_of
 from marey_worker.kinds.evaluation_options import options_of
 from marey_worker.kinds.evaluation_report import write_report
-from marey_worker.kinds.evaluation_verdict import headline_of, verdict_on
 from marey_worker.kinds.matching_clips import read_database
 
 GATHERING_STEPS = 4
@@ -83,10 +84,9 @@ def _read_records(context: Context, results: Sequence[Mapping[str, Any]]) -> dic
 
 
 def _evaluation_document(result: EvaluationResult, database: MatchingDatabase) -> dict[str, Any]:
-    headline = headline_of(result)
     return {
         **result_to_tree(result),
         "normaliser": database.normaliser.as_tree(),
-        "verdict": verdict_on(result, headline),
-        "headline": headline,
+        "verdict": verdict(result),
+        "headline": headline_of(result),
     }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 from typing import Any
 
 from marey_motion.evaluation.figures import FIGURES, DrawnFigure, draw_figure
@@ -20,6 +22,7 @@ def write_report(context: Context, result: EvaluationResult, title: str) -> dict
     report = EvaluationReport(
         title=title,
         html=_stored(context, page.encode()),
+        scripts=_scripts(page),
         figures=tuple(_stored_figure(context, figure) for figure in figures.values()),
     )
     return report.model_dump(mode="json", by_alias=True)
@@ -30,6 +33,13 @@ def draw_figures(result: EvaluationResult) -> dict[str, DrawnFigure]:
     families = result.options.families
     wanted = [name for name in FIGURES if OF_ONE_FAMILY.get(name, families[0]) in families]
     return {name: draw_figure(name, result) for name in wanted}
+
+
+def _scripts(page: str) -> tuple[str, ...]:
+    """The script of the page: its last one. Anything before it that looks like one came with a name of something."""
+    _, found, rest = page.rpartition("<script>")
+    digest = hashlib.sha256(rest.partition("</script>")[0].encode()).digest()
+    return (f"sha256-{base64.b64encode(digest).decode()}",) if found else ()
 
 
 def _stored_figure(context: Context, figure: DrawnFigure) -> StoredFigure:
