@@ -22,8 +22,9 @@ from marey_motion.evaluation.figures.scenarios import draw_circle, draw_switchin
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
 from marey_motion.evaluation.figures.transition_costs import draw_transition_costs
 from marey_motion.evaluation.result import EvaluationResult
+from marey_motion.evaluation.scenario import Family
 
-__all__ = ["FIGURES", "DrawnFigure", "FigureKind", "FigureOptions", "draw_figure"]
+__all__ = ["FIGURES", "DrawnFigure", "FigureKind", "FigureOptions", "draw_figure", "draw_figures"]
 
 
 class FigureKind(NamedTuple):
@@ -33,6 +34,7 @@ class FigureKind(NamedTuple):
     ----------
     number : in the paper, or ""
     trials : "one" when it shows one trial, "any" when it shows the suite or one trial, "none" when always the suite
+    families : those whose trials it can show
     draw : makes the page of one or two subjects
     """
 
@@ -40,12 +42,13 @@ class FigureKind(NamedTuple):
     title: str
     trials: str
     draw: Callable[[Sequence[Subject], str | None, FigureOptions], Sketch]
+    families: tuple[Family, ...] = ("circle", "switching")
 
 
 FIGURES = {
     "points": FigureKind("1", "Speeds and turn rates of every clip", "none", draw_points),
-    "scenario-circle": FigureKind("4a", "A trial at constant speed", "one", draw_circle),
-    "scenario-switching": FigureKind("4b", "A trial whose speed switches", "one", draw_switching),
+    "scenario-circle": FigureKind("4a", "A trial at constant speed", "one", draw_circle, ("circle",)),
+    "scenario-switching": FigureKind("4b", "A trial whose speed switches", "one", draw_switching, ("switching",)),
     "offsets": FigureKind("5", "Distance from the path", "none", draw_offsets),
     "density": FigureKind("6", "Where the data is", "none", draw_density),
     "transition-cost": FigureKind("7", "Cost of transitions over a trial", "one", draw_transition_costs),
@@ -89,3 +92,26 @@ def draw_figure(
         raise MotionError(f"the figure {name!r} shows the whole suite, not a trial", code="figure-without-trial")
     subjects = [Subject("", result)] if other is None else [Subject(labels[0], result), Subject(labels[1], other)]
     return finish(kind.draw(subjects, trial, options or FigureOptions()), name, kind.number, kind.title)
+
+
+def draw_figures(
+    result: EvaluationResult,
+    *,
+    other: EvaluationResult | None = None,
+    labels: tuple[str, str] = ("before", "after"),
+    options: FigureOptions | None = None,
+) -> dict[str, DrawnFigure]:
+    """Every figure that can be drawn of a result, or of two, by name.
+
+    Left out are those of trials that there are not, and those that need records where these were not kept.
+    """
+    results = [result] if other is None else [result, other]
+    names = set.intersection(*({each.trial.name for each in one.trials} for one in results))
+    families = {each.trial.family for each in result.trials if each.trial.name in names}
+    with_records = all(one.records for one in results)
+    return {
+        name: draw_figure(name, result, other=other, labels=labels, options=options)
+        for name, kind in FIGURES.items()
+        if kind.trials != "one" or (with_records and families.intersection(kind.families))
+        if name != "offsets" or families
+    }

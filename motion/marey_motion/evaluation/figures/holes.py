@@ -98,6 +98,7 @@ def _caption(subjects: Sequence[Subject]) -> str:
     for subject in subjects:
         missing = subject.result.coverage.deficit_s
         parts.append(
-            f"{subject.prefix}{np.count_nonzero(missing > 0)} of {missing.size} cells lack data, {missing.sum():.1f} s in all."
+            f"{subject.prefix}{np.count_nonzero(missing > 0)} of {missing.size} cells lack data, "
+            f"{missing.sum():.1f} s in all."
         )
     return f"What to record: seconds that each cell lacks; a dot stands where there is enough. {' '.join(parts)}"

@@ -1,0 +1,50 @@
+"""Reports of evaluations for people: one HTML file each, which needs no network and no other file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from marey_motion.evaluation.figures import DrawnFigure, draw_figures
+from marey_motion.evaluation.report.chapters import (
+    appendix_chapter,
+    baseline_chapter,
+    coverage_chapter,
+    error_chapter,
+    headline,
+    load_chapter,
+    notes,
+    recording_chapter,
+    unused_chapter,
+)
+from marey_motion.evaluation.report.definitions import definitions
+from marey_motion.evaluation.report.markup import element
+from marey_motion.evaluation.report.page import Section, page
+from marey_motion.evaluation.report.provenance import provenance
+from marey_motion.evaluation.report.verdict import Judgement, judge, verdict
+from marey_motion.evaluation.result import EvaluationResult
+
+__all__ = ["Judgement", "judge", "render_report", "verdict"]
+
+
+def render_report(result: EvaluationResult, *, title: str, figures: Mapping[str, DrawnFigure] | None = None) -> str:
+    """The report of one evaluation as an HTML document.
+
+    Parameters
+    ----------
+    title : heading of the page, for example the name of the dataset
+    figures : by name, as `draw_figures` gives them; drawn when None. Those that are missing leave no gap
+    """
+    drawn = draw_figures(result) if figures is None else figures
+    sections = [
+        coverage_chapter(result, drawn),
+        error_chapter(result, drawn),
+        load_chapter(result, drawn),
+        unused_chapter(result),
+        recording_chapter(result, drawn),
+        baseline_chapter(result),
+        appendix_chapter(result),
+        Section("definitions", "What the numbers mean", definitions()),
+        Section("provenance", "Where this comes from", (provenance([result], ["value"]), notes(result))),
+    ]
+    lead = element("p", verdict(result), class_="verdict"), headline(result)
+    return page(title, lead, sections, f"Written by Marey {result.provenance.code_version}.")

@@ -1,0 +1,115 @@
+"""Speeds, turn rates and amounts as an animator says them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from marey_motion.evaluation.result import Coverage
+from marey_motion.evaluation.scenario import Trial
+
+STRAIGHT_DEG_S = 1e-6
+
+
+class Hole(NamedTuple):
+    """Neighbouring cells of one speed that lack data: what to record there, and how much.
+
+    Parameters
+    ----------
+    turn_rates_deg_s, speeds_m_s : (low, high)
+    missing_s : seconds of data that lack in all
+    """
+
+    turn_rates_deg_s: tuple[float, float]
+    speeds_m_s: tuple[float, float]
+    missing_s: float
+
+    @property
+    def words(self) -> str:
+        """For example "left turns of 75 to 100 degrees a second at 2 to 3 m/s"."""
+        return f"{turning(*self.turn_rates_deg_s)} at {span(*self.speeds_m_s)} m/s"
+
+
+def find_holes(coverage: Coverage) -> list[Hole]:
+    """What is missing as few rectangles of cells, the largest deficit first.
+
+    Cells are joined along the turn rate within one side (left, straight on, right), then runs that are alike along the
+    speed. A rectangle is named by the centres of its outermost cells: they are the trials that it stands for.
+    """
+    lacking = coverage.deficit_s > 0.0
+    speeds, turns = (_centres(edges) for edges in (coverage.speed_edges_m_s, coverage.turn_rate_edges_deg_s))
+    sides = np.where(np.abs(turns) <= STRAIGHT_DEG_S, 0.0, np.sign(turns))
+    done: list[tuple[int, int, int, int]] = []  # first and last column, first and last row
+    for row in range(len(lacking)):
+        for first, last in _runs(lacking[row], sides):
+            before = next((hole for hole in done if hole[:2] == (first, last) and hole[3] == row - 1), None)
+            if before is not None:
+                done[done.index(before)] = (first, last, before[2], row)
+            else:
+                done.append((first, last, row, row))
+    holes = [
+        Hole(
+            (float(turns[first]), float(turns[last])),
+            (float(speeds[low]), float(speeds[high])),
+            float(coverage.deficit_s[low : high + 1, first : last + 1].sum()),
+        )
+        for first, last, low, high in done
+    ]
+    return sorted(holes, key=lambda hole: (-hole.missing_s, hole))
+
+
+def turning(low_deg_s: float, high_deg_s: float) -> str:
+    """A range of turn rates of one side."""
+    least, most = sorted((abs(low_deg_s), abs(high_deg_s)))
+    if most <= STRAIGHT_DEG_S:
+        return "straight ahead"
+    side = "left" if low_deg_s + high_deg_s > 0.0 else "right"
+    return f"{side} turns of {span(least, most)} degrees a second"
+
+
+def span(low: float, high: float) -> str:
+    """A range of numbers, or the one number."""
+    return f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.4g} to {high:.4g}"
+
+
+def demand(trial: Trial) -> str:
+    """What a trial asks for."""
+    turn = float(np.degrees(trial.turn_rate_rad_s))
+    speed = f"{trial.speed_m_s:g} m/s"
+    if trial.family == "switching":
+        speed = f"{trial.speed_m_s:g} m/s switching to {trial.switch_speed_m_s:g}"
+    if abs(turn) <= STRAIGHT_DEG_S:
+        return f"straight ahead at {speed}"
+    return f"{'left' if turn > 0 else 'right'} turns of {abs(turn):.4g} degrees a second at {speed}"
+
+
+def amount(count: int, thing: str) -> str:
+    """A number of things: one clip, 2 clips, 3 trajectories."""
+    if count == 1:
+        return f"1 {thing}"
+    plural = f"{thing[:-1]}ies" if thing.endswith("y") else f"{thing}s"
+    return f"{count:,} {plural}"
+
+
+def duration(seconds: float) -> str:
+    """Seconds, or minutes and seconds."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    return f"{whole} s" if whole < 120 else f"{whole // 60} min {whole % 60} s"
+
+
+def _centres(edges: np.ndarray) -> np.ndarray:
+    return np.round(0.5 * (edges[:-1] + edges[1:]), 9)
+
+
+def _runs(lacking: np.ndarray, sides: np.ndarray) -> list[tuple[int, int]]:
+    """First and last of each run of lacking cells that lie on one side."""
+    runs: list[tuple[int, int]] = []
+    for column in np.flatnonzero(lacking).tolist():
+        if runs and runs[-1][1] == column - 1 and sides[column] == sides[column - 1]:
+            runs[-1] = (runs[-1][0], column)
+        else:
+            runs.append((column, column))
+    return runs
