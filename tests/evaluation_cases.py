@@ -86,6 +86,39 @@ def arc(speed_m_s: float, turn_rate_deg_s: float, duration_s: float) -> tuple[ND
     return asked.positions[: asked.tick_count], asked.headings[: asked.tick_count]
 
 
+def trajectory_database(*roots: tuple[NDArray[np.float64], NDArray[np.float64]]) -> MatchingDatabase:
+    """A database whose rows match by where their roots go, every body alike; futures clamp to the clip's last frame."""
+    database = root_database(*roots)
+    ahead = np.round(np.array(database.options.horizons_s) * RATE_HZ).astype(np.int64)
+    features = [np.concatenate([_futures(*root, ahead) for root in roots])]
+    features.insert(0, np.zeros((database.row_count, 27 - features[0].shape[1])))
+    stops = np.array([clip.stop for clip in database.clips])
+    rows = np.arange(database.row_count)
+    left = stops[np.searchsorted(stops, rows, side="right")] - rows
+    return replace(
+        database,
+        features=np.concatenate(features, axis=1),
+        normaliser=Normaliser(np.zeros(27), np.ones(27), ""),
+        selectable=left > ahead[0],
+    )
+
+
+def _futures(
+    positions: NDArray[np.float64], headings: NDArray[np.float64], ahead: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """(F, 12) positions, then directions, at each horizon in the frame of each row."""
+    frames = len(headings)
+    later = np.minimum(np.arange(frames)[:, None] + ahead, frames - 1)
+    step = positions[later] - positions[:, None]
+    sine, cosine = np.sin(headings)[:, None], np.cos(headings)[:, None]
+    places = np.stack(
+        (step[..., 0] * cosine - step[..., 1] * sine, step[..., 0] * sine + step[..., 1] * cosine), axis=-1
+    )
+    turned = headings[later] - headings[:, None]
+    directions = np.stack((np.sin(turned), np.cos(turned)), axis=-1)
+    return np.concatenate((places.reshape(frames, -1), directions.reshape(frames, -1)), axis=1)
+
+
 def root_database(
     *roots: tuple[NDArray[np.float64], NDArray[np.float64]], options: DatabaseOptions | None = None
 ) -> MatchingDatabase:

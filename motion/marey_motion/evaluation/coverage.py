@@ -64,15 +64,18 @@ def sliding_windows(positions: Floats, headings: Floats, rate_hz: float) -> Wind
 
 
 def measure_coverage(
-    database: MatchingDatabase, options: EvaluationOptions, *, excluded: Sequence[int] = ()
+    database: MatchingDatabase, options: EvaluationOptions, *, with_in_place: bool = False
 ) -> Coverage:
-    """Windows of all clips but the excluded ones (indices), and how long the cells of the trial grid are covered."""
+    """Windows of all clips, and how long they cover each cell of the trial grid.
+
+    Clips that walk in place, as on a treadmill, would count as standing still: they are left out unless asked for.
+    """
     rate = database.options.rate_hz
     parts = [Windows(*np.empty((4, 0)))]
     owners = [np.empty(0, dtype=np.int32)]
     too_short: list[int] = []
     for index, clip in enumerate(database.clips):
-        if index in excluded:
+        if clip.in_place and not with_in_place:
             continue
         rows = slice(clip.start, clip.stop)
         windows = sliding_windows(database.root_positions[rows], database.root_headings[rows], rate)

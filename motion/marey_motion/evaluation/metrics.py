@@ -226,12 +226,13 @@ def _switch_metrics(record: TrialRecord, window: Mask) -> dict[str, float | None
 
 
 def _cost_metrics(record: TrialRecord, window: Mask) -> dict[str, float | None]:
+    """A step's costs are those of the tick it starts from: what was searched and chosen there is displayed after it."""
     entered = window & (record.status[1:] == Status.REPLACING)
     series = {
-        "pose_cost": record.pose_cost[1:][window],
+        "pose_cost": record.pose_cost[:-1][window],
         "switch_pose_cost": record.pose_cost[:-1][entered],
-        "match_cost": record.match_cost[1:][window],
-        "continuing_cost": record.continuing_cost[1:][window],
+        "match_cost": record.match_cost[:-1][window],
+        "continuing_cost": record.continuing_cost[:-1][window],
     }
     metrics: dict[str, float | None] = {}
     for name, costs in series.items():

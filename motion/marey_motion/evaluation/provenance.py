@@ -27,9 +27,7 @@ def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials
     return Provenance(
         dataset=_digest(sorted(rows)),
         clips={clip.uid: clip.content or own for clip, own in zip(database.clips, rows, strict=True)},
-        normaliser=_digest(
-            {"offset": database.normaliser.offset.tolist(), "scale": database.normaliser.scale.tolist()}
-        ),
+        normaliser=database.normaliser.digest,
         options=_digest({"database": database.options, "controller": options.controller, "window": options.window}),
         scenarios=_digest(list(trials)),
         code_version=_code_version(),

@@ -76,7 +76,7 @@ def run_suite(
             finished(trial, record)
         tell(sum(one.name in records for one in wanted), len(wanted), trial.name)
 
-    _run_ahead(run, ahead, keep, threads or len(os.sched_getaffinity(0)), cancelled or (lambda: False))
+    _run_ahead(run, ahead, keep, threads or os.cpu_count() or 1, cancelled or (lambda: False))
     return [records[trial.name] for trial in wanted]
 
 
@@ -131,6 +131,7 @@ def assemble(
         coverage=measure_coverage(database, options),
         records=tuple(records),
         baseline=baseline,
+        notes=tuple(str(note) for note in database.notes),
     )
 
 
@@ -173,7 +174,7 @@ def evaluate_baseline(
         trials = suite_trials(options)
         database, notes = baseline_database(options)
         records = run_suite(database, options, trials=trials, threads=threads, cancelled=cancelled)
-        made = replace(assemble(database, options, trials, records), records=(), notes=tuple(notes))
+        made = assemble(database, options, trials, records)
         _baselines.clear()
-        _baselines[options] = made
+        _baselines[options] = replace(made, records=(), notes=(*notes, *made.notes))
     return _baselines[options]

@@ -243,7 +243,6 @@ def test_costs_are_summed_up_where_they_are_defined():
 def test_costs_of_each_speed_are_told_apart():
     asked = closed_reference(SWITCHING)
     fast = asked.speeds_m_s[: asked.tick_count] == 4.0
-    fast = np.concatenate(([False], fast[:-1]))  # a cost belongs to the step that leads to its tick
     result = measured(SWITCHING, record_of(asked, pose_cost=np.where(fast, 0.9, 0.2)))
 
     assert result.regimes["base"]["pose_cost_max"] == 0.2
