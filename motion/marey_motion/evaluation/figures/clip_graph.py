@@ -59,7 +59,7 @@ def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: Fig
     dots = [{uid: _per_dot(each[uid], circles[uid]) for uid in uids if uid in each} for each in popularity]
     most = max([1, *(int(total.max()) for each in dots for total in each.values())])
     width, height = (8.6, 6.6) if len(subjects) == 1 else (9.6, 4.7)
-    figure = new_figure(width, height + 0.3)
+    figure = new_figure(width, height + 0.3 * (len(subjects) > 1))
     across = width / len(subjects)
     for number, subject in enumerate(subjects):
         panel = add_panel(figure, Place(number * across, 0.0, across, height), grid=False)

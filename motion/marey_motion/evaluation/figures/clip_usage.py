@@ -46,7 +46,7 @@ def draw_usage(subjects: Sequence[Subject], trial: str | None, options: FigureOp
     shown, others = order[: options.most_clips], order[options.most_clips :]
     rows = len(shown) + bool(others) + 1
     height = ROW * rows * (1.0 if len(subjects) == 1 else 1.35)
-    figure = new_figure(8.6, height + 1.25)
+    figure = new_figure(8.6, height + (1.05 if trial or len(subjects) > 1 else 0.65))
     place = Place(2.55, 0.55, 5.2, height)
     panel = add_panel(figure, place, title=trial or "", x="frames displayed, or times switched")
     panel.grid(visible=False, axis="y")
@@ -130,4 +130,4 @@ def _caption(subjects: Sequence[Subject], uses: Sequence[_Use]) -> str:
             f"{subject.prefix}{used} of {len(use.ticks)} clips used over {sum(use.ticks.values()):,} displayed frames, "
             f"{use.transitions:,} transitions between them."
         )
-    return "How often a frame of each clip was displayed. " + " ".join(parts)
+    return "How often frames of each clip were displayed. " + " ".join(parts)

@@ -48,7 +48,7 @@ def draw_points(subjects: Sequence[Subject], _trial: str | None, options: Figure
     width = 9.6 if len(subjects) > 1 else 8.6
     keys = 2.5
     each = (width - 0.75 - keys - 0.45 * (len(subjects) - 1)) / len(subjects)
-    figure = new_figure(width, 4.9)
+    figure = new_figure(width, 4.9 if len(subjects) > 1 else 4.65)
     limits = _limits(subjects, chosen)
     styles: dict[str, int] = {}  # a clip looks the same in both panels
     for number, (subject, points) in enumerate(zip(subjects, chosen, strict=True)):
@@ -147,6 +147,6 @@ def _caption(subjects: Sequence[Subject], chosen: Sequence[_Points]) -> str:
     parts = []
     for subject, points in zip(subjects, chosen, strict=True):
         held, total = len(np.unique(subject.result.coverage.clip)), len(subject.result.coverage.clip)
-        drawn = "all of them" if len(points.windows) == total else f"{len(points.windows)} of them, evenly spaced"
-        parts.append(f"{subject.prefix}{total} windows of one second from {held} clips, {drawn} drawn.")
-    return "What the clips hold: each point is the mean speed and turn rate of one second. " + " ".join(parts)
+        drawn = "all of them" if len(points.windows) == total else f"{len(points.windows):,} of them, evenly spaced"
+        parts.append(f"{subject.prefix}{total:,} windows from {held} clips, {drawn} drawn.")
+    return "Each point is the mean speed and turn rate of one second of a clip. " + " ".join(parts)

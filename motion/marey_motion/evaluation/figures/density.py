@@ -61,7 +61,7 @@ SPEEDS = _Plane(
     names=("turn_rate_deg_s", "speed_m_s"),
     cell=_grid_cell,
     cell_label="seconds of data around one trial",
-    about="Where the data is: brighter holds more seconds. The frame is the grid of trials.",
+    about="Brighter is where the clips hold more seconds. The frame is the grid of trials.",
 )
 DIRECTIONS = _Plane(
     x=lambda coverage: coverage.strafe_m_s,
@@ -70,7 +70,7 @@ DIRECTIONS = _Plane(
     names=("strafe_m_s", "forward_m_s"),
     cell=lambda _: (DIRECTION_CELL_M_S, DIRECTION_CELL_M_S),
     cell_label="seconds of data per 0.25 x 0.25 m/s",
-    about="Which way the body moves while it faces ahead: backward and sideways motion, which a speed alone hides.",
+    about="Which way the body moves as seen from where it faces; a speed alone hides backward and sideways motion.",
 )
 
 
@@ -90,7 +90,7 @@ def _draw(subjects: Sequence[Subject], plane: _Plane) -> Sketch:
     maps = [_seconds(subject, plane, edges, cell) for subject in subjects]
     two = len(subjects) > 1
     width, height, gap = (2.62, 2.7, 0.3) if two else (5.9, 3.9, 0.3)
-    figure = new_figure(9.6 if two else 7.6, height + (1.75 if two else 1.0))
+    figure = new_figure(9.6 if two else 7.6, height + (1.75 if two else 0.75))
     bottom = 1.3 if two else 0.58
     ceiling = nice_ceiling(max(float(each.max()) for each in maps))
     for number, (subject, each) in enumerate(zip(subjects, maps, strict=True)):

@@ -156,5 +156,5 @@ def _caption(trial: str, views: Sequence[TrialView], errors: Sequence[tuple[_Err
             f"{view.subject.prefix}speed {speed.one.means[0]:+.2f} ± {speed.one.deviations[0]:.2f} m/s, "
             f"turn rate {turn.one.means[0]:+.1f} ± {turn.one.deviations[0]:.1f} deg/s"
         )
-    text = f"Errors at every step of {trial}: the place of a peak is the static error, its width the dynamic one. "
+    text = f"Errors at every step of {trial}: the place of a peak is the static error, its width the dynamic one: "
     return f"{text}{'; '.join(parts)}."

@@ -48,7 +48,7 @@ def draw_frame_use(subjects: Sequence[Subject], trial: str | None, options: Figu
     strips = [_strips(subject, trial, options.most_clips) for subject in subjects]
     rows = max([1, *(len(each) for each in strips)])
     width = 5.0 if len(subjects) == 1 else 1.55
-    figure = new_figure(9.0 if len(subjects) == 1 else 9.6, ROW * rows + 1.55)
+    figure = new_figure(9.0 if len(subjects) == 1 else 9.6, ROW * rows + (1.6 if trial or len(subjects) > 1 else 1.3))
     ceiling = nice_ceiling(max([0.0, *(float(strip.ticks_per_frame.max()) for each in strips for strip in each)]))
     drawn = None
     for number, (subject, each) in enumerate(zip(subjects, strips, strict=True)):
@@ -135,4 +135,4 @@ def _caption(subjects: Sequence[Subject], strips: Sequence[Sequence[_Strip]]) ->
         parts.append(
             f"{subject.prefix}{share} of all frames were displayed at least once in the suite; {len(each)} clips drawn."
         )
-    return "Which stretches of the clips are used, from beginning to end; blank stretches never. " + " ".join(parts)
+    return "Darker stretches were displayed more often, blank ones never. " + " ".join(parts)

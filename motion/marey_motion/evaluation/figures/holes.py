@@ -40,7 +40,7 @@ def draw_holes(subjects: Sequence[Subject], _trial: str | None, _options: Figure
     """A cell per trial of the grid, with the seconds it lacks; an empty cell has enough."""
     two = len(subjects) > 1
     width, height, gap = (4.0, 3.3, 0.4) if two else (6.2, 3.9, 0.0)
-    figure = new_figure(9.6 if two else 7.8, height + 1.15)
+    figure = new_figure(9.6 if two else 7.8, height + (1.15 if two else 0.85))
     least = max([subject.result.options.coverage_least_s for subject in subjects])
     drawn = None
     for number, subject in enumerate(subjects):
@@ -101,4 +101,4 @@ def _caption(subjects: Sequence[Subject]) -> str:
             f"{subject.prefix}{np.count_nonzero(missing > 0)} of {missing.size} cells lack data, "
             f"{missing.sum():.1f} s in all."
         )
-    return f"What to record: seconds that each cell lacks; a dot stands where there is enough. {' '.join(parts)}"
+    return f"Seconds that each cell lacks; a dot stands where there is enough. {' '.join(parts)}"

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-FAMILY_TITLES = {"circle": "constant speed", "switching": "switching speed"}
+FAMILY_TITLES = {"circle": "Constant speed", "switching": "Switching speed"}
 
 
 class _Field(NamedTuple):

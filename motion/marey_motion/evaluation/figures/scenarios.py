@@ -49,7 +49,7 @@ def _draw(subjects: Sequence[Subject], name: str | None, family: Family) -> Sket
     sections = _sections(trial, guide.tick_count, guide.rate_hz)
     followed = [_followed(subject, trial) for subject in subjects]
     limits = _limits([guide.positions, *(path for path in followed if path is not None)])
-    figure = new_figure(0.75 + len(subjects) * (SIDE + GAP), SIDE + 1.15)
+    figure = new_figure(0.75 + len(subjects) * (SIDE + GAP), SIDE + (1.15 if len(subjects) > 1 else 0.9))
     for number, (subject, path) in enumerate(zip(subjects, followed, strict=True)):
         place = Place(0.7 + number * (SIDE + GAP), 0.72, SIDE, SIDE)
         panel = add_panel(

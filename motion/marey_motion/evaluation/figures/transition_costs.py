@@ -71,6 +71,6 @@ def _caption(views: Sequence[TrialView]) -> str:
             spread = f"mean {costs.mean():.3f} m, 95 % below {np.quantile(costs, 0.95):.3f} m"
             parts.append(f"{view.subject.prefix}{spread}, {switches} switches")
     text = (
-        "Distance over the joints from each displayed pose to the next; peaks are switches between poses that differ. "
+        "Distance over the joints from each displayed pose to the next; peaks are switches between poses that differ: "
     )
     return f"{text}{'; '.join(parts)}."

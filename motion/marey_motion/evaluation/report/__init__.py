@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from marey_motion.evaluation.compare import Comparison
 from marey_motion.evaluation.figures import DrawnFigure, draw_figures
 from marey_motion.evaluation.report.chapters import (
     appendix_chapter,
@@ -16,6 +17,14 @@ from marey_motion.evaluation.report.chapters import (
     recording_chapter,
     unused_chapter,
 )
+from marey_motion.evaluation.report.comparison import (
+    clip_chapter,
+    compared,
+    coverage_of_two_chapter,
+    headline_of_two,
+    metric_chapter,
+    trial_chapter,
+)
 from marey_motion.evaluation.report.definitions import definitions
 from marey_motion.evaluation.report.markup import element
 from marey_motion.evaluation.report.page import Section, page
@@ -23,7 +32,7 @@ from marey_motion.evaluation.report.provenance import provenance
 from marey_motion.evaluation.report.verdict import Judgement, judge, verdict
 from marey_motion.evaluation.result import EvaluationResult
 
-__all__ = ["Judgement", "judge", "render_report", "verdict"]
+__all__ = ["Judgement", "compared", "judge", "render_comparison", "render_report", "verdict"]
 
 
 def render_report(result: EvaluationResult, *, title: str, figures: Mapping[str, DrawnFigure] | None = None) -> str:
@@ -48,3 +57,33 @@ def render_report(result: EvaluationResult, *, title: str, figures: Mapping[str,
     ]
     lead = element("p", verdict(result), class_="verdict"), headline(result)
     return page(title, lead, sections, f"Written by Marey {result.provenance.code_version}.")
+
+
+def render_comparison(
+    before: EvaluationResult,
+    after: EvaluationResult,
+    *,
+    title: str,
+    comparison: Comparison | None = None,
+    labels: tuple[str, str] = ("before", "after"),
+    figures: Mapping[str, DrawnFigure] | None = None,
+) -> str:
+    """The report of two evaluations as an HTML document.
+
+    Parameters
+    ----------
+    comparison : of the two; it adds intervals of confidence, and says which trials differ in any tick
+    labels : what figures and tables call the two
+    figures : by name, as `draw_figures` gives them for two results; drawn when None
+    """
+    drawn = draw_figures(before, other=after, labels=labels) if figures is None else figures
+    sections = [
+        metric_chapter(before, after, comparison),
+        trial_chapter(before, after, comparison, drawn),
+        clip_chapter(before, after, drawn),
+        coverage_of_two_chapter(drawn),
+        Section("definitions", "What the numbers mean", definitions()),
+        Section("provenance", "Where this comes from", provenance([before, after], labels)),
+    ]
+    lead = element("p", compared(before, after), class_="verdict"), headline_of_two(before, after, labels)
+    return page(title, lead, sections, f"Written by Marey {after.provenance.code_version}.")

@@ -71,8 +71,13 @@ def error_chapter(result: EvaluationResult, figures: Figures) -> Section:
     listing = table(
         "The worst trials, by seconds of travel that the character is off", TRIAL_HEADS, rows, numbers=range(1, 8)
     )
-    pictures = shown(figures, "offsets", "scenario-circle", "scenario-switching", "transition-cost", "errors")
-    return Section("errors", "Where the errors are", (element("p", text), listing, pictures))
+    pictures = (
+        shown(figures, "offsets"),
+        listing,
+        element("div", shown(figures, "scenario-circle", "scenario-switching"), class_="pair"),
+        shown(figures, "transition-cost", "errors"),
+    )
+    return Section("errors", "Where the errors are", (element("p", text), pictures))
 
 
 def load_chapter(result: EvaluationResult, figures: Figures) -> Section:

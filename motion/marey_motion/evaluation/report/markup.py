@@ -25,14 +25,12 @@ def text(value: str) -> Html:
     return Html(html.escape(_UNSEEN.sub("\ufffd", value), quote=True))
 
 
-def element(tag: str, /, *content: Content, **attributes: str | bool | None) -> Html:
-    """An element. A trailing underscore is no part of an attribute's name, others are hyphens; False and None leave it out."""
+def element(tag: str, /, *content: Content, **attributes: str | None) -> Html:
+    """An element. Underscores within names of attributes become hyphens, one at the end goes; None leaves it out."""
     parts = [tag]
     for key, value in attributes.items():
-        if value is None or value is False:
-            continue
-        label = key.rstrip("_").replace("_", "-")
-        parts.append(label if value is True else f'{label}="{text(value)}"')
+        if value is not None:
+            parts.append(f'{key.rstrip("_").replace("_", "-")}="{text(value)}"')
     opened = f"<{' '.join(parts)}>"
     return Html(opened) if tag in VOID else Html(f"{opened}{joined(content)}</{tag}>")
 

@@ -77,6 +77,6 @@ def facts(pairs: Iterable[tuple[str, Content, str]]) -> Html:
     return element("dl", tiles, class_="tiles")
 
 
-def folded(summary: str, content: Content, *, opened: bool = False) -> Html:
+def folded(summary: str, content: Content) -> Html:
     """Something that is opened by a click."""
-    return element("details", element("summary", summary), content, open=opened)
+    return element("details", element("summary", summary), content)

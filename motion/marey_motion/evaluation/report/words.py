@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from marey_motion.evaluation.result import Coverage
 from marey_motion.evaluation.scenario import Trial
+
+Floats = NDArray[np.float64]
 
 STRAIGHT_DEG_S = 1e-6
 
@@ -81,7 +84,7 @@ def demand(trial: Trial) -> str:
         speed = f"{trial.speed_m_s:g} m/s switching to {trial.switch_speed_m_s:g}"
     if abs(turn) <= STRAIGHT_DEG_S:
         return f"straight ahead at {speed}"
-    return f"{'left' if turn > 0 else 'right'} turns of {abs(turn):.4g} degrees a second at {speed}"
+    return f"{'left' if turn > 0 else 'right'} turn of {abs(turn):.4g} deg/s at {speed}"
 
 
 def amount(count: int, thing: str) -> str:
@@ -100,11 +103,11 @@ def duration(seconds: float) -> str:
     return f"{whole} s" if whole < 120 else f"{whole // 60} min {whole % 60} s"
 
 
-def _centres(edges: np.ndarray) -> np.ndarray:
+def _centres(edges: Floats) -> Floats:
     return np.round(0.5 * (edges[:-1] + edges[1:]), 9)
 
 
-def _runs(lacking: np.ndarray, sides: np.ndarray) -> list[tuple[int, int]]:
+def _runs(lacking: NDArray[np.bool_], sides: Floats) -> list[tuple[int, int]]:
     """First and last of each run of lacking cells that lie on one side."""
     runs: list[tuple[int, int]] = []
     for column in np.flatnonzero(lacking).tolist():
