@@ -91,9 +91,18 @@ def job_kinds_page() -> str:
         inputs = [(f"`{name}`", _input(spec), spec.description) for name, spec in kind.inputs.items()]
         text += _table(("input", "takes", "meaning"), inputs) if inputs else ""
         schema = kind.params.model_json_schema()
-        rows = [(f"`{name}`", _type(each), each.get("description", "")) for name, each in schema["properties"].items()]
-        text += _table(("parameter", "type", "meaning"), rows)
+        text += _table(("parameter", "type", "meaning"), list(_properties(schema, schema.get("$defs", {}))))
     return NOTE + text.rstrip() + "\n"
+
+
+def _properties(schema: dict[str, Any], known: dict[str, Any], within: str = "") -> Iterator[tuple[str, str, str]]:
+    """Name, type and meaning of each member; members of an object stand under its name and their own."""
+    for name, each in schema["properties"].items():
+        inner = known.get(str(each.get("$ref", "")).rpartition("/")[2])
+        if inner is not None and "properties" in inner:
+            yield from _properties(inner, known, f"{within}{name}.")
+        else:
+            yield f"`{within}{name}`", _type(each), each.get("description", "")
 
 
 def _input(spec: Any) -> str:

@@ -21,11 +21,12 @@ MOST_EVALUATION_TASKS = 64
 
 Speed = Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)]
 TurnRate = Annotated[float, Field(ge=-720, le=720, allow_inf_nan=False)]
-Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
+Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False, description="Weight of these features.")]
 ItemId = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 ScriptDigest = Annotated[str, StringConstraints(pattern=r"^sha256-[A-Za-z0-9+/]{43}=$")]
 """A script by its content, as a Content-Security-Policy names it."""
 
+TrialName = Annotated[str, StringConstraints(min_length=1, max_length=100)]
 FigureName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
 
 DEFAULT_SPEEDS_M_S = tuple(1.0 + 0.25 * step for step in range(9))
@@ -101,9 +102,11 @@ class EvaluateParams(Request):
 
     name: ItemName = Field("evaluation", description="Name of the result.")
     tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the result.")
-    speeds_m_s: tuple[Speed, ...] = Field(DEFAULT_SPEEDS_M_S, min_length=1, max_length=200)
+    speeds_m_s: tuple[Speed, ...] = Field(
+        DEFAULT_SPEEDS_M_S, min_length=1, max_length=200, description="Speeds of the trials, each with each turn rate."
+    )
     turn_rates_deg_s: tuple[TurnRate, ...] = Field(
-        DEFAULT_TURN_RATES_DEG_S, min_length=1, max_length=200, description="Positive to the left."
+        DEFAULT_TURN_RATES_DEG_S, min_length=1, max_length=200, description="Turn rates, positive to the left."
     )
     families: tuple[Literal["circle", "switching"], ...] = Field(
         ("circle", "switching"), min_length=1, max_length=2, description="switching: the speed changes on the circle."
@@ -111,7 +114,7 @@ class EvaluateParams(Request):
     approach_s: float = Field(3.0, ge=0, le=60, allow_inf_nan=False, description="Straight ahead before the circle.")
     duration_s: float = Field(30.0, ge=1, le=600, allow_inf_nan=False, description="Of the circle.")
     switch_speed_m_s: Speed = Field(4.0, description="The other speed of switching trials.")
-    switch_every_s: float = Field(5.0, ge=0.5, le=600, allow_inf_nan=False)
+    switch_every_s: float = Field(5.0, ge=0.5, le=600, allow_inf_nan=False, description="How long each speed lasts.")
     window: Literal["circle", "all"] = Field("circle", description="all: the approach is measured, too.")
     coverage_least_s: float = Field(
         1.0, gt=0, le=3600, allow_inf_nan=False, description="Seconds of data that a cell needs to count as covered."
@@ -127,6 +130,9 @@ class EvaluateParams(Request):
     )
     baseline: bool = Field(True, description="Measure generated clips that own every cell, too, for comparison.")
     report: bool = Field(True, description="Write the report and its figures.")
+    trial_figures: tuple[TrialName, ...] = Field(
+        (), max_length=16, description="Trials that get figures of their own, by name, as `circle v=1.25 w=-50`."
+    )
 
     @property
     def trial_count(self) -> int:
@@ -199,7 +205,7 @@ class StoredFigure(Request):
     number: str = Field("", description="The published figure it corresponds to.")
     title: str
     caption: str
-    trial: str | None = Field(None, description="The trial it shows, where it shows one.")
+    trial: TrialName | None = Field(None, description="The trial it was asked for; others show the worst, or all.")
     png: StoredFile
     svg: StoredFile
     json_: StoredFile = Field(alias="json")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.addresses import Address, require_item
+from marey_client.cli.addresses import Address, find_item, require_item
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import clips_at, follow
@@ -42,7 +42,15 @@ def evaluate(
     duration: Annotated[float | None, typer.Option(help="Seconds of the circle; default 30.")] = None,
     mirror: Annotated[str | None, typer.Option(help="none, add (mirrored twins beside the clips) or only.")] = None,
     follow_mode: Annotated[str | None, typer.Option("--follow", help="time, path or open_loop; default time.")] = None,
-    end_policy: Annotated[str | None, typer.Option(help="What clips' ends look ahead to: clamp, trim or loop.")] = None,
+    loop: Annotated[
+        list[str] | None, typer.Option(help="A clip that is a loop, or a folder of such; may be repeated.")
+    ] = None,
+    trim: Annotated[
+        list[str] | None, typer.Option(help="project/folder/clip=first:stop, the frames to use; may be repeated.")
+    ] = None,
+    end_policy: Annotated[
+        str | None, typer.Option(help="What clips' ends look ahead to: clamp, trim, loop; default clamp, or loop.")
+    ] = None,
     normaliser: Annotated[
         str | None, typer.Option(help="Use the scales of this evaluation, to be comparable: project/folder/name.")
     ] = None,
@@ -69,11 +77,13 @@ def evaluate(
         approach_s=approach,
         duration_s=duration,
         baseline=baseline,
-        database={"mirroring": mirror, "end_policy": end_policy},
+        database={"mirroring": mirror, "end_policy": end_policy or ("loop" if loop else None)},
         controller={"follow": follow_mode},
     )
     with connect(context) as marey:
         project = marey.project(addresses[0].project)
+        loops = [one.id for place in loop or () for one in _clips_in(marey, Address.parse(place))]
+        trims = dict(_trim(marey, text) for text in trim or ())
         pinned = _evaluation_at(marey, normaliser).id if normaliser else None
         submitted = project.evaluate(
             [clips_at(marey, address) for address in addresses],
@@ -81,6 +91,8 @@ def evaluate(
             normaliser=pinned,
             priority=priority,
             **params.model_dump(exclude_unset=True),
+            loops=loops,
+            trims=trims,
         )
         if not wait:
             return print_json(submitted) if as_json else typer.echo(submitted.id)
@@ -115,6 +127,28 @@ def report(
         import webbrowser
 
         webbrowser.open(out.absolute().as_uri())
+
+
+def _clips_in(marey: Marey, address: Address) -> list[Any]:
+    """The clip at an address, or all in a folder and below it."""
+    from marey_schemas.kinds import Kind
+
+    clip = find_item(marey, address, [Kind.CLIP])
+    found = [clip] if clip is not None else list(marey.project(address.project).clips.list(collection=address.path))
+    if not found:
+        raise WrongUsage(f"there is no clip at {address}")
+    return found
+
+
+def _trim(marey: Marey, text: str) -> tuple[str, tuple[int, int]]:
+    """Id of a clip and the frames to use of it."""
+    from marey_schemas.kinds import Kind
+
+    place, _, frames = text.rpartition("=")
+    first, colon, stop = frames.partition(":")
+    if not (place and colon and first.isdecimal() and stop.isdecimal()):
+        raise WrongUsage(f"{text!r}: write project/folder/clip=first:stop, as in lab/walks/take=120:900")
+    return require_item(marey, Address.parse(place), [Kind.CLIP]).id, (int(first), int(stop))
 
 
 def _evaluation_at(marey: Marey, place: str) -> EvaluationHandle:

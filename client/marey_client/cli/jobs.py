@@ -81,9 +81,11 @@ def show_progress(now: Job, advance: Advance, count: int | None = None, unit: st
     what = f"{now.kind} {now.state}"
     if now.progress is None:
         return advance(what, 0, None)
-    if now.size and count and now.progress.total == now.size:
-        return advance(unit or what, round(now.progress.done / now.size * count), count)
-    return advance(what if now.size else now.progress.note or what, now.progress.done, now.progress.total)
+    if now.size is None or now.progress.total != now.size:
+        return advance(now.progress.note or what, now.progress.done, now.progress.total)
+    if count is None:
+        return advance(what, now.progress.done, now.size)
+    return advance(unit or what, round(now.progress.done / now.size * count), count)
 
 
 def _print_ended(ended: Job, as_json: bool) -> None:

@@ -8,9 +8,9 @@ from typing import Any
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.report.verdict import verdict
-from marey_motion.evaluation.result import EvaluationResult
+from marey_motion.evaluation.result import EvaluationOptions, EvaluationResult
 from marey_motion.evaluation.result_documents import records_from_tree, records_to_tree, result_to_tree
-from marey_motion.evaluation.scenario import suite_trials
+from marey_motion.evaluation.scenario import Trial, suite_trials
 from marey_motion.evaluation.suite import assemble, evaluate_baseline, run_suite
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import TrialRecord
@@ -30,8 +30,8 @@ GATHERING_STEPS = 4
 def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
     """Let motion matching follow this task's share of the trials; the result names the file of their records."""
     options = options_of(params)
+    trials = _trials(params, options)[context.task.position :: context.task.size]
     database = read_database(context, params, options.database)
-    trials = suite_trials(options)[context.task.position :: context.task.size]
     started = time.monotonic()
     records = run_suite(database, options, trials=trials, threads=context.threads, progress=context.progress)
     file = context.scratch / "records.msgpack"
@@ -49,7 +49,7 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     options = options_of(params)
     context.progress(0, GATHERING_STEPS, "reading what the trials recorded")
     database = read_database(context, params, options.database)
-    trials = suite_trials(options)
+    trials = _trials(params, options)
     known = _read_records(context, results)
     records = [known[trial.name] for trial in trials]
     try:
@@ -65,7 +65,7 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     }
     if params.report:
         context.progress(3, GATHERING_STEPS, "writing the report")
-        parts["report"] = write_report(context, result, params.name)
+        parts["report"] = write_report(context, result, params)
     context.stage(
         [StagedOutput(name=params.name, kind=Kind.EVALUATION, item_name=params.name, tags=params.tags, parts=parts)]
     )
@@ -74,6 +74,15 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
         **parts["evaluation"]["headline"],
         "seconds": round(sum(one["seconds"] for one in results), 4),
     }
+
+
+def _trials(params: EvaluateParams, options: EvaluationOptions) -> tuple[Trial, ...]:
+    """Every trial of the suite; those that figures are asked of must be among them."""
+    trials = suite_trials(options)
+    if unknown := set(params.trial_figures) - {trial.name for trial in trials}:
+        named = f"{min(unknown)!r}; a name is like {trials[0].name!r}"
+        raise JobRefused("unknown-trial", f"trial_figures: the suite has no trial {named}")
+    return trials
 
 
 def _read_records(context: Context, results: Sequence[Mapping[str, Any]]) -> dict[str, TrialRecord]:
