@@ -34,6 +34,8 @@ MOST_CLIPS = 24
 MOST_LINES = 400
 BOW = 0.45  # how far a line is drawn towards the middle of the ring
 SIZES, LARGEST_DOT = 8, 90.0  # number of sizes of dots; area in square points
+LONGEST_NAME, LETTER_IN = 18, 0.066  # signs of a name, and how wide one is
+ABSENT = "(not in this one)"
 RADIAL_NAMES = 8  # more names than this run outwards, lest they meet
 
 
@@ -44,7 +46,7 @@ class _Line(NamedTuple):
     left: int
     target: str
     entered: int
-    count: int
+    times: int
 
 
 def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: FigureOptions) -> Sketch:
@@ -65,10 +67,11 @@ def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: Fig
         panel = add_panel(figure, Place(number * across, 0.0, across, height), grid=False)
         panel.axis("off")
         write(panel, (0.03, 1.01), subject.label, transform=panel.transAxes, fontsize=HEADING, fontweight="bold")
-        _fit(panel, circles, across / height)
+        names = {clip.uid: clip.name for clip in subject.result.clips}
+        _fit(panel, circles, names, (across, height))
         _draw_lines(panel, circles, lines[number])
         _draw_dots(panel, circles, dots[number], most, options.logarithmic)
-        _draw_rings(panel, circles, {clip.uid: clip.name for clip in subject.result.clips})
+        _draw_rings(panel, circles, names)
     tables = {"frames": _frame_table(subjects, dots, circles), "transitions": _line_table(subjects, lines)}
     return Sketch(figure, tables, _caption(subjects, popularity, switches, circles, lines))
 
@@ -134,11 +137,15 @@ def _per_dot(popularity: Ints, circle: Circle) -> Ints:
     return np.bincount(dots, weights=popularity, minlength=circle.dots).astype(np.int64)
 
 
-def _fit(panel: Axes, circles: dict[str, Circle], aspect: float) -> None:
+def _fit(panel: Axes, circles: dict[str, Circle], names: dict[str, str], size_in: tuple[float, float]) -> None:
     """Limits that hold all circles and their names, at one scale in both directions."""
     reach = max([1.0, *(float(np.linalg.norm(circle.centre)) + circle.radius for circle in circles.values())])
-    high = max((1.30 if len(circles) > RADIAL_NAMES else 1.16) * reach, 1.45 * reach / aspect)
-    panel.set(xlim=(-high * aspect, high * aspect), ylim=(-high, high))
+    longest = max([0, *(len(shortened(names.get(uid, ABSENT), LONGEST_NAME)) for uid in circles)])
+    aside = 0.2 + longest * LETTER_IN
+    above = aside if len(circles) > RADIAL_NAMES else 0.4
+    unit = min(0.5 * size_in[0] - aside, 0.5 * size_in[1] - above) / reach  # inches
+    panel.set(xlim=(-0.5 * size_in[0] / unit, 0.5 * size_in[0] / unit))
+    panel.set(ylim=(-0.5 * size_in[1] / unit, 0.5 * size_in[1] / unit))
 
 
 def _draw_lines(panel: Axes, circles: dict[str, Circle], lines: Sequence[_Line]) -> None:
@@ -147,14 +154,14 @@ def _draw_lines(panel: Axes, circles: dict[str, Circle], lines: Sequence[_Line])
     from matplotlib.path import Path
 
     colours = _colours(circles)
-    most = max([1, *(line.count for line in lines)])
+    most = max([1, *(line.times for line in lines)])
     codes = [Path.MOVETO, Path.CURVE3, Path.CURVE3]
     paths, edges, widths = [], [], []
     for line in reversed(lines):
         first, last = circles[line.source].place_of(line.left), circles[line.target].place_of(line.entered)
         middle = circles[line.source].centre if line.source == line.target else np.zeros(2)
         paths.append(Path(np.stack((first, (1.0 - BOW) * 0.5 * (first + last) + BOW * middle, last)), codes))
-        strength = (line.count / most) ** 0.5
+        strength = (line.times / most) ** 0.5
         edges.append((colours[line.source], round(0.15 + 0.65 * strength, 2)))
         widths.append(round(0.4 + 2.2 * strength, 1))
     panel.add_collection(PathCollection(paths, facecolors="none", edgecolors=edges, linewidths=widths, zorder=2))
@@ -175,7 +182,7 @@ def _draw_dots(panel: Axes, circles: dict[str, Circle], dots: dict[str, Ints], m
         mine = level == size
         if mine.any():
             area = LARGEST_DOT * size / SIZES
-            panel.scatter(*place[mine].T, s=area, c=look[mine], lw=0, alpha=0.9, zorder=3)
+            panel.scatter(place[mine, 0], place[mine, 1], s=area, c=look[mine], lw=0, alpha=0.9, zorder=3)
 
 
 def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str]) -> None:
@@ -184,7 +191,8 @@ def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str]) 
 
     for uid, circle in circles.items():
         ends = 90 - 180 * OPEN
-        ring = Arc(circle.centre, 2 * circle.radius, 2 * circle.radius, theta1=ends + 360 * OPEN, theta2=ends + 360,
+        centre = float(circle.centre[0]), float(circle.centre[1])
+        ring = Arc(centre, 2 * circle.radius, 2 * circle.radius, theta1=ends + 360 * OPEN, theta2=ends + 360,
                    color=REFERENCE, lw=0.7, ls="-" if uid in names else (0, (1, 3)))  # fmt: skip
         panel.add_patch(ring)
         distance = float(np.linalg.norm(circle.centre))
@@ -198,7 +206,7 @@ def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str]) 
         else:
             look["ha"] = "left" if away[0] > 0.3 else "right" if away[0] < -0.3 else "center"
             look["va"] = "bottom" if away[1] > 0.3 else "top" if away[1] < -0.3 else "center"
-        write(panel, (float(x), float(y)), shortened(names.get(uid, "(not in this one)"), 20), **look)
+        write(panel, (float(x), float(y)), shortened(names.get(uid, ABSENT), LONGEST_NAME), **look)
 
 
 def _colours(circles: dict[str, Circle]) -> dict[str, str]:
@@ -237,7 +245,7 @@ def _caption(
     for subject, ticks, each, drawn in zip(subjects, popularity, switches, lines, strict=True):
         used = [uid for uid, own in ticks.items() if own.any()]
         shown = sum(1 for uid in used if uid in circles)
-        jumps = f"{sum(line.count for line in drawn):,} of {int(each[:, 2].sum()):,} jumps"
+        jumps = f"{sum(line.times for line in drawn):,} of {int(each[:, 2].sum()):,} jumps"
         parts.append(f"{subject.prefix}{shown} of {len(used)} used clips and {jumps} between frames drawn.")
     return (
         "Each circle is a clip that runs clockwise from the gap above; a dot is larger the more its frames were shown. "

@@ -72,7 +72,7 @@ def arrange(frames: Mapping[str, int], links: Mapping[tuple[str, str], int]) -> 
 
 def _neighbours(uids: Sequence[str], links: Mapping[tuple[str, str], int]) -> list[str]:
     """Begin with the first; go on with the clip that has most transitions with the last one."""
-    left, order = list(uids), []
+    left, order = list(uids), list[str]()
     while left:
         last = order[-1] if order else None
         best = max(left, key=lambda uid: links.get((last, uid), 0) + links.get((uid, last), 0) if last else 0)
@@ -99,4 +99,4 @@ def _dots(frames: Sequence[int]) -> Ints:
     """Dots per circle: one per frame while they fit, else as many as its share of all frames earns."""
     counts = np.asarray(frames, dtype=np.float64)
     earned = np.clip(MOST_DOTS * counts**0.5 / max((counts**0.5).sum(), 1.0), FEWEST_DOTS, FULLEST)
-    return np.maximum(1, np.minimum(counts, earned)).astype(np.int64)
+    return np.asarray(np.maximum(1, np.minimum(counts, earned)), dtype=np.int64)

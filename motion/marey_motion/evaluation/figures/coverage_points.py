@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ class _Points(NamedTuple):
 
 def draw_points(subjects: Sequence[Subject], _trial: str | None, options: FigureOptions) -> Sketch:
     """One point per window of a second, of up to `MOST_POINTS` windows at even intervals."""
-    chosen = [_choose(subject, min(options.most_clips, CATEGORIES)) for subject in subjects]
+    chosen = _choose(subjects, min(options.most_clips, CATEGORIES))
     width = 9.6 if len(subjects) > 1 else 8.6
     keys = 2.5
     each = (width - 0.75 - keys - 0.45 * (len(subjects) - 1)) / len(subjects)
@@ -54,6 +54,7 @@ def draw_points(subjects: Sequence[Subject], _trial: str | None, options: Figure
     for number, (subject, points) in enumerate(zip(subjects, chosen, strict=True)):
         place = Place(0.65 + number * (each + 0.45), 0.55, each, 3.85)
         panel = add_panel(figure, place, title=subject.label, x=TURN_RATE, y=SPEED if number == 0 else "")
+        panel.tick_params(labelleft=number == 0)
         panel.set_title(plain(subject.label), pad=17, loc="left", fontweight="bold", color=INK, parse_math=False)
         _draw(panel, subject, points, styles)
         panel.set(xlim=limits[0], ylim=limits[1])
@@ -62,14 +63,21 @@ def draw_points(subjects: Sequence[Subject], _trial: str | None, options: Figure
     return Sketch(figure, {"points": _table(subjects, chosen)}, _caption(subjects, chosen))
 
 
-def _choose(subject: Subject, most_clips: int) -> _Points:
-    """The clips with most data get a look of their own; windows at even intervals within the whole."""
-    clips = subject.result.coverage.clip
-    step = max(1, -(-len(clips) // MOST_POINTS))
-    windows = np.arange(0, len(clips), step)
-    held = np.bincount(clips, minlength=len(subject.result.clips))
-    order = np.argsort(-held, kind="stable")[:most_clips]
-    return _Points(windows, [int(clip) for clip in order if held[clip]])
+def _choose(subjects: Sequence[Subject], most_clips: int) -> list[_Points]:
+    """Windows at even intervals of the whole, and the clips with most data of all, which get a look of their own."""
+    held: dict[str, int] = {}
+    for subject in subjects:
+        for clip, windows in enumerate(np.bincount(subject.result.coverage.clip).tolist()):
+            uid = subject.result.clips[clip].uid
+            held[uid] = held.get(uid, 0) + windows
+    named = sorted((uid for uid, windows in held.items() if windows), key=lambda uid: (-held[uid], uid))[:most_clips]
+    chosen = []
+    for subject in subjects:
+        step = max(1, -(-len(subject.result.coverage.clip) // MOST_POINTS))
+        index = {clip.uid: number for number, clip in enumerate(subject.result.clips)}
+        windows = np.arange(0, len(subject.result.coverage.clip), step)
+        chosen.append(_Points(windows, [index[uid] for uid in named if uid in index]))
+    return chosen
 
 
 def _limits(subjects: Sequence[Subject], chosen: Sequence[_Points]) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -97,7 +105,7 @@ def _draw(panel: Axes, subject: Subject, points: _Points, styles: dict[str, int]
         panel.scatter(turn[mine], speed[mine], s=13, alpha=0.75, lw=0, rasterized=as_image, zorder=3, **_look(style))
 
 
-def _look(style: int) -> dict[str, str]:
+def _look(style: int) -> dict[str, Any]:
     """Neighbours differ in colour and in marker."""
     row = style // len(COLOURS)
     return {"c": COLOURS[style % len(COLOURS)], "marker": MARKERS[(style + row) % len(MARKERS)]}
@@ -127,7 +135,7 @@ def _draw_keys(panel: Axes, subjects: Sequence[Subject], chosen: Sequence[_Point
 
 
 def _other_clips(subject: Subject, points: _Points) -> int:
-    return len(np.unique(subject.result.coverage.clip)) - len(points.named)
+    return len(np.setdiff1d(subject.result.coverage.clip, points.named))
 
 
 def _table(subjects: Sequence[Subject], chosen: Sequence[_Points]) -> dict[str, object]:

@@ -97,6 +97,7 @@ def _draw(subjects: Sequence[Subject], plane: _Plane) -> Sketch:
         place = Place(0.68 + number * (width + gap), bottom, width, height)
         x, y = plane.labels
         panel = add_panel(figure, place, title=subject.label, x=x, y=y if number == 0 else "", grid=False)
+        panel.tick_params(labelleft=number == 0)
         drawn = panel.pcolormesh(
             *edges, each, cmap=MORE_IS_DENSER, norm=_norm(ceiling), rasterized=True, shading="flat"
         )
@@ -175,6 +176,7 @@ def _draw_change(
     change = maps[1] - maps[0]
     largest = nice_ceiling(float(np.abs(change).max()))
     panel = add_panel(figure, place, title="change", x=plane.labels[0], grid=False)
+    panel.tick_params(labelleft=False)
     norm = SymLogNorm(linthresh=0.1 * largest, linscale=1.0, vmin=-largest, vmax=largest)
     drawn = panel.pcolormesh(*edges, change, cmap="PuOr", norm=norm, rasterized=True, shading="flat")
     bar = add_colour_bar(figure, drawn, Place(place.left, 0.52, place.width, 0.12), "seconds more (violet) or less")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from marey_motion.evaluation.figures.subjects import FigureOptions, Subject, Tri
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 
 BINS = 48
 FINE = 400
@@ -50,7 +50,7 @@ def draw_errors(subjects: Sequence[Subject], trial: str | None, options: FigureO
         (f"turn rate error (deg/s, left positive), {meaning}", "deg/s"),
     )
     height, gap = (3.2, 0.0) if len(subjects) == 1 else (2.3, 0.75)
-    figure = new_figure(9.6, len(subjects) * (height + gap) + 1.15)
+    figure = new_figure(9.6, len(subjects) * (height + gap) + 1.15 - gap)
     tables: dict[str, dict[str, list[object]]] = {
         "histogram": {name: [] for name in ("dataset", "quantity", "low", "high", "seconds")},
         "fits": {name: [] for name in ("dataset", "quantity", "components", "weight", "mean", "deviation")},
@@ -115,10 +115,8 @@ def _draw(
     panel.stairs(heights, edges, fill=True, color=colour, alpha=0.35, lw=0)
     seconds = len(errors.values) / view.record.rate_hz * (edges[1] - edges[0])
     fine = np.linspace(edges[0], edges[-1], FINE)
-    for fit, name, look in (
-        (errors.two, "two normals", {"color": colour, "lw": 1.6}),
-        (errors.one, "one normal", {"color": QUIET, "lw": 1.2, "ls": (0, (4, 2))}),
-    ):
+    looks: tuple[dict[str, Any], ...] = {"color": colour, "lw": 1.6}, {"color": QUIET, "lw": 1.2, "ls": (0, (4, 2))}
+    for fit, name, look in zip((errors.two, errors.one), ("two normals", "one normal"), looks, strict=True):
         curve = np.minimum(seconds * fit.density(fine), 1.3 * heights.max())  # a collapsed component has no scale
         moments = "; ".join(
             f"{mean:+.2f} ± {deviation:.2f}" for mean, deviation in zip(fit.means, fit.deviations, strict=True)

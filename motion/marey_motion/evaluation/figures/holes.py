@@ -40,12 +40,13 @@ def draw_holes(subjects: Sequence[Subject], _trial: str | None, _options: Figure
     """A cell per trial of the grid, with the seconds it lacks; an empty cell has enough."""
     two = len(subjects) > 1
     width, height, gap = (4.0, 3.3, 0.4) if two else (6.2, 3.9, 0.0)
-    figure = new_figure(9.6 if two else 7.8, height + (1.15 if two else 0.85))
+    figure = new_figure(9.9 if two else 7.8, height + (1.15 if two else 0.85))
     least = max([subject.result.options.coverage_least_s for subject in subjects])
     drawn = None
     for number, subject in enumerate(subjects):
         place = Place(0.65 + number * (width + gap), 0.58, width, height)
         panel = add_panel(figure, place, x=TURN_RATE, y=SPEED if number == 0 else "", grid=False)
+        panel.tick_params(labelleft=number == 0)
         panel.set_title(plain(subject.label), pad=17, loc="left", fontweight="bold", color=INK, parse_math=False)
         drawn = _draw(panel, subject, least, SMALL if not two else 6.5)
         mark_sides(panel)
@@ -63,7 +64,7 @@ def _draw(panel: Axes, subject: Subject, least: float, size: float) -> ScalarMap
     turn, speed = (0.5 * (each[:-1] + each[1:]) for each in edges)
     for row, column in np.argwhere(coverage.deficit_s > 0.0):
         value = float(coverage.deficit_s[row, column])
-        light = bool(luminance(np.asarray(drawn.cmap(drawn.norm(value)))) > 0.3)
+        light = bool(luminance(np.asarray(drawn.to_rgba(np.array(value)))) > 0.3)
         text = f"{value:.1f}" if value < 9.95 else f"{value:.0f}"
         place = float(turn[column]), float(speed[row])
         write(panel, place, text, ha="center", fontsize=size, color=DARK if light else LIGHT)

@@ -109,7 +109,13 @@ def _draw_two(
         add_colour_bar(figure, shared, Place(0.85, 0.52, 2 * width + gap, 0.12), "mean offset (m)", levels)
     if changed is not None:
         place = Place(0.85 + 2 * (width + gap), 0.52, width, 0.12)
-        add_colour_bar(figure, changed, place, "change of the mean offset (m), blue is better", both_ways[::2])
+        add_colour_bar(
+            figure,
+            changed,
+            place,
+            "change of the mean offset (m), blue is better",
+            np.concatenate((-upward[:0:-1], upward))[:: max(1, (len(upward) - 1) // 2)],
+        )
     return figure
 
 
@@ -148,7 +154,7 @@ def _draw_field(
         zorder=4, clip_on=False,
     )  # fmt: skip
     colours_of_dots = dots.cmap(dots.norm(field.offset_m[known]))
-    dots.set_edgecolor([DARK if light else LIGHT for light in luminance(colours_of_dots) > 0.3])
+    dots.set_edgecolor([DARK if light else LIGHT for light in luminance(np.asarray(colours_of_dots)) > 0.3])
     _mark_extreme(panel, field, dots)
     panel.set_xticks(field.turn_rates_deg_s[:: max(1, len(field.turn_rates_deg_s) // 4)])
     if not labels["y"]:

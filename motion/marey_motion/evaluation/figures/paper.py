@@ -89,7 +89,7 @@ def add_colour_bar(
     axes = figure.add_axes((left / width, bottom / height, across / width, up / height))
     upright = up > across
     bar = figure.colorbar(mappable, cax=axes, orientation="vertical" if upright else "horizontal")
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
     axes.tick_params(colors=QUIET, labelsize=SMALL, length=3, width=0.6)
     bar.set_label(label, fontsize=TEXT, color=INK)
     if ticks is not None:
@@ -150,7 +150,7 @@ def nice_levels(largest: float) -> NDArray[np.float64]:
     reach = largest if largest > 0.0 and np.isfinite(largest) else 1.0
     scale = 10.0 ** np.floor(np.log10(reach / 10.0))
     step = next(factor * scale for factor in (1, 2, 5, 10, 20) if reach <= 10 * factor * scale * (1 + 1e-9))
-    return np.arange(round(np.ceil(reach / step * (1 - 1e-9))) + 1) * step
+    return np.asarray(np.arange(round(np.ceil(reach / step * (1 - 1e-9))) + 1) * step, dtype=np.float64)
 
 
 def luminance(colours: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
@@ -182,9 +182,10 @@ def _svg_settings() -> Iterator[None]:
     import matplotlib
 
     with _svg_writer:
-        before = {name: matplotlib.rcParams[name] for name in _SVG_SETTINGS}
-        matplotlib.rcParams.update(_SVG_SETTINGS)
+        settings: Any = matplotlib.rcParams
+        before = {name: settings[name] for name in _SVG_SETTINGS}
+        settings.update(_SVG_SETTINGS)
         try:
             yield
         finally:
-            matplotlib.rcParams.update(before)
+            settings.update(before)

@@ -111,9 +111,17 @@ def _number_sections(
         spot = candidates[enough]
         placed.append(spot)
         panel.text(
-            *spot, str(number), fontsize=SMALL, color=INK, ha="center", va="center", zorder=6, fontweight="bold",
+            float(spot[0]),
+            float(spot[1]),
+            str(number),
+            fontsize=SMALL,
+            color=INK,
+            ha="center",
+            va="center",
+            zorder=6,
+            fontweight="bold",
             bbox={"boxstyle": "circle,pad=0.25", "facecolor": PAPER, "edgecolor": REFERENCE, "linewidth": 0.8},
-        )  # fmt: skip
+        )
 
 
 def _room(spot: Floats, placed: Sequence[Floats]) -> float:

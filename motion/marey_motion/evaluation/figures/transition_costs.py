@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,7 @@ def draw_transition_costs(subjects: Sequence[Subject], trial: str | None, _optio
     costs = [view.record.pose_cost[1:] for view in views]
     top = max([0.0, *(float(np.nanmax(cost, initial=0.0)) for cost in costs)]) or 1.0
     for number, (view, cost) in enumerate(zip(views, costs, strict=True)):
-        look = {"color": COLOURS[number], "lw": 0.9, "alpha": 0.85}
+        look: dict[str, Any] = {"color": COLOURS[number], "lw": 0.9, "alpha": 0.85}
         above.plot(view.series.times_s, view.series.speeds_m_s, label=view.subject.label or "recorded", **look)
         below.plot(view.series.times_s, cost, **look)
         switches = view.series.times_s[view.switched]

@@ -71,7 +71,7 @@ def metric_chapter(before: EvaluationResult, after: EvaluationResult, comparison
         if old is None and new is None:
             continue
         change = known.change if known else new - old if old is not None and new is not None else None
-        row = [metric.label, *(number(value, metric.digits) for value in (old, new))]
+        row: list[Cell] = [metric.label, *(number(value, metric.digits) for value in (old, new))]
         row.append(number(change, metric.digits, signed=True, look=_look(known)))
         if comparison is not None:
             row += [_interval(known, metric.digits), known.verdict if known else ""]
