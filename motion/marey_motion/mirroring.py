@@ -1,110 +1,155 @@
-"""The same motion with left and right exchanged."""
+"""Clips reflected from left to right."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion import kinematics, quaternions
+from marey_motion import quaternions
 from marey_motion.clip import Clip
-from marey_motion.resampling import Motion
+from marey_motion.errors import MotionError
+from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.integer]
 
-REFLECTED = np.array((-1.0, 1.0, 1.0))
-_CONJUGATED = np.array((1.0, 1.0, -1.0, -1.0))
+REFLECTION = np.diag([-1.0, 1.0, 1.0])
+HALF_TURN_ABOUT_X = np.array([0.0, 1.0, 0.0, 0.0])
+# Rest poses whose bones mirror each other to within this count as symmetric: sides measured apart differ a little.
+SAME_DIRECTION_RAD = 0.05
+# Share of the spread of a joint's bones that must lie beside the longest direction for them to tell its twist.
+SPREAD = 1e-3
 
 
-def mirror_clip(clip: Clip, partners: NDArray[np.int32]) -> Clip:
-    """A clip reflected in the plane x = 0, each joint moving as its partner (J,) on the other side did.
+@dataclass(frozen=True, eq=False)
+class _Mirror:
+    """What to do to the joints of a skeleton.
 
-    Works for any local axes: see `mirror_motion`.
+    Parameters
+    ----------
+    sources : (J,) the joint that each joint takes its motion from
+    frames : (J, 3, 3) improper; takes the partner's local axes to the joint's own
+    outer, inner : (J, 4) rotations to multiply the source's local rotation with, from the left and from the right
+    carried : (J,) joints that have no counterpart and keep their local motion
     """
-    motion = mirror_motion(clip.skeleton, partners, Motion.of(clip), clip.translated_joints)
-    poses = np.concatenate((motion.root_translations, motion.rotations.reshape(clip.frame_count, -1)), axis=1)
-    translations = None if clip.translations is None else motion.translations.astype(np.float32)
-    return Clip(clip.skeleton, clip.frame_rate_hz, poses.astype(np.float32), translations, clip.translated_joints)
+
+    sources: NDArray[np.int64]
+    frames: Floats
+    outer: Floats
+    inner: Floats
+    carried: NDArray[np.bool_]
 
 
-def mirror_motion(
-    skeleton: Skeleton, partners: NDArray[np.int32], motion: Motion, translated_joints: tuple[int, ...]
-) -> Motion:
-    """As `mirror_clip`, in double precision.
+def mirror_clip(clip: Clip, partners: Ints) -> Clip:
+    """The motion seen in a mirror, left limbs doing what right ones did: global positions reflected in x.
 
-    A joint's mirrored rotation is the reflection of its partner's, in the joint's own local axes: these may differ from
-    the partner's reflected ones by a constant rotation, found from the rest pose and the offsets of the children.
+    Exact where both sides have the same bone lengths, whatever the rest pose and the joints' local axes; twice is the
+    motion itself. A joint that has no counterpart, such as a prop in one hand, moves with its parent as before.
+
+    Parameters
+    ----------
+    partners : (J,) each joint's partner on the other side, itself for joints of the centre
+        (`rigs.symmetric_joints`)
+
+    Raises
+    ------
+    MotionError    when `partners` is not a pairing of the skeleton's joints
+
+    Notes
+    -----
+    With F the constant that takes the local axes of the partner p to those of the joint j (improper, as it mirrors),
+    the global rotation is M·G_p·F_j⁻¹, so the local one is F_parent·L_p·F_j⁻¹, and -F is a rotation. F comes from the
+    rest pose, corrected to take the partner's bones to the joint's own where the rest pose is not symmetric.
     """
-    world = kinematics.as_global_rotations(skeleton, motion.rotations)
-    corrections = _frame_corrections(skeleton, tuple(int(partner) for partner in partners))
-    mirrored = quaternions.multiply(_reflected(world[:, partners]), corrections)
-    local = quaternions.unroll(kinematics.as_local_rotations(skeleton, mirrored))
+    mirrored = mirror_motion(clip.skeleton, partners, Motion.of(clip))
+    return mirrored.as_clip(clip.skeleton, clip.frame_rate_hz)
+
+
+def mirror_motion(skeleton: Skeleton, partners: Ints, motion: Motion) -> Motion:
+    """As `mirror_clip`, in double precision."""
+    mirror = _mirror_of(skeleton, tuple(int(partner) for partner in partners))
+    rotations = quaternions.multiply(mirror.outer, motion.rotations[:, mirror.sources])
+    rotations = quaternions.multiply(rotations, mirror.inner)
+    translations, joints = _mirrored_translations(skeleton, mirror, motion)
     return Motion(
-        motion.root_translations * REFLECTED,
-        np.asarray(local, dtype=np.float64),
-        _mirrored_translations(skeleton, partners, motion.translations, translated_joints, corrections),
+        motion.root_translations * np.diagonal(REFLECTION),
+        np.asarray(rotations, dtype=np.float64),
+        translations,
+        joints,
     )
 
 
-def _reflected(rotations: Floats) -> Floats:
-    """Rotations as a mirror in the plane x = 0 shows them."""
-    return rotations * _CONJUGATED
+@lru_cache(maxsize=16)
+def _mirror_of(skeleton: Skeleton, pairing: tuple[int, ...]) -> _Mirror:
+    partners = np.array(pairing)
+    count = skeleton.joint_count
+    if partners.shape != (count,) or not np.array_equal(np.sort(partners), np.arange(count)):
+        raise MotionError(f"each of the {count} joints needs one partner of its own", where="partners")
+    if partners[0] != 0 or not np.array_equal(partners[partners], np.arange(count)):
+        raise MotionError("partners must be each other's, and the root its own", where="partners")
+    sources = partners.astype(np.int64)
+    carried = np.zeros(count, np.bool_)
+    for joint in range(1, count):
+        parent, other = skeleton.parents[joint], skeleton.parents[sources[joint]]
+        carried[joint] = sources[parent] != other or carried[parent]
+    sources[carried] = np.flatnonzero(carried)
+    frames = np.stack([_frame(skeleton, sources, carried, joint) for joint in range(count)])
+    return _Mirror(sources, frames, *_turns(skeleton, frames, carried), carried)
 
 
-def _mirrored_translations(
-    skeleton: Skeleton,
-    partners: NDArray[np.int32],
-    translations: Floats,
-    translated_joints: tuple[int, ...],
-    corrections: Floats,
-) -> Floats:
-    """Local positions of the translated joints; a partner that keeps its offset brings that one."""
-    slots = {joint: slot for slot, joint in enumerate(translated_joints)}
-    mirrored = np.empty_like(translations)
-    for slot, joint in enumerate(translated_joints):
-        partner = int(partners[joint])
-        theirs = translations[:, slots[partner]] if partner in slots else skeleton.offsets[partner]
-        frame = quaternions.conjugate(corrections[skeleton.parents[joint]])
-        mirrored[:, slot] = quaternions.rotate_vectors(frame, theirs * REFLECTED)
-    return mirrored
-
-
-@lru_cache(maxsize=64)
-def _frame_corrections(skeleton: Skeleton, partners: tuple[int, ...]) -> Floats:
-    """(J, 4) rotation from each joint's local axes to the reflected ones of its partner."""
-    rest = kinematics.as_global_rotations(skeleton, skeleton.rest_rotations[None])[0]
-    corrections = np.asarray(
-        quaternions.multiply(quaternions.conjugate(_reflected(rest[list(partners)])), rest), dtype=np.float64
+def _frame(skeleton: Skeleton, sources: NDArray[np.int64], carried: NDArray[np.bool_], joint: int) -> Floats:
+    """The improper matrix (3, 3) that takes the local axes of the partner to those of the joint."""
+    source = sources[joint]
+    rest = quaternions.as_matrix(skeleton.rest_global_rotations[[joint, source]])
+    by_rest = rest[0].T @ REFLECTION @ rest[1]
+    own = [child for child in skeleton.children[joint] if not carried[child]]
+    bones = [(skeleton.offsets[child], skeleton.offsets[sources[child]]) for child in own]
+    tips, others = ([site.offset for site in skeleton.end_sites if site.joint == one] for one in (joint, source))
+    if len(tips) == len(others):
+        bones += zip(tips, others, strict=True)
+    return (
+        _frame_of_bones(by_rest, *(np.array(side).reshape(-1, 3) for side in zip(*bones, strict=True)))
+        if bones
+        else by_rest
     )
-    children: dict[int, list[int]] = {}
-    for child, parent in enumerate(skeleton.parents.tolist()):
-        if parent >= 0:
-            children.setdefault(parent, []).append(child)
-    for joint, own in children.items():
-        # Children whose partner hangs elsewhere say nothing about this joint.
-        pairs = [child for child in own if skeleton.parents[partners[child]] == partners[joint]]
-        ours = skeleton.offsets[pairs]
-        theirs = skeleton.offsets[[partners[child] for child in pairs]] * REFLECTED
-        corrections[joint] = _turned_onto(corrections[joint], ours, theirs)
-    return corrections
 
 
-def _turned_onto(correction: Floats, ours: Floats, theirs: Floats) -> Floats:
-    """The correction, turned as little as it takes for the directions `ours` (n, 3) to come to lie on `theirs`."""
-    lengths = np.linalg.norm(ours, axis=1), np.linalg.norm(theirs, axis=1)
-    telling = (lengths[0] > 1e-6) & (lengths[1] > 1e-6)
-    if not telling.any():
-        return correction
-    turned = quaternions.rotate_vectors(correction, ours[telling] / lengths[0][telling, None])
-    wanted = theirs[telling] / lengths[1][telling, None]
-    cosines = np.sum(turned * wanted, axis=1)
-    if np.all(cosines > np.cos(0.05)):  # sides measured apart differ a little and mean the same axes
-        return correction
-    if telling.sum() == 1:
-        return np.asarray(quaternions.multiply(quaternions.between_vectors(turned[0], wanted[0]), correction))
-    from scipy.spatial.transform import Rotation
+def _frame_of_bones(by_rest: Floats, bones: Floats, partners: Floats) -> Floats:
+    """The improper matrix nearest to `by_rest` that takes the partner's bones (n, 3) to the joint's own."""
+    seen = partners @ by_rest.T
+    lengths = np.linalg.norm(bones, axis=1) * np.linalg.norm(seen, axis=1)
+    if np.all(np.sum(bones * seen, axis=1) >= np.cos(SAME_DIRECTION_RAD) * lengths):
+        return by_rest
+    left, sizes, right = np.linalg.svd(bones.T @ partners)
+    if sizes[1] > SPREAD * sizes[0]:  # the orthogonal Procrustes problem among matrices that mirror
+        sign = -np.sign(np.linalg.det(left) * np.linalg.det(right))
+        return np.asarray(left @ np.diag([1.0, 1.0, sign]) @ right, dtype=np.float64)
+    correction = quaternions.between_vectors(by_rest @ right[0], left[:, 0])
+    return np.asarray(quaternions.as_matrix(correction) @ by_rest, dtype=np.float64)
 
-    best, _ = Rotation.align_vectors(wanted, turned)
-    return np.asarray(quaternions.multiply(best.as_quat(scalar_first=True), correction))
+
+def _turns(skeleton: Skeleton, frames: Floats, carried: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    rotations = np.asarray(quaternions.from_matrix(-frames), dtype=np.float64)
+    outer = np.concatenate((HALF_TURN_ABOUT_X[None], rotations[skeleton.parents[1:]]))
+    inner = np.asarray(quaternions.conjugate(rotations), dtype=np.float64)
+    outer[carried] = inner[carried] = quaternions.identity()
+    return outer, inner
+
+
+def _mirrored_translations(skeleton: Skeleton, mirror: _Mirror, motion: Motion) -> tuple[Floats, tuple[int, ...]]:
+    """Translations of the joints that have any and of their partners: the partner's, in the axes of their parent."""
+    if not motion.translated_joints:
+        return motion.translations, ()
+    moving = np.array(motion.translated_joints)
+    joints = np.union1d(moving, mirror.sources[moving])
+    every = np.empty((motion.frame_count, skeleton.joint_count, 3))
+    every[:] = skeleton.offsets
+    every[:, moving] = motion.translations
+    frames = mirror.frames[skeleton.parents[joints]]
+    frames[mirror.carried[joints]] = np.eye(3)
+    mirrored = np.einsum("kab,fkb->fka", frames, every[:, mirror.sources[joints]])
+    return mirrored, tuple(int(joint) for joint in joints)

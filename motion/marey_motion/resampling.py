@@ -2,83 +2,88 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError
+from marey_motion.looping import LoopSeam, continue_motion
+from marey_motion.motion import Motion
 
 Floats = NDArray[np.float64]
 
-
-class Motion(NamedTuple):
-    """The numbers of a clip in double precision: what is computed with before it is stored.
-
-    root_translations : (F, 3) metres; rotations : (F, J, 4) local; translations : (F, k, 3) metres, k may be 0
-    """
-
-    root_translations: Floats
-    rotations: Floats
-    translations: Floats
-
-    @classmethod
-    def of(cls, clip: Clip) -> Motion:
-        """A clip's own numbers, its quaternions brought to unit length and continuous in sign."""
-        rotations = quaternions.unroll(quaternions.normalise(clip.rotations.astype(np.float64)))
-        moved = clip.translations
-        return cls(
-            clip.root_translations.astype(np.float64),
-            rotations,
-            np.zeros((clip.frame_count, 0, 3)) if moved is None else moved.astype(np.float64),
-        )
+SAME_RATE = 1e-9
+# What a frame adds to a cubic spline falls to a quarter from one frame to the next: nothing is left after so many.
+LOOP_REACH = 20
+# Channels interpolated at a time, so that an hour of motion needs little more memory than its own.
+CHANNELS = 32
 
 
-def resample_clip(clip: Clip, frame_rate_hz: float) -> Clip:
+def resample_clip(clip: Clip, frame_rate_hz: float, *, seam: LoopSeam | None = None) -> Clip:
     """The same motion at another rate: first frames coincide, and no frame lies beyond the last one.
 
     Positions follow cubic splines; rotations cubic splines through their sign-continuous components, brought back to
-    unit length.
+    unit length. Where all samples fall on frames, those are taken as they are.
+
+    Parameters
+    ----------
+    seam : how a round of a loop leads into the next one (`looping.loop_seam`), None for other clips. A round is sampled
+        at even distances, so that one of a fractional number of samples gets slower or faster by less than half a
+        sample.
+
+    Raises `ClipError` when the rate is not a positive number.
     """
-    if frame_rate_hz == clip.frame_rate_hz:
+    if _are_same(frame_rate_hz, clip.frame_rate_hz):
         return clip
-    motion = resample_motion(Motion.of(clip), clip.frame_rate_hz, frame_rate_hz)
-    poses = np.concatenate((motion.root_translations, motion.rotations.reshape(len(motion.rotations), -1)), axis=1)
-    translations = None if clip.translations is None else motion.translations.astype(np.float32)
-    return Clip(clip.skeleton, frame_rate_hz, poses.astype(np.float32), translations, clip.translated_joints)
+    motion = resample_motion(Motion.of(clip), clip.frame_rate_hz, frame_rate_hz, seam=seam)
+    return motion.as_clip(clip.skeleton, frame_rate_hz)
 
 
-def resample_motion(motion: Motion, from_hz: float, to_hz: float) -> Motion:
+def resample_motion(motion: Motion, from_hz: float, to_hz: float, *, seam: LoopSeam | None = None) -> Motion:
     """As `resample_clip`, in double precision."""
     if not (np.isfinite(to_hz) and to_hz > 0):
         raise ClipError(f"the frame rate is {to_hz}, a positive number is needed", where="frame_rate_hz")
-    if from_hz == to_hz:
+    if _are_same(to_hz, from_hz):
         return motion
-    frames = len(motion.rotations)
+    frames = motion.frame_count
+    if seam is not None:
+        count = max(1, round(frames / from_hz * to_hz))
+        places: Floats = LOOP_REACH + np.arange(count) * (frames / count)
+        return _sampled(continue_motion(motion, seam, LOOP_REACH, LOOP_REACH), places)
     # Rates that divide each other must not lose their last frame to rounding.
-    count = int(np.floor((frames - 1) / from_hz * to_hz + 1e-6)) + 1
-    at = np.minimum(np.arange(count) * (from_hz / to_hz), frames - 1.0)
-    columns = np.concatenate(
-        (motion.root_translations, motion.rotations.reshape(frames, -1), motion.translations.reshape(frames, -1)),
-        axis=1,
-    )
-    sampled = _through(columns, at)
-    rotation_columns = motion.rotations.shape[1] * 4
-    rotations = sampled[:, 3 : 3 + rotation_columns].reshape(count, -1, 4)
-    return Motion(
-        sampled[:, :3],
-        quaternions.normalise(rotations),
-        sampled[:, 3 + rotation_columns :].reshape(count, -1, 3),
+    count = int((frames - 1) / from_hz * to_hz + 1e-6) + 1
+    return _sampled(motion, np.minimum(np.arange(count) * (from_hz / to_hz), frames - 1.0))
+
+
+def _are_same(rate_hz: float, other_hz: float) -> bool:
+    return abs(rate_hz - other_hz) <= SAME_RATE * other_hz
+
+
+def _sampled(motion: Motion, places: Floats) -> Motion:
+    """The motion at fractional frame numbers `places` (n,)."""
+    nearest = np.round(places).astype(np.int64)
+    if np.all(np.abs(places - nearest) <= SAME_RATE * motion.frame_count):
+        return motion.at_frames(nearest)
+    rotations = quaternions.normalise(_interpolated(motion.rotations, places))
+    return motion._replace(
+        root_translations=_interpolated(motion.root_translations, places),
+        rotations=np.asarray(rotations, dtype=np.float64),
+        translations=_interpolated(motion.translations, places),
     )
 
 
-def _through(columns: Floats, at: Floats) -> Floats:
-    """Cubic splines through the rows of `columns` (F, C), read at fractional frames."""
+def _interpolated(values: Floats, places: Floats) -> Floats:
+    """Cubic splines through `values` (F, ...), read at frame numbers `places` (n,): (n, ...)."""
     from scipy.interpolate import CubicSpline
 
-    if len(columns) == 1:
-        return np.repeat(columns, len(at), axis=0)
-    sampled: Floats = CubicSpline(np.arange(len(columns)), columns, axis=0)(at)
-    return sampled
+    columns = values.reshape(len(values), -1)
+    if len(values) == 1:
+        return np.repeat(values, len(places), axis=0)
+    sampled = np.empty((len(places), columns.shape[1]))
+    frames = np.arange(len(values), dtype=np.float64)
+    for start in range(0, columns.shape[1], CHANNELS):
+        channels = slice(start, start + CHANNELS)
+        # Few frames have no cubic: the library takes the parabola through three and the line through two.
+        sampled[:, channels] = CubicSpline(frames, columns[:, channels])(places)
+    return sampled.reshape(len(places), *values.shape[1:])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,7 @@ class MatchingBody:
     lefts, rights : matching joints of both sides, hips and shoulders, whose difference tells where the body faces
     pose_joints : the joints of the pose cost, in the order of `POSE_JOINTS`, those that the skeleton has
     partners : (J,) each joint's partner on the other side, its own index for joints of the centre
+    standard_joints : joint index by standard name, of all that the mapping knows
     """
 
     skeleton: Skeleton
@@ -39,6 +41,7 @@ class MatchingBody:
     rights: tuple[int, ...]
     pose_joints: tuple[int, ...]
     partners: NDArray[np.int32]
+    standard_joints: Mapping[str, int]
 
     @classmethod
     def from_mapping(cls, skeleton: Skeleton, mapping: JointMapping) -> MatchingBody:
@@ -59,4 +62,5 @@ class MatchingBody:
             rights=mapping.indices(skeleton, ("right_hip", "right_shoulder")),
             pose_joints=tuple(dict.fromkeys(mapping.indices(skeleton, known))),
             partners=symmetric_joints(skeleton, mapping),
+            standard_joints={standard: skeleton.index_of(name) for standard, name in mapping.joints.items()},
         )

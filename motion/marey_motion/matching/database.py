@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from marey_motion.clip import Clip
 from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.features import FeatureLayout, feature_layout
 from marey_motion.matching.normaliser import Normaliser
 from marey_motion.matching.options import DatabaseOptions
 from marey_motion.matching.root_motion import RootMotion, root_motion
@@ -39,7 +40,10 @@ class SourceClip:
 
 @dataclass(frozen=True)
 class DatabaseClip:
-    """A clip in a database. Its rows are [start, stop); a mirrored one has the uid of its source plus "~mirrored"."""
+    """A clip in a database. Its rows are [start, stop); a mirrored one has the uid of its source plus "~mirrored".
+
+    `in_place` clips walk without travelling, as on a treadmill: their speeds say nothing.
+    """
 
     uid: str
     name: str
@@ -49,6 +53,7 @@ class DatabaseClip:
     loop: bool = False
     mirrored_from: str | None = None
     tags: tuple[str, ...] = ()
+    in_place: bool = False
 
     @property
     def frame_count(self) -> int:
@@ -56,9 +61,37 @@ class DatabaseClip:
         return self.stop - self.start
 
 
+NOTES = {
+    "rest-pose-dropped": "The clip begins or ends with a rest pose, which was left out.",
+    "only-a-rest-pose": "The clip is a rest pose from beginning to end; it was kept.",
+    "in-place-gait": "The clip walks without travelling; leave it out of speed coverage.",
+    "too-short": "The clip is shorter than what may not be chosen at its end: it can never be.",
+    "loop-end-repeated": "The loop's last frame repeats its first one and was left out.",
+    "loop-does-not-close": "The loop's last frame is far from its first one: it will jump there.",
+    "many-joints": "So many matched joints drown the trajectory.",
+    "scale-floored": "A group of features hardly varies; its scale was raised to the least one.",
+}
+
+
+@dataclass(frozen=True)
+class DatabaseNote:
+    """Something to know about a database; `NOTES` explains every code. `clip` is the uid of the clip concerned."""
+
+    code: str
+    message: str
+    clip: str | None = None
+
+    def __str__(self) -> str:
+        return self.message
+
+
 @dataclass(frozen=True, eq=False)
 class MatchingDatabase:
     """N rows, D feature dimensions, P pose joints, C clips in ascending order of uid: the lowest row wins a tie.
+
+    A row's pose stands where its root does: with p and theta the position and heading of the root, wherever it is put,
+    joint 0 is at R(theta)·poses[:3] + (p.x, 0, p.z) with the rotation R(theta)·poses[3:7], R(theta) being the turn
+    about +Y; all other joints are local. That holds for joint 0 of the skeleton, whether or not it is the hips.
 
     Parameters
     ----------
@@ -68,8 +101,11 @@ class MatchingDatabase:
     root_positions : (N, 2) float64    the simulation root on the ground, metres, in the clip's own world
     root_headings : (N,) float64    radians, continuous within a clip
     pose_points : (N, P, 3) float32    positions of the body's pose joints in the frame of the row's root, metres
-    poses : (N, 3 + 4·J) float32    hips relative to the simulation root (position and rotation), then local rotations
+    poses : (N, 3 + 4·J) float32    joint 0 relative to the root (position in metres and rotation), then local rotations
     contacts : (N, 2) bool    whether the left and the right foot stand
+    translations : (N, k, 3) float32    local translations in metres that replace the offsets of the k
+        `translated_joints`, as in a clip; None where no clip has any
+    notes : what was left out or looks doubtful
     """
 
     body: MatchingBody
@@ -83,6 +119,9 @@ class MatchingDatabase:
     pose_points: NDArray[np.float32]
     poses: NDArray[np.float32]
     contacts: NDArray[np.bool_]
+    translations: NDArray[np.float32] | None = None
+    translated_joints: tuple[int, ...] = ()
+    notes: tuple[DatabaseNote, ...] = ()
 
     @property
     def row_count(self) -> int:
@@ -93,6 +132,16 @@ class MatchingDatabase:
     def starts(self) -> NDArray[np.int64]:
         """(C + 1,) first row of each clip, and N."""
         return np.array([clip.start for clip in self.clips] + [self.row_count], dtype=np.int64)
+
+    @cached_property
+    def layout(self) -> FeatureLayout:
+        """What the D dimensions of the features are."""
+        return feature_layout(self.options, self.body)
+
+    @cached_property
+    def clip_of_row(self) -> NDArray[np.int32]:
+        """(N,) index of each row's clip."""
+        return np.repeat(np.arange(len(self.clips), dtype=np.int32), np.diff(self.starts))
 
     @cached_property
     def root_motion(self) -> RootMotion:

@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.matching.features import FeatureLayout
+
+Floats = NDArray[np.float64]
+
+LEAST_SCALE = 1e-3
+"""Smaller scales are raised to this: what does not vary must not decide."""
+UNMATCHED_SCALE = 1e30
+"""Scale of groups with weight 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,8 +30,110 @@ class Normaliser:
     ----------
     offset, scale : (D,) float64    `apply` gives (features - offset) / scale; weights are part of the scale
     fitted_on : digest of the data it was fitted on
+    names : of the D dimensions; empty when they are not known
+    floored : groups whose scale was raised to the least one
     """
 
     offset: NDArray[np.float64]
     scale: NDArray[np.float64]
     fitted_on: str
+    names: tuple[str, ...] = ()
+    floored: tuple[str, ...] = ()
+
+    def apply(self, features: Floats) -> Floats:
+        """Normalised features (..., D); costs are squared distances between such rows."""
+        normalised = features - self.offset
+        normalised /= self.scale
+        return normalised
+
+    @property
+    def digest(self) -> str:
+        """What a pinned normaliser is called: "sha256:…" of dimensions, offsets and scales."""
+        content = hashlib.sha256(json.dumps(self.names).encode())
+        for values in (self.offset, self.scale):
+            content.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
+        return f"sha256:{content.hexdigest()}"
+
+    def require_fit(self, layout: FeatureLayout) -> None:
+        """Raise `MotionError` unless this normaliser is one of the layout's dimensions."""
+        if len(self.offset) != layout.dimension_count:
+            raise MotionError(
+                f"the normaliser has {len(self.offset)} dimensions, the features have {layout.dimension_count}; "
+                "use one that was fitted with the same joints and horizons",
+                code="normaliser-mismatch",
+                where="normaliser",
+            )
+        different = [pair for pair in zip(self.names, layout.names, strict=False) if pair[0] != pair[1]]
+        if different:
+            raise MotionError(
+                f"the normaliser was fitted to {different[0][0]} where the features have {different[0][1]}; "
+                "use one that was fitted with the same joints and horizons",
+                code="normaliser-mismatch",
+                where="normaliser",
+            )
+
+    def as_tree(self) -> dict[str, Any]:
+        """Plain values and arrays, to keep or send; `from_tree` takes them back."""
+        return {
+            "digest": self.digest,
+            "fitted_on": self.fitted_on,
+            "names": list(self.names),
+            "floored": list(self.floored),
+            "offset": np.asarray(self.offset),
+            "scale": np.asarray(self.scale),
+        }
+
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any]) -> Normaliser:
+        """The normaliser of `as_tree`. Raises `MotionError` naming the member that is wrong or was changed."""
+        try:
+            offset, scale = (np.asarray(tree[name], dtype=np.float64) for name in ("offset", "scale"))
+            names, floored = tuple(tree["names"]), tuple(tree["floored"])
+            fitted_on, digest = str(tree["fitted_on"]), str(tree["digest"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise MotionError(
+                f"this is no normaliser: {error}", code="normaliser-invalid", where="normaliser"
+            ) from error
+        if offset.ndim != 1 or scale.shape != offset.shape or len(names) not in (0, len(offset)):
+            raise MotionError(
+                f"{len(names)} names, offsets of shape {offset.shape} and scales of shape {scale.shape} do not match",
+                code="normaliser-invalid",
+                where="normaliser",
+            )
+        if not np.all(np.isfinite(offset)) or not np.all(np.isfinite(scale) & (scale > 0.0)):
+            raise MotionError(
+                "offsets must be finite and scales positive", code="normaliser-invalid", where="normaliser"
+            )
+        result = cls(offset, scale, fitted_on, names, floored)
+        if result.digest != digest:
+            raise MotionError(
+                f"its digest is {result.digest}, not {digest}: it was changed",
+                code="normaliser-invalid",
+                where="normaliser",
+            )
+        return result
+
+
+def fit_normaliser(features: Floats, layout: FeatureLayout, fitted_on: str) -> Normaliser:
+    """Means, and one scale per group: the mean of its standard deviations divided by its weight.
+
+    Parameters
+    ----------
+    features : (N, D) before normalisation
+    fitted_on : digest of the data they are of
+
+    Groups that hardly vary get the least scale, and are named in `floored`.
+    """
+    if not len(features):
+        raise MotionError("there are no features to fit a normaliser to", code="no-features")
+    offset = features.mean(axis=0)
+    deviations = np.array([features[:, d].std() for d in range(layout.dimension_count)])
+    scale = np.empty(layout.dimension_count)
+    floored = []
+    for group in layout.groups:
+        spread = float(deviations[group.start : group.stop].mean())
+        wanted = spread / group.weight if group.weight > 0.0 else UNMATCHED_SCALE
+        if wanted < LEAST_SCALE:
+            floored.append(group.name)
+        scale[group.start : group.stop] = max(wanted, LEAST_SCALE)
+    return Normaliser(offset, scale, fitted_on, layout.names, tuple(floored))

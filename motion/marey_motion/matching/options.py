@@ -19,7 +19,10 @@ HORIZONS_S = (1 / 3, 2 / 3, 1.0)
 
 @dataclass(frozen=True)
 class FeatureWeights:
-    """Weight of each group of features; the groups in the order of the 27 dimensions of the default layout."""
+    """Weight of each group of features; the groups in the order of the 27 dimensions of the default layout.
+
+    A weight of 0 leaves the group out of all costs.
+    """
 
     left_foot_position: float = 0.75
     right_foot_position: float = 0.75
@@ -42,7 +45,9 @@ class DatabaseOptions:
         selectable), nothing ("trim", the last second is not selectable), or the clip's own beginning ("loop", for the
         clips marked as loops; the others clamp)
     root_mode : "bone" takes the root joint itself as the root's motion, for data that has one
-    extra_joints : standard joints whose position and velocity are matched beside feet and hips
+    extra_joints : standard joints whose position and velocity are matched beside feet and hips; more than five matched
+        joints drown the trajectory
+    keep_rest_poses : keep the rest poses that a clip begins or ends with, which are left out otherwise
     """
 
     mirroring: Mirroring = "none"
@@ -52,6 +57,7 @@ class DatabaseOptions:
     horizons_s: tuple[float, ...] = HORIZONS_S
     extra_joints: tuple[str, ...] = ()
     rate_hz: float = TICK_RATE_HZ
+    keep_rest_poses: bool = False
 
 
 @dataclass(frozen=True)

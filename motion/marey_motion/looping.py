@@ -1,0 +1,80 @@
+"""Clips whose last frame leads into their first one, elsewhere on the ground: where a round ends the next one begins.
+
+Ground positions are (x, z) in metres, headings radians that grow to the left.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import quaternions
+from marey_motion.motion import Motion
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class LoopSeam(NamedTuple):
+    """The move on the ground that takes each round of a loop to the next one: a turn about the origin, then a shift."""
+
+    turn_rad: float
+    shift_m: Floats
+
+
+def loop_seam(positions: Floats, headings: Floats) -> LoopSeam:
+    """The seam of a loop that moves on the ground.
+
+    The step from the last frame to the first one of the next round is not in the data: it is taken as the mean of its
+    neighbours, each as its own frame sees it, so that velocities go on through the seam.
+
+    Parameters
+    ----------
+    positions : (F, 2) metres
+    headings : (F,) continuous
+    """
+    if len(headings) < 2:
+        return LoopSeam(0.0, np.zeros(2))
+    turns = np.array([headings[1] - headings[0], headings[-1] - headings[-2]])
+    steps = np.stack((positions[1] - positions[0], positions[-1] - positions[-2]))
+    local = rotated(steps, -headings[[0, -2]]).mean(axis=0)
+    arrival = positions[-1] + rotated(local, headings[-1])
+    turn = float(headings[-1] + turns.mean() - headings[0])
+    return LoopSeam(turn, arrival - rotated(positions[0], turn))
+
+
+def rotated(vectors: Floats, angles_rad: Floats | float) -> Floats:
+    """Ground vectors (..., 2) turned to the left by angles (...)."""
+    sine, cosine = np.sin(angles_rad), np.cos(angles_rad)
+    x, z = vectors[..., 0], vectors[..., 1]
+    return np.stack((x * cosine + z * sine, z * cosine - x * sine), axis=-1)
+
+
+def moves_of_rounds(seam: LoopSeam, rounds: Ints) -> tuple[Floats, Floats]:
+    """Turns (n,) and shifts (n, 2) from the recorded round to each of `rounds` (n,): 1 is the next."""
+    first, last = int(rounds.min(initial=0)), int(rounds.max(initial=0))
+    turns = seam.turn_rad * np.arange(first, last + 1, dtype=np.float64)
+    shifts = np.zeros((last - first + 1, 2))
+    for n in range(1, last + 1):
+        shifts[n - first] = rotated(shifts[n - 1 - first], seam.turn_rad) + seam.shift_m
+    for n in range(-1, first - 1, -1):
+        shifts[n - first] = rotated(shifts[n + 1 - first] - seam.shift_m, -seam.turn_rad)
+    return turns[rounds - first], shifts[rounds - first]
+
+
+def continue_motion(motion: Motion, seam: LoopSeam, before: int, after: int) -> Motion:
+    """A loop with so many frames more at both ends, taken from the rounds before and after it."""
+    rounds, frames = np.divmod(np.arange(-before, motion.frame_count + after), motion.frame_count)
+    turns, shifts = moves_of_rounds(seam, rounds)
+    going_on = motion.at_frames(frames)
+    going_on.root_translations[:, (0, 2)] = rotated(going_on.root_translations[:, (0, 2)], turns) + shifts
+    going_on.rotations[:, 0] = quaternions.multiply(about_vertical(turns), going_on.rotations[:, 0])
+    return going_on._replace(rotations=np.asarray(quaternions.unroll(going_on.rotations), dtype=np.float64))
+
+
+def about_vertical(angles_rad: Floats) -> Floats:
+    """Rotations (..., 4) by angles (...) about the vertical, to the left."""
+    zero = np.zeros_like(angles_rad)
+    return np.stack((np.cos(0.5 * angles_rad), zero, np.sin(0.5 * angles_rad), zero), axis=-1)

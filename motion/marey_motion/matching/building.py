@@ -1,0 +1,223 @@
+"""From clips to a matching database."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.landmarks import find_landmarks
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.database import DatabaseClip, DatabaseNote, MatchingDatabase, SourceClip
+from marey_motion.matching.features import FeatureLayout, feature_layout
+from marey_motion.matching.normaliser import Normaliser, fit_normaliser
+from marey_motion.matching.options import DatabaseOptions
+from marey_motion.matching.preparing import PreparedClip, mirror_prepared, prepare_clip
+from marey_motion.matching.rows import ClipRows, clip_rows
+
+MOST_MATCHED_JOINTS = 5
+
+Progress = Callable[[int, int, str], None]
+_Row = tuple[DatabaseClip, ClipRows, tuple[int, ...], tuple[DatabaseNote, ...]]
+
+
+def build_database(
+    clips: Sequence[SourceClip],
+    body: MatchingBody,
+    options: DatabaseOptions = DatabaseOptions(),  # noqa: B008 - frozen
+    *,
+    normaliser: Normaliser | None = None,
+    progress: Progress | None = None,
+) -> MatchingDatabase:
+    """Everything motion matching needs of clips of one skeleton; the same whatever order they come in.
+
+    Parameters
+    ----------
+    normaliser : one that was fitted before ("pinned"); it brings its own weights. Fitted to these clips when None
+    progress : called as progress(clips done, of how many, name of the last one)
+
+    Raises
+    ------
+    MotionError    naming the clip that moves another skeleton, faces nowhere or lacks the frames asked for; when uids
+        repeat, options make no sense, or the normaliser is one of other dimensions
+    """
+    layout = feature_layout(options, body)
+    if normaliser is not None:
+        normaliser.require_fit(layout)
+    built = sorted(_built(_ordered(clips), body, layout, options, progress), key=lambda row: row[0].uid)
+    entries, start = [], 0
+    for entry, rows, _, _ in built:
+        entries.append(replace(entry, start=start, stop=start + len(rows.features)))
+        start = entries[-1].stop
+    translations, translated_joints = _joined_translations(built, body)
+    arrays = {
+        name: np.concatenate([getattr(rows, name) for _, rows, _, _ in built])
+        for name in ClipRows._fields
+        if name != "translations"
+    }
+    if normaliser is None:
+        normaliser = fit_normaliser(arrays["features"], layout, _digest_of([arrays["features"]]))
+    return MatchingDatabase(
+        body=body,
+        clips=tuple(entries),
+        options=options,
+        normaliser=normaliser,
+        translations=translations,
+        translated_joints=translated_joints,
+        notes=(*_layout_notes(layout), *_normaliser_notes(normaliser), *(note for row in built for note in row[3])),
+        **arrays,
+    )
+
+
+def with_normaliser(database: MatchingDatabase, normaliser: Normaliser) -> MatchingDatabase:
+    """The same database under another normaliser. Raises `MotionError` when that is one of other dimensions."""
+    normaliser.require_fit(database.layout)
+    kept = [note for note in database.notes if note.code != "scale-floored"]
+    return replace(database, normaliser=normaliser, notes=(*kept, *_normaliser_notes(normaliser)))
+
+
+def union_normaliser(databases: Sequence[MatchingDatabase]) -> Normaliser:
+    """One normaliser fitted to the rows of several databases together, so that their costs can be compared.
+
+    The order of the databases does not matter. Raises `MotionError` when they match different joints or horizons, or
+    with different weights.
+    """
+    if not databases:
+        raise MotionError("there are no databases to fit a normaliser to", code="no-features")
+    ordered = sorted(databases, key=database_digest)
+    layout = ordered[0].layout
+    for other in ordered[1:]:
+        same_groups = [group._replace(joint=None) for group in other.layout.groups] == [
+            group._replace(joint=None) for group in layout.groups
+        ]
+        if other.layout.names != layout.names or not same_groups:
+            raise MotionError(
+                "the databases match different joints or horizons, or with different weights; build them alike",
+                code="normaliser-mismatch",
+            )
+    features = np.concatenate([database.features for database in ordered])
+    return fit_normaliser(features, layout, _digest_of([features]))
+
+
+def database_digest(database: MatchingDatabase) -> str:
+    """ "sha256:…" of all that a search and a controller see of a database, but for its normaliser."""
+    clips = [(clip.uid, clip.start, clip.stop, clip.loop) for clip in database.clips]
+    return _digest_of(
+        [
+            database.features,
+            database.selectable,
+            database.root_positions,
+            database.root_headings,
+            database.pose_points,
+            database.poses,
+        ],
+        json.dumps([clips, database.options.end_policy]),
+    )
+
+
+def _digest_of(arrays: Sequence[NDArray[Any]], text: str = "") -> str:
+    content = hashlib.sha256(text.encode())
+    for array in arrays:
+        content.update(f"{array.dtype.str} {array.shape}\n".encode())
+        content.update(np.ascontiguousarray(array).data)
+    return f"sha256:{content.hexdigest()}"
+
+
+def _ordered(clips: Sequence[SourceClip]) -> list[SourceClip]:
+    if not clips:
+        raise MotionError("there are no clips to build a database of", code="no-clips")
+    ordered = sorted(clips, key=lambda clip: clip.uid)
+    for clip, following in pairwise(ordered):
+        if clip.uid == following.uid:
+            raise MotionError(
+                f"{clip.name} and {following.name} have the same uid {clip.uid}", code="uid-repeated", where=clip.name
+            )
+    return ordered
+
+
+def _built(
+    clips: Sequence[SourceClip],
+    body: MatchingBody,
+    layout: FeatureLayout,
+    options: DatabaseOptions,
+    progress: Progress | None,
+) -> Iterator[_Row]:
+    landmarks = find_landmarks(body.skeleton)
+    for done, source in enumerate(clips, start=1):
+        try:
+            for clip in _variants(prepare_clip(source, body, options, landmarks), body, options):
+                rows = clip_rows(clip.motion, clip.seam, body, layout, options)
+                yield _entry(clip), rows, clip.motion.translated_joints, (*clip.notes, *_row_notes(clip, rows))
+        except MotionError as error:
+            where = f"{source.name}, {error.where}" if error.where else source.name
+            raise MotionError(error.message, code=error.code, where=where) from error
+        if progress is not None:
+            progress(done, len(clips), source.name)
+
+
+def _variants(clip: PreparedClip, body: MatchingBody, options: DatabaseOptions) -> Iterator[PreparedClip]:
+    if options.mirroring != "only":
+        yield clip
+    if options.mirroring != "none":
+        yield mirror_prepared(clip, body, keep_notes=options.mirroring == "only")
+
+
+def _entry(clip: PreparedClip) -> DatabaseClip:
+    source = clip.source
+    return DatabaseClip(
+        uid=clip.uid,
+        name=f"{source.name} (mirrored)" if clip.mirrored else source.name,
+        content=source.content,
+        start=0,
+        stop=clip.motion.frame_count,
+        loop=source.loop,
+        mirrored_from=source.uid if clip.mirrored else None,
+        tags=source.tags,
+        in_place=clip.in_place,
+    )
+
+
+def _row_notes(clip: PreparedClip, rows: ClipRows) -> tuple[DatabaseNote, ...]:
+    if rows.selectable.any() or (clip.mirrored and not clip.notes):
+        return ()
+    message = f"{clip.source.name}: its {len(rows.selectable)} frames are too few to look ahead; none can be chosen"
+    return (DatabaseNote("too-short", message, clip.uid),)
+
+
+def _layout_notes(layout: FeatureLayout) -> tuple[DatabaseNote, ...]:
+    count = len(layout.matched_joints)
+    if count <= MOST_MATCHED_JOINTS:
+        return ()
+    message = f"{count} joints are matched; with more than {MOST_MATCHED_JOINTS} the trajectory hardly counts"
+    return (DatabaseNote("many-joints", message),)
+
+
+def _normaliser_notes(normaliser: Normaliser) -> tuple[DatabaseNote, ...]:
+    return tuple(
+        DatabaseNote("scale-floored", f"{group} hardly varies in these clips; its scale was raised to the least one")
+        for group in normaliser.floored
+    )
+
+
+def _joined_translations(
+    built: Sequence[_Row], body: MatchingBody
+) -> tuple[NDArray[np.float32] | None, tuple[int, ...]]:
+    """Translations of all joints that any clip translates; a clip that does not has their offsets."""
+    joints = np.array(sorted({joint for row in built for joint in row[2]}), dtype=np.int64)
+    if not len(joints):
+        return None, ()
+    joined = np.empty((sum(len(row[1].features) for row in built), len(joints), 3), np.float32)
+    joined[:] = body.skeleton.offsets[joints]
+    start = 0
+    for _, rows, own, _ in built:
+        stop = start + len(rows.features)
+        joined[start:stop, np.searchsorted(joints, own)] = rows.translations
+        start = stop
+    return joined, tuple(int(joint) for joint in joints)

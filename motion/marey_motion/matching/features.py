@@ -1,0 +1,166 @@
+"""What motion matching compares: feet and hips as the root sees them, and where the root goes within a second."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.looping import loop_seam, moves_of_rounds, rotated
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.options import DatabaseOptions
+from marey_motion.matching.simulation_root import SimulationRoot
+
+Floats = NDArray[np.float64]
+
+EXTRA_POSITION_WEIGHT = 0.75
+EXTRA_VELOCITY_WEIGHT = 1.0
+"""Of extra joints: as feet."""
+
+
+class FeatureGroup(NamedTuple):
+    """Dimensions [start, stop) that share a scale. `joint` is the joint they describe, None for the trajectory."""
+
+    name: str
+    start: int
+    stop: int
+    weight: float
+    joint: int | None
+
+
+@dataclass(frozen=True)
+class FeatureLayout:
+    """The D dimensions of a feature vector: those of the pose first, those of the trajectory last.
+
+    Positions and velocities have components left, up, forward in the frame of the root (x, y, z of a body that heads
+    along +z); points and directions of the trajectory have left and forward (x, z).
+    """
+
+    groups: tuple[FeatureGroup, ...]
+    names: tuple[str, ...]
+    horizons_s: tuple[float, ...]
+
+    @property
+    def dimension_count(self) -> int:
+        """D."""
+        return len(self.names)
+
+    @property
+    def pose_dimensions(self) -> int:
+        """How many dimensions the pose has. Those of the trajectory follow: (x, z) at each horizon, then directions."""
+        return self.dimension_count - 4 * len(self.horizons_s)
+
+    @property
+    def matched_joints(self) -> tuple[int, ...]:
+        """Joints that are matched, in order of their groups."""
+        return tuple(dict.fromkeys(group.joint for group in self.groups if group.joint is not None))
+
+
+def feature_layout(options: DatabaseOptions, body: MatchingBody) -> FeatureLayout:
+    """The dimensions that these options ask for; 27 unless joints or horizons are added.
+
+    Raises `MotionError` for a joint that the body lacks, a weight below 0, and horizons that are not ahead.
+    """
+    _check(options, body)
+    weights = options.weights
+    left, right = body.feet
+    blocks: list[tuple[str, Sequence[str], float, int | None]] = [
+        ("left_foot_position", "xyz", weights.left_foot_position, left),
+        ("right_foot_position", "xyz", weights.right_foot_position, right),
+        ("left_foot_velocity", "xyz", weights.left_foot_velocity, left),
+        ("right_foot_velocity", "xyz", weights.right_foot_velocity, right),
+        ("hip_velocity", "xyz", weights.hip_velocity, body.hips),
+    ]
+    for name in options.extra_joints:
+        blocks.append((f"{name}_position", "xyz", EXTRA_POSITION_WEIGHT, body.standard_joints[name]))
+        blocks.append((f"{name}_velocity", "xyz", EXTRA_VELOCITY_WEIGHT, body.standard_joints[name]))
+    points = [f"{horizon_s:.3f}s.{axis}" for horizon_s in options.horizons_s for axis in "xz"]
+    blocks.append(("trajectory_positions", points, weights.trajectory_positions, None))
+    blocks.append(("trajectory_directions", points, weights.trajectory_directions, None))
+    groups: list[FeatureGroup] = []
+    names: list[str] = []
+    for name, parts, weight, joint in blocks:
+        groups.append(FeatureGroup(name, len(names), len(names) + len(parts), float(weight), joint))
+        names += [f"{name}.{part}" for part in parts]
+    return FeatureLayout(tuple(groups), tuple(names), tuple(options.horizons_s))
+
+
+def _check(options: DatabaseOptions, body: MatchingBody) -> None:
+    for field, weight in vars(options.weights).items():
+        if not (np.isfinite(weight) and weight >= 0.0):
+            raise MotionError(f"a weight of {weight} must be 0 or more", where=f"weights.{field}")
+    horizons = np.asarray(options.horizons_s, dtype=np.float64)
+    if not (np.isfinite(options.rate_hz) and options.rate_hz > 0):
+        raise MotionError(f"a rate of {options.rate_hz} must be a positive number", where="rate_hz")
+    if not horizons.size or not np.all(np.isfinite(horizons)) or np.any(np.diff(horizons, prepend=0.0) <= 0.0):
+        raise MotionError("horizons must be seconds ahead, in increasing order", where="horizons_s")
+    missing = [name for name in options.extra_joints if name not in body.standard_joints]
+    if missing:
+        raise MotionError(
+            f"the skeleton has no {', '.join(missing)}; it has {', '.join(sorted(body.standard_joints))}",
+            code="unknown-joint",
+            where="extra_joints",
+        )
+    if len(set(options.extra_joints)) < len(options.extra_joints):
+        raise MotionError("a joint is named twice", where="extra_joints")
+
+
+def in_root_frame(points: Floats, root: SimulationRoot) -> Floats:
+    """Positions (F, K, 3) in the world as each frame's root sees them: (left, up, forward), metres."""
+    seen = points.copy()
+    seen[..., (0, 2)] -= root.positions[:, None]
+    return turned_to_root(seen, root)
+
+
+def turned_to_root(vectors: Floats, root: SimulationRoot) -> Floats:
+    """Vectors (F, K, 3) of the world along the axes of each frame's root: (left, up, forward)."""
+    turned = vectors.copy()
+    turned[..., (0, 2)] = rotated(vectors[..., (0, 2)], -root.headings[:, None])
+    return turned
+
+
+def look_ahead(root: SimulationRoot, ticks: NDArray[np.int64], *, wraps: bool) -> SimulationRoot:
+    """The root `ticks` (H,) frames ahead of each frame: positions (F, H, 2) and headings (F, H).
+
+    Beyond the end a clip stays where it ends, and a loop that wraps goes on with its next rounds.
+    """
+    count = len(root.headings)
+    ahead = np.arange(count)[:, None] + ticks
+    if not wraps:
+        rows = np.minimum(ahead, count - 1)
+        return SimulationRoot(root.positions[rows], root.headings[rows])
+    rounds, rows = np.divmod(ahead, count)
+    turns, shifts = moves_of_rounds(loop_seam(*root), rounds.reshape(-1))
+    turns, shifts = turns.reshape(rounds.shape), shifts.reshape(*rounds.shape, 2)
+    return SimulationRoot(rotated(root.positions[rows], turns) + shifts, root.headings[rows] + turns)
+
+
+def extract_features(
+    layout: FeatureLayout, positions: Floats, velocities: Floats, root: SimulationRoot, future: SimulationRoot
+) -> Floats:
+    """Features (F, D), metres and metres per second in the frame of each frame's root.
+
+    Parameters
+    ----------
+    positions, velocities : (F, J, 3) in the world
+    root : of the frames
+    future : the root at each horizon, positions (F, H, 2) and headings (F, H)
+    """
+    features = np.empty((len(positions), layout.dimension_count))
+    for group in layout.groups:
+        if group.joint is not None:
+            columns = slice(group.start, group.stop)
+            if group.name.endswith("_velocity"):
+                features[:, columns] = turned_to_root(velocities[:, [group.joint]], root)[:, 0]
+            else:
+                features[:, columns] = in_root_frame(positions[:, [group.joint]], root)[:, 0]
+    trajectory = np.empty((len(features), 2, len(layout.horizons_s), 2))
+    trajectory[:, 0] = rotated(future.positions - root.positions[:, None], -root.headings[:, None])
+    turns = future.headings - root.headings[:, None]
+    trajectory[:, 1] = np.stack((np.sin(turns), np.cos(turns)), axis=-1)
+    features[:, layout.pose_dimensions :] = trajectory.reshape(len(features), -1)
+    return features

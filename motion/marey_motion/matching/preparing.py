@@ -1,0 +1,142 @@
+"""From a source clip to the motion that a database samples: the frames to use, at the database's rate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from marey_motion import quaternions
+from marey_motion.checks import CheckWarning, check_clip
+from marey_motion.clip import Clip
+from marey_motion.errors import MotionError
+from marey_motion.landmarks import Landmarks
+from marey_motion.looping import LoopSeam, loop_seam
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.database import DatabaseNote, SourceClip
+from marey_motion.matching.options import DatabaseOptions
+from marey_motion.matching.simulation_root import bone_root, raw_root
+from marey_motion.mirroring import mirror_motion
+from marey_motion.motion import Motion
+from marey_motion.resampling import resample_motion
+from marey_motion.skeleton import same_hierarchy
+
+SAME_OFFSET_M = 1e-3
+"""By which bones of one skeleton may differ between files."""
+
+# The seam of a loop is measured in steps between its frames.
+REPEATED_STEPS = 0.2
+OPEN_STEPS = 3.0
+STILL_RAD = 1e-4
+
+_Tell = Callable[[str, str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedClip:
+    """A source clip's motion at the database's rate.
+
+    Parameters
+    ----------
+    seam : how a round leads into the next one where rows look ahead through it, None where the clip ends
+    mirrored : whether left and right are exchanged
+    """
+
+    source: SourceClip
+    motion: Motion
+    seam: LoopSeam | None
+    in_place: bool
+    notes: tuple[DatabaseNote, ...]
+    mirrored: bool = False
+
+    @property
+    def uid(self) -> str:
+        """What names the clip in the database."""
+        return f"{self.source.uid}~mirrored" if self.mirrored else self.source.uid
+
+
+def prepare_clip(
+    source: SourceClip, body: MatchingBody, options: DatabaseOptions, landmarks: Landmarks
+) -> PreparedClip:
+    """The frames of a source clip that belong into a database, at its rate.
+
+    Raises `MotionError` naming the clip when it moves another skeleton or its range of frames is not there.
+    """
+    notes: list[DatabaseNote] = []
+
+    def tell(code: str, message: str) -> None:
+        notes.append(DatabaseNote(code, f"{source.name}: {message}", source.uid))
+
+    clip, in_place = _wanted_frames(source, body, options, landmarks, tell)
+    motion, seam = Motion.of(clip), None
+    if source.loop and options.end_policy == "loop":
+        motion = _closed(motion, tell)
+        bone = options.root_mode == "bone"
+        seam = loop_seam(*(bone_root(motion, body) if bone else raw_root(motion.positions(body.skeleton), body)))
+    motion = resample_motion(motion, clip.frame_rate_hz, options.rate_hz, seam=seam)
+    return PreparedClip(source, motion, seam, in_place, tuple(notes))
+
+
+def mirror_prepared(clip: PreparedClip, body: MatchingBody, *, keep_notes: bool) -> PreparedClip:
+    """The same with left and right exchanged."""
+    seam = clip.seam
+    if seam is not None:
+        seam = LoopSeam(-seam.turn_rad, seam.shift_m * (-1.0, 1.0))
+    motion = mirror_motion(body.skeleton, body.partners, clip.motion)
+    return replace(clip, motion=motion, seam=seam, mirrored=True, notes=clip.notes if keep_notes else ())
+
+
+def _wanted_frames(
+    source: SourceClip, body: MatchingBody, options: DatabaseOptions, landmarks: Landmarks, tell: _Tell
+) -> tuple[Clip, bool]:
+    """The clip within its range and without rest poses at its ends, and whether it walks in place."""
+    clip = source.clip
+    if not same_hierarchy(clip.skeleton, body.skeleton, tolerance_m=SAME_OFFSET_M):
+        raise MotionError(
+            "the clip moves another skeleton than the database's; retarget it first", code="skeleton-mismatch"
+        )
+    if source.frames is not None:
+        clip = clip.sliced(*source.frames)
+    warnings = check_clip(clip, landmarks)
+    if not options.keep_rest_poses:
+        clip = _without_rest_poses(clip, warnings, tell)
+    in_place = [warning for warning in warnings if warning.code == "in-place-gait"]
+    for warning in in_place:
+        tell(warning.code, warning.message)
+    return clip, bool(in_place)
+
+
+def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], tell: _Tell) -> Clip:
+    start, stop = 0, clip.frame_count
+    for warning in warnings:
+        if warning.code == "rest-pose-frame" and warning.frames is not None:
+            if warning.frames == (0, clip.frame_count):
+                tell("only-a-rest-pose", "all of it is a rest pose; it was kept")
+                return clip
+            if warning.frames[0] == 0:
+                start = warning.frames[1]
+            else:
+                stop = warning.frames[0]
+    if stop - start == clip.frame_count:
+        return clip
+    tell("rest-pose-dropped", f"{start} frames at its start and {clip.frame_count - stop} at its end are a rest pose")
+    return clip.sliced(start, stop)
+
+
+def _closed(motion: Motion, tell: _Tell) -> Motion:
+    """A loop without a last frame that repeats the first one."""
+    if motion.frame_count < 3 or motion.rotations.shape[1] < 2:
+        return motion
+    inner = motion.rotations[:, 1:]
+    steps = quaternions.angle_between(inner[1:], inner[:-1]).max(axis=1)
+    gap = float(quaternions.angle_between(inner[-1], inner[0]).max())
+    if gap < REPEATED_STEPS * float(np.median(steps)):
+        tell("loop-end-repeated", "its last frame repeats its first one and was left out")
+        return motion.at_frames(np.arange(motion.frame_count - 1))
+    if gap > OPEN_STEPS * max(float(steps.max()), STILL_RAD):
+        tell(
+            "loop-does-not-close",
+            f"it is marked as a loop, but a joint turns {np.degrees(gap):.0f}° from its last frame to its first one",
+        )
+    return motion

@@ -1,0 +1,87 @@
+"""One clip as rows of a matching database: on its simulation root, with its features."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import kinematics, quaternions
+from marey_motion.looping import LoopSeam, about_vertical, continue_motion
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.features import FeatureLayout, extract_features, in_root_frame, look_ahead
+from marey_motion.matching.options import DatabaseOptions
+from marey_motion.matching.simulation_root import (
+    DIRECTION_WINDOW_S,
+    SimulationRoot,
+    bone_root,
+    simulation_root,
+    window_frames,
+)
+from marey_motion.motion import Motion
+
+Floats = NDArray[np.float64]
+
+CLAMPED_S = 1 / 3
+"""Of a clip's end, whose futures clamp to the last frame, are not selectable."""
+
+
+class ClipRows(NamedTuple):
+    """The rows of one clip; shapes and meanings as in `MatchingDatabase`."""
+
+    features: Floats
+    selectable: NDArray[np.bool_]
+    root_positions: Floats
+    root_headings: Floats
+    pose_points: NDArray[np.float32]
+    poses: NDArray[np.float32]
+    contacts: NDArray[np.bool_]
+    translations: NDArray[np.float32]
+
+
+def clip_rows(
+    motion: Motion, seam: LoopSeam | None, body: MatchingBody, layout: FeatureLayout, options: DatabaseOptions
+) -> ClipRows:
+    """The rows of a motion at the database's rate.
+
+    `seam` is that of a loop that looks ahead to its own beginning. Raises `MotionError` when the body never faces
+    anywhere.
+    """
+    rate_hz, frames = options.rate_hz, motion.frame_count
+    # A loop is seen going on at both ends, so that filters and differences know nothing of a cut.
+    padding = 0 if seam is None else window_frames(DIRECTION_WINDOW_S, rate_hz)
+    whole = motion if seam is None else continue_motion(motion, seam, padding, padding)
+    positions = whole.positions(body.skeleton)
+    bone = options.root_mode == "bone"
+    root = bone_root(whole, body) if bone else simulation_root(positions, body, rate_hz)
+    velocities = np.asarray(kinematics.velocities(positions, rate_hz), dtype=np.float64)
+    contacts = kinematics.foot_contacts(positions[:, list(body.toes)], rate_hz)
+    inner = slice(padding, padding + frames)
+    root = SimulationRoot(root.positions[inner], root.headings[inner])
+    ticks = np.round(np.array(layout.horizons_s) * rate_hz).astype(np.int64)
+    future = look_ahead(root, ticks, wraps=seam is not None)
+    points = in_root_frame(positions[inner, list(body.pose_joints)], root)
+    return ClipRows(
+        features=extract_features(layout, positions[inner], velocities[inner], root, future),
+        selectable=_selectable(frames, ticks, options, wraps=seam is not None),
+        root_positions=root.positions,
+        root_headings=root.headings,
+        pose_points=points.astype(np.float32),
+        poses=_poses(motion, root),
+        contacts=contacts[inner],
+        translations=motion.translations.astype(np.float32),
+    )
+
+
+def _selectable(frames: int, ticks: NDArray[np.int64], options: DatabaseOptions, *, wraps: bool) -> NDArray[np.bool_]:
+    ahead = int(ticks[-1]) if options.end_policy == "trim" else round(CLAMPED_S * options.rate_hz)
+    return np.full(frames, True) if wraps else np.arange(frames) < frames - ahead
+
+
+def _poses(motion: Motion, root: SimulationRoot) -> NDArray[np.float32]:
+    """Poses (F, 3 + 4·J) whose joint 0 is where the root sees it."""
+    poses = motion.poses
+    poses[:, :3] = in_root_frame(motion.root_translations[:, None], root)[:, 0]
+    poses[:, 3:7] = quaternions.multiply(about_vertical(-root.headings), motion.rotations[:, 0])
+    return poses.astype(np.float32)

@@ -1,0 +1,73 @@
+"""The numbers of a clip in double precision: what is computed with between one clip and the next."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import kinematics, quaternions
+from marey_motion.clip import Clip
+from marey_motion.skeleton import Skeleton
+
+Floats = NDArray[np.float64]
+
+
+class Motion(NamedTuple):
+    """F frames of J joints.
+
+    Parameters
+    ----------
+    root_translations : (F, 3) metres
+    rotations : (F, J, 4) local, of unit length, continuous in sign
+    translations : (F, k, 3) metres in the parent's frame, in place of the offsets of k translated joints; k may be 0
+    translated_joints : increasing indices of those joints
+    """
+
+    root_translations: Floats
+    rotations: Floats
+    translations: Floats
+    translated_joints: tuple[int, ...]
+
+    @classmethod
+    def of(cls, clip: Clip) -> Motion:
+        """A clip's own numbers."""
+        moved = np.zeros((clip.frame_count, 0, 3)) if clip.translations is None else clip.translations
+        rotations = quaternions.unroll(quaternions.normalise(clip.rotations.astype(np.float64)))
+        return cls(
+            clip.root_translations.astype(np.float64),
+            np.asarray(rotations, dtype=np.float64),
+            moved.astype(np.float64),
+            clip.translated_joints,
+        )
+
+    @property
+    def frame_count(self) -> int:
+        """F."""
+        return len(self.root_translations)
+
+    @property
+    def poses(self) -> Floats:
+        """(F, 3 + 4·J) root translations and rotations side by side."""
+        return np.concatenate((self.root_translations, self.rotations.reshape(self.frame_count, -1)), axis=1)
+
+    def as_clip(self, skeleton: Skeleton, frame_rate_hz: float) -> Clip:
+        """The motion as a clip of `skeleton`, in single precision."""
+        translations = self.translations.astype(np.float32) if self.translated_joints else None
+        return Clip(skeleton, frame_rate_hz, self.poses.astype(np.float32), translations, self.translated_joints)
+
+    def positions(self, skeleton: Skeleton) -> Floats:
+        """(F, J, 3) where the joints are, metres."""
+        positions = kinematics.forward_kinematics(
+            skeleton, self.poses, translations=self.translations, translated_joints=self.translated_joints
+        )
+        return np.asarray(positions, dtype=np.float64)
+
+    def at_frames(self, frames: NDArray[np.integer]) -> Motion:
+        """The frames (n,) in that order."""
+        return self._replace(
+            root_translations=self.root_translations[frames],
+            rotations=self.rotations[frames],
+            translations=self.translations[frames],
+        )
