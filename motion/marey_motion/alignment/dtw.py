@@ -1,0 +1,110 @@
+"""Dynamic time warping: the cheapest way through a matrix of costs from its first cell to its last.
+
+A way goes by steps of one frame in both motions (1-1), in the first alone (1-0) or in the second alone (0-1), and costs
+the sum of all cells on it (Sakoe and Chiba 1978, without weights). All results are exact; there is no band.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marey_motion.errors import MotionError
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A way through n × m cells.
+
+    Parameters
+    ----------
+    path : (L, 2) int32    frame of the first and of the second motion, from (0, 0) to (n - 1, m - 1)
+    total : sum of the costs along it
+    """
+
+    path: NDArray[np.int32]
+    total: float
+
+
+def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
+    """The cheapest way, and of equally cheap ones that which goes by 1-1 rather than 1-0, and 1-0 rather than 0-1.
+
+    Parameters
+    ----------
+    costs : (n, m) finite
+    max_run : at most so many steps 1-0, or 0-1, in a row (the slope limit of Kovar and Gleicher 2003); None for any
+
+    Raises `MotionError` for costs that are not finite, and where no way keeps the limit.
+    """
+    from marey_motion.alignment import dtw_kernels as kernels
+
+    matrix = _checked(costs, max_run)
+    longest = np.empty((sum(matrix.shape) - 1, 2), dtype=np.int32)
+    if max_run is None:
+        total, length = kernels.align(matrix, longest)
+    else:
+        total, length = kernels.align_limited(matrix, max_run, longest)
+    if not np.isfinite(total):
+        raise MotionError(
+            f"{len(matrix)} frames cannot be aligned with {matrix.shape[1]} by at most {max_run} equal steps in a row",
+            code="alignment-impossible",
+            where="max_run",
+        )
+    return Alignment(longest[:length][::-1].copy(), float(total))
+
+
+def _checked(costs: ArrayLike, max_run: int | None) -> Floats:
+    matrix = np.ascontiguousarray(costs, dtype=np.float64)
+    if matrix.ndim != 2 or not matrix.size:
+        raise MotionError(f"costs must be a matrix of at least one frame each, not of shape {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        raise MotionError("costs must be finite", where=f"cell {np.argwhere(~np.isfinite(matrix))[0].tolist()}")
+    if max_run is not None and not 0 <= max_run <= 60:
+        raise MotionError("a run is 0 to 60 steps long", where="max_run")
+    return matrix
+
+
+def distances(a: NDArray[np.floating], b: NDArray[np.floating]) -> Floats:
+    """Mean distance (n, m) of the points of each frame of `a` (n, P, 3) from those of each frame of `b` (m, P, 3)."""
+    from marey_motion.alignment import dtw_kernels as kernels
+
+    found = np.empty((len(a), len(b)))
+    kernels.distances(*_points(a, b), found)
+    return found
+
+
+def warped_distance(a: NDArray[np.floating], b: NDArray[np.floating], *, limit: float = np.inf) -> float:
+    """The total of the cheapest way through `distances(a, b)`, divided by the frames of the longer motion.
+
+    Infinite as soon as it is certain to be above `limit`; memory grows with the frames, not with their product.
+    """
+    from marey_motion.alignment import dtw_kernels as kernels
+
+    longer = max(len(a), len(b))
+    return float(kernels.total_within(*_points(a, b), limit * longer) / longer)
+
+
+def box_bound(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
+    """A number that `warped_distance(a, b)` is never below, in a time that grows with n + m.
+
+    Every frame of either motion lies on the way at least once, and costs no less than from the box about all frames of
+    the other motion; the first and the last cell are on every way.
+    """
+    from marey_motion.alignment import dtw_kernels as kernels
+
+    one, other = (np.ascontiguousarray(points, dtype=np.float64) for points in (a, b))
+    boxes = [(points.min(axis=0), points.max(axis=0)) for points in (one, other)]
+    totals = kernels.box_total(one, *boxes[1]), kernels.box_total(other, *boxes[0])
+    ends = [float(np.linalg.norm(one[frame] - other[frame], axis=-1).mean()) for frame in (0, -1)]
+    return max(*totals, *ends) / max(len(a), len(b))
+
+
+def _points(a: NDArray[np.floating], b: NDArray[np.floating]) -> tuple[Floats, Floats]:
+    """Frames first for the one, last for the other: the inner loop runs along the other's frames."""
+    if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
+        raise MotionError(f"points must be (frames, points, 3), the same points in both, not {a.shape} and {b.shape}")
+    return np.ascontiguousarray(a, dtype=np.float64), np.ascontiguousarray(b.transpose(1, 2, 0), dtype=np.float64)

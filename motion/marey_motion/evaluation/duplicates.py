@@ -1,0 +1,137 @@
+"""Clips that show nearly the same motion: the same poses in the same order, led by a root that goes the same way.
+
+A frame is its pose joints and where the root will be at each horizon, as points in the frame of the root: two walks
+whose poses agree but that turn differently are different. The distance of two clips is that of their best alignment in
+time (`alignment.dtw`): mean distance of the points per frame of the longer clip, in metres. Clips with equal content
+are duplicates whatever is measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.alignment.dtw import box_bound, warped_distance
+from marey_motion.evaluation.selection import clips_by_source
+from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
+from marey_motion.matching.database import DatabaseClip, MatchingDatabase
+
+ProgressCallback = Callable[[int, int, str], None]
+
+THRESHOLD_CM = 3.0
+
+
+@dataclass(frozen=True)
+class NearDuplicate:
+    """Two sources that show nearly the same, `second` when `mirrored` after being mirrored.
+
+    Parameters
+    ----------
+    distance_cm : per frame; 0 for equal content
+    same_content : their documents are equal
+    """
+
+    first: str
+    second: str
+    first_name: str
+    second_name: str
+    distance_cm: float
+    same_content: bool
+    mirrored: bool
+
+
+@dataclass(frozen=True)
+class NearDuplicates:
+    """Pairs under the threshold, the nearest first, and how many pairs had to be aligned of all there are."""
+
+    pairs: tuple[NearDuplicate, ...]
+    threshold_cm: float
+    aligned: int
+    compared: int
+
+
+def find_near_duplicates(
+    database: MatchingDatabase,
+    *,
+    threshold_cm: float = THRESHOLD_CM,
+    progress: ProgressCallback | None = None,
+    cancelled: CancelCallback | None = None,
+) -> NearDuplicates:
+    """All pairs of sources whose distance is at most the threshold; exact, whatever is passed over.
+
+    Most pairs are settled by a bound that is never above their distance. Progress counts sources.
+    """
+    points = frame_points(database)
+    families = list(clips_by_source(database.clips).items())
+    limit = threshold_cm / 100.0
+    found: list[NearDuplicate] = []
+    aligned = compared = 0
+    for number, (first, own) in enumerate(families):
+        if cancelled is not None and cancelled():
+            raise EvaluationCancelled(f"stopped with {number} of {len(families)} clips compared")
+        one = database.clips[own[0]]
+        for second, others in families[number + 1 :]:
+            best: tuple[float, DatabaseClip] | None = None
+            for other in (database.clips[index] for index in others):
+                compared += 1
+                if one.content and one.content == other.content and _mirrored(one) == _mirrored(other):
+                    best = (0.0, other)
+                    break
+                sides = points[one.start : one.stop], points[other.start : other.stop]
+                if box_bound(*sides) > limit:
+                    continue
+                aligned += 1
+                distance = warped_distance(*sides, limit=limit)
+                if distance <= limit and (best is None or distance < best[0]):
+                    best = (distance, other)
+            if best is not None:
+                found.append(_pair(first, second, one, *best))
+        if progress is not None:
+            progress(number + 1, len(families), first)
+    found.sort(key=lambda pair: (pair.distance_cm, pair.first, pair.second))
+    return NearDuplicates(tuple(found), threshold_cm, aligned, compared)
+
+
+def frame_points(database: MatchingDatabase) -> NDArray[np.float64]:
+    """(N, P + H, 3) pose joints and the root at each horizon, metres in the frame of each row's root."""
+    horizons = len(database.options.horizons_s)
+    first = database.features.shape[1] - 4 * horizons
+    ahead = np.zeros((database.row_count, horizons, 3))
+    ahead[..., (0, 2)] = database.features[:, first : first + 2 * horizons].reshape(-1, horizons, 2)
+    return np.concatenate((database.pose_points.astype(np.float64), ahead), axis=1)
+
+
+def spared_sources(
+    database: MatchingDatabase, duplicates: NearDuplicates, ticks: dict[str, int]
+) -> tuple[tuple[str, NearDuplicate], ...]:
+    """Sources to take away so that no pair is left, each with the pair whose other source stays.
+
+    Of a pair that one goes that is displayed less (`ticks` by source), then the shorter, then that of the higher uid.
+    """
+    families = clips_by_source(database.clips)
+    frames = {source: database.clips[own[0]].frame_count for source, own in families.items()}
+    gone: dict[str, NearDuplicate] = {}
+    for pair in duplicates.pairs:
+        if pair.first not in gone and pair.second not in gone:
+            worth = {source: (ticks.get(source, 0), frames[source]) for source in (pair.first, pair.second)}
+            gone[pair.first if worth[pair.first] < worth[pair.second] else pair.second] = pair
+    return tuple(gone.items())
+
+
+def _mirrored(clip: DatabaseClip) -> bool:
+    return clip.mirrored_from is not None
+
+
+def _pair(first: str, second: str, one: DatabaseClip, distance: float, other: DatabaseClip) -> NearDuplicate:
+    return NearDuplicate(
+        first=first,
+        second=second,
+        first_name=one.name,
+        second_name=other.name,
+        distance_cm=100.0 * distance,
+        same_content=bool(one.content) and one.content == other.content and _mirrored(one) == _mirrored(other),
+        mirrored=_mirrored(one) != _mirrored(other),
+    )

@@ -1,0 +1,134 @@
+"""Parts of a matching database: with fewer clips, with fewer frames, or joined with another one.
+
+Nothing is computed anew: rows keep their features, and the normaliser stays. Clips are taken with their mirrored twins;
+both are named by the uid of the source.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.matching.database import DatabaseClip, MatchingDatabase
+
+Mask = NDArray[np.bool_]
+
+
+def source_of(clip: DatabaseClip) -> str:
+    """The uid of the clip as recorded."""
+    return clip.mirrored_from or clip.uid
+
+
+def clips_by_source(clips: Sequence[DatabaseClip]) -> dict[str, tuple[int, ...]]:
+    """Indices of the one or two clips of each source, in the order of the sources' uids."""
+    families: dict[str, list[int]] = {}
+    for index, clip in enumerate(clips):
+        families.setdefault(source_of(clip), []).append(index)
+    return {source: tuple(own) for source, own in sorted(families.items())}
+
+
+def rows_of_sources(clips: Sequence[DatabaseClip], sources: Collection[str]) -> Mask:
+    """(N,) rows of the clips of these sources. Raises `MotionError` for a source that has no clip."""
+    unknown = sorted(set(sources) - {source_of(clip) for clip in clips})
+    if unknown:
+        raise MotionError(f"there is no clip {unknown[0]}", code="unknown-clip", where=unknown[0])
+    rows = np.zeros(clips[-1].stop if clips else 0, dtype=np.bool_)
+    for clip in clips:
+        if source_of(clip) in sources:
+            rows[clip.start : clip.stop] = True
+    return rows
+
+
+def without_sources(database: MatchingDatabase, sources: Collection[str]) -> MatchingDatabase:
+    """The database without the clips of these sources. Raises `MotionError` for unknown ones, and when none is left."""
+    removed = rows_of_sources(database.clips, sources)
+    return _gathered(database, [clip for clip in database.clips if not removed[clip.start]], ~removed)
+
+
+def without_rows(database: MatchingDatabase, removed: Mask) -> MatchingDatabase:
+    """The database without these rows (N,); where rows inside a clip go, what is left of it are clips of their own.
+
+    A part of a clip is named by its uid and its frames, as "walk#120-480". Its last row cannot be chosen, since nothing
+    follows it.
+    """
+    selectable = database.selectable.copy()
+    pieces = []
+    for clip in database.clips:
+        kept = np.flatnonzero(~removed[clip.start : clip.stop])
+        if len(kept) == clip.frame_count:
+            pieces.append(clip)
+            continue
+        for run in np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1) if len(kept) else ():
+            first, stop = int(run[0]), int(run[-1]) + 1
+            name = f"#{first}-{stop}"
+            piece = replace(clip, start=clip.start + first, stop=clip.start + stop, loop=False)
+            pieces.append(replace(piece, uid=clip.uid + name, name=clip.name + name))
+            selectable[clip.start + stop - 1] = False
+    return _gathered(replace(database, selectable=selectable), pieces, ~removed)
+
+
+def _gathered(database: MatchingDatabase, clips: Sequence[DatabaseClip], kept: Mask) -> MatchingDatabase:
+    """The rows of `clips`, which are all that are `kept`, in one database."""
+    if not clips:
+        raise MotionError("no clip is left", code="no-clips")
+    before = np.concatenate(([0], np.cumsum(kept)))
+    return replace(
+        database,
+        clips=tuple(replace(clip, start=int(before[clip.start]), stop=int(before[clip.stop])) for clip in clips),
+        **{name: rows[kept] for name, rows in _by_row(database).items()},
+    )
+
+
+def _by_row(database: MatchingDatabase) -> dict[str, NDArray[Any]]:
+    """The arrays that have one entry per row."""
+    values = {field.name: getattr(database, field.name) for field in fields(database)}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+def joined(first: MatchingDatabase, second: MatchingDatabase) -> MatchingDatabase:
+    """The clips of two databases of one skeleton and the same options, under the first one's normaliser.
+
+    Raises `MotionError` where they differ, or share a clip.
+    """
+    if first.options != second.options:
+        raise MotionError("both databases must be made with the same options", where="options")
+    require_same_skeleton(first, second)
+    shared = sorted({clip.uid for clip in first.clips} & {clip.uid for clip in second.clips})
+    if shared:
+        raise MotionError(f"both databases have the clip {shared[0]}", where=shared[0])
+    origins = [(clip, 0) for clip in first.clips] + [(clip, first.row_count) for clip in second.clips]
+    clips, rows, start = [], [], 0
+    for clip, offset in sorted(origins, key=lambda origin: origin[0].uid):
+        rows.append(np.arange(clip.start, clip.stop) + offset)
+        clips.append(replace(clip, start=start, stop=start + clip.frame_count))
+        start += clip.frame_count
+    order = np.concatenate(rows)
+    return replace(
+        first,
+        clips=tuple(clips),
+        notes=tuple(dict.fromkeys((*first.notes, *second.notes))),
+        **{name: np.concatenate((rows, getattr(second, name)))[order] for name, rows in _by_row(first).items()},
+    )
+
+
+def same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> bool:
+    """Whether clips of both can be mixed as they are."""
+    from marey_motion.matching.preparing import SAME_OFFSET_M
+    from marey_motion.skeleton import same_hierarchy
+
+    return first.body.pose_joints == second.body.pose_joints and same_hierarchy(
+        first.body.skeleton, second.body.skeleton, tolerance_m=SAME_OFFSET_M
+    )
+
+
+def require_same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> None:
+    """Raise `MotionError` unless clips of both can be mixed as they are."""
+    if not same_skeleton(first, second):
+        raise MotionError(
+            "the clips are of another skeleton; retarget them first", code="skeleton-differs", where="skeleton"
+        )

@@ -1,0 +1,148 @@
+"""Can what covers a cell be blended? Poses of the frames that move alike, compared across clips.
+
+A cell of the coverage map may be full and of no use for motion matching, when its clips never come near each other:
+data that is dense but not blendable. A frame belongs to the cell of the second that begins with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.result import Coverage
+from marey_motion.evaluation.selection import clips_by_source
+from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
+from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.record import Status, TrialRecord
+
+Floats = NDArray[np.float64]
+ProgressCallback = Callable[[int, int, str], None]
+
+MOST_FRAMES = 2_000
+"""Of a cell with more frames every k-th is measured, k the least that leaves no more than this. All are candidates."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSimilarity:
+    """Per cell (V, O) of the coverage map, how near its frames are to the nearest frame of another source in it.
+
+    Parameters
+    ----------
+    threshold_m : up to where a frame can be blended: summed distance of the pose joints, metres
+    frames, sources : (V, O) int64    in the cell; a clip and its mirrored twin are one source
+    measured : (V, O) int64    how many frames were compared, evenly chosen where there are more than `MOST_FRAMES`
+    distance_m : (V, O) median distance; NaN where there are no two sources
+    blendable_share : (V, O) share of the measured frames within the threshold; 0 with one source, NaN without frames
+    share : of all frames in cells, each cell's share counting by its frames; None when there are none
+    """
+
+    threshold_m: float
+    frames: NDArray[np.int64]
+    sources: NDArray[np.int64]
+    measured: NDArray[np.int64]
+    distance_m: Floats
+    blendable_share: Floats
+    share: float | None
+
+
+def accepted_distance(records: Sequence[TrialRecord]) -> float | None:
+    """Median pose cost in metres of the transitions that motion matching made; None without any."""
+    costs = [record.pose_cost[:-1][record.status[1:] == Status.REPLACING] for record in records]
+    joined = np.concatenate([np.empty(0), *costs])
+    return float(np.median(joined)) if len(joined) else None
+
+
+def measure_similarity(
+    database: MatchingDatabase,
+    coverage: Coverage,
+    threshold_m: float,
+    *,
+    most_frames: int = MOST_FRAMES,
+    progress: ProgressCallback | None = None,
+    cancelled: CancelCallback | None = None,
+) -> PoseSimilarity:
+    """Compare the frames of every cell of the database's coverage map. `accepted_distance` is the usual threshold.
+
+    Distances are exact. Progress counts cells with frames.
+    """
+    if not (np.isfinite(threshold_m) and threshold_m > 0.0):
+        raise MotionError("the threshold must be a distance in metres above 0", where="threshold_m")
+    shape = coverage.seconds.shape
+    rows, cells = window_rows(database, coverage), window_cells(coverage)
+    groups = source_of_rows(database)
+    frames, sources, measured = (np.zeros(shape, dtype=np.int64) for _ in range(3))
+    distance, share = np.full(shape, np.nan), np.full(shape, np.nan)
+    filled = np.unique(cells[cells >= 0])
+    for done, cell in enumerate(filled.tolist()):
+        if cancelled is not None and cancelled():
+            raise EvaluationCancelled(f"stopped with {done} of {len(filled)} cells compared")
+        own = rows[cells == cell]
+        place = divmod(cell, shape[1])
+        chosen = own[:: max(1, -(-len(own) // most_frames))]
+        frames[place], sources[place] = len(own), len(np.unique(groups[own]))
+        measured[place] = len(chosen)
+        found = nearest_poses(database.pose_points[chosen], groups[chosen], database.pose_points[own], groups[own])
+        if sources[place] > 1:
+            distance[place] = np.median(found)
+        share[place] = np.mean(found <= threshold_m)
+        if progress is not None:
+            progress(done + 1, len(filled), "")
+    total = int(frames.sum())
+    return PoseSimilarity(
+        threshold_m=threshold_m,
+        frames=frames,
+        sources=sources,
+        measured=measured,
+        distance_m=distance,
+        blendable_share=share,
+        share=float(np.nansum(share * frames) / total) if total else None,
+    )
+
+
+def window_rows(database: MatchingDatabase, coverage: Coverage) -> NDArray[np.int64]:
+    """(W,) the row with which each window of the coverage begins."""
+    clips = coverage.clip.astype(np.int64)
+    firsts = np.concatenate(([True], np.diff(clips) != 0))[: len(clips)]
+    numbers = np.arange(len(clips))
+    within = numbers - np.maximum.accumulate(np.where(firsts, numbers, 0))
+    rows: NDArray[np.int64] = database.starts[clips] + within
+    return rows
+
+
+def window_cells(coverage: Coverage) -> NDArray[np.int64]:
+    """(W,) flat index of the cell of each window, -1 outside the map."""
+    shape = coverage.seconds.shape
+    speeds = np.searchsorted(coverage.speed_edges_m_s, coverage.speed_m_s, side="right") - 1
+    turns = np.searchsorted(coverage.turn_rate_edges_deg_s, np.degrees(coverage.turn_rate_rad_s), side="right") - 1
+    inside = (speeds >= 0) & (speeds < shape[0]) & (turns >= 0) & (turns < shape[1])
+    return np.where(inside, speeds * shape[1] + turns, -1)
+
+
+def source_of_rows(database: MatchingDatabase) -> NDArray[np.int64]:
+    """(N,) number of each row's source."""
+    of_clip = np.empty(len(database.clips), dtype=np.int64)
+    for number, own in enumerate(clips_by_source(database.clips).values()):
+        of_clip[list(own)] = number
+    return of_clip[database.clip_of_row]
+
+
+def nearest_poses(
+    queries: NDArray[np.float32],
+    query_groups: NDArray[np.int64],
+    points: NDArray[np.float32],
+    groups: NDArray[np.int64],
+) -> Floats:
+    """Distance (Q,) of each query (Q, P, 3) from the nearest pose (N, P, 3) of another group; infinite without any.
+
+    Metres, summed over the points, as the pose cost of a transition.
+    """
+    from marey_motion.evaluation import similarity_kernels as kernels
+
+    found = np.full(len(queries), np.inf)
+    if len(points):
+        kernels.nearest_of_others(queries, query_groups, points, groups, found)
+    return found

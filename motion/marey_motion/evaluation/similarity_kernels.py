@@ -1,0 +1,37 @@
+"""Compiled search for the nearest pose, kept apart so that importing the rest of the package does not load numba."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+
+
+@_compiled
+def nearest_of_others(queries, query_groups, points, groups, found):  # type: ignore[no-untyped-def]
+    """Fill found (Q,) with the summed distance of each query (Q, P, 3) from the nearest of points (N, P, 3).
+
+    Only points of another group count; infinite where there are none. The points that were nearest to the query before
+    are tried first, which settles most others early.
+    """
+    before = 0
+    for q in range(queries.shape[0]):
+        best, best_row = np.inf, before
+        for step in range(-1, points.shape[0]):
+            row = before if step < 0 else step
+            if groups[row] == query_groups[q]:
+                continue
+            distance = 0.0
+            for p in range(points.shape[1]):
+                square = 0.0
+                for c in range(3):
+                    difference = np.float64(queries[q, p, c]) - np.float64(points[row, p, c])
+                    square += difference * difference
+                distance += np.sqrt(square)
+                if distance >= best:
+                    break
+            if distance < best:
+                best, best_row = distance, row
+        found[q] = best
+        before = best_row
