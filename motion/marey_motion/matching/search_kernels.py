@@ -34,6 +34,9 @@ _ROUNDING = 2.0**-22
 _SMALLEST = 1e-36
 
 _compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+# Index and query are some hundred words; handing them to a function that is called per group would cost as much as
+# what it does.
+_inlined = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy", forceinline=True)
 
 
 class _Query(NamedTuple):
@@ -52,7 +55,7 @@ class _Query(NamedTuple):
     bounds: Any
 
 
-@_compiled
+@_inlined
 def _cost(values, query, weights):  # type: ignore[no-untyped-def]
     cost = 0.0
     for d in range(query.shape[0]):
@@ -100,14 +103,14 @@ def _prepared(index, query, weights, skip_start, skip_stop):  # type: ignore[no-
     )
 
 
-@_compiled
+@_inlined
 def _limit(query, best):  # type: ignore[no-untyped-def]
     """The float32 cost that no row as near as `best` can exceed."""
     distance = np.sqrt(best) + query.reach
     return np.float32(distance * distance * query.margin + query.least)
 
 
-@_compiled
+@_inlined
 def _lane_of_least(sums, lanes):  # type: ignore[no-untyped-def]
     """Which of the lanes, given as bits, holds the least sum."""
     best = -1
@@ -117,10 +120,19 @@ def _lane_of_least(sums, lanes):  # type: ignore[no-untyped-def]
     return best
 
 
-@_compiled
-def _search_block(index, query, block, row, cost, limit):  # type: ignore[no-untyped-def]
-    """The best of (row, cost) and a block's rows, and its limit."""
-    lanes = row_costs(index.blocks[block], query.rounded, query.weights, query.sums, limit)
+@_inlined
+def _screened_rows(index, query, block, limit):  # type: ignore[no-untyped-def]
+    return row_costs(index.blocks, query.rounded, query.weights, query.sums, block, limit)
+
+
+@_inlined
+def _screened_boxes(boxes, query, number, sums, limit):  # type: ignore[no-untyped-def]
+    return box_costs(boxes, query.rounded, query.weights, sums, number, limit)
+
+
+@_inlined
+def _choose_row(index, query, block, lanes, row, cost, limit):  # type: ignore[no-untyped-def]
+    """The best of (row, cost) and those rows of a block, given as bits, that the screening left; and its limit."""
     while lanes:
         lane = _lane_of_least(query.sums, lanes)
         if query.sums[lane] > limit:
@@ -135,31 +147,33 @@ def _search_block(index, query, block, row, cost, limit):  # type: ignore[no-unt
     return row, cost, limit
 
 
-@_compiled
+@_inlined
 def _search_group(index, query, group, row, cost, limit):  # type: ignore[no-untyped-def]
-    """The best of (row, cost) and the rows of a group's blocks, the nearest box first."""
+    """The best of (row, cost) and the rows of a group's blocks, the nearest box first; and its limit."""
+    boxes = _screened_boxes(index.boxes, query, group, query.bounds, limit)
     first = index.group_blocks[group]
-    lanes = box_costs(index.boxes[group], query.rounded, query.weights, query.bounds, limit)
-    lanes &= (1 << (index.group_blocks[group + 1] - first)) - 1
-    while lanes:
-        lane = _lane_of_least(query.bounds, lanes)
-        if query.bounds[lane] > limit:
+    boxes &= (1 << (index.group_blocks[group + 1] - first)) - 1
+    while boxes:
+        box = _lane_of_least(query.bounds, boxes)
+        if query.bounds[box] > limit:
             break
-        lanes ^= 1 << lane
-        row, cost, limit = _search_block(index, query, first + lane, row, cost, limit)
+        boxes ^= 1 << box
+        lanes = _screened_rows(index, query, first + box, limit)
+        if lanes:
+            row, cost, limit = _choose_row(index, query, first + box, lanes, row, cost, limit)
     return row, cost, limit
 
 
 @_compiled
 def _search_boxes(index, query, row, cost, limit):  # type: ignore[no-untyped-def]
-    """The group with the nearest box first, for a tight limit; then the others that are left, in their order.
+    """The group with the nearest box first, for a tight limit; then those of the others that are left, in their order.
 
-    Sorting them all by distance would look at a few per cent fewer, and take longer.
+    Taking them all by distance would look at a few per cent fewer, and take longer.
     """
     groups = index.boxes.shape[0]
     bounds = np.empty((index.group_boxes.shape[0], LANES), np.float32)
     for some in range(bounds.shape[0]):
-        box_costs(index.group_boxes[some], query.rounded, query.weights, bounds[some], limit)
+        _screened_boxes(index.group_boxes, query, some, bounds[some], limit)
     bound = bounds.reshape(-1)
     nearest_group = 0
     for group in range(groups):
@@ -174,16 +188,26 @@ def _search_boxes(index, query, row, cost, limit):  # type: ignore[no-untyped-de
 
 
 @_compiled
+def _search_blocks(index, query, start, stop, row, cost, limit):  # type: ignore[no-untyped-def]
+    """The best of (row, cost) and the rows of blocks [start, stop), all of them; and its limit."""
+    for block in range(start, stop):
+        lanes = _screened_rows(index, query, block, limit)
+        if lanes:
+            row, cost, limit = _choose_row(index, query, block, lanes, row, cost, limit)
+    return row, cost, limit
+
+
+@_compiled
 def _nearest(index, query, weights, warm_row, skip_start, skip_stop):  # type: ignore[no-untyped-def]
     prepared = _prepared(index, query, weights, skip_start, skip_stop)
     row, cost, limit = np.int64(-1), np.inf, np.float32(np.inf)
     if warm_row >= 0:
-        row, cost, limit = _search_block(index, prepared, index.block_of_row[warm_row], row, cost, limit)
+        block = index.block_of_row[warm_row]
+        row, cost, limit = _search_blocks(index, prepared, block, block + 1, row, cost, limit)
     if index.boxed:
         row, cost, limit = _search_boxes(index, prepared, row, cost, limit)
     else:
-        for block in range(index.blocks.shape[0]):
-            row, cost, limit = _search_block(index, prepared, block, row, cost, limit)
+        row, cost, limit = _search_blocks(index, prepared, 0, index.blocks.shape[0], row, cost, limit)
     return row, cost
 
 
@@ -223,7 +247,7 @@ def boxes_within(index, query, cost):  # type: ignore[no-untyped-def]
     limit = _limit(prepared, cost)
     count = 0
     for group in range(index.boxes.shape[0]):
-        lanes = box_costs(index.boxes[group], prepared.rounded, prepared.weights, prepared.bounds, limit)
+        lanes = _screened_boxes(index.boxes, prepared, group, prepared.bounds, limit)
         for lane in range(index.group_blocks[group + 1] - index.group_blocks[group]):
             count += lanes >> lane & 1
     return count

@@ -51,13 +51,14 @@ def _summed(gap: Gap, operands: int) -> Any:
     """An intrinsic that sums weight · gap² over the dimensions, for arrays with `operands` vectors per dimension."""
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Values) -> ir.Value:
-        *arrays, limit = arguments
-        block, query, weights, sums = (
+        blocks, query, weights, sums = (
             context.make_array(kind)(context, builder, array)
-            for kind, array in zip(signature.args, arrays, strict=False)
+            for kind, array in zip(signature.args[:4], arguments[:4], strict=True)
         )
-        vectors = builder.bitcast(block.data, _SIXTEEN.as_pointer())
+        number, limit = arguments[4:]
         dimensions = builder.extract_value(query.shape, 0)
+        first = builder.mul(number, builder.mul(dimensions, ir.Constant(number.type, operands)))
+        vectors = builder.gep(builder.bitcast(blocks.data, _SIXTEEN.as_pointer()), [first])
         running = [cgutils.alloca_once_value(builder, _ZEROS) for _ in range(DIMENSIONS_PER_STEP)]  # type: ignore[no-untyped-call]
 
         def at(base: ir.Value, scale: int, offset: int) -> ir.Value:
@@ -79,19 +80,20 @@ def _summed(gap: Gap, operands: int) -> Any:
         within = builder.fcmp_ordered("<=", result, _spread(builder, limit))
         return builder.zext(builder.bitcast(within, ir.IntType(LANES)), ir.IntType(64))
 
-    def typed(_context: Any, block: Any, query: Any, weights: Any, sums: Any, limit: Any) -> Any:
-        arrays = (block, query, weights, sums)
+    def typed(_context: Any, blocks: Any, query: Any, weights: Any, sums: Any, _number: Any, limit: Any) -> Any:
+        arrays = (blocks, query, weights, sums)
         if limit != types.float32 or any(a.dtype != types.float32 or a.layout != "C" for a in arrays):
             return None
-        return types.int64(*arrays, limit), generate
+        return types.int64(*arrays, types.int64, limit), generate
 
     return intrinsic(typed)
 
 
 row_costs = _summed(_from_row, 1)
-"""row_costs(block (D, 16), query (D,), weights (D,), sums (16,), limit): distances of 16 rows, all float32, D even.
+"""row_costs(blocks (B, D, 16), query (D,), weights (D,), sums (16,), number, limit): squared distances of 16 rows.
 
-Fills `sums`; returns an integer whose bit l is set where sums[l] <= limit."""
+All are float32 and D is even. Fills `sums` for block `number`; the integer returned has bit l set where
+sums[l] <= limit."""
 
 box_costs = _summed(_from_box, 2)
-"""box_costs(boxes (D, 2, 16), …): the same, of the query to the nearest point of 16 boxes (low and high sides)."""
+"""box_costs(boxes (G, D, 2, 16), …): the same to the nearest point of each of 16 boxes, of low and high sides."""
