@@ -111,11 +111,8 @@ def _frame(skeleton: Skeleton, sources: NDArray[np.int64], carried: NDArray[np.b
     tips, others = ([site.offset for site in skeleton.end_sites if site.joint == one] for one in (joint, source))
     if len(tips) == len(others):
         bones += zip(tips, others, strict=True)
-    return (
-        _frame_of_bones(by_rest, *(np.array(side).reshape(-1, 3) for side in zip(*bones, strict=True)))
-        if bones
-        else by_rest
-    )
+    own_bones, other_bones = np.array(bones, dtype=np.float64).reshape(-1, 2, 3).swapaxes(0, 1)
+    return _frame_of_bones(by_rest, own_bones, other_bones)
 
 
 def _frame_of_bones(by_rest: Floats, bones: Floats, partners: Floats) -> Floats:

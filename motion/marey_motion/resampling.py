@@ -49,11 +49,11 @@ def resample_motion(motion: Motion, from_hz: float, to_hz: float, *, seam: LoopS
     frames = motion.frame_count
     if seam is not None:
         count = max(1, round(frames / from_hz * to_hz))
-        places: Floats = LOOP_REACH + np.arange(count) * (frames / count)
+        places = LOOP_REACH + np.arange(count, dtype=np.float64) * (frames / count)
         return _sampled(continue_motion(motion, seam, LOOP_REACH, LOOP_REACH), places)
     # Rates that divide each other must not lose their last frame to rounding.
     count = int((frames - 1) / from_hz * to_hz + 1e-6) + 1
-    return _sampled(motion, np.minimum(np.arange(count) * (from_hz / to_hz), frames - 1.0))
+    return _sampled(motion, np.minimum(np.arange(count, dtype=np.float64) * (from_hz / to_hz), frames - 1.0))
 
 
 def _are_same(rate_hz: float, other_hz: float) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ class MatchingBody:
     Parameters
     ----------
     hips : the joint whose velocity is matched
+    carrier : the last joint that all standard joints hang from, mostly the hips. Those above it, such as a static
+        reference, only move the whole body about.
     torso : the joint whose ground projection carries the simulation root: the upper spine, else the hips
     feet, toes : (left, right); the ankles, and what touches the ground (the ankles where there are no toes)
     lefts, rights : matching joints of both sides, hips and shoulders, whose difference tells where the body faces
@@ -34,6 +37,7 @@ class MatchingBody:
 
     skeleton: Skeleton
     hips: int
+    carrier: int
     torso: int
     feet: tuple[int, int]
     toes: tuple[int, int]
@@ -51,10 +55,12 @@ class MatchingBody:
         def optional(name: str, otherwise: int) -> int:
             return mapping.indices(skeleton, (name,))[0] if name in mapping.joints else otherwise
 
+        standard_joints = {standard: skeleton.index_of(name) for standard, name in mapping.joints.items()}
         known = [joint for joint in POSE_JOINTS if joint in mapping.joints]
         return cls(
             skeleton=skeleton,
             hips=hips,
+            carrier=_carrier(skeleton, standard_joints),
             torso=optional("spine_2", hips),
             feet=(left_foot, right_foot),
             toes=(optional("left_toe", left_foot), optional("right_toe", right_foot)),
@@ -62,5 +68,23 @@ class MatchingBody:
             rights=mapping.indices(skeleton, ("right_hip", "right_shoulder")),
             pose_joints=tuple(dict.fromkeys(mapping.indices(skeleton, known))),
             partners=symmetric_joints(skeleton, mapping),
-            standard_joints={standard: skeleton.index_of(name) for standard, name in mapping.joints.items()},
+            standard_joints=standard_joints,
         )
+
+
+def _carrier(skeleton: Skeleton, standard_joints: Mapping[str, int]) -> int:
+    paths = [skeleton.path_to_root(joint)[::-1] for name, joint in standard_joints.items() if name != "root"]
+    return max(int(joints[0]) for joints in zip(*paths, strict=False) if len(set(joints)) == 1)
+
+    @cached_property
+    def pose_chain(self) -> tuple[NDArray[np.int64], Skeleton]:
+        """The pose joints and those that carry them (K,), in the skeleton's order, and the skeleton of these alone."""
+        needed = {0}
+        for joint in self.pose_joints:
+            while joint > 0:
+                needed.add(joint)
+                joint = int(self.skeleton.parents[joint])
+        whole, chain = self.skeleton, np.array(sorted(needed), dtype=np.int64)
+        parents = np.concatenate(([-1], np.searchsorted(chain, whole.parents[chain[1:]])))
+        names = tuple(whole.joint_names[joint] for joint in chain)
+        return chain, Skeleton(names, parents.astype(np.int32), whole.offsets[chain], whole.rest_rotations[chain])

@@ -25,7 +25,7 @@ from marey_motion.matching.rows import ClipRows, clip_rows
 MOST_MATCHED_JOINTS = 5
 
 Progress = Callable[[int, int, str], None]
-_Row = tuple[DatabaseClip, ClipRows, tuple[int, ...], tuple[DatabaseNote, ...]]
+_Built = tuple[DatabaseClip, ClipRows, tuple[DatabaseNote, ...]]
 
 
 def build_database(
@@ -53,14 +53,14 @@ def build_database(
         normaliser.require_fit(layout)
     built = sorted(_built(_ordered(clips), body, layout, options, progress), key=lambda row: row[0].uid)
     entries, start = [], 0
-    for entry, rows, _, _ in built:
+    for entry, rows, _ in built:
         entries.append(replace(entry, start=start, stop=start + len(rows.features)))
         start = entries[-1].stop
     translations, translated_joints = _joined_translations(built, body)
     arrays = {
-        name: np.concatenate([getattr(rows, name) for _, rows, _, _ in built])
+        name: np.concatenate([getattr(rows, name) for _, rows, _ in built])
         for name in ClipRows._fields
-        if name != "translations"
+        if name not in ("translations", "translated_joints")
     }
     if normaliser is None:
         normaliser = fit_normaliser(arrays["features"], layout, _digest_of([arrays["features"]]))
@@ -71,7 +71,7 @@ def build_database(
         normaliser=normaliser,
         translations=translations,
         translated_joints=translated_joints,
-        notes=(*_layout_notes(layout), *_normaliser_notes(normaliser), *(note for row in built for note in row[3])),
+        notes=(*_layout_notes(layout), *_normaliser_notes(normaliser), *(note for row in built for note in row[2])),
         **arrays,
     )
 
@@ -148,13 +148,13 @@ def _built(
     layout: FeatureLayout,
     options: DatabaseOptions,
     progress: Progress | None,
-) -> Iterator[_Row]:
+) -> Iterator[_Built]:
     landmarks = find_landmarks(body.skeleton)
     for done, source in enumerate(clips, start=1):
         try:
             for clip in _variants(prepare_clip(source, body, options, landmarks), body, options):
                 rows = clip_rows(clip.motion, clip.seam, body, layout, options)
-                yield _entry(clip), rows, clip.motion.translated_joints, (*clip.notes, *_row_notes(clip, rows))
+                yield _entry(clip), rows, (*clip.notes, *_row_notes(clip, rows))
         except MotionError as error:
             where = f"{source.name}, {error.where}" if error.where else source.name
             raise MotionError(error.message, code=error.code, where=where) from error
@@ -207,17 +207,17 @@ def _normaliser_notes(normaliser: Normaliser) -> tuple[DatabaseNote, ...]:
 
 
 def _joined_translations(
-    built: Sequence[_Row], body: MatchingBody
+    built: Sequence[_Built], body: MatchingBody
 ) -> tuple[NDArray[np.float32] | None, tuple[int, ...]]:
     """Translations of all joints that any clip translates; a clip that does not has their offsets."""
-    joints = np.array(sorted({joint for row in built for joint in row[2]}), dtype=np.int64)
+    joints = np.array(sorted({joint for row in built for joint in row[1].translated_joints}), dtype=np.int64)
     if not len(joints):
         return None, ()
     joined = np.empty((sum(len(row[1].features) for row in built), len(joints), 3), np.float32)
     joined[:] = body.skeleton.offsets[joints]
     start = 0
-    for _, rows, own, _ in built:
+    for _, rows, _ in built:
         stop = start + len(rows.features)
-        joined[start:stop, np.searchsorted(joints, own)] = rows.translations
+        joined[start:stop, np.searchsorted(joints, rows.translated_joints)] = rows.translations
         start = stop
     return joined, tuple(int(joint) for joint in joints)

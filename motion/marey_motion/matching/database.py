@@ -89,9 +89,11 @@ class DatabaseNote:
 class MatchingDatabase:
     """N rows, D feature dimensions, P pose joints, C clips in ascending order of uid: the lowest row wins a tie.
 
-    A row's pose stands where its root does: with p and theta the position and heading of the root, wherever it is put,
-    joint 0 is at R(theta)·poses[:3] + (p.x, 0, p.z) with the rotation R(theta)·poses[3:7], R(theta) being the turn
-    about +Y; all other joints are local. That holds for joint 0 of the skeleton, whether or not it is the hips.
+    A row's pose hangs from its root: with p and theta the position and heading of the root, wherever it is put, and
+    R(theta) the turn about +Y, joint 0 is at R(theta)·poses[:3] + (p.x, 0, p.z) with the rotation R(theta)·poses[3:7].
+    All other joints follow by their local rotations, offsets and translations. With the clip's own root that gives the
+    clip's pose, for the body's carrier and every joint below it. Joints above the carrier, which in clips may be left
+    behind at an origin, stand at rest under the body and head as the root does.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ from marey_motion.matching.simulation_root import bone_root, raw_root
 from marey_motion.mirroring import mirror_motion
 from marey_motion.motion import Motion
 from marey_motion.resampling import resample_motion
-from marey_motion.skeleton import same_hierarchy
+from marey_motion.skeleton import Skeleton, same_hierarchy
 
 SAME_OFFSET_M = 1e-3
 """By which bones of one skeleton may differ between files."""
@@ -61,7 +61,7 @@ def prepare_clip(
 ) -> PreparedClip:
     """The frames of a source clip that belong into a database, at its rate.
 
-    Raises `MotionError` naming the clip when it moves another skeleton or its range of frames is not there.
+    Raises `MotionError` when it moves another skeleton or its range of frames is not there.
     """
     notes: list[DatabaseNote] = []
 
@@ -92,7 +92,7 @@ def _wanted_frames(
 ) -> tuple[Clip, bool]:
     """The clip within its range and without rest poses at its ends, and whether it walks in place."""
     clip = source.clip
-    if not same_hierarchy(clip.skeleton, body.skeleton, tolerance_m=SAME_OFFSET_M):
+    if not _moves(clip, body.skeleton):
         raise MotionError(
             "the clip moves another skeleton than the database's; retarget it first", code="skeleton-mismatch"
         )
@@ -105,6 +105,19 @@ def _wanted_frames(
     for warning in in_place:
         tell(warning.code, warning.message)
     return clip, bool(in_place)
+
+
+def _moves(clip: Clip, skeleton: Skeleton) -> bool:
+    """Whether a clip can move this skeleton as it is: tips, and offsets that translations replace, may differ."""
+    own = clip.skeleton
+    if own is skeleton:
+        return True
+    if own.joint_count != skeleton.joint_count:
+        return False
+    offsets, replaced = own.offsets.copy(), [0, *clip.translated_joints]
+    offsets[replaced] = skeleton.offsets[replaced]
+    alike = replace(own, offsets=offsets, end_sites=skeleton.end_sites)
+    return same_hierarchy(alike, skeleton, tolerance_m=SAME_OFFSET_M)
 
 
 def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], tell: _Tell) -> Clip:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from marey_motion.matching.simulation_root import (
     DIRECTION_WINDOW_S,
     SimulationRoot,
     bone_root,
+    rest_heading,
     simulation_root,
     window_frames,
 )
@@ -38,6 +39,7 @@ class ClipRows(NamedTuple):
     poses: NDArray[np.float32]
     contacts: NDArray[np.bool_]
     translations: NDArray[np.float32]
+    translated_joints: tuple[int, ...]
 
 
 def clip_rows(
@@ -68,9 +70,9 @@ def clip_rows(
         root_positions=root.positions,
         root_headings=root.headings,
         pose_points=points.astype(np.float32),
-        poses=_poses(motion, root),
+        poses=_poses(motion, positions[inner, [body.carrier]], root, body),
         contacts=contacts[inner],
-        translations=motion.translations.astype(np.float32),
+        **_translations(motion, body),
     )
 
 
@@ -79,9 +81,43 @@ def _selectable(frames: int, ticks: NDArray[np.int64], options: DatabaseOptions,
     return np.full(frames, True) if wraps else np.arange(frames) < frames - ahead
 
 
-def _poses(motion: Motion, root: SimulationRoot) -> NDArray[np.float32]:
-    """Poses (F, 3 + 4·J) whose joint 0 is where the root sees it."""
+def _poses(motion: Motion, carrier: Floats, root: SimulationRoot, body: MatchingBody) -> NDArray[np.float32]:
+    """Poses (F, 3 + 4·J) of a body that hangs from the root, as `MatchingDatabase` describes them.
+
+    `carrier` (F, 1, 3) is where the joint is that carries the body.
+    """
     poses = motion.poses
-    poses[:, :3] = in_root_frame(motion.root_translations[:, None], root)[:, 0]
-    poses[:, 3:7] = quaternions.multiply(about_vertical(-root.headings), motion.rotations[:, 0])
+    rotations = poses[:, 3:].reshape(motion.frame_count, -1, 4)
+    facing = about_vertical(-root.headings)
+    poses[:, :3] = in_root_frame(carrier, root)[:, 0]
+    if body.carrier == 0:
+        rotations[:, 0] = quaternions.multiply(facing, motion.rotations[:, 0])
+    else:
+        _hang(poses, rotations, facing, motion, body)
     return poses.astype(np.float32)
+
+
+def _hang(poses: Floats, rotations: Floats, facing: Floats, motion: Motion, body: MatchingBody) -> None:
+    """Put the joints above the carrier at rest, so that they follow the root and the carrier is where it was."""
+    skeleton = body.skeleton
+    above = skeleton.path_to_root(body.carrier)[1:]
+    turned = quaternions.identity(motion.frame_count)
+    for joint in (*above[::-1], body.carrier):
+        turned = quaternions.multiply(turned, motion.rotations[:, joint])
+    unturn = about_vertical(np.array(-rest_heading(body)))
+    parent = quaternions.multiply(unturn, skeleton.rest_global_rotations[above[0]])
+    rest = skeleton.rest_global_positions
+    poses[:, :3] -= quaternions.rotate_vectors(unturn, rest[body.carrier] - rest[0])
+    rotations[:, above] = skeleton.rest_rotations[list(above)]
+    rotations[:, 0] = quaternions.multiply(unturn, skeleton.rest_rotations[0])
+    rotations[:, body.carrier] = quaternions.multiply(
+        quaternions.conjugate(parent), quaternions.multiply(facing, turned)
+    )
+
+
+def _translations(motion: Motion, body: MatchingBody) -> dict[str, Any]:
+    """Translations of the joints below the carrier: those on the way to it are in the place of joint 0."""
+    path = body.skeleton.path_to_root(body.carrier)
+    joints = [joint for joint in motion.translated_joints if joint not in path]
+    kept = [slot for slot, joint in enumerate(motion.translated_joints) if joint in joints]
+    return {"translations": motion.translations[:, kept].astype(np.float32), "translated_joints": tuple(joints)}

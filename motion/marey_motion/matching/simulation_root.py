@@ -65,10 +65,16 @@ def bone_root(motion: Motion, body: MatchingBody) -> SimulationRoot:
     rest pose faces nowhere.
     """
     skeleton = body.skeleton
-    rest = headings(forward_directions(skeleton.rest_global_positions[None], body.lefts, body.rights))
+    rest = rest_heading(body)
     turns = quaternions.multiply(motion.rotations[:, 0], quaternions.conjugate(skeleton.rest_rotations[0]))
     twist = 2.0 * np.arctan2(turns[:, 2], turns[:, 0])
     return SimulationRoot(motion.root_translations[:, ::2], np.unwrap(twist + rest))
+
+
+def rest_heading(body: MatchingBody) -> float:
+    """Heading of the rest pose. Raises `MotionError` when it faces nowhere."""
+    positions = body.skeleton.rest_global_positions[None]
+    return float(headings(forward_directions(positions, body.lefts, body.rights))[0])
 
 
 def window_frames(window_s: float, rate_hz: float) -> int:
