@@ -64,6 +64,7 @@ class DatabaseParams(Request):
     extra_joints: tuple[Annotated[str, StringConstraints(min_length=1, max_length=64)], ...] = Field(
         (), max_length=16, description="Standard joints matched beside feet and hips; many drown the trajectory."
     )
+    keep_rest_poses: bool = Field(False, description="Keep frames that look like calibration or a T-pose.")
 
 
 class ControllerParams(Request):

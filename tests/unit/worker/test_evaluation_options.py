@@ -32,6 +32,7 @@ def test_every_option_of_the_mathematics_can_be_asked_for() -> None:
                 "weights": {"hip_velocity": 2},
                 "horizons_s": [0.25, 0.75],
                 "extra_joints": ["head"],
+                "keep_rest_poses": True,
             },
             "controller": {
                 "follow": "path",

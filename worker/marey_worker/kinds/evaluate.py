@@ -22,7 +22,7 @@ from marey_worker.context import Context, JobRefused
 from marey_worker.kinds.evaluation_headline import headline_of
 from marey_worker.kinds.evaluation_options import options_of
 from marey_worker.kinds.evaluation_report import write_report
-from marey_worker.kinds.matching_clips import read_database
+from marey_worker.kinds.matching_clips import read_clips
 
 GATHERING_STEPS = 4
 
@@ -31,9 +31,16 @@ def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
     """Let motion matching follow this task's share of the trials; the result names the file of their records."""
     options = options_of(params)
     trials = _trials(params, options)[context.task.position :: context.task.size]
-    database = read_database(context, params, options.database)
+    clips = read_clips(context, params, options.database)
     started = time.monotonic()
-    records = run_suite(database, options, trials=trials, threads=context.threads, progress=context.progress)
+    records = run_suite(
+        clips.database,
+        options,
+        trials=trials,
+        index=clips.index,
+        threads=context.threads,
+        progress=context.progress,
+    )
     file = context.scratch / "records.msgpack"
     file.write_bytes(encode_tree(records_to_tree(trials, records), MSGPACK, arrays="blocks"))
     return {
@@ -48,7 +55,7 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     """Measure the records of all trials and stage the evaluation, with its report if it is wanted."""
     options = options_of(params)
     context.progress(0, GATHERING_STEPS, "reading what the trials recorded")
-    database = read_database(context, params, options.database)
+    database = read_clips(context, params, options.database).database
     trials = _trials(params, options)
     known = _read_records(context, results)
     records = [known[trial.name] for trial in trials]

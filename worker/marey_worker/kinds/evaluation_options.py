@@ -30,6 +30,7 @@ def options_of(params: EvaluateParams) -> EvaluationOptions:
             weights=FeatureWeights(**database.weights.model_dump()),
             horizons_s=database.horizons_s,
             extra_joints=database.extra_joints,
+            keep_rest_poses=database.keep_rest_poses,
         ),
         controller=ControllerOptions(**params.controller.model_dump()),
         **{name: getattr(params, name) for name in OF_THE_SUITE},

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 from marey_motion.matching.building import build_database
 
@@ -13,6 +15,7 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.normaliser import Normaliser
 from marey_motion.matching.options import DatabaseOptions
+from marey_motion.matching.search import SearchIndex, build_index
 from marey_schemas.canonical import canonical_json, document_digest
 from marey_schemas.documents import Motion, RevisionRef
 from marey_schemas.evaluation import EvaluateParams
@@ -27,11 +30,25 @@ NAMES_SHOWN = 5
 MOST_KEPT = 1
 """Databases; one of an hour of motion takes a few hundred megabytes."""
 
-_databases: Kept[bytes, MatchingDatabase] = Kept(MOST_KEPT)
+
+@dataclass(frozen=True)
+class MatchingClips:
+    """Clips as motion matching searches them."""
+
+    database: MatchingDatabase
+
+    @cached_property
+    def index(self) -> SearchIndex:
+        """Of the database's normalised features; made when it is first needed."""
+        database = self.database
+        return build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
 
 
-def read_database(context: Context, params: EvaluateParams, options: DatabaseOptions) -> MatchingDatabase:
-    """The database of the job's clips.
+_kept: Kept[bytes, MatchingClips] = Kept(MOST_KEPT)
+
+
+def read_clips(context: Context, params: EvaluateParams, options: DatabaseOptions) -> MatchingClips:
+    """The job's clips, ready to be matched.
 
     Raises `JobRefused` for clips of several skeletons, for trims that do not fit, for a skeleton that lacks joints, and
     where too little is left to match.
@@ -40,7 +57,7 @@ def read_database(context: Context, params: EvaluateParams, options: DatabaseOpt
     chosen = params.model_dump(mode="json", include={"database", "loops", "trims"})
     key = canonical_json({"inputs": pins, "params": chosen})
     try:
-        return _databases.get(key, lambda: _build(context, params, options))
+        return _kept.get(key, lambda: MatchingClips(_build(context, params, options)))
     except MotionError as error:
         raise JobRefused(error.code, str(error)) from error
 

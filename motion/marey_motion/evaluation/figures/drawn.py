@@ -92,8 +92,12 @@ def finish(sketch: Sketch, name: str, number: str, title: str) -> DrawnFigure:
 
 def listed(values: Column) -> list[Any]:
     """A column as a list of plain values; None for not-a-number."""
-    rows = values.tolist() if isinstance(values, np.ndarray) else list(values)
+    rows = values.tolist() if isinstance(values, np.ndarray) else [_plain(value) for value in values]
     return [None if isinstance(value, float) and not math.isfinite(value) else value for value in rows]
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def as_csv(columns: Mapping[str, Column]) -> str:
