@@ -74,10 +74,10 @@ def forward_kinematics(
     turned[parents[1:]] = True  # a leaf's own rotation moves nothing
     out = np.empty((len(poses), 3 * points), dtype=poses.dtype)
     kinematics_kernels.positions(
-        _as_kernel_input(poses),
-        _as_kernel_input(offsets),
-        _as_kernel_input(parents),
-        _as_kernel_input(translations),
+        as_kernel_input(poses),
+        as_kernel_input(offsets),
+        as_kernel_input(parents),
+        as_kernel_input(translations),
         slots,
         turned,
         out,
@@ -95,11 +95,11 @@ def as_global_rotations(skeleton: Skeleton, rotations: Floats) -> Floats:
         )
     flat = rotations.reshape(len(rotations), -1)
     out = np.empty(flat.shape, dtype=rotations.dtype)
-    kinematics_kernels.rotations(_as_kernel_input(flat), _as_kernel_input(skeleton.parents), out)
+    kinematics_kernels.rotations(as_kernel_input(flat), as_kernel_input(skeleton.parents), out)
     return out.reshape(rotations.shape)
 
 
-def _as_kernel_input(array: NDArray[Any]) -> NDArray[Any]:
+def as_kernel_input(array: NDArray[Any]) -> NDArray[Any]:
     """The array contiguous and read-only, so that each kernel is compiled for one layout only."""
     view = np.ascontiguousarray(array).view()
     view.setflags(write=False)

@@ -71,11 +71,6 @@ class MatchingBody:
             standard_joints=standard_joints,
         )
 
-
-def _carrier(skeleton: Skeleton, standard_joints: Mapping[str, int]) -> int:
-    paths = [skeleton.path_to_root(joint)[::-1] for name, joint in standard_joints.items() if name != "root"]
-    return max(int(joints[0]) for joints in zip(*paths, strict=False) if len(set(joints)) == 1)
-
     @cached_property
     def pose_chain(self) -> tuple[NDArray[np.int64], Skeleton]:
         """The pose joints and those that carry them (K,), in the skeleton's order, and the skeleton of these alone."""
@@ -88,3 +83,8 @@ def _carrier(skeleton: Skeleton, standard_joints: Mapping[str, int]) -> int:
         parents = np.concatenate(([-1], np.searchsorted(chain, whole.parents[chain[1:]])))
         names = tuple(whole.joint_names[joint] for joint in chain)
         return chain, Skeleton(names, parents.astype(np.int32), whole.offsets[chain], whole.rest_rotations[chain])
+
+
+def _carrier(skeleton: Skeleton, standard_joints: Mapping[str, int]) -> int:
+    paths = [skeleton.path_to_root(joint)[::-1] for name, joint in standard_joints.items() if name != "root"]
+    return max(int(joints[0]) for joints in zip(*paths, strict=False) if len(set(joints)) == 1)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
+from marey_motion.kinematics import as_kernel_input
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.display import pose_costs
 from marey_motion.matching.inertialisation import decay_matrix
@@ -179,7 +180,7 @@ def playback_of(database: MatchingDatabase) -> Playback:
         successors=database.root_motion.successors,
         steps=database.root_motion.steps,
         starts=database.starts,
-        points=database.pose_points,
+        points=as_kernel_input(database.pose_points),
         offset=database.normaliser.offset,
         scale=database.normaliser.scale,
         horizons_s=ticks / rate_hz,

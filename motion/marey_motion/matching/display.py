@@ -7,13 +7,11 @@ from numpy.typing import NDArray
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
-from marey_motion.kinematics import forward_kinematics
-from marey_motion.matching.body import MatchingBody
+from marey_motion.kinematics import as_kernel_input, forward_kinematics
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.inertialisation import decay_matrix
 from marey_motion.matching.options import ControllerOptions
 from marey_motion.matching.record import TrialRecord
-from marey_motion.skeleton import Skeleton
 
 Floats = NDArray[np.float64]
 
@@ -21,7 +19,7 @@ Floats = NDArray[np.float64]
 def displayed_clip(database: MatchingDatabase, record: TrialRecord, options: ControllerOptions) -> Clip:
     """The motion of a trial as a clip: every joint inertialised at every switch, the root where the record has it."""
     joints = np.arange(database.body.skeleton.joint_count)
-    poses = _inertialised(database, record.rows, joints, options.half_life_s)
+    poses, places = _inertialised(database, record.rows, joints, options.half_life_s)
     half = 0.5 * record.headings
     zero = np.zeros_like(half)
     facing = np.stack((np.cos(half), zero, np.sin(half), zero), axis=-1)
@@ -30,7 +28,13 @@ def displayed_clip(database: MatchingDatabase, record: TrialRecord, options: Con
     poses[:, 3:7] = quaternions.multiply(facing, poses[:, 3:7])
     rotations = quaternions.unroll(poses[:, 3:].reshape(len(poses), -1, 4))
     poses[:, 3:] = rotations.reshape(len(poses), -1)
-    return Clip(database.body.skeleton, record.rate_hz, poses.astype(np.float32))
+    return Clip(
+        database.body.skeleton,
+        record.rate_hz,
+        poses.astype(np.float32),
+        places.astype(np.float32) if database.translated_joints else None,
+        database.translated_joints,
+    )
 
 
 def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: ControllerOptions) -> Floats:
@@ -39,15 +43,15 @@ def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: Con
     Both stand in the frame of the root. The displayed pose has what is left of earlier switches; the next one is the
     row that was chosen for the next tick as it is in the database. After the last tick that is the row that follows.
     """
-    if not database.body.pose_joints:
-        return np.zeros(len(rows))
-    chain, skeleton = _chain(database.body)
-    shown = forward_kinematics(skeleton, _inertialised(database, rows, chain, options.half_life_s))
+    chain, skeleton = database.body.pose_chain
+    poses, places = _inertialised(database, rows, chain, options.half_life_s)
+    moved = np.flatnonzero(np.isin(chain, database.translated_joints))
+    shown = forward_kinematics(skeleton, poses, translations=places, translated_joints=tuple(moved.tolist()))
     points = shown[:, np.searchsorted(chain, database.body.pose_joints)]
     after = database.root_motion.successors[rows[-1]]
     following = np.append(rows[1:], after if after >= 0 else rows[-1])
-    distances: Floats = np.linalg.norm(points - database.pose_points[following], axis=-1)
-    return distances.sum(axis=-1)
+    distances: Floats = np.linalg.norm(points - database.pose_points[following], axis=-1).sum(axis=-1)
+    return distances
 
 
 def switched_rows(database: MatchingDatabase, rows: NDArray[np.int32]) -> NDArray[np.int64]:
@@ -64,35 +68,28 @@ def switched_rows(database: MatchingDatabase, rows: NDArray[np.int32]) -> NDArra
 
 def _inertialised(
     database: MatchingDatabase, rows: NDArray[np.int32], joints: NDArray[np.int64], half_life_s: float
-) -> Floats:
-    """Displayed poses (T, 3 + 4·K) of K joints in the frame of the root."""
+) -> tuple[Floats, Floats]:
+    """Displayed poses (T, 3 + 4·K) of K joints in the frame of the root, and local translations (T, M, 3) of theirs."""
     from marey_motion.matching import display_kernels
 
     rate_hz = database.options.rate_hz
+    moved = np.flatnonzero(np.isin(database.translated_joints, joints))
+    translations = database.translations
+    if translations is None:
+        translations = np.empty((database.row_count, 0, 3), dtype=np.float32)
     shown = np.empty((len(rows), 3 + 4 * len(joints)))
+    places = np.empty((len(rows), len(moved), 3))
     display_kernels.inertialised(
-        database.poses,
+        as_kernel_input(database.poses),
+        as_kernel_input(translations),
         database.root_motion.successors,
         joints,
+        moved,
         rows,
         switched_rows(database, rows),
         decay_matrix(half_life_s, 1.0 / rate_hz),
         rate_hz,
         shown,
+        places,
     )
-    return shown
-
-
-def _chain(body: MatchingBody) -> tuple[NDArray[np.int64], Skeleton]:
-    """The joints that carry the pose joints, in the skeleton's order, and the skeleton of these alone."""
-    whole = body.skeleton
-    needed = {0}
-    for joint in body.pose_joints:
-        while joint > 0:
-            needed.add(int(joint))
-            joint = int(whole.parents[joint])
-    chain = np.array(sorted(needed), dtype=np.int64)
-    names = tuple(whole.joint_names[joint] for joint in chain)
-    parents = np.concatenate(([-1], np.searchsorted(chain, whole.parents[chain[1:]])))
-    skeleton = Skeleton(names, parents.astype(np.int32), whole.offsets[chain], whole.rest_rotations[chain], (), names)
-    return chain, skeleton
+    return shown, places

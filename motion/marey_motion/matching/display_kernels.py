@@ -59,33 +59,62 @@ def _turn_to(pose, column, w, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _add_velocity(poses, successors, joints, row, rate, velocities):  # type: ignore[no-untyped-def]
-    """Add `rate` times the step from a row to the next one to `velocities` (1 + K, 3)."""
+def _add_velocity(poses, places, successors, joints, moved, row, rate, velocities):  # type: ignore[no-untyped-def]
+    """Add `rate` times the step from a row to the next one to `velocities` (1 + M + K, 3)."""
     if successors[row] < 0:  # a clip's end goes on as it came
         if row == 0 or successors[row - 1] != row:
             return
         row -= 1
-    here, ahead = poses[row], poses[successors[row]]
+    following = successors[row]
+    here, ahead = poses[row], poses[following]
     for c in range(3):
         velocities[0, c] += rate * (np.float64(ahead[c]) - np.float64(here[c]))
+        for m in range(moved.shape[0]):
+            step = np.float64(places[following, moved[m], c]) - np.float64(places[row, moved[m], c])
+            velocities[1 + m, c] += rate * step
     for k in range(joints.shape[0]):
-        j = 3 + 4 * joints[k]
+        j, o = 3 + 4 * joints[k], 1 + moved.shape[0] + k
         turn = _turn_to(here, j, ahead[j], ahead[j + 1], ahead[j + 2], ahead[j + 3])
         for c in range(3):
-            velocities[1 + k, c] += rate * turn[c]
+            velocities[o, c] += rate * turn[c]
 
 
 @_compiled
-def _show(pose, joints, offsets, shown):  # type: ignore[no-untyped-def]
-    """Fill `shown` (3 + 4·K) with the joints of a pose and their offsets (1 + K, 3)."""
+def _show(pose, place, joints, moved, offsets, shown, shown_places):  # type: ignore[no-untyped-def]
+    """Fill `shown` (3 + 4·K) and `shown_places` (M, 3) with a row and its offsets (1 + M + K, 3)."""
     for c in range(3):
         shown[c] = pose[c] + offsets[0, c]
+        for m in range(moved.shape[0]):
+            shown_places[m, c] = place[moved[m], c] + offsets[1 + m, c]
     for k in range(joints.shape[0]):
-        j, o = 3 + 4 * joints[k], 3 + 4 * k
-        turn = _exponential(offsets[1 + k, 0], offsets[1 + k, 1], offsets[1 + k, 2])
-        shown[o], shown[o + 1], shown[o + 2], shown[o + 3] = _product(
+        j, o, s = 3 + 4 * joints[k], 1 + moved.shape[0] + k, 3 + 4 * k
+        turn = _exponential(offsets[o, 0], offsets[o, 1], offsets[o, 2])
+        shown[s], shown[s + 1], shown[s + 2], shown[s + 3] = _product(
             turn[0], turn[1], turn[2], turn[3], pose[j], pose[j + 1], pose[j + 2], pose[j + 3]
         )
+
+
+@_compiled
+def _show_row(pose, place, joints, moved, shown, shown_places):  # type: ignore[no-untyped-def]
+    """`_show` without offsets."""
+    shown[:3] = pose[:3]
+    for m in range(moved.shape[0]):
+        shown_places[m] = place[moved[m]]
+    for k in range(joints.shape[0]):
+        shown[3 + 4 * k : 7 + 4 * k] = pose[3 + 4 * joints[k] : 7 + 4 * joints[k]]
+
+
+@_compiled
+def _take_offsets(shown, shown_places, pose, place, joints, moved, offsets):  # type: ignore[no-untyped-def]
+    """Fill `offsets` with what takes a row to what is shown."""
+    for c in range(3):
+        offsets[0, c] = shown[c] - pose[c]
+        for m in range(moved.shape[0]):
+            offsets[1 + m, c] = shown_places[m, c] - place[moved[m], c]
+    for k in range(joints.shape[0]):
+        o, s = 1 + moved.shape[0] + k, 3 + 4 * k
+        turn = _turn_to(pose, 3 + 4 * joints[k], shown[s], shown[s + 1], shown[s + 2], shown[s + 3])
+        offsets[o, 0], offsets[o, 1], offsets[o, 2] = turn
 
 
 @_compiled
@@ -102,34 +131,28 @@ def _decay(decay, offsets, velocities):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def inertialised(poses, successors, joints, rows, cuts, decay, rate_hz, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (T, 3 + 4·K) with the displayed poses of K joints of the database's `poses` (N, 3 + 4·J).
+def inertialised(  # type: ignore[no-untyped-def]
+    poses, places, successors, joints, moved, rows, cuts, decay, rate_hz, out, out_places
+):
+    """Fill `out` (T, 3 + 4·K) and `out_places` (T, M, 3) with the displayed poses of K joints, M of which have places.
 
-    joints (K,) increasing; rows (T,) displayed at each tick; cuts (T,) the row that takes the place of the displayed
-    one after its tick, or -1; decay (2, 2) of offsets and velocities in one tick.
+    poses (N, 3 + 4·J) and places (N, L, 3), local translations, of the database; joints (K,) and moved (M,), which of J
+    and of L are wanted; rows (T,) displayed at each tick; cuts (T,) the row that takes the place of the displayed one
+    after its tick, or -1; decay (2, 2) of offsets and velocities in one tick.
     """
-    offsets = np.zeros((1 + joints.shape[0], 3))
-    velocities = np.zeros((1 + joints.shape[0], 3))
+    offsets = np.zeros((1 + moved.shape[0] + joints.shape[0], 3))
+    velocities = np.zeros_like(offsets)
     blends = False
     for tick in range(rows.shape[0]):
-        shown = out[tick]
+        row, cut = rows[tick], cuts[tick]
         if blends:
-            _show(poses[rows[tick]], joints, offsets, shown)
+            _show(poses[row], places[row], joints, moved, offsets, out[tick], out_places[tick])
         else:
-            pose = poses[rows[tick]]
-            shown[:3] = pose[:3]
-            for k in range(joints.shape[0]):
-                shown[3 + 4 * k : 7 + 4 * k] = pose[3 + 4 * joints[k] : 7 + 4 * joints[k]]
-        if cuts[tick] >= 0:
-            target = poses[cuts[tick]]
-            for c in range(3):
-                offsets[0, c] = shown[c] - target[c]
-            for k in range(joints.shape[0]):
-                o = 3 + 4 * k
-                turn = _turn_to(target, 3 + 4 * joints[k], shown[o], shown[o + 1], shown[o + 2], shown[o + 3])
-                offsets[1 + k, 0], offsets[1 + k, 1], offsets[1 + k, 2] = turn
-            _add_velocity(poses, successors, joints, rows[tick], rate_hz, velocities)
-            _add_velocity(poses, successors, joints, cuts[tick], -rate_hz, velocities)
+            _show_row(poses[row], places[row], joints, moved, out[tick], out_places[tick])
+        if cut >= 0:
+            _take_offsets(out[tick], out_places[tick], poses[cut], places[cut], joints, moved, offsets)
+            _add_velocity(poses, places, successors, joints, moved, row, rate_hz, velocities)
+            _add_velocity(poses, places, successors, joints, moved, cut, -rate_hz, velocities)
             blends = True
         if blends:
             blends = _decay(decay, offsets, velocities)

@@ -1,0 +1,208 @@
+"""Why motion matching chose what it chose: the best candidates of one tick and what each of them costs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.matching.controller import Guide, Playback, Rules, Wish, playback_of, rules_of, wish_of
+from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.options import ControllerOptions
+from marey_motion.matching.record import TrialRecord
+from marey_motion.matching.search import SearchIndex
+
+Floats = NDArray[np.float64]
+Reason = Literal["started", "not_searched", "continued", "switched", "clip_ended"]
+
+POSE_DISTANCE = "pose_distance"
+"""The group of the summed distance of the pose joints, in metres, where that is what is compared."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A row that could be chosen: frame `frame` of clip `clip` (an index into the database's clips).
+
+    `groups` is the cost of each group of features; they add up to `cost`. `barred` says why it could not be chosen
+    although it is listed: "not selectable" or "too near"; None when it could.
+    """
+
+    row: int
+    clip: int
+    frame: int
+    cost: float
+    groups: Mapping[str, float]
+    barred: str | None = None
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What happened at one tick of a trial.
+
+    Parameters
+    ----------
+    shown : row displayed at the tick
+    chosen : row that the next tick follows; `shown` itself when its clip was continued
+    sentence : the reason with its numbers, for a person
+    going_on : `shown` as a candidate; None at the start of a trial and at the end of a clip
+    candidates : the cheapest rows that could be chosen, cheapest first
+    others : the rows asked for, in the order asked
+    """
+
+    tick: int
+    time_s: float
+    shown: int
+    chosen: int
+    reason: Reason
+    sentence: str
+    going_on: Candidate | None
+    candidates: tuple[Candidate, ...]
+    others: tuple[Candidate, ...]
+
+
+def explain_choice(
+    database: MatchingDatabase,
+    index: SearchIndex,
+    guide: Guide,
+    options: ControllerOptions,
+    record: TrialRecord,
+    tick: int,
+    *,
+    count: int = 10,
+    others: Sequence[int] = (),
+) -> Explanation:
+    """The `count` cheapest candidates at a tick of a trial and why one of them, or none, was chosen.
+
+    `record` is what `run_trial` gave for the other arguments. At ticks without a search the candidates are those that
+    it would have had. `others` are rows to list beside them: why were these not chosen? Raises `MotionError` for ticks
+    and rows that there are not.
+    """
+    if not 0 <= tick < len(record.rows):
+        raise MotionError(f"tick {tick} is none of the trial's {len(record.rows)}", where="tick")
+    for row in others:
+        if not 0 <= row < database.row_count:
+            raise MotionError(f"row {row} is none of the database's {database.row_count}", where="others")
+    wish, rules, playback = wish_of(guide), rules_of(options, guide.rate_hz), playback_of(database)
+    shown = int(record.rows[tick])
+    query = _query_at(index, playback, wish, rules, record, tick)
+    costs = _Costs(database, index, rules, query, shown, starting=tick == 0)
+    chosen, cost, reason = _chosen(index, playback, rules, query, record, tick)
+    ended = playback.successors[shown] < 0
+    going_on = None if tick == 0 or ended else costs.candidate(shown)
+    return Explanation(
+        tick=tick,
+        time_s=tick / record.rate_hz,
+        shown=shown,
+        chosen=chosen,
+        reason=reason,
+        sentence=_sentence(reason, cost, going_on, options),
+        going_on=going_on,
+        candidates=tuple(costs.candidate(row) for row in costs.cheapest(count)),
+        others=tuple(costs.candidate(row) for row in others),
+    )
+
+
+def _query_at(
+    index: SearchIndex, playback: Playback, wish: Wish, rules: Rules, record: TrialRecord, tick: int
+) -> Floats:
+    from marey_motion.matching import controller_kernels as kernels
+
+    moments = np.empty(tick + 1)
+    kernels.moments_along(rules, wish, record.positions[: tick + 1], moments)
+    query = np.empty(index.rows.shape[1])
+    x, z = record.positions[tick]
+    kernels.fill_query(index, playback, rules, wish, record.rows[tick], moments[-1], x, z, record.headings[tick], query)
+    return query
+
+
+def _chosen(
+    index: SearchIndex, playback: Playback, rules: Rules, query: Floats, record: TrialRecord, tick: int
+) -> tuple[int, float, Reason]:
+    """The row that was chosen, its cost, and the reason."""
+    from marey_motion.matching import controller_kernels as kernels
+
+    shown = int(record.rows[tick])
+    if tick == 0:
+        return shown, float(record.match_cost[0]), "started"
+    if np.isnan(record.match_cost[tick]):
+        return shown, float("nan"), "not_searched"
+    chosen, cost, going_on = kernels.choose(index, playback, rules, shown, query)
+    if np.isnan(going_on):
+        return int(chosen), float(cost), "clip_ended"
+    return int(chosen), float(cost), "continued" if chosen == shown else "switched"
+
+
+def _sentence(reason: Reason, cost: float, going_on: Candidate | None, options: ControllerOptions) -> str:
+    if reason == "started":
+        return f"The trial started on the row whose trajectory fits best, at a cost of {cost:.4g}."
+    if reason == "not_searched":
+        return "No search was due: the clip went on."
+    if going_on is None:
+        return f"The clip had ended, so the cheapest row was taken, at a cost of {cost:.4g}."
+    limit = f"{going_on.cost:.4g} for going on"
+    if options.continuing_bias:
+        limit += f", {options.continuing_bias:+.4g} of bias"
+    limit += f", less a margin of {options.switch_margin:.4g}"
+    if reason == "continued":
+        return f"The clip went on: no other row was cheaper than {limit}."
+    return f"Another row was chosen: it costs {cost:.4g}, which is cheaper than {limit}."
+
+
+class _Costs:
+    """What every row costs at one tick."""
+
+    def __init__(
+        self,
+        database: MatchingDatabase,
+        index: SearchIndex,
+        rules: Rules,
+        query: Floats,
+        shown: int,
+        *,
+        starting: bool,
+    ) -> None:
+        self._database, self._index, self._query = database, index, query
+        self._layout = database.layout
+        self._by_distance = rules.by_distance and not starting
+        self._first = self._layout.pose_dimensions if starting or rules.by_distance else 0
+        self._points = database.pose_points.astype(np.float64)
+        self._shown = shown
+        clip = self._clip_of(shown)
+        self._near = range(0)
+        if rules.window and not starting:
+            self._near = range(
+                max(int(database.starts[clip]), shown - rules.window),
+                min(int(database.starts[clip + 1]), shown + rules.window + 1),
+            )
+        self._totals = self._distances(slice(None)) if self._by_distance else np.zeros(database.row_count)
+        for dimension in range(self._first, len(query)):
+            self._totals += (index.rows[:, dimension] - query[dimension]) ** 2
+
+    def cheapest(self, count: int) -> list[int]:
+        costs = np.where(self._index.selectable, self._totals, np.inf)
+        costs[self._near.start : self._near.stop] = np.inf
+        order = np.argsort(costs, kind="stable")[:count]
+        return [int(row) for row in order if np.isfinite(costs[row])]
+
+    def candidate(self, row: int) -> Candidate:
+        clip = self._clip_of(row)
+        squares = (self._index.rows[row] - self._query) ** 2
+        groups = {POSE_DISTANCE: float(self._distances(slice(row, row + 1))[0])} if self._by_distance else {}
+        for group in self._layout.groups:
+            if group.start >= self._first:
+                groups[group.name] = float(squares[group.start : group.stop].sum())
+        barred = None if self._index.selectable[row] else "not selectable"
+        if row in self._near:
+            barred = "too near"
+        frame = row - int(self._database.starts[clip])
+        return Candidate(row, clip, frame, float(self._totals[row]), groups, barred)
+
+    def _distances(self, rows: slice) -> Floats:
+        return np.asarray(np.linalg.norm(self._points[rows] - self._points[self._shown], axis=-1).sum(axis=-1))
+
+    def _clip_of(self, row: int) -> int:
+        return int(np.searchsorted(self._database.starts, row, side="right")) - 1
