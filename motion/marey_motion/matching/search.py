@@ -20,8 +20,9 @@ LARGEST = 1e18
 
 _SIXTEEN = 16
 _PROBES = 32
-# Above this share of blocks to look at, going through all of them in order is quicker (measured).
-_SCAN_ABOVE = 0.7
+# Where more than this share of the blocks has to be looked at, going through all of them in order is quicker: measured on
+# captured motion with ever more noise, where both take the same time between 0.25 and 0.45.
+_SCAN_ABOVE = 0.35
 
 
 class SearchIndex(NamedTuple):

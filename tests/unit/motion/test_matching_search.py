@@ -138,6 +138,18 @@ def test_differences_that_float32_cannot_show_still_decide(data):
         assert (rows[0], costs[0]) == true_nearest(features, selectable, query)
 
 
+def test_distances_whose_squares_float32_barely_holds_still_decide():
+    """A square of 1e-44 is ten of float32's smallest steps, so rounding hides which of these rows is nearest."""
+    rng = np.random.default_rng(2)
+    query = np.zeros(27)
+    for _ in range(50):
+        features = 1.2e-22 * (1 + 1e-3 * rng.normal(size=(200, 27)))
+        for method in METHODS:
+            index = build_index(features, clips_of(200, 90), np.ones(200, bool), method=method)
+            rows, costs = find_nearest(index, query[None])
+            assert (rows[0], costs[0]) == true_nearest(features, index.selectable, query)
+
+
 @settings(max_examples=100, deadline=None)
 @given(st.data())
 def test_any_numbers_in_range_are_searched_exactly(data):
