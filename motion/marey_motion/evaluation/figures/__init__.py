@@ -76,8 +76,8 @@ def draw_figure(
     Parameters
     ----------
     name : one of `FIGURES`
-    trial : name of the trial to show, such as "switching v=1.5 w=-50". Without it, figures of one trial show that with
-        the largest mean offset, and the others the whole suite
+    trial : name of the trial to show, such as "switching v=1.5 w=-50". Without it, figures of one trial show the one
+        that was followed worst, and the others the whole suite
     other : the result to compare with, drawn second
     labels : what the two are called in a comparison
 

@@ -127,7 +127,7 @@ def _lines(subject: Subject, switches: Ints, circles: dict[str, Circle]) -> list
     totals = np.bincount(inverse.ravel(), weights=counts, minlength=len(keys)).astype(np.int64)
     order = np.lexsort((*keys.T[::-1], -totals))[:MOST_LINES]
     return [
-        _Line(clips[a].uid, coarse[a].middle_of(p), clips[b].uid, coarse[b].middle_of(q), int(totals[index]))
+        _Line(clips[a].uid, int(coarse[a].middle_of(p)), clips[b].uid, int(coarse[b].middle_of(q)), int(totals[index]))
         for index, (a, b, p, q) in zip(order, keys[order].tolist(), strict=True)
     ]
 

@@ -23,6 +23,7 @@ from marey_motion.evaluation.figures.paper import (
     mark_sides,
     new_figure,
     plain,
+    reach,
     shortened,
 )
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
@@ -49,7 +50,7 @@ def draw_points(subjects: Sequence[Subject], _trial: str | None, options: Figure
     keys = 2.5
     each = (width - 0.75 - keys - 0.45 * (len(subjects) - 1)) / len(subjects)
     figure = new_figure(width, 4.9 if len(subjects) > 1 else 4.65)
-    limits = _limits(subjects, chosen)
+    limits = _limits(subjects)
     styles: dict[str, int] = {}  # a clip looks the same in both panels
     for number, (subject, points) in enumerate(zip(subjects, chosen, strict=True)):
         place = Place(0.65 + number * (each + 0.45), 0.55, each, 3.85)
@@ -60,7 +61,7 @@ def draw_points(subjects: Sequence[Subject], _trial: str | None, options: Figure
         panel.set(xlim=limits[0], ylim=limits[1])
         mark_sides(panel)
     _draw_keys(figure.axes[-1], subjects, chosen, styles)
-    return Sketch(figure, {"points": _table(subjects, chosen)}, _caption(subjects, chosen))
+    return Sketch(figure, {"points": _table(subjects, chosen)}, _caption(subjects, chosen, limits))
 
 
 def _choose(subjects: Sequence[Subject], most_clips: int) -> list[_Points]:
@@ -80,15 +81,12 @@ def _choose(subjects: Sequence[Subject], most_clips: int) -> list[_Points]:
     return chosen
 
 
-def _limits(subjects: Sequence[Subject], chosen: Sequence[_Points]) -> tuple[tuple[float, float], tuple[float, float]]:
-    turn, speed = 1.0, 1.0
-    for subject, points in zip(subjects, chosen, strict=True):
-        coverage = subject.result.coverage
-        turn = max(turn, float(np.abs(coverage.turn_rate_edges_deg_s).max(initial=0.0)))
-        speed = max(speed, float(coverage.speed_edges_m_s.max(initial=0.0)))
-        if len(points.windows):
-            turn = max(turn, float(np.abs(np.degrees(coverage.turn_rate_rad_s[points.windows])).max()))
-            speed = max(speed, float(coverage.speed_m_s[points.windows].max()))
+def _limits(subjects: Sequence[Subject]) -> tuple[tuple[float, float], tuple[float, float]]:
+    coverages = [subject.result.coverage for subject in subjects]
+    turns = np.concatenate([np.abs(np.degrees(coverage.turn_rate_rad_s)) for coverage in coverages])
+    speeds = np.concatenate([coverage.speed_m_s for coverage in coverages])
+    turn = reach(turns, max(float(np.abs(coverage.turn_rate_edges_deg_s).max()) for coverage in coverages))
+    speed = reach(speeds, max(float(coverage.speed_edges_m_s[-1]) for coverage in coverages))
     return (-1.04 * turn, 1.04 * turn), (0.0, 1.04 * speed)
 
 
@@ -151,10 +149,17 @@ def _table(subjects: Sequence[Subject], chosen: Sequence[_Points]) -> dict[str, 
     return dict(table)
 
 
-def _caption(subjects: Sequence[Subject], chosen: Sequence[_Points]) -> str:
+def _caption(
+    subjects: Sequence[Subject],
+    chosen: Sequence[_Points],
+    limits: tuple[tuple[float, float], tuple[float, float]],
+) -> str:
     parts = []
     for subject, points in zip(subjects, chosen, strict=True):
         held, total = len(np.unique(subject.result.coverage.clip)), len(subject.result.coverage.clip)
         drawn = "all of them" if len(points.windows) == total else f"{len(points.windows):,} of them, evenly spaced"
-        parts.append(f"{subject.prefix}{total:,} windows from {held} clips, {drawn} drawn.")
+        turn, speed = np.degrees(subject.result.coverage.turn_rate_rad_s), subject.result.coverage.speed_m_s
+        beyond = int(np.count_nonzero((np.abs(turn) > limits[0][1]) | (speed > limits[1][1])))
+        outside = f"; {beyond:,} lie beyond the axes" if beyond else ""
+        parts.append(f"{subject.prefix}{total:,} windows from {held} clips, {drawn} drawn{outside}.")
     return "Each point is the mean speed and turn rate of one second of a clip. " + " ".join(parts)

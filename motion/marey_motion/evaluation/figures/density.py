@@ -19,6 +19,7 @@ from marey_motion.evaluation.figures.paper import (
     add_panel,
     new_figure,
     nice_ceiling,
+    reach,
     write,
 )
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
@@ -115,17 +116,16 @@ def _draw(subjects: Sequence[Subject], plane: _Plane) -> Sketch:
 
 
 def _edges(subjects: Sequence[Subject], plane: _Plane) -> tuple[Floats, Floats]:
-    """Edges of the fine cells along both axes: all windows and the whole grid of trials, the same for all subjects."""
+    """Edges of the fine cells along both axes: the grid of trials and the windows, but for a few far ones."""
     spans = []
     for axis, values in enumerate((plane.x, plane.y)):
         found = np.concatenate([values(subject.result.coverage) for subject in subjects])
         targets = [_target(subject.result.coverage, plane)[axis] for subject in subjects]
-        low = min([float(found.min(initial=0.0)), *(float(each[0]) for each in targets)])
-        high = max([float(found.max(initial=0.0)), *(float(each[-1]) for each in targets)])
+        high = 1.03 * reach(np.maximum(found, 0.0), max(float(each[1]) for each in targets))
+        low = -1.03 * reach(np.maximum(-found, 0.0), max(-float(each[0]) for each in targets))
         if axis == 0:
             low, high = -max(-low, high), max(-low, high)  # left and right alike
-        margin = 0.03 * (high - low)
-        spans.append(np.linspace(low if low == 0.0 else low - margin, high + margin, FINE + 1))
+        spans.append(np.linspace(low, high, FINE + 1))
     return spans[0], spans[1]
 
 

@@ -137,6 +137,14 @@ def shortened(name: str, longest: int = LONGEST_NAME) -> str:
     return f"{name[: longest - 1 - tail]}…{name[-tail:]}"
 
 
+def reach(values: NDArray[np.floating[Any]], wanted: float) -> float:
+    """How far an axis of magnitudes goes: all values, unless a few lie beyond twice what is wanted to be seen."""
+    if not len(values):
+        return wanted
+    most = float(np.quantile(values, 0.98))
+    return max(wanted, min(float(values.max()), max(1.3 * wanted, 1.1 * most), 2.0 * wanted))
+
+
 def nice_ceiling(value: float) -> float:
     """The next number of the form 1, 1.5, 2, 3, 4, 5, 6 or 8 times a power of ten; 1 for what is not above zero."""
     if not value > 0.0 or not np.isfinite(value):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.judgement import strain
 from marey_motion.evaluation.metrics import TrialSeries, trial_series
 from marey_motion.evaluation.relevance import count_switches, measure_usage
 from marey_motion.evaluation.result import ClipUsage, EvaluationResult
@@ -102,7 +103,7 @@ def find_record(subject: Subject, name: str) -> TrialRecord:
 def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequence[Family]) -> Trial:
     """The trial of a name that all subjects have, from the first of the families that has it.
 
-    Without a name it is the one with the largest mean offset of the first subject.
+    Without a name it is the one that the first subject follows worst.
 
     Raises `MotionError` when there is none.
     """
@@ -111,6 +112,6 @@ def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequen
     for family in families:
         candidates = [each for each in shared if each.trial.family == family and name in (None, each.trial.name)]
         if candidates:
-            return max(candidates, key=lambda each: each.metrics.get("offset_mean") or 0.0).trial
+            return max(candidates, key=lambda each: strain(each).worst).trial
     wanted = f"trial {name!r}" if name is not None else "trial"
     raise MotionError(f"the evaluation has no {wanted} of the kind {' or '.join(families)}", code="unknown-trial")

@@ -29,10 +29,10 @@ from marey_motion.evaluation.report.definitions import definitions
 from marey_motion.evaluation.report.markup import element
 from marey_motion.evaluation.report.page import Section, page
 from marey_motion.evaluation.report.provenance import provenance
-from marey_motion.evaluation.report.verdict import Judgement, judge, verdict
+from marey_motion.evaluation.report.verdict import verdict
 from marey_motion.evaluation.result import EvaluationResult
 
-__all__ = ["Judgement", "compared", "judge", "render_comparison", "render_report", "verdict"]
+__all__ = ["compared", "render_comparison", "render_report", "verdict"]
 
 
 def render_report(result: EvaluationResult, *, title: str, figures: Mapping[str, DrawnFigure] | None = None) -> str:

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from marey_motion.evaluation.figures import DrawnFigure
+from marey_motion.evaluation.judgement import is_followed, judge, strain
 from marey_motion.evaluation.relevance import SourceUsage, sum_by_source
 from marey_motion.evaluation.report.definitions import METRICS
 from marey_motion.evaluation.report.markup import Content, Html, element, joined
 from marey_motion.evaluation.report.page import Section, shown
 from marey_motion.evaluation.report.tables import Cell, Number, facts, folded, number, share, table
-from marey_motion.evaluation.report.verdict import is_followed, judge, lag_s
 from marey_motion.evaluation.report.words import amount, demand, duration, find_holes
 from marey_motion.evaluation.result import EvaluationResult, TrialResult
 
@@ -60,7 +60,7 @@ def coverage_chapter(result: EvaluationResult, figures: Figures) -> Section:
 
 def error_chapter(result: EvaluationResult, figures: Figures) -> Section:
     """Where the character goes wrong, the worst trials first."""
-    worst = sorted(result.trials, key=lambda each: (-lag_s(each), each.trial.name))[:WORST_TRIALS]
+    worst = sorted(result.trials, key=lambda each: (-strain(each).worst, each.trial.name))[:WORST_TRIALS]
     lost = sum(not is_followed(each) for each in result.trials)
     text = (
         "Every trajectory is followed."
@@ -68,9 +68,7 @@ def error_chapter(result: EvaluationResult, figures: Figures) -> Section:
         else f"{amount(lost, 'trajectory')} of {len(result.trials)} {'is' if lost == 1 else 'are'} not followed."
     )
     rows = [_trial_row(each) for each in worst]
-    listing = table(
-        "The worst trials, by seconds of travel that the character is off", TRIAL_HEADS, rows, numbers=range(1, 8)
-    )
+    listing = table("The worst trials; what is beyond its limit is marked", TRIAL_HEADS, rows, numbers=range(1, 8))
     pictures = (
         shown(figures, "offsets"),
         listing,
@@ -170,7 +168,7 @@ def baseline_chapter(result: EvaluationResult) -> Section:
 
 def appendix_chapter(result: EvaluationResult) -> Section:
     """Every trial and every clip."""
-    trials = table("All trials", TRIAL_HEADS, map(_trial_row, result.trials), numbers=range(1, 8))
+    trials = table("All trials", TRIAL_HEADS, map(_trial_row, result.trials), numbers=range(1, 7))
     clips = table("All clips", USE_HEADS, map(_use_row, _by_use(result, unused=True)), numbers=range(1, 5))
     return Section(
         "all",
@@ -183,9 +181,9 @@ def appendix_chapter(result: EvaluationResult) -> Section:
     )
 
 
+BEYOND = "bad"
 TRIAL_HEADS = (
     "trial",
-    "off by (s of travel)",
     "distance (m)",
     "largest (m)",
     "speed error (m/s)",
@@ -197,15 +195,14 @@ USE_HEADS = ("clip", "share of frames", "length (s)", "frames shown at all", "ti
 
 
 def _trial_row(outcome: TrialResult) -> list[Cell]:
-    metrics = outcome.metrics
+    metrics, marks = outcome.metrics, [BEYOND if part > 1.0 else "" for part in strain(outcome)]
     name = element("span", demand(outcome.trial), title=outcome.trial.name)
     return [
         name,
-        number(lag_s(outcome), look="" if is_followed(outcome) else "bad"),
-        number(metrics.get("offset_mean")),
+        number(metrics.get("offset_mean"), look=marks[0]),
         number(metrics.get("offset_max")),
-        number(metrics.get("se_v"), signed=True),
-        number(metrics.get("se_omega_deg"), 1, signed=True),
+        number(metrics.get("se_v"), signed=True, look=marks[1]),
+        number(metrics.get("se_omega_deg"), 1, signed=True, look=marks[2]),
         number(metrics.get("transitions_per_s")),
         number(metrics.get("response_s")) if outcome.trial.family == "switching" else Number(None, ""),
     ]

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 
 from marey_motion.evaluation.compare import Comparison, MetricChange
 from marey_motion.evaluation.figures import DrawnFigure
+from marey_motion.evaluation.judgement import Judgement, is_followed, judge
 from marey_motion.evaluation.report.definitions import METRICS
 from marey_motion.evaluation.report.markup import Content, Html, element
 from marey_motion.evaluation.report.page import Section, shown
 from marey_motion.evaluation.report.tables import Cell, Number, facts, folded, number, table
-from marey_motion.evaluation.report.verdict import Judgement, is_followed, judge, lag_s
 from marey_motion.evaluation.report.words import amount, demand
 from marey_motion.evaluation.result import EvaluationResult, TrialResult
 
@@ -146,11 +146,9 @@ def _trial_row(old: TrialResult, new: TrialResult) -> list[Cell]:
 
 
 def _shift(old: TrialResult, new: TrialResult) -> float:
-    """Change of the mean offset in metres; that of a trial that lost or found one counts most."""
+    """Change of the mean offset in metres; 0 where one of the two is not defined."""
     first, second = old.metrics.get("offset_mean"), new.metrics.get("offset_mean")
-    if first is None or second is None:
-        return 0.0 if first is second else lag_s(new) - (0.0 if first is None else first)
-    return second - first
+    return 0.0 if first is None or second is None else second - first
 
 
 def _interval(change: MetricChange | None, digits: int) -> Number:

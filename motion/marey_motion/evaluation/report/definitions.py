@@ -93,7 +93,10 @@ _READINGS = (
 
 def definitions() -> Html:
     """Metrics in words, rules of the verdict, and the reading of every ambiguous formula."""
-    metrics = [(metric.label, metric.unit, metric.meaning, element("code", name)) for name, metric in METRICS.items()]
+    metrics = [
+        (metric.label, metric.unit, metric.meaning, element("code", name, class_="name"))
+        for name, metric in METRICS.items()
+    ]
     rules = (
         "on average no farther from the wished place than it goes in half a second",
         "on average no more than 15 % faster or slower than wished",

@@ -83,7 +83,7 @@ def demand(trial: Trial) -> str:
     if trial.family == "switching":
         speed = f"{trial.speed_m_s:g} m/s switching to {trial.switch_speed_m_s:g}"
     if abs(turn) <= STRAIGHT_DEG_S:
-        return f"straight ahead at {speed}"
+        return f"straight line at {speed}"
     return f"{'left' if turn > 0 else 'right'} turn of {abs(turn):.4g} deg/s at {speed}"
 
 

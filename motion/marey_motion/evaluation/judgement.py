@@ -1,0 +1,91 @@
+"""How good a dataset is, by rules that anybody can check.
+
+A trial counts as followed when the character, on average over it,
+
+* is no farther from the wished place than it goes in half a second at the wished speed,
+* is no more than 15 % faster or slower than wished, and
+* turns no more than 10 degrees a second faster or slower than wished.
+
+The share of followed trials gives the grade: from 90 % very good, from 70 % good, from 40 % usable in part, below that
+poor. Clips generated for every cell of the default grid follow 95 % of its trials, so the best grade is within reach.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from marey_motion.evaluation.result import EvaluationResult, TrialResult
+from marey_motion.evaluation.scenario import Trial
+
+LONGEST_LAG_S = 0.5
+LARGEST_SPEED_SHARE = 0.15
+LARGEST_TURN_DEG_S = 10.0
+GRADES = ((0.9, "very good"), (0.7, "good"), (0.4, "usable in part"), (0.0, "poor"))
+TOLERANCE = 1e-12
+
+
+class Strain(NamedTuple):
+    """How much of each of the three limits a trial takes up; more than 1 is too much, endless where not defined."""
+
+    place: float
+    speed: float
+    turn: float
+
+    @property
+    def worst(self) -> float:
+        """The largest of the three."""
+        return max(self)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the verdict rests on.
+
+    Parameters
+    ----------
+    grade : one of `GRADES`
+    followed, trials : how many trials were followed, of how many
+    worst : the trial that goes farthest beyond its limits, or nearest to them; None without trials
+    """
+
+    grade: str
+    followed: int
+    trials: int
+    worst: TrialResult | None
+
+
+def judge(result: EvaluationResult) -> Judgement:
+    """Apply the rules to every trial."""
+    followed = sum(is_followed(each) for each in result.trials)
+    share = followed / len(result.trials) if result.trials else 0.0
+    grade = next(name for least, name in GRADES if share >= least - TOLERANCE)
+    worst = max(result.trials, key=lambda each: strain(each).worst, default=None)
+    return Judgement(grade, followed, len(result.trials), worst)
+
+
+def is_followed(outcome: TrialResult) -> bool:
+    """Whether a trial keeps to the three limits."""
+    return strain(outcome).worst <= 1.0 + TOLERANCE
+
+
+def strain(outcome: TrialResult) -> Strain:
+    """How near a trial comes to each limit."""
+    speed = max(mean_speed_m_s(outcome.trial), TOLERANCE)
+    place, bias, turn = (outcome.metrics.get(name) for name in ("offset_mean", "se_v", "se_omega_deg"))
+    return Strain(
+        float("inf") if place is None else place / (LONGEST_LAG_S * speed),
+        float("inf") if bias is None else abs(bias) / (LARGEST_SPEED_SHARE * speed),
+        float("inf") if turn is None else abs(turn) / LARGEST_TURN_DEG_S,
+    )
+
+
+def mean_speed_m_s(trial: Trial) -> float:
+    """The wished speed over the circle; a switching trial begins it with its own speed."""
+    if trial.family == "circle" or trial.duration_s <= 0.0:
+        return trial.speed_m_s
+    pieces = int(trial.duration_s // trial.switch_every_s)
+    rest_s = trial.duration_s - pieces * trial.switch_every_s
+    switched_s = (pieces // 2) * trial.switch_every_s + (rest_s if pieces % 2 else 0.0)
+    share = switched_s / trial.duration_s
+    return (1.0 - share) * trial.speed_m_s + share * trial.switch_speed_m_s

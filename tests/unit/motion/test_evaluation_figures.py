@@ -1,0 +1,428 @@
+"""Figures of evaluations: what is drawn is what was measured, whatever the evaluation looks like."""
+
+import csv
+import io
+import json
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from evaluation_results import SMALL, evaluated, made_up, some_coverage, wandering
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.figures import FIGURES, FigureOptions, draw_figure, draw_figures
+from marey_motion.evaluation.figures.clip_graph_layout import MOST_DOTS, arrange
+from marey_motion.evaluation.figures.mixtures import fit_one, fit_two
+from marey_motion.evaluation.figures.paper import nice_levels, shortened
+from marey_motion.evaluation.result import EvaluationOptions, Grid
+from marey_motion.evaluation.scenario import suite_trials
+from marey_motion.matching.database import DatabaseClip
+from marey_motion.matching.record import Status
+
+ONE_TRIAL = [name for name, kind in FIGURES.items() if kind.trials == "one"]
+SWITCHING = "switching v=2 w=50"
+
+
+@pytest.fixture(scope="module")
+def result():
+    return made_up()
+
+
+@pytest.fixture(scope="module")
+def other():
+    return made_up(seed=5, clips=9, sway_m=0.05)
+
+
+def is_sound(figure):
+    """Both pictures can be read, all columns of a table are of one length, and there is something to say."""
+    assert imread(io.BytesIO(figure.png)).shape[0] > 100
+    assert ElementTree.fromstring(figure.svg).tag.endswith("svg")
+    assert figure.caption.endswith(".")
+    assert "nan" not in figure.caption
+    for columns in figure.data["tables"].values():
+        assert len({len(values) for values in columns.values()}) == 1
+    json.dumps(figure.data, allow_nan=False)
+    return figure
+
+
+def rows_of(figure, table):
+    columns = figure.data["tables"][table]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_figure_is_drawn_of_one_result_and_of_two_with_the_same_bytes_each_time(name, result, other):
+    for compared in (None, other):
+        first, second = (is_sound(draw_figure(name, result, other=compared)) for _ in range(2))
+        assert first.png == second.png
+        assert first.svg == second.svg
+        assert first.files() == second.files()
+
+
+def test_threads_draw_the_same_figures_at_once(result):
+    alone = draw_figure("clip-graph", result)
+    with ThreadPoolExecutor(4) as pool:
+        drawn = list(pool.map(lambda _: draw_figure("clip-graph", result), range(4)))
+
+    assert {figure.svg for figure in drawn} == {alone.svg}
+    assert {figure.png for figure in drawn} == {alone.png}
+
+
+def test_drawing_leaves_the_settings_of_matplotlib_alone(result):
+    import matplotlib
+
+    before = dict(matplotlib.rcParams)
+    draw_figure("holes", result)
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_matplotlib_is_not_loaded_before_something_is_drawn():
+    script = "import sys, marey_motion.evaluation.report; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+
+
+def test_the_files_of_a_figure_are_its_pictures_and_its_data(result):
+    figure = draw_figure("errors", result)
+    files = figure.files()
+
+    assert set(files) == {"errors.png", "errors.svg", "errors.json", "errors-histogram.csv", "errors-fits.csv"}
+    assert json.loads(files["errors.json"]) == figure.data
+    rows = list(csv.DictReader(io.StringIO(files["errors-fits.csv"].decode())))
+    assert [float(row["mean"]) for row in rows] == figure.data["tables"]["fits"]["mean"]
+
+
+def test_all_figures_of_a_result_are_drawn_but_those_it_has_no_trials_or_records_for(result):
+    assert list(draw_figures(result)) == list(FIGURES)
+    assert not set(draw_figures(replace(result, records=()))) & set(ONE_TRIAL)
+    circles = made_up(replace(SMALL, families=("circle",)))
+    assert set(FIGURES) - set(draw_figures(circles)) == {"scenario-switching"}
+
+
+# Figure 1
+
+
+def test_points_are_the_windows_of_the_coverage(result):
+    rows = rows_of(draw_figure("points", result), "points")
+    coverage = result.coverage
+
+    assert [row["speed_m_s"] for row in rows] == coverage.speed_m_s.tolist()
+    assert [row["turn_rate_deg_s"] for row in rows] == np.degrees(coverage.turn_rate_rad_s).tolist()
+    assert [row["clip"] for row in rows] == [result.clips[clip].uid for clip in coverage.clip]
+
+
+def test_of_very_many_windows_evenly_spaced_ones_are_drawn():
+    big = made_up(clips=300, frames=500)
+    figure = draw_figure("points", big)
+    drawn = figure.data["tables"]["points"]["speed_m_s"]
+
+    assert 3_000 <= len(drawn) <= 6_000
+    assert drawn == big.coverage.speed_m_s[:: -(-len(big.coverage.clip) // 6_000)].tolist()
+    assert "280 other clips" in figure.svg
+
+
+# Figures 4a and 4b
+
+
+def test_a_scenario_has_the_approach_and_a_section_for_each_speed(result):
+    sections = rows_of(draw_figure("scenario-switching", result, trial=SWITCHING), "sections")
+
+    assert [row["section"] for row in sections] == [1, 2, 3, 4]
+    assert [row["speed_m_s"] for row in sections] == [2.0, 2.0, 4.0, 2.0]
+    assert [(row["start_s"], row["stop_s"]) for row in sections] == [(0, 3), (3, 8), (8, 13), (13, 15)]
+    assert [row["turn_rate_deg_s"] for row in sections] == pytest.approx([0.0, 50.0, 50.0, 50.0])
+
+
+def test_a_scenario_shows_where_the_character_went_beside_where_it_should_have(result, other):
+    name = "circle v=1 w=100"
+    index = [each.trial.name for each in result.trials].index(name)
+    paths = draw_figure("scenario-circle", result, trial=name, other=other, labels=("old", "new")).tables["paths"]
+
+    assert np.array_equal(paths["old_x_m"], result.records[index].positions[:, 0])
+    assert np.array_equal(paths["new_z_m"], other.records[index].positions[:, 1])
+    assert np.max(np.asarray(paths["reference_x_m"])) > 0.5  # a left turn
+
+
+def test_scenarios_can_be_drawn_without_records(result):
+    bare = replace(result, records=())
+    assert set(draw_figure("scenario-circle", bare).tables["paths"]) == {"time_s", "reference_x_m", "reference_z_m"}
+
+
+# Figure 5
+
+
+def test_offsets_are_those_of_the_trials(result):
+    rows = rows_of(draw_figure("offsets", result), "offsets")
+    drawn = {(row["family"], row["speed_m_s"], round(row["turn_rate_deg_s"])): row["offset_mean_m"] for row in rows}
+
+    assert len(drawn) == len(result.trials) == 30
+    for each in result.trials:
+        key = each.trial.family, each.trial.speed_m_s, round(np.degrees(each.trial.turn_rate_rad_s))
+        assert drawn[key] == each.metrics["offset_mean"]
+
+
+def test_levels_of_a_scale_are_round_numbers_that_reach_the_largest_value():
+    assert nice_levels(0.61).tolist() == pytest.approx(np.arange(0, 0.71, 0.1).tolist())
+    assert nice_levels(14.0).tolist() == list(range(0, 15, 2))
+    assert nice_levels(1.0)[-1] == pytest.approx(1.0)
+    assert nice_levels(0.0)[-1] == 1.0
+
+
+# Figure 6
+
+
+@pytest.mark.parametrize(("name", "cell"), [("density", 50.0 * 1.0), ("directions", 0.25 * 0.25)])
+def test_the_map_of_density_holds_all_seconds_of_data(name, cell, result):
+    table = draw_figure(name, result).data["tables"]["density"]
+    x, y = (np.unique(values) for values in list(table.values())[:2])
+    fine = (x[1] - x[0]) * (y[1] - y[0])
+    held = np.sum(table["seconds_s"]) * fine / cell
+
+    # What lies near the border is partly smoothed beyond it.
+    assert held == pytest.approx(len(result.coverage.clip) / 60.0, rel=0.12)
+
+
+# Figure 7
+
+
+def test_transition_costs_and_switches_are_those_of_the_record(result):
+    table = draw_figure("transition-cost", result, trial=SWITCHING).tables["costs"]
+    record = result.records[[each.trial.name for each in result.trials].index(SWITCHING)]
+
+    assert np.array_equal(table["pose_cost_m"], record.pose_cost[1:])
+    assert np.array_equal(table["switched"], record.status[1:] == Status.REPLACING)
+    assert set(np.asarray(table["wished_speed_m_s"])) == {2.0, 4.0}
+
+
+# Figure 8
+
+
+def test_one_normal_has_the_static_error_as_its_mean_and_the_sign_can_be_turned(result):
+    trial = "circle v=3 w=-50"
+    metrics = next(each.metrics for each in result.trials if each.trial.name == trial)
+    for negate, sign in ((False, 1.0), (True, -1.0)):
+        rows = rows_of(draw_figure("errors", result, trial=trial, options=FigureOptions(negate_errors=negate)), "fits")
+        one = {row["quantity"]: row for row in rows if row["components"] == 1}
+        assert one["speed_m_s"]["mean"] == pytest.approx(sign * metrics["se_v"], abs=1e-12)
+        assert one["speed_m_s"]["deviation"] == pytest.approx(metrics["dse_v"], abs=1e-12)
+        assert one["turn_rate_deg_s"]["mean"] == pytest.approx(sign * metrics["se_omega_deg"], abs=1e-9)
+
+
+def test_the_histogram_holds_the_evaluated_seconds(result):
+    rows = rows_of(draw_figure("errors", result, trial=SWITCHING), "histogram")
+    for quantity in ("speed_m_s", "turn_rate_deg_s"):
+        held = sum(row["seconds"] for row in rows if row["quantity"] == quantity)
+        assert held == pytest.approx(12.0, abs=0.1)
+
+
+def test_two_normals_are_found_again():
+    random = np.random.default_rng(0)
+    values = np.concatenate((random.normal(-0.1, 0.2, 3_000), random.normal(-1.5, 0.1, 2_000)))
+    begins = np.arange(5_000) >= 2_800  # the begin need not be right
+
+    fit = fit_two(values, begins)
+    assert fit.means == pytest.approx((-1.5, -0.1), abs=0.02)
+    assert fit.deviations == pytest.approx((0.1, 0.2), abs=0.02)
+    assert fit.weights == pytest.approx((0.4, 0.6), abs=0.02)
+
+
+def test_a_fit_without_spread_or_without_groups_is_still_one():
+    fit = fit_two(np.full(50, 0.3), np.zeros(50, dtype=bool))
+    assert fit.means.tolist() == [0.3, 0.3]
+    assert fit.weights.sum() == 1.0
+    split = fit_two(np.repeat([0.0, 1.0], 50), np.zeros(100, dtype=bool))
+    assert split.means == pytest.approx((0.0, 1.0))
+    assert np.isfinite(fit_one(np.full(3, 2.0)).density(np.zeros(1))).all()
+
+
+# Figure 9
+
+
+def test_usage_counts_the_frames_of_every_clip_and_the_transitions(result):
+    rows = rows_of(draw_figure("usage", result), "usage")
+
+    assert {row["clip"]: row["frames"] for row in rows[:-1]} == {
+        result.clips[usage.clip].uid: usage.ticks for usage in result.usage
+    }
+    assert rows[-1]["name"] == "Transitions"
+    assert rows[-1]["frames"] == sum(each.metrics["transitions"] for each in result.trials)
+
+
+def test_usage_of_one_trial_is_that_of_its_record(result):
+    rows = rows_of(draw_figure("usage", result, trial=SWITCHING), "usage")
+    record = result.records[[each.trial.name for each in result.trials].index(SWITCHING)]
+
+    assert sum(row["frames"] for row in rows[:-1]) == len(record.rows)
+
+
+def test_less_used_clips_are_one_bar(result):
+    figure = draw_figure("usage", result, options=FigureOptions(most_clips=4, logarithmic=True))
+
+    assert "6 other clips" in figure.svg
+    assert len(figure.data["tables"]["usage"]["clip"]) == 13
+
+
+# Figure 10
+
+
+def test_the_dots_hold_all_displayed_frames_and_the_lines_all_jumps(result):
+    figure = draw_figure("clip-graph", result)
+    frames, lines = rows_of(figure, "frames"), rows_of(figure, "transitions")
+
+    for usage in result.usage:
+        mine = [row for row in frames if row["clip"] == result.clips[usage.clip].uid]
+        assert sum(row["ticks"] for row in mine) == usage.ticks
+        for row in mine:
+            assert row["ticks"] == usage.popularity[row["first_frame"] : row["stop_frame"]].sum()
+    assert sum(row["count"] for row in lines) == result.switches[:, 2].sum()
+    assert len(lines) <= 400
+
+
+def test_lines_of_many_clips_are_joined_rather_than_left_out():
+    big = made_up(clips=40, unused=0, seed=3)
+    figure = draw_figure("clip-graph", big)
+    shown = set(figure.data["tables"]["frames"]["clip"])
+    uids = [clip.uid for clip in big.clips]
+    starts = [clip.start for clip in big.clips]
+    inside = [
+        count
+        for left, entered, count in big.switches
+        if uids[np.searchsorted(starts, left, side="right") - 1] in shown
+        and uids[np.searchsorted(starts, entered, side="right") - 1] in shown
+    ]
+
+    assert len(shown) == 20
+    assert len(figure.data["tables"]["transitions"]["count"]) <= 400
+    assert sum(figure.data["tables"]["transitions"]["count"]) == sum(inside)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 24])
+def test_circles_touch_none_other_and_hold_each_frame_in_one_dot(count):
+    frames = {f"clip{index}": 5 + 400 * index for index in range(count)}
+    circles = list(arrange(frames, {("clip0", "clip2"): 9}).values())
+
+    for first in range(count):
+        for second in range(first):
+            apart = np.linalg.norm(circles[first].centre - circles[second].centre)
+            assert apart > circles[first].radius + circles[second].radius
+    assert sum(circle.dots for circle in circles) <= MOST_DOTS + 12 * count
+    for circle in circles:
+        dots = circle.dot_of(np.arange(circle.frames))
+        assert np.array_equal(np.unique(dots), np.arange(circle.dots))
+        assert np.array_equal(circle.bounds, np.searchsorted(dots, np.arange(circle.dots + 1)))
+
+
+# Holes, and use of frames
+
+
+def test_holes_are_the_deficits_of_the_coverage(result):
+    rows = rows_of(draw_figure("holes", result), "holes")
+
+    assert [row["missing_s"] for row in rows] == result.coverage.deficit_s.ravel().tolist()
+    assert [row["seconds_s"] for row in rows] == result.coverage.seconds.ravel().tolist()
+    assert [row["turn_rate_deg_s"] for row in rows[:5]] == pytest.approx([-100, -50, 0, 50, 100])
+
+
+def test_the_use_of_frames_averages_their_popularity(result):
+    rows = rows_of(draw_figure("frame-use", result), "stretches")
+    most = max(result.usage, key=lambda usage: usage.ticks)
+    mine = [row for row in rows if row["clip"] == result.clips[most.clip].uid]
+    sizes = np.diff(np.append(np.arange(len(mine)) * len(most.popularity) // len(mine), len(most.popularity)))
+
+    assert np.dot([row["ticks_per_frame"] for row in mine], sizes) == pytest.approx(most.ticks)
+
+
+# What is asked for
+
+
+def test_without_a_name_the_trial_that_went_worst_is_shown(result):
+    worst = max(
+        (each for each in result.trials if each.trial.family == "switching"),
+        key=lambda each: each.metrics["offset_mean"],
+    )
+    assert worst.trial.name in draw_figure("transition-cost", result).svg
+
+
+def test_what_there_is_not_is_refused(result):
+    for name, trial, code in (
+        ("offset", None, "unknown-figure"),
+        ("errors", "circle v=9 w=0", "unknown-trial"),
+        ("usage", "circle v=9 w=0", "unknown-trial"),
+        ("scenario-circle", SWITCHING, "unknown-trial"),
+        ("density", SWITCHING, "figure-without-trial"),
+    ):
+        with pytest.raises(MotionError) as refused:
+            draw_figure(name, result, trial=trial)
+        assert refused.value.code == code
+    with pytest.raises(MotionError) as refused:
+        draw_figure("errors", replace(result, records=()))
+    assert refused.value.code == "records-missing"
+
+
+# Evaluations of little
+
+
+def tiny(clips, options=SMALL, seed=0, covered=True):
+    random = np.random.default_rng(seed)
+    trials = suite_trials(options)
+    records = tuple(wandering(trial, clips, 0.1, random) for trial in trials)
+    how = type("How", (), {"turns_deg_s": (-5.0, 5.0)})
+    coverage = some_coverage(options, clips if covered else (), how, random)
+    return evaluated(options, clips, trials, records, coverage)
+
+
+def without_transitions(result):
+    records = tuple(
+        replace(
+            record,
+            status=np.zeros_like(record.status),
+            rows=np.minimum(np.arange(len(record.rows)), result.clips[0].stop - 1).astype(np.int32),
+        )
+        for record in result.records
+    )
+    trials = [each.trial for each in result.trials]
+    made = evaluated(result.options, result.clips, trials, records, result.coverage)
+    return replace(made, switches=np.zeros((0, 3), dtype=np.int64))
+
+
+LITTLE = {
+    "one clip": lambda: tiny((DatabaseClip("only", "only", "", 0, 900),)),
+    "clips of one frame": lambda: tiny(tuple(DatabaseClip(f"c{i}", f"c{i}", "", i, i + 1) for i in range(3))),
+    "no transitions": lambda: without_transitions(made_up(clips=1, unused=0)),
+    "no windows": lambda: tiny((DatabaseClip("short", "short", "", 0, 30),), covered=False),
+    "one trial": lambda: made_up(EvaluationOptions(grid=Grid((1.5,), (0.0,)), duration_s=3.0, families=("circle",))),
+    "one speed": lambda: made_up(EvaluationOptions(grid=Grid((1.5,), (-50.0, 50.0)), duration_s=6.0)),
+    "no tick moved": lambda: replace(
+        (still := made_up()), records=tuple(replace(r, positions=0.0 * r.positions) for r in still.records)
+    ),
+    "unknown numbers": lambda: replace(
+        (known := made_up()),
+        trials=tuple(
+            replace(each, metrics=dict.fromkeys(each.metrics)) if index % 2 else each
+            for index, each in enumerate(known.trials)
+        ),
+    ),
+    "costs unknown": lambda: replace(
+        (known := made_up()), records=tuple(replace(r, pose_cost=np.nan * r.pose_cost) for r in known.records)
+    ),
+}
+
+
+@pytest.mark.parametrize("little", LITTLE)
+def test_evaluations_of_little_are_drawn(little):
+    result = LITTLE[little]()
+    for compared in (None, made_up(seed=8)):
+        for figure in draw_figures(result, other=compared).values():
+            is_sound(figure)
+
+
+def test_names_of_clips_are_drawn_as_they_are_but_for_signs_that_cannot_be():
+    names = (r"cost $5 and \frac{1}{0} ^_ {", "<b>bold</b> & more", "line\nbreak \x00\x1b", "x" * 5000, "")
+    for figure in draw_figures(made_up(names=names)).values():
+        is_sound(figure)
+        assert "<b>" not in figure.svg
+    assert shortened("a" * 20 + "b" * 20, 11) == "aaaaa…bbbbb"[:11]
