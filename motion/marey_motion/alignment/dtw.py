@@ -15,6 +15,9 @@ from marey_motion.errors import MotionError
 
 Floats = NDArray[np.float64]
 
+# A bound is a sum of many terms: lowered by more than its rounding, it stays one.
+_ROUNDING_SLACK = 1.0 - 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
@@ -85,22 +88,31 @@ def warped_distance(a: NDArray[np.floating], b: NDArray[np.floating], *, limit: 
     from marey_motion.alignment import dtw_kernels as kernels
 
     longer = max(len(a), len(b))
-    return float(kernels.total_within(*_points(a, b), limit * longer) / longer)
+    one, other = _points(a, b)
+    costs = _box_costs(one, b) * _ROUNDING_SLACK
+    rest = np.concatenate((np.cumsum(costs[:0:-1])[::-1], [0.0]))
+    return float(kernels.total_within(one, other, rest, limit * longer) / longer)
 
 
-def box_bound(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
+def distance_bound(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
     """A number that `warped_distance(a, b)` is never below, in a time that grows with n + m.
 
-    Every frame of either motion lies on the way at least once, and costs no less than from the box about all frames of
-    the other motion; the first and the last cell are on every way.
+    Every frame of either motion lies on the way at least once, and costs no less than its distance from the box about
+    all frames of the other motion; the first and the last cell are on every way.
     """
+    one, other = _points(a, b)[0], _points(b, a)[0]
+    boxes = _box_costs(one, other).sum(), _box_costs(other, one).sum()
+    ends = [np.linalg.norm(one[frame] - other[frame], axis=-1).mean() for frame in (0, -1)]
+    return float(max(*boxes, *ends) * _ROUNDING_SLACK / max(len(a), len(b)))
+
+
+def _box_costs(a: Floats, b: NDArray[np.floating]) -> Floats:
+    """Mean distance (n,) of the points of each frame of `a` from the boxes that hold them in all frames of `b`."""
     from marey_motion.alignment import dtw_kernels as kernels
 
-    one, other = (np.ascontiguousarray(points, dtype=np.float64) for points in (a, b))
-    boxes = [(points.min(axis=0), points.max(axis=0)) for points in (one, other)]
-    totals = kernels.box_total(one, *boxes[1]), kernels.box_total(other, *boxes[0])
-    ends = [float(np.linalg.norm(one[frame] - other[frame], axis=-1).mean()) for frame in (0, -1)]
-    return max(*totals, *ends) / max(len(a), len(b))
+    costs = np.empty(len(a))
+    kernels.box_costs(a, *(np.asarray(edge, dtype=np.float64) for edge in (b.min(axis=0), b.max(axis=0))), costs)
+    return costs
 
 
 def _points(a: NDArray[np.floating], b: NDArray[np.floating]) -> tuple[Floats, Floats]:

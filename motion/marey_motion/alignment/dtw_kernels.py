@@ -149,10 +149,11 @@ def distances(a, b, out):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def total_within(a, b, limit):  # type: ignore[no-untyped-def]
+def total_within(a, b, rest, limit):  # type: ignore[no-untyped-def]
     """Least total of a way through the distances of a (n, P, 3) and b (P, 3, m); infinite when it is above `limit`.
 
-    Every way passes every row, and totals never fall along it: once a whole row is above the limit, so is the end.
+    rest (n,): what the rows after each row cost at the least. Every way passes every row, and totals never fall along
+    it: once the least of a row and the rest are above the limit, so is the end.
     """
     n, m = a.shape[0], b.shape[2]
     costs = np.empty(m)
@@ -167,15 +168,14 @@ def total_within(a, b, limit):  # type: ignore[no-untyped-def]
             totals[j] = left
             diagonal = above
             least = min(least, left)
-        if least > limit:
+        if least + rest[i] > limit:
             return np.inf
     return totals[m - 1] if totals[m - 1] <= limit else np.inf
 
 
 @_compiled
-def box_total(a, low, high):  # type: ignore[no-untyped-def]
-    """Sum over the frames of a (n, P, 3) of the mean distance of their points from boxes low, high (P, 3)."""
-    total = 0.0
+def box_costs(a, low, high, out):  # type: ignore[no-untyped-def]
+    """Fill out (n,) with the mean distance of the points of each frame of a (n, P, 3) from boxes low, high (P, 3)."""
     for i in range(a.shape[0]):
         cost = 0.0
         for p in range(a.shape[1]):
@@ -184,5 +184,4 @@ def box_total(a, low, high):  # type: ignore[no-untyped-def]
                 gap = max(low[p, c] - a[i, p, c], a[i, p, c] - high[p, c], 0.0)
                 square += gap * gap
             cost += np.sqrt(square)
-        total += cost / a.shape[1]
-    return total
+        out[i] = cost / a.shape[1]

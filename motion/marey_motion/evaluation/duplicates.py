@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.alignment.dtw import box_bound, warped_distance
+from marey_motion.alignment.dtw import distance_bound, warped_distance
 from marey_motion.evaluation.selection import clips_by_source
 from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
@@ -81,7 +81,7 @@ def find_near_duplicates(
                     best = (0.0, other)
                     break
                 sides = points[one.start : one.stop], points[other.start : other.stop]
-                if box_bound(*sides) > limit:
+                if distance_bound(*sides) > limit:
                     continue
                 aligned += 1
                 distance = warped_distance(*sides, limit=limit)

@@ -108,12 +108,25 @@ def joined(first: MatchingDatabase, second: MatchingDatabase) -> MatchingDatabas
         clips.append(replace(clip, start=start, stop=start + clip.frame_count))
         start += clip.frame_count
     order = np.concatenate(rows)
+    joints = tuple(sorted({*first.translated_joints, *second.translated_joints}))
+    first, second = _translating(first, joints), _translating(second, joints)
     return replace(
         first,
         clips=tuple(clips),
         notes=tuple(dict.fromkeys((*first.notes, *second.notes))),
         **{name: np.concatenate((rows, getattr(second, name)))[order] for name, rows in _by_row(first).items()},
     )
+
+
+def _translating(database: MatchingDatabase, joints: tuple[int, ...]) -> MatchingDatabase:
+    """The database with local translations of these joints, the joints' offsets where it had none."""
+    if joints == database.translated_joints:
+        return database
+    translations = np.empty((database.row_count, len(joints), 3), np.float32)
+    translations[:] = database.body.skeleton.offsets[list(joints)]
+    if database.translations is not None:
+        translations[:, np.searchsorted(joints, database.translated_joints)] = database.translations
+    return replace(database, translations=translations, translated_joints=joints)
 
 
 def same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> bool:

@@ -1,0 +1,155 @@
+"""Dynamic time warping against a plain dynamic program and against all ways there are."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from marey_motion.alignment.dtw import align, distance_bound, distances, warped_distance
+from marey_motion.errors import MotionError
+
+STEPS = ((1, 1), (1, 0), (0, 1))
+
+
+def plain_total(costs):
+    """The textbook recursion, cell by cell."""
+    n, m = costs.shape
+    totals = np.full((n + 1, m + 1), np.inf)
+    totals[0, 0] = 0.0
+    for i, j in product(range(1, n + 1), range(1, m + 1)):
+        totals[i, j] = costs[i - 1, j - 1] + min(totals[i - 1, j - 1], totals[i - 1, j], totals[i, j - 1])
+    return totals[n, m]
+
+
+def all_ways(n, m, max_run=None):
+    """Every way from the first cell to the last, as lists of cells."""
+
+    def go(cells, run_step, run):
+        i, j = cells[-1]
+        if (i, j) == (n - 1, m - 1):
+            yield cells
+        for step in STEPS:
+            there = i + step[0], j + step[1]
+            length = run + 1 if step == run_step else 1
+            barred = max_run is not None and step != (1, 1) and length > max_run
+            if there[0] < n and there[1] < m and not barred:
+                yield from go([*cells, there], step, length)
+
+    yield from go([(0, 0)], None, 0)
+
+
+def cheapest_way(costs, max_run=None):
+    return min((sum(costs[cell] for cell in way) for way in all_ways(*costs.shape, max_run)), default=None)
+
+
+def walking_points(frames, speed=1.0, phase=0.0, points=5, seed=0):
+    """(frames, points, 3) that swing like limbs."""
+    random = np.random.default_rng(seed)
+    centres, swings, delays = (random.normal(size=(points, 3)) for _ in range(3))
+    angle = speed * np.arange(frames)[:, None, None] / 8.0 + phase
+    return centres + 0.3 * swings * np.sin(angle + delays)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (7, 1), (2, 2), (23, 31), (40, 17)])
+def test_the_total_is_that_of_a_plain_dynamic_program(shape):
+    for seed in range(20):
+        costs = np.random.default_rng(seed).random(shape)
+        assert align(costs).total == pytest.approx(plain_total(costs), rel=1e-14)
+
+
+@pytest.mark.parametrize("max_run", [None, 0, 1, 2, 3])
+@pytest.mark.parametrize("shape", [(1, 1), (3, 3), (4, 5), (5, 3), (5, 5)])
+def test_no_way_that_keeps_the_limit_is_cheaper(shape, max_run):
+    for seed in range(10):
+        costs = np.random.default_rng(seed).random(shape)
+        least = cheapest_way(costs, max_run)
+        if least is None:
+            with pytest.raises(MotionError, match="cannot be aligned"):
+                align(costs, max_run=max_run)
+        else:
+            assert align(costs, max_run=max_run).total == pytest.approx(least, rel=1e-14)
+
+
+@pytest.mark.parametrize("max_run", [None, 1, 2, 4])
+def test_the_path_is_a_way_of_allowed_steps_that_costs_the_total(max_run):
+    for seed in range(20):
+        costs = np.random.default_rng(seed).random((25, 33))
+        found = align(costs, max_run=max_run)
+        path = found.path
+        assert path[0].tolist() == [0, 0]
+        assert path[-1].tolist() == [24, 32]
+        steps = [tuple(step) for step in np.diff(path, axis=0).tolist()]
+        assert set(steps) <= set(STEPS)
+        assert costs[path[:, 0], path[:, 1]].sum() == pytest.approx(found.total, rel=1e-13)
+        assert longest_run(steps) <= (max_run or 60)
+
+
+def longest_run(steps):
+    longest = run = 0
+    for before, step in zip([None, *steps], steps, strict=False):
+        run = 0 if step == (1, 1) else run + 1 if step == before else 1
+        longest = max(longest, run)
+    return longest
+
+
+def test_a_wide_limit_changes_nothing():
+    costs = np.random.default_rng(5).random((30, 34))
+    assert align(costs, max_run=40).total == align(costs).total
+
+
+def test_no_steps_in_one_motion_alone_leave_the_diagonal():
+    costs = np.random.default_rng(6).random((12, 12))
+    assert align(costs, max_run=0).path.tolist() == [[frame, frame] for frame in range(12)]
+
+
+def test_of_equally_cheap_ways_the_one_with_steps_in_both_motions_is_taken():
+    assert align(np.zeros((4, 4))).path.tolist() == [[0, 0], [1, 1], [2, 2], [3, 3]]
+    assert align(np.zeros((4, 4)), max_run=2).path.tolist() == [[0, 0], [1, 1], [2, 2], [3, 3]]
+
+
+def test_a_motion_played_slower_is_aligned_frame_by_frame_with_itself():
+    motion = walking_points(40)
+    slower = motion[np.repeat(np.arange(40), 2)]
+    found = align(distances(motion, slower))
+    assert found.total == 0.0
+    assert np.array_equal(found.path[:, 0], found.path[:, 1] // 2)
+
+
+def test_distances_are_mean_distances_of_points():
+    a, b = walking_points(7, seed=1), walking_points(9, seed=2)
+    expected = np.linalg.norm(a[:, None] - b[None], axis=-1).mean(axis=-1)
+    assert np.allclose(distances(a, b), expected, rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("frames", [(1, 1), (1, 20), (35, 20), (20, 64)])
+def test_the_distance_of_motions_is_the_total_of_their_alignment_per_frame_of_the_longer(frames):
+    a, b = walking_points(frames[0], seed=3), walking_points(frames[1], 1.3, 0.4, seed=3)
+    assert warped_distance(a, b) == pytest.approx(align(distances(a, b)).total / max(frames), rel=1e-13)
+    assert warped_distance(a, b) == pytest.approx(warped_distance(b, a), rel=1e-13)
+
+
+def test_a_limit_gives_up_exactly_what_is_above_it():
+    a, b = walking_points(50, seed=4), walking_points(60, 1.2, seed=4)
+    distance = warped_distance(a, b)
+    assert warped_distance(a, b, limit=distance * 1.000001) == distance
+    assert warped_distance(a, b, limit=distance * 0.999999) == np.inf
+
+
+def test_the_bound_is_never_above_the_distance_and_tells_distant_motions_apart():
+    for seed in range(30):
+        a = walking_points(20 + seed, 1.0 + 0.05 * seed, seed=seed)
+        b = walking_points(45 - seed, 1.4, 0.1 * seed, seed=seed + seed % 2)
+        assert 0.0 <= distance_bound(a, b) <= warped_distance(a, b)
+    apart = walking_points(30) + (0.0, 0.0, 10.0)
+    assert distance_bound(walking_points(30), apart) > 5.0
+
+
+def test_what_cannot_be_aligned_is_refused():
+    with pytest.raises(MotionError, match="matrix"):
+        align(np.zeros((0, 3)))
+    with pytest.raises(MotionError, match="finite"):
+        align(np.array([[0.0, np.nan]]))
+    with pytest.raises(MotionError, match="max_run"):
+        align(np.zeros((3, 3)), max_run=-1)
+    with pytest.raises(MotionError, match="same points"):
+        distances(walking_points(3, points=4), walking_points(3, points=5))
