@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
+from itertools import count
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.baseline import baseline_database
@@ -62,22 +63,27 @@ def run_suite(
     wanted = suite_trials(options) if trials is None else tuple(trials)
     records = dict(done or {})
     ahead = [trial for trial in wanted if trial.name not in records]
-    if ahead and index is None:
-        index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
     tell = progress or (lambda _done, _total, _note: None)
     tell(len(wanted) - len(ahead), len(wanted), "")
-
-    def run(trial: Trial) -> TrialRecord:
-        return run_trial(database, index, reference(trial, database.options.rate_hz), options.controller)
+    numbers = count(len(wanted) - len(ahead) + 1)
 
     def keep(trial: Trial, record: TrialRecord) -> None:
         records[trial.name] = record
         if finished is not None:
             finished(trial, record)
-        tell(sum(one.name in records for one in wanted), len(wanted), trial.name)
+        tell(next(numbers), len(wanted), trial.name)
 
-    _run_ahead(run, ahead, keep, threads or os.cpu_count() or 1, cancelled or (lambda: False))
+    if ahead:
+        run = _runner(database, index, options)
+        _run_ahead(run, ahead, keep, threads or os.cpu_count() or 1, cancelled or (lambda: False))
     return [records[trial.name] for trial in wanted]
+
+
+def _runner(
+    database: MatchingDatabase, index: SearchIndex | None, options: EvaluationOptions
+) -> Callable[[Trial], TrialRecord]:
+    searched = index or build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
+    return lambda trial: run_trial(database, searched, reference(trial, database.options.rate_hz), options.controller)
 
 
 def _run_ahead(
@@ -167,13 +173,17 @@ _baselines: dict[EvaluationOptions, EvaluationResult] = {}
 
 
 def evaluate_baseline(
-    options: EvaluationOptions, *, threads: int | None = None, cancelled: CancelCallback | None = None
+    options: EvaluationOptions,
+    *,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+    cancelled: CancelCallback | None = None,
 ) -> EvaluationResult:
     """The suite over generated clips that own every cell, without its records; the last one is kept."""
     if options not in _baselines:
         trials = suite_trials(options)
         database, notes = baseline_database(options)
-        records = run_suite(database, options, trials=trials, threads=threads, cancelled=cancelled)
+        records = run_suite(database, options, trials=trials, threads=threads, progress=progress, cancelled=cancelled)
         made = assemble(database, options, trials, records)
         _baselines.clear()
         _baselines[options] = replace(made, records=(), notes=(*notes, *made.notes))

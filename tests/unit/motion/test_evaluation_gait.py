@@ -1,0 +1,182 @@
+"""Whole suites over generated walks and runs: from clips through database and controller to what is measured."""
+
+from dataclasses import replace
+from itertools import product
+from math import radians
+
+import numpy as np
+import pytest
+
+from marey_motion.evaluation import suite as suites
+from marey_motion.evaluation.coverage import coverage_holes, measure_coverage
+from marey_motion.evaluation.result import EvaluationOptions, Grid
+from marey_motion.evaluation.scenario import suite_trials
+from marey_motion.evaluation.suite import assemble, evaluate, evaluate_baseline, run_suite
+from marey_motion.gait import GaitStyle, generate_gait
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.building import build_database
+from marey_motion.matching.database import SourceClip
+from marey_motion.matching.options import DatabaseOptions
+from marey_motion.rigs import map_joints
+
+TURN_RATES = (-100.0, -75.0, -50.0, -25.0, 0.0, 25.0, 50.0, 75.0, 100.0)
+GRID = Grid((1.0, 2.0, 3.0), TURN_RATES)
+CIRCLES = EvaluationOptions(grid=GRID, families=("circle",))
+IMPOSSIBLE_M_S = 50.0
+RIGID = GaitStyle(bounce=0.0, lean=0.0, sway=0.0, arm_swing=0.0)
+SMALL = EvaluationOptions(grid=Grid((1.0, 2.0), (-50.0, 0.0, 50.0)), duration_s=6.0, switch_every_s=2.0)
+
+
+def gait_clips(cells, seconds, *, varied=False):
+    return [
+        SourceClip(
+            f"gait-{number:03d}",
+            f"v={speed:g} w={turn_rate:g}",
+            generate_gait(speed, radians(turn_rate), seconds, style=GaitStyle.varied(number) if varied else None),
+        )
+        for number, (speed, turn_rate) in enumerate(cells)
+    ]
+
+
+def database_of(clips, options=None, **given):
+    skeleton = clips[0].clip.skeleton
+    body = MatchingBody.from_mapping(skeleton, map_joints(skeleton))
+    return build_database(clips, body, options or DatabaseOptions(), **given)
+
+
+def evaluated(database, options):
+    trials = suite_trials(options)
+    return assemble(database, options, trials, run_suite(database, options, trials=trials))
+
+
+@pytest.fixture(scope="module")
+def grid_clips():
+    return gait_clips(product(GRID.speeds_m_s, GRID.turn_rates_deg_s), 10.0)
+
+
+def test_a_mirror_closed_data_set_turns_alike_to_both_sides():
+    clips = gait_clips(((v, w) for v in GRID.speeds_m_s for w in GRID.turn_rates_deg_s if w >= 0.0), 10.0)
+    mirrored = DatabaseOptions(mirroring="add")
+    # From the first tick on the circle: the way straight ahead has no side, and begins on the same foot for both.
+    options = replace(CIRCLES, approach_s=0.0, database=mirrored)
+    result = evaluated(database_of(clips, mirrored), options)
+
+    assert result.suite["offset_asymmetry"] < 1e-12
+    assert result.coverage.symmetry == 1.0
+    assert result.coverage.index == 1.0
+
+
+@pytest.mark.parametrize("family", ["circle", "switching"])
+def test_a_mirrored_data_set_does_to_the_right_what_the_original_does_to_the_left(family):
+    generator = np.random.default_rng(7)
+    cells = np.stack((generator.uniform(0.8, 3.2, 25), generator.uniform(-30.0, 110.0, 25)), axis=1).tolist()
+    clips = gait_clips(cells, 6.0, varied=True)
+    options = replace(CIRCLES, families=(family,), grid=Grid((1.0, 2.0, 3.0), (25.0, -50.0, 75.0, -100.0)))
+    opposite = replace(options, grid=Grid((1.0, 2.0, 3.0), (-25.0, 50.0, -75.0, 100.0)))
+    plain = evaluated(database_of(clips), options)
+    mirrored = evaluated(database_of(clips, DatabaseOptions(mirroring="only")), opposite)
+
+    for one, other, record, twin in zip(plain.trials, mirrored.trials, plain.records, mirrored.records, strict=True):
+        assert np.array_equal(record.rows, twin.rows)
+        for name, value in one.metrics.items():
+            turned = name in ("se_omega_deg", "se_omega_path_deg", "cross_track_mean")
+            expected = -other.metrics[name] if turned and value is not None else other.metrics[name]
+            assert value == pytest.approx(expected, abs=1e-9), name
+    assert mirrored.coverage.symmetry == pytest.approx(plain.coverage.symmetry, abs=1e-12)
+    assert plain.suite["offset_mean"] > 0.1  # the trials are not trivially the same
+
+
+def test_clips_that_own_every_cell_follow_every_circle(grid_clips):
+    result = evaluated(database_of(grid_clips), CIRCLES)
+
+    assert max(one.metrics["offset_mean"] for one in result.trials) < 0.8
+    assert max(one.metrics["abs_se_v"] for one in result.trials) < 0.2
+    assert max(one.metrics["abs_se_omega_deg"] for one in result.trials) < 3.0
+    assert coverage_holes(result.coverage, GRID) == ()
+
+
+def test_without_tight_turns_the_tight_circles_are_missed_and_the_others_are_not(grid_clips):
+    options = replace(CIRCLES, grid=GRID)
+    wide = [clip for clip in grid_clips if abs(float(clip.name.split("w=")[1])) <= 70.0]
+    result = evaluated(database_of(wide), options)
+    offsets = np.array([one.metrics["offset_mean"] for one in result.trials]).reshape(3, 9)
+
+    assert offsets[:, [0, 1, 7, 8]].min() > 1.2
+    assert offsets[:, [0, 8]].min() > 2.0
+    assert offsets[:, 2:7].max() < 1.0
+    holes = {(hole.speed_m_s, hole.turn_rate_deg_s) for hole in coverage_holes(result.coverage, GRID)}
+    assert holes == set(product(GRID.speeds_m_s, (-100.0, -75.0, 75.0, 100.0)))
+    assert result.coverage.index == pytest.approx(5 / 9)
+
+
+def test_the_windows_of_a_generated_circle_lie_at_its_speed_and_turn_rate():
+    clip = generate_gait(2.0, radians(50.0), 10.0 + 1 / 60, style=RIGID)
+    coverage = measure_coverage(database_of([SourceClip("circle", "circle", clip)]), SMALL)
+
+    assert len(coverage.speed_m_s) == 541
+    assert coverage.speed_m_s == pytest.approx(2.0, abs=1e-3)
+    assert coverage.turn_rate_rad_s == pytest.approx(radians(50.0), abs=1e-3)
+    # Near its ends a clip is smoothed from one side only.
+    assert np.degrees(coverage.turn_rate_rad_s[30:-30]) == pytest.approx(50.0, abs=1e-3)
+    assert coverage.strafe_m_s == pytest.approx(0.0, abs=1e-3)
+
+
+def test_removing_what_no_trial_used_changes_no_bit_with_a_pinned_normaliser():
+    clips = gait_clips(product((1.0, 2.0, 4.0), (-50.0, 0.0, 50.0, 300.0)), 6.0)
+    database = database_of(clips)
+    result = evaluated(database, SMALL)
+    unused = {database.clips[at].uid for at, usage in enumerate(result.usage) if not usage.ticks}
+    assert unused
+    less = database_of([clip for clip in clips if clip.uid not in unused], normaliser=database.normaliser)
+    again = evaluated(less, SMALL)
+
+    assert again.provenance.dataset != result.provenance.dataset
+    assert [one.metrics for one in again.trials] == [one.metrics for one in result.trials]
+    for before, after in zip(result.records, again.records, strict=True):
+        for name in ("positions", "headings", "match_cost", "continuing_cost", "pose_cost"):
+            assert getattr(before, name).tobytes() == getattr(after, name).tobytes()
+
+
+# The baseline
+
+
+def test_the_baseline_owns_every_cell_and_both_speeds():
+    baseline = evaluate_baseline(SMALL)
+
+    assert baseline.coverage.index == 1.0
+    assert {clip.name for clip in baseline.clips} >= {"v=4 w=-50", "v=1 w=0", "v=2 w=50"}
+    assert baseline.notes == ()
+    assert baseline.records == ()
+    assert baseline.suite["circle.offset_mean"] < 0.8
+
+
+def test_the_baseline_is_the_same_whenever_it_is_made(monkeypatch):
+    first = evaluate_baseline(SMALL, threads=1)
+    assert evaluate_baseline(SMALL) is first
+    monkeypatch.setattr(suites, "_baselines", {})
+    second = evaluate_baseline(SMALL, threads=2)
+
+    assert second is not first
+    assert second.provenance == first.provenance
+    assert second.trials == first.trials
+    assert second.suite == first.suite
+
+
+def test_cells_that_nobody_can_walk_are_left_out_of_the_baseline_and_named():
+    options = replace(SMALL, grid=Grid((2.0, IMPOSSIBLE_M_S), (0.0,)), families=("circle",))
+    baseline = evaluate_baseline(options)
+
+    assert [clip.name for clip in baseline.clips] == ["v=2 w=0"]
+    assert baseline.notes[0].startswith(f"no generated clip for v={IMPOSSIBLE_M_S:g} w=0: ")
+
+
+def test_an_evaluation_has_its_baseline_beside_it():
+    database = database_of(gait_clips([(1.0, 0.0), (1.0, 50.0)], 6.0))
+    told = []
+    result = evaluate(database, SMALL, threads=2, progress=lambda done, total, _note: told.append(done / total))
+
+    assert result.baseline is not None
+    assert result.baseline.suite["offset_mean"] < result.suite["offset_mean"]
+    assert len(result.records) == len(result.trials) == 12
+    assert told[-1] == 1.0
+    assert evaluate(database, SMALL, with_baseline=False).baseline is None
