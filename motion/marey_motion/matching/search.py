@@ -20,8 +20,8 @@ LARGEST = 1e18
 
 _SIXTEEN = 16
 _PROBES = 32
-# Where more than this share of the blocks has to be looked at, going through all of them in order is quicker: measured on
-# captured motion with ever more noise, where both take the same time between 0.25 and 0.45.
+# Where more than this share of the blocks has to be looked at, going through all of them in order is quicker. Measured
+# on captured motion with ever more noise: both take the same time at some place between 0.25 and 0.45.
 _SCAN_ABOVE = 0.35
 
 

@@ -139,11 +139,11 @@ def test_differences_that_float32_cannot_show_still_decide(data):
 
 
 def test_distances_whose_squares_float32_barely_holds_still_decide():
-    """A square of 1e-44 is ten of float32's smallest steps, so rounding hides which of these rows is nearest."""
+    """Squares about ten and a half of float32's smallest steps become ten or eleven, which hides the nearest row."""
     rng = np.random.default_rng(2)
     query = np.zeros(27)
     for _ in range(50):
-        features = 1.2e-22 * (1 + 1e-3 * rng.normal(size=(200, 27)))
+        features = np.sqrt(10.5 * 2.0**-149) * (1 + 1e-3 * rng.normal(size=(200, 27)))
         for method in METHODS:
             index = build_index(features, clips_of(200, 90), np.ones(200, bool), method=method)
             rows, costs = find_nearest(index, query[None])
