@@ -118,7 +118,7 @@ def test_the_windows_of_a_generated_circle_lie_at_its_speed_and_turn_rate():
     assert coverage.turn_rate_rad_s == pytest.approx(radians(50.0), abs=1e-3)
     # Near its ends a clip is smoothed from one side only.
     assert np.degrees(coverage.turn_rate_rad_s[30:-30]) == pytest.approx(50.0, abs=1e-3)
-    assert coverage.strafe_m_s == pytest.approx(0.0, abs=1e-3)
+    assert coverage.strafe_m_s == pytest.approx(0.0, abs=0.02)  # the spine swings about the hips
 
 
 def test_removing_what_no_trial_used_changes_no_bit_with_a_pinned_normaliser():
