@@ -81,6 +81,8 @@ def explain_choice(
     it would have had. `others` are rows to list beside them: why were these not chosen? Raises `MotionError` for ticks
     and rows that there are not.
     """
+    if record.rows.max(initial=0) >= database.row_count:
+        raise MotionError("the record is of another database: it shows rows that this one does not have")
     if not 0 <= tick < len(record.rows):
         raise MotionError(f"tick {tick} is none of the trial's {len(record.rows)}", where="tick")
     for row in others:
