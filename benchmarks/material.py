@@ -11,10 +11,18 @@ from numpy.typing import NDArray
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
-from marey_motion.gait import generate_gait
+from marey_motion.formats import read_motion
+from marey_motion.gait import generate_dataset, generate_gait
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.building import build_database
+from marey_motion.matching.database import MatchingDatabase, SourceClip
+from marey_motion.matching.features import feature_layout
+from marey_motion.matching.normaliser import fit_normaliser
+from marey_motion.rigs import map_joints
 from marey_motion.skeleton import Skeleton
 
 _FINGER_BONE_M = (0.0, -0.025, 0.005)
+_REAL_LOCOMOTION = ("bandai-namco-1/*.bvh", "bandai-namco-2/*.bvh", "cmu-bvh/*.bvh")
 
 
 def real_folder() -> Path | None:
@@ -87,3 +95,21 @@ def with_fingers(skeleton: Skeleton, joints: int, hand: str) -> Skeleton:
         offsets=np.concatenate([skeleton.offsets, np.tile(_FINGER_BONE_M, (new, 1))]),
         rest_rotations=np.concatenate([skeleton.rest_rotations, np.tile([1.0, 0.0, 0.0, 0.0], (new, 1))]),
     )
+
+
+def matching_features() -> list[NDArray[np.float64]]:
+    """Normalised features (F, 27) of each generated take, and of each captured one where there is real capture."""
+    databases = [_database_of(take.name, take.clip) for take in generate_dataset()]
+    folder = real_folder()
+    for path in sorted(file for pattern in _REAL_LOCOMOTION if folder for file in folder.glob(pattern)):
+        clip = read_motion(path.read_bytes(), path.name).clip
+        assert clip is not None, f"{path.name} holds no motion"
+        databases.append(_database_of(path.name, clip))
+    layout = feature_layout(databases[0].options, databases[0].body)
+    normaliser = fit_normaliser(np.concatenate([database.features for database in databases]), layout, "")
+    return [normaliser.apply(database.features) for database in databases]
+
+
+def _database_of(name: str, clip: Clip) -> MatchingDatabase:
+    body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
+    return build_database([SourceClip(name, name, clip)], body)
