@@ -58,9 +58,11 @@ def run_suite(
     finished : called with each trial and its record as soon as it is made, to keep it
     cancelled : asked before each trial is begun
 
-    Callbacks run in the calling thread. Raises `EvaluationCancelled` once trials already begun are finished.
+    Callbacks run in the calling thread. Raises `EvaluationCancelled` once trials already begun are finished, and
+    `MotionError` for two trials of one name, such as speeds that differ by less than a millionth.
     """
     wanted = suite_trials(options) if trials is None else tuple(trials)
+    _require_names(wanted)
     records = dict(done or {})
     ahead = [trial for trial in wanted if trial.name not in records]
     tell = progress or (lambda _done, _total, _note: None)
@@ -77,6 +79,16 @@ def run_suite(
         run = _runner(database, index, options)
         _run_ahead(run, ahead, keep, threads or os.cpu_count() or 1, cancelled or (lambda: False))
     return [records[trial.name] for trial in wanted]
+
+
+def _require_names(trials: Sequence[Trial]) -> None:
+    seen: set[str] = set()
+    for trial in trials:
+        if trial.name in seen:
+            raise MotionError(
+                f"two trials are called {trial.name}; their records could not be told apart", where="grid"
+            )
+        seen.add(trial.name)
 
 
 def _runner(

@@ -138,6 +138,12 @@ def test_an_option_that_makes_no_sense_ends_the_suite_with_its_name(database):
         run_suite(database, options, threads=2)
 
 
+def test_trials_that_cannot_be_told_apart_are_refused(database):
+    options = replace(OPTIONS, grid=Grid((1.0, 1.0 + 1e-9), (0.0,)), families=("circle",))
+    with pytest.raises(MotionError, match="two trials are called circle v=1 w=0"):
+        run_suite(database, options)
+
+
 # Putting together
 
 
