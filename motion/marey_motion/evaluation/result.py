@@ -58,7 +58,7 @@ class ClipUsage:
 
     Parameters
     ----------
-    ticks, entries : ticks displayed; times chosen as the target of a switch
+    ticks, entries : ticks displayed; times jumped to, by choice or because another clip had ended
     popularity : (frames,) int64    ticks each frame was displayed
     trials : number of trials that displayed it
     """
@@ -121,7 +121,7 @@ class EvaluationResult:
     ----------
     suite : pooled metrics over all trials, and by family under "circle.…" and "switching.…"
     usage : one per clip, in the order of `clips`
-    switches : (S, 3) int64    row left, row entered, how often, summed over the suite; ordered by the first two
+    switches : (S, 3) int64    row left, row entered, how often, of all jumps of the suite; ordered by the first two
     records : one per trial, in the order of `trials`
     baseline : the same suite over generated clips that own every cell of the grid, without records; None when left out
     """
