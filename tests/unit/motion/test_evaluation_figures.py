@@ -182,8 +182,8 @@ def test_the_map_of_density_holds_all_seconds_of_data(name, cell, result):
     fine = (x[1] - x[0]) * (y[1] - y[0])
     held = np.sum(table["seconds_s"]) * fine / cell
 
-    # What lies near the border is partly smoothed beyond it.
-    assert held == pytest.approx(len(result.coverage.clip) / 60.0, rel=0.12)
+    # What lies near or beyond the border is not all drawn.
+    assert held == pytest.approx(len(result.coverage.clip) / 60.0, rel=0.15)
 
 
 # Figure 7
@@ -414,10 +414,14 @@ LITTLE = {
 
 @pytest.mark.parametrize("little", LITTLE)
 def test_evaluations_of_little_are_drawn(little):
-    result = LITTLE[little]()
-    for compared in (None, made_up(seed=8)):
-        for figure in draw_figures(result, other=compared).values():
-            is_sound(figure)
+    for figure in draw_figures(LITTLE[little]()).values():
+        is_sound(figure)
+
+
+@pytest.mark.parametrize("little", ["one clip", "no windows", "one speed", "unknown numbers"])
+def test_evaluations_of_little_are_compared(little, other):
+    for figure in draw_figures(other, other=LITTLE[little]()).values():
+        is_sound(figure)
 
 
 def test_names_of_clips_are_drawn_as_they_are_but_for_signs_that_cannot_be():

@@ -113,5 +113,4 @@ def draw_figures(
         name: draw_figure(name, result, other=other, labels=labels, options=options)
         for name, kind in FIGURES.items()
         if kind.trials != "one" or (with_records and families.intersection(kind.families))
-        if name != "offsets" or families
     }

@@ -20,6 +20,7 @@ from marey_motion.evaluation.figures.paper import (
     new_figure,
     nice_ceiling,
     reach,
+    square_root_ticks,
     write,
 )
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
@@ -108,10 +109,18 @@ def _draw(subjects: Sequence[Subject], plane: _Plane) -> Sketch:
                 panel, (0.5, 0.5), "no clip of a second or longer", transform=panel.transAxes, ha="center", color=LIGHT
             )
     if two:
-        add_colour_bar(figure, drawn, Place(0.68, 0.52, 2 * width + gap, 0.12), plane.cell_label)
+        add_colour_bar(
+            figure, drawn, Place(0.68, 0.52, 2 * width + gap, 0.12), plane.cell_label, square_root_ticks(ceiling)
+        )
         _draw_change(figure, Place(0.68 + 2 * (width + gap), bottom, width, height), plane, edges, maps)
     else:
-        add_colour_bar(figure, drawn, Place(0.68 + width + 0.15, bottom, 0.14, height), plane.cell_label)
+        add_colour_bar(
+            figure,
+            drawn,
+            Place(0.68 + width + 0.15, bottom, 0.14, height),
+            plane.cell_label,
+            square_root_ticks(ceiling),
+        )
     return Sketch(figure, {"density": _table(subjects, plane, edges, maps)}, _caption(subjects, plane))
 
 
@@ -131,10 +140,11 @@ def _edges(subjects: Sequence[Subject], plane: _Plane) -> tuple[Floats, Floats]:
 
 def _target(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float], tuple[float, float]]:
     """What has to be seen even without data there, along both axes."""
-    if plane is SPEEDS:
-        turn, speed = coverage.turn_rate_edges_deg_s, coverage.speed_edges_m_s
-        return (float(turn[0]), float(turn[-1])), (0.0, float(speed[-1]))
-    return (-1.0, 1.0), (-1.0, 1.0)
+    fastest = float(coverage.speed_edges_m_s[-1])
+    if plane is DIRECTIONS:
+        return (-1.0, 1.0), (-1.0, fastest)
+    turn = coverage.turn_rate_edges_deg_s
+    return (float(turn[0]), float(turn[-1])), (0.0, fastest)
 
 
 def _seconds(subject: Subject, plane: _Plane, edges: tuple[Floats, Floats], cell: tuple[float, float]) -> Floats:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from marey_motion.evaluation.figures.drawn import Sketch
 from marey_motion.evaluation.figures.paper import (
-    MISSING,
     QUIET,
     SMALL,
     Place,
@@ -19,6 +18,8 @@ from marey_motion.evaluation.figures.paper import (
     name_ticks,
     new_figure,
     nice_ceiling,
+    square_root_ticks,
+    warm_colours,
 )
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
 from marey_motion.evaluation.result import ClipUsage
@@ -66,7 +67,7 @@ def draw_frame_use(subjects: Sequence[Subject], trial: str | None, options: Figu
         panel.set(xlim=(0.0, 100.0), ylim=(rows - 0.4, -0.6))
     if drawn is not None:
         place = Place(2.45, 0.5, len(subjects) * (width + between) - between, 0.12)
-        add_colour_bar(figure, drawn, place, "times each frame was displayed")
+        add_colour_bar(figure, drawn, place, "times each frame was displayed", square_root_ticks(ceiling))
     return Sketch(figure, {"stretches": _table(subjects, strips)}, _caption(subjects, strips))
 
 
@@ -107,7 +108,9 @@ def _draw(panel: Axes, uids: Sequence[str], strips: dict[str, _Strip], ceiling: 
         edges = np.linspace(0.0, 100.0, len(strip.ticks_per_frame) + 1)
         values = np.ma.masked_equal(strip.ticks_per_frame[None], 0.0)
         norm = PowerNorm(0.5, 0.0, ceiling)
-        drawn = panel.pcolormesh(edges, [row - 0.42, row + 0.42], values, cmap=MISSING, norm=norm, rasterized=True)
+        drawn = panel.pcolormesh(
+            edges, [row - 0.42, row + 0.42], values, cmap=warm_colours(), norm=norm, rasterized=True
+        )
         about = f"{strip.duration_s:.1f} s, {100 * strip.shown:.0f} % shown"
         look: dict[str, Any] = {"va": "center", "textcoords": "offset points", "fontsize": SMALL, "color": QUIET}
         panel.annotate(about, (100.0, row), (4, 0), annotation_clip=False, **look)

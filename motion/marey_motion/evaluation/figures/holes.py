@@ -13,7 +13,6 @@ from marey_motion.evaluation.figures.paper import (
     DARK,
     INK,
     LIGHT,
-    MISSING,
     QUIET,
     SMALL,
     SPEED,
@@ -25,6 +24,7 @@ from marey_motion.evaluation.figures.paper import (
     mark_sides,
     new_figure,
     plain,
+    warm_colours,
     write,
 )
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
@@ -60,7 +60,7 @@ def _draw(panel: Axes, subject: Subject, least: float, size: float) -> ScalarMap
     coverage = subject.result.coverage
     missing = np.ma.masked_less_equal(coverage.deficit_s, 0.0)
     edges = coverage.turn_rate_edges_deg_s, coverage.speed_edges_m_s
-    drawn = panel.pcolormesh(*edges, missing, cmap=MISSING, vmin=0.0, vmax=least, edgecolors="none")
+    drawn = panel.pcolormesh(*edges, missing, cmap=warm_colours(), vmin=0.0, vmax=least, edgecolors="none")
     turn, speed = (0.5 * (each[:-1] + each[1:]) for each in edges)
     for row, column in np.argwhere(coverage.deficit_s > 0.0):
         value = float(coverage.deficit_s[row, column])

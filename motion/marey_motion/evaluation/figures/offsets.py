@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.errors import MotionError
 from marey_motion.evaluation.figures.drawn import Sketch
 from marey_motion.evaluation.figures.paper import (
     CHANGE,
@@ -47,9 +46,7 @@ def draw_offsets(subjects: Sequence[Subject], _trial: str | None, _options: Figu
     """A row per family of trials; two subjects share the scale, and a third column shows the change."""
     families = [family for family in subjects[0].result.options.families if family in FAMILY_TITLES]
     fields = [[_field(subject, family) for subject in subjects] for family in families]
-    if not fields or not any(np.isfinite(field.offset_m).any() for row in fields for field in row):
-        raise MotionError("the evaluation has no trial with an offset", code="nothing-to-draw")
-    levels = nice_levels(max(float(np.nanmax(field.offset_m, initial=0.0)) for row in fields for field in row))
+    levels = nice_levels(max(_largest(field) for row in fields for field in row))
     if len(subjects) == 1:
         figure = _draw_one(families, [row[0] for row in fields], levels)
     else:
@@ -68,6 +65,11 @@ def _field(subject: Subject, family: str) -> _Field:
         value = each.metrics.get("offset_mean")
         offset[row, column] = np.nan if value is None else value
     return _Field(turn_rates, speeds, offset)
+
+
+def _largest(field: _Field) -> float:
+    """Offset or change of it, whatever its sign; 0 where nothing is known."""
+    return float(np.abs(np.nan_to_num(field.offset_m)).max(initial=0.0))
 
 
 def _draw_one(families: Sequence[str], fields: Sequence[_Field], levels: Floats) -> Figure:
@@ -90,7 +92,7 @@ def _draw_two(
     width, height, gap = 2.62, 2.3, 0.3
     figure = new_figure(9.6, len(families) * (height + 0.85) + 0.95)
     changes = [_change(*row) for row in fields]
-    upward = nice_levels(max(float(np.nanmax(np.abs(change.offset_m), initial=0.0)) for change in changes))
+    upward = nice_levels(max(_largest(change) for change in changes))
     both_ways = np.concatenate((-upward[:0:-1], upward))
     shared, changed = None, None
     for number, (family, row, change) in enumerate(zip(families, fields, changes, strict=True)):

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
 # These four follow the theme of the page that a figure is shown in; see `marey_motion.evaluation.report`.
@@ -32,7 +33,6 @@ MARKERS = "os^DvPX*"
 
 # Lightness runs one way in each, so that they read in grey, too.
 MORE_IS_WORSE = "magma_r"
-MISSING = "YlOrBr"
 MORE_IS_DENSER = "viridis"
 CHANGE = "RdBu_r"
 
@@ -93,7 +93,7 @@ def add_colour_bar(
     axes.tick_params(colors=QUIET, labelsize=SMALL, length=3, width=0.6)
     bar.set_label(label, fontsize=TEXT, color=INK)
     if ticks is not None:
-        bar.set_ticks(ticks.tolist(), labels=[f"{tick:.6g}" for tick in ticks])
+        bar.set_ticks(ticks.tolist(), labels=[f"{tick:,.6g}" for tick in ticks])
     return axes
 
 
@@ -151,6 +151,19 @@ def nice_ceiling(value: float) -> float:
         return 1.0
     scale = 10.0 ** np.floor(np.log10(value))
     return float(next(step * scale for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if value <= step * scale * (1 + 1e-9)))
+
+
+def warm_colours() -> Colormap:
+    """From a yellow that is told from an empty page to brown."""
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(colormaps["YlOrBr"](np.linspace(0.12, 1.0, 256)))
+
+
+def square_root_ticks(ceiling: float) -> NDArray[np.float64]:
+    """Ticks for a colour bar whose colours follow the square root of the value, which is 0 to `ceiling`."""
+    return ceiling * np.array((0.0, 0.05, 0.25, 0.5, 1.0))
 
 
 def nice_levels(largest: float) -> NDArray[np.float64]:

@@ -9,11 +9,18 @@ from importlib.resources import files
 from typing import NamedTuple
 
 from marey_motion.evaluation.figures import DrawnFigure
-from marey_motion.evaluation.figures.paper import HAIRLINE, INK, PAPER, QUIET
+from marey_motion.evaluation.figures.paper import COLOURS, HAIRLINE, INK, PAPER, QUIET
 from marey_motion.evaluation.report.markup import Content, Html, element, joined
 
-# The four colours of figures that follow the page's theme.
-_THEMED = {INK: "var(--ink)", QUIET: "var(--quiet)", HAIRLINE: "var(--hairline)", PAPER: "var(--paper)"}
+# The colours of figures that follow the page's theme.
+_THEMED = {
+    INK: "var(--ink)",
+    QUIET: "var(--quiet)",
+    HAIRLINE: "var(--hairline)",
+    PAPER: "var(--paper)",
+    COLOURS[0]: "var(--first)",
+    COLOURS[1]: "var(--second)",
+}
 _NEEDLESS = re.compile(
     r"<\?xml.*?\?>|<!DOCTYPE.*?>|<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->| xmlns:xlink=\"[^\"]*\"",
     re.DOTALL,

@@ -1,0 +1,363 @@
+"""Reports of evaluations: one sound HTML file that says what was measured, whatever clips are called."""
+
+import json
+import re
+from collections import Counter
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from evaluation_results import made_up
+from marey_motion.evaluation.compare import compare_results
+from marey_motion.evaluation.figures import FIGURES, draw_figures
+from marey_motion.evaluation.judgement import is_followed, judge, mean_speed_m_s
+from marey_motion.evaluation.report import compared, render_comparison, render_report, verdict
+from marey_motion.evaluation.report.definitions import METRICS
+from marey_motion.evaluation.report.markup import element, text
+from marey_motion.evaluation.report.words import amount, demand, duration, find_holes
+from marey_motion.evaluation.result import TrialResult
+from marey_motion.evaluation.scenario import Trial
+
+VOID = {"br", "hr", "img", "meta", "col"}
+HOSTILE = (
+    '<script>alert("1")</script>',
+    '"><img src=x onerror=alert(1)>',
+    "</style></title>&amp;",
+    "\x00\u202egnp",
+    "",
+)
+
+
+class Page(HTMLParser):
+    """A page taken apart: are its tags balanced, what does it say, what would it fetch or run?"""
+
+    def __init__(self, source):
+        super().__init__()
+        self.opened, self.tags, self.ids, self.links = [], Counter(), Counter(), []
+        self.attributes, self.words, self.scripts = set(), [], []
+        self.feed(source)
+        self.close()
+        assert not self.opened
+
+    def handle_starttag(self, tag, attributes):
+        self.tags[tag] += 1
+        if tag not in VOID:
+            self.opened.append(tag)
+        for name, value in attributes:
+            self.attributes.add(name)
+            if name == "id":
+                self.ids[value] += 1
+            if name in ("href", "src", "action", "data", "xlink:href"):
+                self.links.append(value)
+
+    def handle_startendtag(self, tag, attributes):
+        self.handle_starttag(tag, attributes)
+        if tag not in VOID:
+            self.opened.pop()
+
+    def handle_endtag(self, tag):
+        assert self.opened.pop() == tag
+
+    def handle_data(self, data):
+        if self.opened and self.opened[-1] == "script":
+            self.scripts.append(data)
+        elif self.opened and self.opened[-1] != "style":
+            self.words.append(data)
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.words).split())
+
+
+def is_sound(source):
+    """Balanced, one id each, nothing fetched, no code but the page's own."""
+    page = Page(source)
+    assert set(page.ids.values()) == {1}
+    for link in page.links:
+        assert link.startswith("data:image/png;base64,") or (link.startswith("#") and link[1:] in page.ids)
+    assert set(re.findall(r"url\(([^)]*)\)", source)) <= {f"#{name}" for name in page.ids}
+    assert not {name for name in page.attributes if name.startswith("on")}
+    assert page.tags["script"] == 1
+    assert not {"iframe", "object", "embed", "link", "form", "base"} & set(page.tags)
+    return page
+
+
+@pytest.fixture(scope="module")
+def result():
+    return made_up(seed=4, turns_deg_s=(-90.0, 20.0))
+
+
+@pytest.fixture(scope="module")
+def figures(result):
+    return draw_figures(result)
+
+
+@pytest.fixture(scope="module")
+def page(result, figures):
+    return is_sound(render_report(result, title="Walks", figures=figures))
+
+
+# The page
+
+
+def test_a_report_is_one_sound_file_that_shows_every_figure(page, figures):
+    assert page.tags["svg"] == page.tags["figcaption"] == len(FIGURES)
+    assert page.tags["h1"] == 1
+    assert page.text.count("What to record next") == 2  # the link and the heading
+    for figure in figures.values():
+        assert figure.caption in page.text
+
+
+def test_the_same_result_gives_the_same_page(result):
+    assert render_report(result, title="Walks") == render_report(result, title="Walks")
+
+
+def test_the_page_opens_with_the_verdict(page, result):
+    assert page.text.startswith("Walks Walks " + verdict(result))
+
+
+def test_pictures_and_tables_can_be_read_aloud(result, figures):
+    source = render_report(result, title="Walks", figures=figures)
+
+    for svg in re.findall(r"<svg.*?</svg>", source, re.DOTALL):
+        assert 'role="img"' in svg
+        assert re.search(r"<title>[^<]+</title><desc>[^<]+</desc>", svg)
+    for table in re.findall(r"<table.*?</table>", source, re.DOTALL):
+        assert "<caption>" in table
+        assert 'scope="col"' in table
+        assert table.count("<tr>") - 1 == table.count('scope="row"')
+    assert '<html lang="en">' in source
+
+
+def test_names_of_clips_and_titles_are_shown_and_never_run(result):
+    hostile = made_up(names=HOSTILE, unused=10, seed=2)
+    page = is_sound(render_report(hostile, title=HOSTILE[1]))
+
+    for name in HOSTILE[:3]:
+        assert name in page.text
+    assert "alert" not in "".join(page.scripts)
+    assert "\u202e" not in page.text
+    assert is_sound(render_comparison(hostile, result, title=HOSTILE[0], labels=("<i>", "</td>")))
+
+
+def test_notes_of_the_evaluation_are_told(result, figures):
+    source = render_report(replace(result, notes=("walk_<3> stays in place",)), title="t", figures=figures)
+    assert "walk_<3> stays in place" in is_sound(source).text
+
+
+def test_markup_is_escaped_unless_it_was_made_here():
+    assert element("p", "<b>", element("b", "&"), class_='x"y') == '<p class="x&quot;y">&lt;b&gt;<b>&amp;</b></p>'
+    assert element("td", None, ["a", None, "b"], data_value="1", title=None) == '<td data-value="1">ab</td>'
+    assert text("a\x00b\ud800") == "a\ufffdb\ufffd"
+
+
+# What it says
+
+
+def test_all_trials_and_clips_are_listed_with_their_numbers(page, result):
+    for each in result.trials:
+        assert demand(each.trial) in page.text
+        assert f"{each.metrics['offset_mean']:.2f}" in page.text
+    for clip in result.clips:
+        assert clip.name in page.text
+
+
+def test_the_suite_s_numbers_stand_beside_the_baseline_s(result, figures):
+    base = replace(made_up(seed=9, sway_m=0.02), records=())
+    page = is_sound(render_report(replace(result, baseline=base), title="t", figures=figures))
+
+    assert "generated baseline" in page.text
+    for name, metric in METRICS.items():
+        if name in result.suite:
+            assert metric.label in page.text
+    assert f"{base.suite['offset_mean']:.2f} m with generated clips" in page.text
+
+
+def test_clips_that_were_never_used_are_named(page, result):
+    unused = [result.clips[usage.clip].name for usage in result.usage if not usage.ticks]
+    start = page.text.index("were displayed in no trial")
+    told = page.text[start : page.text.index("What to record next", start)]
+
+    assert len(unused) == 2
+    assert all(name in told for name in unused)
+    assert "Every clip was used" in is_sound(render_report(made_up(unused=0), title="t", figures={})).text
+
+
+def test_digests_and_options_are_there_to_repeat_it(page, result):
+    for digest in (result.provenance.dataset, result.provenance.normaliser, result.provenance.options):
+        assert digest in page.text
+    assert "controller.search_every_s 0.1" in page.text
+    assert result.provenance.clips[result.clips[3].uid] in page.text
+
+
+def test_a_report_of_a_thousand_clips_stays_small():
+    big = made_up(clips=1_000, frames=1_000, unused=300)
+    source = render_report(big, title="big")
+
+    assert len(source.encode()) < 5_000_000
+    assert f"All {sum(1 for usage in big.usage if not usage.ticks)} names" in source
+    is_sound(source)
+
+
+@pytest.mark.parametrize("change", ["bare", "nothing used", "no trials", "no metrics"])
+def test_reports_are_made_of_little(change, result):
+    little = {
+        "bare": replace(result, records=(), notes=()),
+        "nothing used": replace(
+            result,
+            usage=tuple(replace(u, ticks=0, share=0.0, popularity=0 * u.popularity) for u in result.usage),
+            switches=np.zeros((0, 3), dtype=np.int64),
+        ),
+        "no trials": replace(result, trials=(), records=(), suite={}),
+        "no metrics": replace(
+            result, trials=tuple(replace(t, metrics=dict.fromkeys(t.metrics)) for t in result.trials), suite={}
+        ),
+    }[change]
+    is_sound(render_report(little, title="little"))
+    is_sound(render_comparison(little, result, title="little"))
+
+
+# Words
+
+
+def test_holes_in_words_hold_every_missing_second_once(result):
+    holes = find_holes(result.coverage)
+
+    assert sum(hole.missing_s for hole in holes) == pytest.approx(result.coverage.deficit_s.sum())
+    assert [hole.missing_s for hole in holes] == sorted((hole.missing_s for hole in holes), reverse=True)
+    for hole in holes:
+        assert hole.turn_rates_deg_s[0] * hole.turn_rates_deg_s[1] >= 0.0
+
+
+def test_a_hole_is_told_as_an_animator_says_it(result):
+    deficit = np.zeros_like(result.coverage.deficit_s)
+    deficit[1:, 3:] = (1.0, 2.0)  # 2 and 3 m/s, 50 and 100 deg/s to the left
+    deficit[0, 2] = 0.5
+    left, ahead = find_holes(replace(result.coverage, deficit_s=deficit))
+
+    assert left.words == "left turns of 50 to 100 degrees a second at 2 to 3 m/s"
+    assert left.missing_s == 6.0
+    assert ahead.words == "straight ahead at 1 m/s"
+    page = is_sound(render_report(replace(result, coverage=replace(result.coverage, deficit_s=deficit)), title="t"))
+    assert "left turns of 50 to 100 degrees a second at 2 to 3 m/s: 6.0 s missing" in page.text
+
+
+def test_amounts_durations_and_demands_are_words():
+    assert [amount(1, "clip"), amount(2, "trajectory"), amount(1200, "cell")] == [
+        "1 clip",
+        "2 trajectories",
+        "1,200 cells",
+    ]
+    assert [duration(3.21), duration(45.4), duration(200)] == ["3.2 s", "45 s", "3 min 20 s"]
+    assert demand(Trial("circle", 1.5, np.radians(-75.0))) == "right turn of 75 deg/s at 1.5 m/s"
+    assert demand(Trial("switching", 2.0, 0.0)) == "straight line at 2 m/s switching to 4"
+
+
+# The verdict
+
+
+LEFT = Trial("circle", 2.0, 0.9)
+
+
+def outcome(trial=LEFT, offset=0.2, speed=0.0, turn=0.0):
+    return TrialResult(trial, {"offset_mean": offset, "se_v": speed, "se_omega_deg": turn})
+
+
+def judged(result, followed, trials):
+    names = [replace(result.trials[0].trial, speed_m_s=1.0 + 0.01 * index) for index in range(trials)]
+    return replace(
+        result,
+        trials=tuple(outcome(trial, offset=0.1 if index < followed else 4.0) for index, trial in enumerate(names)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("metrics", "followed"),
+    [
+        ({}, True),
+        ({"offset": 1.0}, True),
+        ({"offset": 1.001}, False),
+        ({"speed": -0.3}, True),
+        ({"speed": 0.301}, False),
+        ({"turn": 10.0}, True),
+        ({"turn": -10.1}, False),
+        ({"offset": None}, False),
+        ({"turn": None}, False),
+    ],
+)
+def test_a_trial_is_followed_within_its_three_limits(metrics, followed):
+    assert is_followed(outcome(**metrics)) is followed
+
+
+def test_a_switching_trial_is_measured_by_its_mean_speed():
+    assert mean_speed_m_s(Trial("switching", 2.0, 0.0, duration_s=30.0)) == pytest.approx(3.0)
+    assert mean_speed_m_s(Trial("switching", 2.0, 0.0, duration_s=12.0)) == pytest.approx(2.0 + 2.0 * 5.0 / 12.0)
+    assert mean_speed_m_s(Trial("switching", 2.0, 0.0, duration_s=3.0)) == 2.0
+
+
+@pytest.mark.parametrize(
+    ("followed", "grade"), [(10, "very good"), (9, "very good"), (8, "good"), (7, "good"), (6, "usable in part"),
+                            (4, "usable in part"), (3, "poor"), (0, "poor")]
+)  # fmt: skip
+def test_the_share_of_followed_trials_gives_the_grade(followed, grade, result):
+    judgement = judge(judged(result, followed, 10))
+    assert (judgement.grade, judgement.followed, judgement.trials) == (grade, followed, 10)
+
+
+def test_the_verdict_is_one_sentence_with_the_worst_trial_and_its_reason(result):
+    slow = replace(result, trials=(outcome(), outcome(Trial("circle", 3.0, np.radians(-100.0)), speed=-1.62)))
+    sentence = verdict(slow)
+
+    assert sentence.startswith(
+        "Usable in part: the character follows 1 of 2 trajectories, worst at a right turn of 100"
+    )
+    assert "at 3 m/s (1.6 m/s too slow)" in sentence
+    assert "2 of 12 clips are never used." in sentence
+    assert sentence.count(". ") == 0
+    little = replace(result, trials=(outcome(Trial("circle", 1.0, np.radians(-50.0)), turn=22.0),))
+    assert "(22 deg/s too little)" in verdict(little)
+    assert "not measured" in verdict(replace(result, trials=(outcome(offset=None),)))
+    assert verdict(replace(result, trials=())) == "Not judged: the evaluation has no trials."
+
+
+# Comparisons
+
+
+def test_a_comparison_says_whether_it_helped(result):
+    assert compared(judged(result, 3, 10), judged(result, 5, 10)).startswith(
+        "Better: the character follows 5 of 10 trajectories, 3 before; 2 trajectories gained and 0 lost"
+    )
+    assert compared(judged(result, 5, 10), judged(result, 3, 10)).startswith("Worse: ")
+    assert compared(result, result).startswith("Neither better nor worse: ")
+
+
+def test_a_comparison_shows_what_came_went_and_changed(result):
+    after = made_up(seed=4, clips=10, turns_deg_s=(-90.0, 20.0), sway_m=0.05)
+    after = replace(after, clips=(replace(after.clips[0], uid="new@1", name="newcomer"), *after.clips[1:]))
+    page = is_sound(render_comparison(result, after, title="Change", labels=("old", "new")))
+
+    assert page.tags["figure"] == len(FIGURES)
+    assert "Clips that came (1) newcomer" in page.text
+    assert "Clips that went (3)" in page.text
+    assert f"{after.suite['offset_mean'] - result.suite['offset_mean']:+.2f}" in page.text
+    assert "old → new" in page.text
+
+
+def test_a_comparison_with_intervals_shows_them_and_the_trials_that_changed(result):
+    records = list(result.records)
+    records[3] = replace(records[3], positions=records[3].positions + 0.01)
+    comparison = compare_results(result, replace(result, records=tuple(records)))
+    page = is_sound(
+        render_comparison(comparison.before, comparison.after, title="Change", comparison=comparison, figures={})
+    )
+
+    assert "1 trial of 30 went another way." in page.text
+    assert "+0.00 and +0.00" in page.text
+
+
+def test_what_the_script_sorts_by_is_a_number(result, figures):
+    source = render_report(result, title="Walks", figures=figures)
+    for value in re.findall(r'data-value="([^"]*)"', source):
+        assert value == "" or isinstance(json.loads(value), int | float)
