@@ -2,8 +2,8 @@
 
 A frame is its pose joints and where the root will be at each horizon, as points in the frame of the root: two walks
 whose poses agree but that turn differently are different. The distance of two clips is that of their best alignment in
-time (`alignment.dtw`): mean distance of the points per frame of the longer clip, in metres. Clips with equal content
-are duplicates whatever is measured.
+time (`alignment.dtw`): mean distance of the points per frame of the longer clip, in metres. It is 0 for the same frames
+of clips with equal content.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.alignment.dtw import distance_bound, warped_distance
-from marey_motion.evaluation.selection import clips_by_source
+from marey_motion.evaluation.selection import clips_by_source, source_of
 from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 
@@ -30,8 +30,8 @@ class NearDuplicate:
 
     Parameters
     ----------
-    distance_cm : per frame; 0 for equal content
-    same_content : their documents are equal
+    distance_cm : per frame
+    same_content : they are the same frames of equal documents
     """
 
     first: str
@@ -65,32 +65,30 @@ def find_near_duplicates(
     Most pairs are settled by a bound that is never above their distance. Progress counts sources.
     """
     points = frame_points(database)
-    families = list(clips_by_source(database.clips).items())
+    families = list(clips_by_source(database.clips).values())
     limit = threshold_cm / 100.0
     found: list[NearDuplicate] = []
     aligned = compared = 0
-    for number, (first, own) in enumerate(families):
+    for number, own in enumerate(families):
         if cancelled is not None and cancelled():
             raise EvaluationCancelled(f"stopped with {number} of {len(families)} clips compared")
+        # That both are mirrored changes no distance, so one side is taken as it is.
         one = database.clips[own[0]]
-        for second, others in families[number + 1 :]:
-            best: tuple[float, DatabaseClip] | None = None
+        for others in families[number + 1 :]:
+            best: NearDuplicate | None = None
             for other in (database.clips[index] for index in others):
                 compared += 1
-                if one.content and one.content == other.content and _mirrored(one) == _mirrored(other):
-                    best = (0.0, other)
-                    break
                 sides = points[one.start : one.stop], points[other.start : other.stop]
                 if distance_bound(*sides) > limit:
                     continue
                 aligned += 1
                 distance = warped_distance(*sides, limit=limit)
-                if distance <= limit and (best is None or distance < best[0]):
-                    best = (distance, other)
+                if distance <= limit and (best is None or 100.0 * distance < best.distance_cm):
+                    best = _pair(one, other, distance)
             if best is not None:
-                found.append(_pair(first, second, one, *best))
+                found.append(best)
         if progress is not None:
-            progress(number + 1, len(families), first)
+            progress(number + 1, len(families), source_of(one))
     found.sort(key=lambda pair: (pair.distance_cm, pair.first, pair.second))
     return NearDuplicates(tuple(found), threshold_cm, aligned, compared)
 
@@ -121,17 +119,14 @@ def spared_sources(
     return tuple(gone.items())
 
 
-def _mirrored(clip: DatabaseClip) -> bool:
-    return clip.mirrored_from is not None
-
-
-def _pair(first: str, second: str, one: DatabaseClip, distance: float, other: DatabaseClip) -> NearDuplicate:
+def _pair(one: DatabaseClip, other: DatabaseClip, distance: float) -> NearDuplicate:
+    mirrored = (one.mirrored_from is None) != (other.mirrored_from is None)
     return NearDuplicate(
-        first=first,
-        second=second,
+        first=source_of(one),
+        second=source_of(other),
         first_name=one.name,
         second_name=other.name,
         distance_cm=100.0 * distance,
-        same_content=bool(one.content) and one.content == other.content and _mirrored(one) == _mirrored(other),
-        mirrored=_mirrored(one) != _mirrored(other),
+        same_content=distance == 0.0 and one.content == other.content != "" and not mirrored,
+        mirrored=mirrored,
     )

@@ -49,6 +49,8 @@ class Resimulation:
     trials : the suite's when None
     records : of these trials over the whole database, where they are there already
     threads, cancelled : as in `suite.run_suite`
+
+    `simulated` counts the trials that were run, `sources` has the indices of each source's clips.
     """
 
     def __init__(
@@ -67,10 +69,10 @@ class Resimulation:
         self.simulated = 0
         self._threads, self._cancelled = threads, cancelled
         self._source_of_clip = np.array([source_of(clip) for clip in database.clips], dtype=object)
-        self._index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
+        self.index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
         self._known: list[list[tuple[Sources, Outcome]]] = [[] for _ in self.trials]
         if records is not None:
-            self._keep(NONE, range(len(self.trials)), records, self._index)
+            self._keep(NONE, range(len(self.trials)), records, self.index)
 
     def outcomes(self, removed: Collection[str] = NONE) -> tuple[Outcome, ...]:
         """One per trial, in their order, without the clips of the sources `removed`.
@@ -81,7 +83,7 @@ class Resimulation:
         found = [self._find(number, gone) for number in range(len(self.trials))]
         ahead = [number for number, outcome in enumerate(found) if outcome is None]
         if ahead:
-            index = self._index_without(gone)
+            index = self.index_without(gone)
             records = run_suite(
                 self.database,
                 self.options,
@@ -123,10 +125,10 @@ class Resimulation:
 
     def _index_without(self, gone: Sources) -> SearchIndex:
         if not gone:
-            return self._index
+            return self.index
         selectable = self.database.selectable & ~rows_of_sources(self.database.clips, gone)
-        method = "boxes" if self._index.boxed else "scan"
-        return build_index(self._index.rows, self.database.starts, selectable, method=method)
+        method = "boxes" if self.index.boxed else "scan"
+        return build_index(self.index.rows, self.database.starts, selectable, method=method)
 
     def _keep(
         self, gone: Sources, numbers: Sequence[int], records: Sequence[TrialRecord], index: SearchIndex

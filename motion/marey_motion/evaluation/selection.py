@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
+from marey_motion.matching.preparing import SAME_OFFSET_M
+from marey_motion.skeleton import same_hierarchy
 
 Mask = NDArray[np.bool_]
 
@@ -130,18 +132,22 @@ def _translating(database: MatchingDatabase, joints: tuple[int, ...]) -> Matchin
 
 
 def same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> bool:
-    """Whether clips of both can be mixed as they are."""
-    from marey_motion.matching.preparing import SAME_OFFSET_M
-    from marey_motion.skeleton import same_hierarchy
+    """Whether clips of both can be mixed as they are: tips, and offsets that both replace by translations, may differ.
 
-    return first.body.pose_joints == second.body.pose_joints and same_hierarchy(
-        first.body.skeleton, second.body.skeleton, tolerance_m=SAME_OFFSET_M
-    )
+    A database built with the other's body (`build_database`) is of its skeleton.
+    """
+    one, other = first.body.skeleton, second.body.skeleton
+    if first.body.pose_joints != second.body.pose_joints or one.joint_count != other.joint_count:
+        return False
+    offsets, replaced = other.offsets.copy(), [0, *({*first.translated_joints} & {*second.translated_joints})]
+    offsets[replaced] = one.offsets[replaced]
+    alike = replace(other, offsets=offsets, end_sites=one.end_sites)
+    return same_hierarchy(one, alike, tolerance_m=SAME_OFFSET_M)
 
 
 def require_same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> None:
     """Raise `MotionError` unless clips of both can be mixed as they are."""
     if not same_skeleton(first, second):
         raise MotionError(
-            "the clips are of another skeleton; retarget them first", code="skeleton-differs", where="skeleton"
+            "the clips are of another skeleton; retarget them first", code="skeleton-mismatch", where="skeleton"
         )

@@ -23,7 +23,7 @@ from marey_motion.evaluation.scenario import Trial
 from marey_motion.evaluation.selection import clips_by_source
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import TrialRecord
-from marey_motion.matching.search import build_index
+from marey_motion.matching.search import SearchIndex, build_index
 from marey_motion.matching.simulation_root import DIRECTION_WINDOW_S
 
 LEAST_RANGE_S = 0.5
@@ -76,9 +76,14 @@ def find_unused(
     trials: Sequence[Trial],
     records: Sequence[TrialRecord],
     options: EvaluationOptions,
+    *,
+    index: SearchIndex | None = None,
 ) -> Unused:
-    """Sources and frames that none of these trials needs; the longest first. Loops that wrap are kept or go whole."""
-    needed = _needed(database, trials, records, options)
+    """Sources and frames that none of these trials needs; the longest first. Loops that wrap are kept or go whole.
+
+    `index` is the one the trials were run with, built when None.
+    """
+    needed = _needed(database, trials, records, options, index)
     rate = database.options.rate_hz
     before = int(np.ceil(MARGIN_BEFORE_S * rate))
     after = int(np.ceil((max(database.options.horizons_s) + MARGIN_AFTER_S) * rate))
@@ -111,10 +116,10 @@ def _needed(
     trials: Sequence[Trial],
     records: Sequence[TrialRecord],
     options: EvaluationOptions,
+    index: SearchIndex | None,
 ) -> NDArray[np.bool_]:
-    index = build_index(
-        database.normaliser.apply(database.features), database.starts, database.selectable, method="scan"
-    )
+    if index is None:
+        index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
     needed = np.zeros(database.row_count, dtype=np.bool_)
     for trial, record in zip(trials, records, strict=True):
         needed[needed_rows(database, index, trial, record, options)] = True

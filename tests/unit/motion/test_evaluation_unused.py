@@ -1,0 +1,118 @@
+"""What no trial needs can go without changing a single bit of any trial."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_databases import arc_track, made_database
+from suggestion_cases import (
+    OPTIONS,
+    UNWANTED,
+    named,
+    same_to_the_bit,
+    simulated,
+    wandering_tracks,
+    with_mirrored,
+)
+
+from marey_motion.evaluation.resimulation import needed_rows
+from marey_motion.evaluation.scenario import suite_trials
+from marey_motion.evaluation.selection import without_rows, without_sources
+from marey_motion.evaluation.unused import find_unused
+from marey_motion.matching.options import DatabaseOptions
+from marey_motion.matching.search import build_index
+
+VARIANTS = {
+    "as usual": {},
+    "by pose distance": {"selection": "pose_distance"},
+    "along the path": {"follow": "path"},
+    "open loop": {"follow": "open_loop"},
+    "with frames nearby barred": {"reselect_window_s": 1.0},
+}
+
+
+def unused_of(database, options=OPTIONS):
+    records = simulated(database, options)
+    return records, find_unused(database, suite_trials(options), records, options)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_removing_all_that_is_unused_leaves_every_record_bit_identical(variant):
+    options = replace(OPTIONS, controller=replace(OPTIONS.controller, **VARIANTS[variant]))
+    database = made_database(wandering_tracks())
+    records, unused = unused_of(database, options)
+    assert unused.clips
+    assert unused.ranges
+    less = without_rows(database, unused.rows)
+    assert less.row_count < database.row_count
+    assert same_to_the_bit(database, records, less, simulated(less, options))
+
+
+def test_clips_that_no_trial_displays_are_told_with_their_length():
+    database = made_database(wandering_tracks())
+    records, unused = unused_of(database)
+    assert {clip.source for clip in unused.clips} >= set(UNWANTED)
+    assert all(clip.seconds == 4.0 for clip in unused.clips if clip.source in UNWANTED)
+    shown = np.concatenate([record.rows for record in records])
+    never = {clip.uid for clip in database.clips if not np.any((shown >= clip.start) & (shown < clip.stop))}
+    assert {clip.source for clip in unused.clips} <= never
+    less = without_sources(database, [clip.source for clip in unused.clips])
+    assert same_to_the_bit(database, records, less, simulated(less))
+
+
+def test_ranges_keep_their_distance_from_every_frame_that_is_needed():
+    database = made_database(wandering_tracks())
+    records, unused = unused_of(database)
+    index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
+    needed = np.unique(
+        np.concatenate(
+            [
+                needed_rows(database, index, trial, record, OPTIONS)
+                for trial, record in zip(suite_trials(OPTIONS), records, strict=True)
+            ]
+        )
+    )
+    starts = {clip.uid: clip for clip in database.clips}
+    for part in unused.ranges:
+        clip = starts[part.source]
+        own = needed[(needed >= clip.start) & (needed < clip.stop)] - clip.start
+        assert len(own)
+        assert part.seconds >= 0.5
+        assert np.all((own - 30 > part.stop - 1) | (own + 60 + 30 < part.start))
+    assert int(unused.rows.sum()) == round(
+        60 * (sum(clip.seconds for clip in unused.clips) + sum(part.seconds for part in unused.ranges))
+    )
+
+
+def test_a_clip_of_which_only_the_mirrored_twin_is_used_stays_with_it():
+    database = with_mirrored(wandering_tracks(3))
+    records, unused = unused_of(database)
+    shown = {uid for record in records for uid, _ in places_of(database, record)}
+    gone = {clip.source for clip in unused.clips}
+    assert not {uid.removesuffix("~mirrored") for uid in shown} & gone
+    less = without_rows(database, unused.rows)
+    assert same_to_the_bit(database, records, less, simulated(less))
+
+
+def places_of(database, record):
+    return {(database.clips[index].uid, 0) for index in np.unique(database.clip_of_row[record.rows])}
+
+
+def test_a_loop_that_wraps_is_never_cut():
+    tracks = [arc_track(1.5, 0.0, 12.0, loop=True), arc_track(1.5, 50.0, 12.0, loop=True), arc_track(2.0, 0.0, 8.0)]
+    database = made_database(named(tracks), DatabaseOptions(end_policy="loop"))
+    records, unused = unused_of(database)
+    assert not {part.source for part in unused.ranges} & {"clip_000", "clip_001"}
+    if unused.rows.any():
+        less = without_rows(database, unused.rows)
+        assert same_to_the_bit(database, records, less, simulated(less))
+
+
+def test_what_only_the_last_search_chose_is_needed_too():
+    """With a search at the last tick, its choice decides the cost that is recorded there."""
+    options = replace(OPTIONS, approach_s=2.0, duration_s=6.0 + 1 / 60)
+    database = made_database(wandering_tracks(12, seed=7))
+    records, unused = unused_of(database, options)
+    assert all(np.isfinite(record.match_cost[-1]) for record in records)
+    less = without_rows(database, unused.rows)
+    assert same_to_the_bit(database, records, less, simulated(less, options))
