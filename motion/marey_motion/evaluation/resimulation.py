@@ -83,7 +83,7 @@ class Resimulation:
         found = [self._find(number, gone) for number in range(len(self.trials))]
         ahead = [number for number, outcome in enumerate(found) if outcome is None]
         if ahead:
-            index = self.index_without(gone)
+            index = self._index_without(gone)
             records = run_suite(
                 self.database,
                 self.options,
