@@ -1,4 +1,4 @@
-"""The demonstration: takes go in, are retargeted to a second skeleton by a worker, and come out as files and a picture.
+"""The demonstration: takes go in, are retargeted to a second skeleton, drawn, evaluated, and come out as files.
 
 Everything goes through a server of its own on this machine, by the same requests that any other program would send.
 """
@@ -16,6 +16,7 @@ from typing import Any
 from marey_client import embedded
 from marey_client.cli.output import Advance, print_json, progress, tell
 from marey_client.credentials import ADMIN_TOKEN, read_secret
+from marey_client.demo_evaluation import evaluate_locomotion
 from marey_client.demo_report import Report, print_report
 from marey_client.errors import NotFound
 from marey_client.imports import FoundFiles, LocalFile, find_files
@@ -64,7 +65,8 @@ class Story:
         with self._timed("import"):
             entries = self._import()
         with self._timed("retarget"):
-            job = self._retarget(self._target())
+            target = self._target()
+            job = self._retarget(target)
         tasks = [job, *self.project.jobs(filters={"parent": job.id})] if job else []
         tasks = [task for task in tasks if task.size is None]
         sources = {clip.path: clip for clip in self.project.clips.list(collection=TAKES)}
@@ -73,6 +75,9 @@ class Story:
             shown = _evenly(results, SHEET_TAKES)
             exported = [self._export(clip) for clip in shown]
             sheet = self._contact_sheet([(sources[_source_path(clip)], clip) for clip in shown])
+        with self._timed("evaluate"):
+            root = target.hierarchy().joints[0].name
+            evaluation = evaluate_locomotion(self.project, results, root, self.data, self.advance)
         return Report(
             entries=entries,
             left_out=len(self.files.left_out),
@@ -85,6 +90,7 @@ class Story:
             tasks=len(tasks),
             shared_tasks=sum(task.cached_from is not None for task in tasks),
             sheet=sheet,
+            evaluation=evaluation,
         )
 
     @contextmanager

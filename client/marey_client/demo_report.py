@@ -8,7 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import typer
+
 from marey_client.cli.output import print_rows, tell
+from marey_client.demo_evaluation import DemoEvaluation
 from marey_client.imports import refusal_text
 from marey_schemas.imports import ImportEntry
 from marey_schemas.items import Item
@@ -19,7 +22,7 @@ REASONS_SHOWN = 12
 
 @dataclass
 class Report:
-    """Figures and places. `seconds` is by step: import, retarget, files."""
+    """Figures and places. `seconds` is by step: import, retarget, files, evaluate."""
 
     entries: Sequence[ImportEntry]
     left_out: int
@@ -32,6 +35,7 @@ class Report:
     tasks: int
     shared_tasks: int
     sheet: Path | None
+    evaluation: DemoEvaluation
     server: str = ""
 
     @property
@@ -71,6 +75,9 @@ class Report:
             "job": self.job.id if self.job else None,
             "contact_sheet": str(self.sheet.absolute()) if self.sheet else None,
             "exported": [str(path.absolute()) for path in self.exported],
+            "evaluated_clips": self.evaluation.chosen,
+            "evaluation": self.evaluation.summary,
+            "evaluation_report": str(self.evaluation.report.absolute()) if self.evaluation.report else None,
         }
 
     def _rates(self) -> dict[str, float]:
@@ -79,7 +86,8 @@ class Report:
 
 
 def print_report(report: Report) -> None:
-    """A table of figures, the reasons of refusals, and where everything is."""
+    """How good the motion is, a table of figures, the reasons of refusals, and where everything is."""
+    typer.echo(f"{report.evaluation.sentence}\n")
     print_rows(_rows(report))
     for step, reason in report.refused[:REASONS_SHOWN]:
         tell(f"refused at {step}: {reason}")
@@ -90,6 +98,8 @@ def print_report(report: Report) -> None:
         tell(f"retargeted files  {report.exported[0].parent.absolute()}")
     if report.sheet:
         tell(f"contact sheet     {report.sheet.absolute()}")
+    if report.evaluation.report:
+        tell(f"evaluation        {report.evaluation.report.absolute()}")
     tell(f"look around       marey serve --data {report.data}   and then   marey ls demo")
 
 
@@ -118,6 +128,20 @@ def _rows(report: Report) -> Iterator[tuple[str, str, str]]:
     yield "", f"{seconds['retarget']:.2f}", f"seconds, through queue and worker{shared}"
     yield "", f"{rates['retarget']:,.0f}", "poses per second"
     yield "", f"{sizes['retargeted']:.0f}", "bytes per pose"
+    yield from _evaluation_rows(report)
+
+
+def _evaluation_rows(report: Report) -> Iterator[tuple[str, str, str]]:
+    yield "evaluated", f"{report.evaluation.chosen}", report.evaluation.selection
+    if (found := report.evaluation.summary) is not None:
+        yield (
+            "",
+            f"{report.seconds['evaluate']:.2f}",
+            f"seconds for {found['trials']} trials, report and figures included",
+        )
+        if found["offset_mean_m"] is not None:
+            yield "", f"{found['offset_mean_m']:.2f}", "metres off the path on average"
+        yield "", f"{found['coverage_index']:.0%}", "of the speeds and turn rates covered"
 
 
 def _counted(counts: dict[str, int]) -> str:

@@ -38,6 +38,7 @@ class LeaseKeeper:
         self._heard = self._tried = time.monotonic()
         self._progress: Progress | None = None
         self._told: Progress | None = None
+        self._saying_last_word = False
         self._stopped = threading.Event()
         self._beating = threading.Lock()
         self._thread = threading.Thread(target=self._run, name=f"heartbeat-{lease.job}", daemon=True)
@@ -53,6 +54,7 @@ class LeaseKeeper:
 
     def confirm(self) -> None:
         """Make sure that the lease is held before publishing. Raises `LeaseLost`, or why the server does not answer."""
+        self._saying_last_word = True
         if self.lost.is_set() or time.monotonic() - self._heard > CONFIRM_AFTER * self._ttl_s:
             self._beat()
 
@@ -68,7 +70,8 @@ class LeaseKeeper:
         try:
             self._beat()
         except LeaseLost as error:
-            log.warning("%s: %s", self._job, error)
+            if not self._saying_last_word:  # a heartbeat may well come after it
+                log.warning("%s: %s", self._job, error)
             self.lost.set()
             self._stopped.set()
         except MareyError as error:

@@ -7,7 +7,7 @@ Rows are locked downstream: a job before its gathering job and before its depend
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from itertools import islice
 from typing import Any
 
@@ -148,7 +148,7 @@ def _open_fan_out(tx: Transaction, row: Row[Any]) -> list[Ended]:
 
 def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
     """Count the tasks that ended at their gathering jobs; where it was the last one, the gathering job ends too."""
-    following: list[Ended] = []
+    following = _stop_idle_tasks(tx, {end.parent_id for end in ended if end.state == "failed"} - {None})
     for parent_id, count in sorted(Counter(end.parent_id for end in ended if end.parent_id is not None).items()):
         left = tx.execute(
             update(job)
@@ -159,6 +159,16 @@ def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
         if left == 0:
             following += gather(tx, parent_id)
     return following
+
+
+def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
+    """Cancel tasks that nobody has begun where a worker would gather: with one failed there is nothing to gather."""
+    if not parents:
+        return []
+    gathered = select(job.c.id).where(job.c.id.in_(parents), job.c.gathers)
+    idle = and_(job.c.parent_id.in_(gathered), job.c.state.in_(("queued", "waiting")))
+    tx.execute(select(job.c.id).where(idle).order_by(job.c.id).with_for_update()).all()  # in the order of all others
+    return end_jobs(tx, idle, "cancelled")
 
 
 # -- into the queue ---------------------------------------------------------------------------------------------------

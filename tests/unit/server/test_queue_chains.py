@@ -345,6 +345,19 @@ def test_a_failed_task_leaves_nothing_to_gather_and_trying_again_repeats_only_wh
     assert desk.state(again.id) == "succeeded"
 
 
+def test_when_a_task_has_failed_for_good_those_that_nobody_began_are_not_begun(desk: Desk) -> None:
+    job = a_survey(desk, tasks=4)
+    first, second = desk.claim_many(2)
+    desk.complete(first)
+    desk.fail(second, "refused", retryable=False, detail="things are crooked")
+    head = desk.job(job)
+    assert head.failure is not None
+    assert (head.state, head.failure.code) == ("failed", "refused")
+    assert head.children == {"succeeded": 1, "failed": 1, "cancelled": 2}
+    again = desk.database.write(desk.user, jobs.retry_job, job)
+    assert again.children == {"succeeded": 1, "queued": 3}
+
+
 def test_a_gathering_that_is_lost_or_fails_is_done_again_without_the_tasks(desk: Desk) -> None:
     job = a_survey(desk, tasks=2)
     for lease in desk.claim_many():

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.report.verdict import verdict
+from marey_motion.evaluation.report import verdict
 from marey_motion.evaluation.result import EvaluationOptions, EvaluationResult
 from marey_motion.evaluation.result_documents import records_from_tree, records_to_tree, result_to_tree
 from marey_motion.evaluation.scenario import Trial, suite_trials

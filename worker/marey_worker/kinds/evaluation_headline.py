@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from marey_motion.evaluation.judgement import judge
 from marey_motion.evaluation.relevance import sum_by_source
-from marey_motion.evaluation.report.verdict import judge
 from marey_motion.evaluation.result import EvaluationResult
 
 Headline = dict[str, float | int | None]

@@ -7,11 +7,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from marey_motion.matching.building import build_database
-
 from marey_motion import documents
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.building import build_database
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.normaliser import Normaliser
 from marey_motion.matching.options import DatabaseOptions
@@ -99,10 +98,12 @@ def _common_rig(context: Context, pins: Sequence[PinnedInput], motions: Sequence
     (most, count), *others = Counter(ref.item for ref in used).most_common()
     if others:
         odd = [_place(pin) for pin, ref in zip(pins, used, strict=True) if ref.item != most]
+        commonest = context.item(Kind.SKELETON, most)
+        place = f"{commonest.collection}/{commonest.name}".lstrip("/")
         raise JobRefused(
             "several-skeletons",
-            f"{_listed(odd)} {'moves' if len(odd) == 1 else 'move'} another skeleton than the {count} other clips "
-            f"({most}); retarget all to one first, with `marey retarget`",
+            f"the clips move {len(others) + 1} skeletons: {count} of {len(used)} move {place}, but not {_listed(odd)}; "
+            "move all to one of them first, with marey retarget",
         )
     skeleton = max(used, key=lambda ref: ref.revision)
     edited = context.inputs.get("rig", ())

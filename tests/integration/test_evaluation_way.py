@@ -1,0 +1,145 @@
+"""The way of an evaluation as its users walk it: command line and SDK, a real server, a real worker."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evaluation_takes import write_walks
+from marey_client import Marey
+from marey_client.errors import JobUnsuccessful
+from marey_client.imports import find_files
+from marey_client.project import ProjectHandle
+from marey_motion.clip import Clip
+from marey_motion.formats import write_bvh
+from marey_motion.gait import game_skeleton
+from marey_schemas.access import ProjectCreate
+from marey_schemas.imports import ImportOptions
+from marey_schemas.items import ItemChange
+from server_process import ServerProcess
+
+pytestmark = pytest.mark.timeout(300)
+
+SMALL: dict[str, Any] = {"speeds_m_s": (1.0, 2.0), "turn_rates_deg_s": (-50.0, 0.0, 50.0), "duration_s": 10.0}
+"""12 trials in 2 tasks."""
+
+
+@pytest.fixture
+def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
+    process = ServerProcess(tmp_path, database_url)
+    process.start(workers=1)
+    yield process
+    process.stop()
+
+
+@pytest.fixture
+def marey(server: ServerProcess) -> Iterator[Marey]:
+    with server.client() as client:
+        yield client
+
+
+@pytest.fixture
+def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
+    """A project with nine walks."""
+    project = marey.create_project(ProjectCreate(name="lab"))
+    files = find_files([write_walks(tmp_path / "takes")]).files
+    project.imports.upload(files, ImportOptions(collection="walks"))
+    return project
+
+
+@pytest.fixture
+def run(server: ServerProcess, tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs the command line against the server, in a folder of its own."""
+
+    def run(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
+        surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
+        known = {"MAREY_URL": server.url, "MAREY_DATA": str(server.data), "HOME": str(tmp_path)}
+        done = subprocess.run(
+            [sys.executable, "-m", "marey_client.cli", *map(str, arguments)],
+            env={**surroundings, **known, "XDG_CONFIG_HOME": str(tmp_path)},
+            capture_output=True, text=True, cwd=tmp_path, timeout=240,
+        )  # fmt: skip
+        assert done.returncode == status, done.stdout + done.stderr
+        return done
+
+    return run
+
+
+def test_from_a_folder_of_clips_to_a_verdict_and_a_report(
+    lab: ProjectHandle, run: Callable[..., Any], tmp_path: Path
+) -> None:
+    grid = ("--speeds", "1:2:1", "--turns=-50:50:50", "--duration", "10")
+    told = run("evaluate", "lab/walks", *grid, "--out", "report.html").stdout
+    (found,) = lab.evaluations.list()
+    assert found.path == "walks-eval"
+    assert found.verdict in told
+    assert "circle v=" in told or "switching v=" in told
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert page.startswith("<!DOCTYPE html>")
+    assert "walk 1.5 60" in page
+
+    again = json.loads(run("evaluate", "lab/walks", *grid, "--json").stdout)
+    assert again["evaluation"]["revision"] == 1
+    assert len(again["trials"]) == again["summary"]["trials"] == 12
+
+    run("report", "lab/walks-eval", "--out", "again.html", "--figures", "figures")
+    assert (tmp_path / "again.html").read_text(encoding="utf-8") == page
+    assert (tmp_path / "figures" / "offsets.png").read_bytes().startswith(b"\x89PNG")
+    assert "again.html" in {path.name for path in tmp_path.iterdir()}
+
+
+def test_an_evaluation_holds_every_tick_and_knows_every_clip(lab: ProjectHandle) -> None:
+    found = lab.evaluation(lab.evaluate("walks", name="small", into="results", tags=("nightly",), **SMALL))
+    assert (found.path, found.item.tags) == ("results/small", ("nightly",))
+    trials, clips, records = found.trials(), found.clips(), found.records()
+    assert [trial["trial"] for trial in trials] == list(records)
+    assert {clip["clip"] for clip in clips} == {clip.path for clip in lab.clips.list()}
+    ticks = round((3.0 + SMALL["duration_s"]) * 60)
+    for record in records.values():
+        assert record["positions"].shape == (ticks, 2)
+        assert np.isfinite(record["pose_cost"]).any()
+    assert sum(clip["ticks"] for clip in clips) == ticks * len(trials)
+    assert {edge.item for edge in found.lineage().inputs} == {clip.id for clip in lab.clips.list()}
+    assert not found.staleness().stale
+
+
+def test_clips_of_two_skeletons_are_refused_by_name(lab: ProjectHandle, tmp_path: Path) -> None:
+    skeleton = game_skeleton()
+    at_rest = np.concatenate([skeleton.offsets[0], skeleton.rest_rotations.ravel()]).astype(np.float32)
+    (tmp_path / "stranger.bvh").write_bytes(write_bvh(Clip(skeleton, 30.0, np.tile(at_rest, (60, 1)), None, ())))
+    lab.imports.upload(find_files([tmp_path / "stranger.bvh"]).files, ImportOptions(collection="walks"))
+    with pytest.raises(JobUnsuccessful, match=r"but not walks/stranger; .* marey retarget"):
+        lab.evaluation(lab.evaluate("walks", **SMALL))
+    assert list(lab.evaluations.list()) == []
+
+
+def test_clips_tagged_as_loops_are_looped_and_frames_can_be_trimmed(lab: ProjectHandle) -> None:
+    first, second, *_ = sorted(lab.clips.list(), key=lambda clip: clip.path)
+    first.change(ItemChange(tags=("loop",)))
+    options = {**SMALL, "database": {"end_policy": "loop"}, "trims": {second.id: (30, 90)}, "baseline": False}
+    found = lab.evaluation(lab.evaluate("walks", **options))
+    clips = {clip["clip"]: clip for clip in found.clips()}
+    assert [name for name, clip in clips.items() if clip["loop"]] == [first.path]
+    rate_hz = second.item.summary["frame_rate_hz"]
+    assert clips[second.path]["frames"] == pytest.approx(60 * 60 / rate_hz, abs=2)
+    with pytest.raises(JobUnsuccessful, match="the frames 30:9999 are not there"):
+        lab.evaluation(lab.evaluate("walks", **{**options, "trims": {second.id: (30, 9999)}}))
+
+
+def test_the_normaliser_of_another_evaluation_can_be_used(lab: ProjectHandle) -> None:
+    first = lab.evaluation(lab.evaluate("walks", name="all", **SMALL))
+    some = sorted(lab.clips.list(), key=lambda clip: clip.path)[:6]
+    inputs = [clip.as_input() for clip in some]
+    own = lab.evaluation(lab.evaluate(inputs, name="own", **SMALL))
+    pinned = lab.evaluation(lab.evaluate(inputs, name="pinned", normaliser=first.id, **SMALL))
+    scales = [found.document()["provenance"]["normaliser"] for found in (first, own, pinned)]
+    assert scales[0] == scales[2] != scales[1]
+    assert first.id in {edge.item for edge in pinned.lineage().inputs}
