@@ -232,7 +232,7 @@ def test_two_normals_are_found_again():
 
 def test_a_fit_without_spread_or_without_groups_is_still_one():
     fit = fit_two(np.full(50, 0.3), np.zeros(50, dtype=bool))
-    assert fit.means.tolist() == [0.3, 0.3]
+    assert fit.means == pytest.approx((0.3, 0.3))
     assert fit.weights.sum() == 1.0
     split = fit_two(np.repeat([0.0, 1.0], 50), np.zeros(100, dtype=bool))
     assert split.means == pytest.approx((0.0, 1.0))

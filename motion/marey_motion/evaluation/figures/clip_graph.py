@@ -35,7 +35,7 @@ MOST_LINES = 400
 BOW = 0.45  # how far a line is drawn towards the middle of the ring
 SIZES, LARGEST_DOT = 8, 90.0  # number of sizes of dots; area in square points
 LONGEST_NAME, LETTER_IN = 18, 0.066  # signs of a name, and how wide one is
-ABSENT = "(not in this one)"
+ABSENT = "(absent)"
 RADIAL_NAMES = 8  # more names than this run outwards, lest they meet
 
 
@@ -63,15 +63,16 @@ def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: Fig
     width, height = (8.6, 6.6) if len(subjects) == 1 else (9.6, 4.7)
     figure = new_figure(width, height + 0.3 * (len(subjects) > 1))
     across = width / len(subjects)
+    names = [{clip.uid: clip.name for clip in subject.result.clips} for subject in subjects]
+    longest = max([0, *(len(shortened(each.get(uid, ABSENT), LONGEST_NAME)) for each in names for uid in uids)])
     for number, subject in enumerate(subjects):
         panel = add_panel(figure, Place(number * across, 0.0, across, height), grid=False)
         panel.axis("off")
         write(panel, (0.03, 1.01), subject.label, transform=panel.transAxes, fontsize=HEADING, fontweight="bold")
-        names = {clip.uid: clip.name for clip in subject.result.clips}
-        _fit(panel, circles, names, (across, height))
+        _fit(panel, circles, longest, (across, height))
         _draw_lines(panel, circles, lines[number])
         _draw_dots(panel, circles, dots[number], most, options.logarithmic)
-        _draw_rings(panel, circles, names)
+        _draw_rings(panel, circles, names[number])
     tables = {"frames": _frame_table(subjects, dots, circles), "transitions": _line_table(subjects, lines)}
     return Sketch(figure, tables, _caption(subjects, popularity, switches, circles, lines))
 
@@ -137,11 +138,10 @@ def _per_dot(popularity: Ints, circle: Circle) -> Ints:
     return np.bincount(dots, weights=popularity, minlength=circle.dots).astype(np.int64)
 
 
-def _fit(panel: Axes, circles: dict[str, Circle], names: dict[str, str], size_in: tuple[float, float]) -> None:
+def _fit(panel: Axes, circles: dict[str, Circle], longest_name: int, size_in: tuple[float, float]) -> None:
     """Limits that hold all circles and their names, at one scale in both directions."""
     reach = max([1.0, *(float(np.linalg.norm(circle.centre)) + circle.radius for circle in circles.values())])
-    longest = max([0, *(len(shortened(names.get(uid, ABSENT), LONGEST_NAME)) for uid in circles)])
-    aside = 0.2 + longest * LETTER_IN
+    aside = 0.2 + longest_name * LETTER_IN
     above = aside if len(circles) > RADIAL_NAMES else 0.4
     unit = min(0.5 * size_in[0] - aside, 0.5 * size_in[1] - above) / reach  # inches
     panel.set(xlim=(-0.5 * size_in[0] / unit, 0.5 * size_in[0] / unit))

@@ -38,7 +38,7 @@ def fit_two(values: Floats, second: NDArray[np.bool_]) -> Normals:
     values are split at their mean. Values without spread give two equal components.
     """
     spread = float(values.std())
-    if spread == 0.0:
+    if np.ptp(values) == 0.0:
         one = fit_one(values)
         return Normals(np.full(2, 0.5), np.repeat(one.means, 2), np.repeat(one.deviations, 2))
     if second.all() or not second.any():

@@ -14,6 +14,7 @@ from marey_motion.evaluation.figures.paper import (
     DARK,
     LIGHT,
     MORE_IS_WORSE,
+    SMALL,
     SPEED,
     TURN_RATE,
     Place,
@@ -27,6 +28,7 @@ from marey_motion.evaluation.figures.paper import (
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
@@ -157,7 +159,7 @@ def _draw_field(
     )  # fmt: skip
     colours_of_dots = dots.cmap(dots.norm(field.offset_m[known]))
     dots.set_edgecolor([DARK if light else LIGHT for light in luminance(np.asarray(colours_of_dots)) > 0.3])
-    _mark_extreme(panel, field, dots)
+    _mark_extreme(panel, field, signed=bool(levels[0] < 0.0))
     panel.set_xticks(field.turn_rates_deg_s[:: max(1, len(field.turn_rates_deg_s) // 4)])
     if not labels["y"]:
         panel.tick_params(labelleft=False)
@@ -165,19 +167,23 @@ def _draw_field(
     return drawn or dots
 
 
-def _mark_extreme(panel: Any, field: _Field, dots: Any) -> None:
+def _mark_extreme(panel: Axes, field: _Field, signed: bool) -> None:
     """The value of the dot that is farthest from zero, beside it."""
     row, column = np.unravel_index(np.nanargmax(np.abs(field.offset_m)), field.offset_m.shape)
-    value, place = field.offset_m[row, column], (field.turn_rates_deg_s[column], field.speeds_m_s[row])
-    right = column <= field.offset_m.shape[1] // 2
-    up = row <= field.offset_m.shape[0] // 2
-    light = luminance(np.asarray(dots.cmap(dots.norm(value)))) > 0.3
-    sign = "+" if value > 0 and dots.norm.vmin < 0 else ""
+    right, up = column <= field.offset_m.shape[1] // 2, row <= field.offset_m.shape[0] // 2
     panel.annotate(
-        f"{sign}{value:.2f} m", place, (5 if right else -5, 5 if up else -5), textcoords="offset points", fontsize=8,
-        color=DARK if light else LIGHT, ha="left" if right else "right", va="bottom" if up else "top", zorder=5,
+        f"{field.offset_m[row, column]:{'+' if signed else ''}.2f} m",
+        (float(field.turn_rates_deg_s[column]), float(field.speeds_m_s[row])),
+        (6 if right else -6, 6 if up else -6),
+        textcoords="offset points",
+        fontsize=SMALL,
         fontweight="bold",
-    )  # fmt: skip
+        color=DARK,
+        ha="left" if right else "right",
+        va="bottom" if up else "top",
+        bbox={"facecolor": LIGHT, "alpha": 0.75, "lw": 0, "pad": 1.5},
+        zorder=5,
+    )
 
 
 def _table(
@@ -201,7 +207,7 @@ def _caption(subjects: Sequence[Subject], families: Sequence[str], fields: Seque
     for family, row in zip(families, fields, strict=True):
         for subject, field in zip(subjects, row, strict=True):
             if np.isfinite(field.offset_m).any():
-                name = f"{subject.label}, " if subject.label else ""
+                name = f"{subject.label}, {FAMILY_TITLES[family].lower()}" if subject.label else FAMILY_TITLES[family]
                 low, middle, high = np.nanquantile(field.offset_m, (0.0, 0.5, 1.0))
-                parts.append(f"{name}{FAMILY_TITLES[family]}: {low:.2f} to {high:.2f} m, median {middle:.2f} m")
+                parts.append(f"{name}: {low:.2f} to {high:.2f} m, median {middle:.2f} m")
     return "Mean distance to the wished place over each trial; dots are trials. " + "; ".join(parts) + "."

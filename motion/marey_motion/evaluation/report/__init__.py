@@ -78,7 +78,7 @@ def render_comparison(
     """
     drawn = draw_figures(before, other=after, labels=labels) if figures is None else figures
     sections = [
-        metric_chapter(before, after, comparison),
+        metric_chapter(before, after, comparison, labels),
         trial_chapter(before, after, comparison, drawn),
         clip_chapter(before, after, drawn),
         coverage_of_two_chapter(drawn),

@@ -52,7 +52,7 @@ def headline_of_two(before: EvaluationResult, after: EvaluationResult, labels: t
     used = [sum(1 for usage in each.usage if usage.ticks) for each in (before, after)]
     return facts(
         (
-            ("trajectories followed", _arrow(_share(first), _share(second)), " → ".join(labels)),
+            ("trajectories followed", f"{first.followed} → {_share(second)}", " → ".join(labels)),
             ("distance from the path (m)", _arrow(*(_written(each, "offset_mean") for each in (before, after))), ""),
             ("speeds and turns covered", _arrow(*(f"{100 * each.index:.0f} %" for each in cells)), ""),
             ("clips used", _arrow(str(used[0]), str(used[1])), f"of {len(before.clips)} and {len(after.clips)}"),
@@ -60,10 +60,12 @@ def headline_of_two(before: EvaluationResult, after: EvaluationResult, labels: t
     )
 
 
-def metric_chapter(before: EvaluationResult, after: EvaluationResult, comparison: Comparison | None) -> Section:
+def metric_chapter(
+    before: EvaluationResult, after: EvaluationResult, comparison: Comparison | None, labels: tuple[str, str]
+) -> Section:
     """How the suite's numbers changed, with intervals where they were computed."""
     changes = {change.metric: change for change in comparison.metrics} if comparison is not None else {}
-    heads = ["measure", "before", "after", "change", *(["between", "verdict"] if comparison else []), "unit"]
+    heads = ["measure", *labels, "change", *(["between", "verdict"] if comparison else []), "unit"]
     rows: list[Sequence[Cell]] = []
     for name, metric in METRICS.items():
         known = changes.get(name)

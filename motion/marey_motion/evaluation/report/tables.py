@@ -24,7 +24,8 @@ def number(value: float | None, digits: int = 2, *, signed: bool = False, look: 
     """A number with so many decimals; a dash for none."""
     if value is None or not math.isfinite(value):
         return Number(None, "–")
-    return Number(value, f"{value:{'+' if signed else ''},.{digits}f}", look)
+    written = round(value, digits) + 0.0  # not -0.00
+    return Number(value, f"{written:{'+' if signed else ''},.{digits}f}", look)
 
 
 def share(value: float) -> Number:
