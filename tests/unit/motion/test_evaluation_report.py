@@ -17,8 +17,14 @@ from marey_motion.evaluation.report import compared, render_comparison, render_r
 from marey_motion.evaluation.report.definitions import METRICS
 from marey_motion.evaluation.report.markup import element, text
 from marey_motion.evaluation.report.words import amount, demand, duration, find_holes
-from marey_motion.evaluation.result import TrialResult
+from marey_motion.evaluation.result import EvaluationOptions, Grid, TrialResult
 from marey_motion.evaluation.scenario import Trial
+from marey_motion.evaluation.suite import evaluate
+from marey_motion.gait import generate_gait
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.building import build_database
+from marey_motion.matching.database import SourceClip
+from marey_motion.rigs import map_joints
 
 VOID = {"br", "hr", "img", "meta", "col"}
 HOSTILE = (
@@ -217,6 +223,22 @@ def test_reports_are_made_of_little(change, result):
     }[change]
     is_sound(render_report(little, title="little"))
     is_sound(render_comparison(little, result, title="little"))
+
+
+def test_a_real_evaluation_is_reported():
+    options = EvaluationOptions(grid=Grid((1.25, 2.0), (-50.0, 0.0, 50.0)), duration_s=6.0)
+    clips = [
+        SourceClip(f"gait{index}", f"gait {index}", generate_gait(speed, turn_rate, 4.0))
+        for index, (speed, turn_rate) in enumerate(((1.25, 0.0), (1.25, 0.9), (2.0, 0.0)))
+    ]
+    skeleton = clips[0].clip.skeleton
+    database = build_database(clips, MatchingBody.from_mapping(skeleton, map_joints(skeleton)), options.database)
+    real = evaluate(database, options, threads=1, with_baseline=False)
+    page = is_sound(render_report(real, title="Real"))
+
+    assert page.tags["figure"] == len(FIGURES)
+    assert verdict(real) in page.text
+    assert "turns of 50 degrees a second at 1.25 to 2 m/s" in page.text
 
 
 # Words

@@ -11,6 +11,7 @@ Floats = NDArray[np.floating[Any]]
 
 MOST_STEPS = 500
 TOLERANCE = 1e-9
+LEAST_DEVIATION = 1e-9
 NARROWEST = 1e-3  # of the spread of all values: a component may not collapse onto a single value
 
 
@@ -28,7 +29,7 @@ class Normals(NamedTuple):
 
 def fit_one(values: Floats) -> Normals:
     """Mean and population standard deviation."""
-    return Normals(np.ones(1), np.array([values.mean()]), np.array([max(values.std(), np.finfo(float).tiny)]))
+    return Normals(np.ones(1), np.array([values.mean()]), np.array([max(values.std(), LEAST_DEVIATION)]))
 
 
 def fit_two(values: Floats, second: NDArray[np.bool_]) -> Normals:
