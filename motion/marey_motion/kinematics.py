@@ -135,10 +135,7 @@ def forward_directions(positions: Floats, left: Sequence[int], right: Sequence[i
     The sum of the left-minus-right vectors crossed with up. Frames in which that axis is vertical take the direction of
     the frame before them (the first ones, of the first frame that has one); `MotionError` when no frame has one.
     """
-    if not left or len(left) != len(right):
-        raise MotionError("a heading needs at least one pair of left and right joints", code="heading-undefined")
-    lateral = np.sum(positions[:, list(left)].astype(np.float64) - positions[:, list(right)], axis=1)
-    forward = np.stack((-lateral[:, 2], lateral[:, 0]), axis=1)
+    forward = forward_vectors(positions, left, right)
     length = np.linalg.norm(forward, axis=1)
     known = length >= SHORTEST_LATERAL_M
     if not known.any():
@@ -147,6 +144,14 @@ def forward_directions(positions: Floats, left: Sequence[int], right: Sequence[i
     frames = np.where(last_known < 0, int(np.argmax(known)), last_known)
     directions: NDArray[np.float64] = forward[frames] / length[frames, None]
     return directions
+
+
+def forward_vectors(positions: Floats, left: Sequence[int], right: Sequence[int]) -> NDArray[np.float64]:
+    """As `forward_directions`, not brought to length 1 (F, 2): one under `SHORTEST_LATERAL_M` tells no direction."""
+    if not left or len(left) != len(right):
+        raise MotionError("a heading needs at least one pair of left and right joints", code="heading-undefined")
+    lateral = np.sum(positions[:, list(left)].astype(np.float64) - positions[:, list(right)], axis=1)
+    return np.stack((-lateral[:, 2], lateral[:, 0]), axis=1)
 
 
 def headings(directions: Floats) -> NDArray[np.float64]:

@@ -101,10 +101,8 @@ def coverage_of(
     speed_edges = cell_edges(grid.speeds_m_s, SPEED_STEP_M_S)
     turn_edges = cell_edges(grid.turn_rates_deg_s, TURN_RATE_STEP_DEG_S)
     turn_rates = np.degrees(windows.turn_rate_rad_s)
-    seconds = window_s * _histogram(windows.speed_m_s, speed_edges, turn_rates, turn_edges)
-    deficit = np.maximum(options.coverage_least_s - seconds, 0.0)
-    # A whole number of windows is meant, however its seconds are rounded.
-    deficit[deficit < 0.5 * window_s] = 0.0
+    seconds = window_s * cell_counts(windows.speed_m_s, speed_edges, turn_rates, turn_edges)
+    deficit = cell_deficits(seconds, options.coverage_least_s, window_s)
     return Coverage(
         clip=owners,
         speed_m_s=windows.speed_m_s,
@@ -119,6 +117,13 @@ def coverage_of(
         symmetry=symmetry(windows.speed_m_s, turn_rates, speed_edges, turn_edges),
         too_short=too_short,
     )
+
+
+def cell_deficits(seconds: Floats, least_s: float, window_s: float) -> Floats:
+    """Seconds that cells lack of `least_s`, where each window stands for `window_s` of them."""
+    deficits = np.maximum(least_s - seconds, 0.0)
+    # A whole number of windows is meant, however its seconds are rounded.
+    return np.where(deficits < 0.5 * window_s, 0.0, deficits)
 
 
 def cell_edges(values: Sequence[float], step: float) -> Floats:
@@ -140,7 +145,7 @@ def symmetry(speeds: Floats, turn_rates_deg_s: Floats, speed_edges: Floats, turn
     sizes: Floats = np.unique(np.round(np.abs(turn_edges), EDGE_DECIMALS))
     bounds = sizes if turn_edges[0] > 0.0 or turn_edges[-1] < 0.0 else np.concatenate(([0.0], sizes[sizes > 0.0]))
     sides = [
-        _histogram(speeds[side], speed_edges, np.abs(turn_rates_deg_s[side]), bounds)
+        cell_counts(speeds[side], speed_edges, np.abs(turn_rates_deg_s[side]), bounds)
         for side in (turn_rates_deg_s > 0.0, turn_rates_deg_s < 0.0, turn_rates_deg_s == 0.0)
     ]
     left, right, straight = sides
@@ -202,7 +207,7 @@ def coverage_density(coverage: Coverage, rate_hz: float, *, resolution: int = 96
     )
     speed_edges = np.linspace(0.0, fastest, resolution + 1)
     turn_edges = np.linspace(-widest, widest, resolution + 1 + resolution % 2)
-    counts = _histogram(coverage.speed_m_s, speed_edges, turn_rates, turn_edges)
+    counts = cell_counts(coverage.speed_m_s, speed_edges, turn_rates, turn_edges)
     steps = speed_edges[1] - speed_edges[0], turn_edges[1] - turn_edges[0]
     smooth = gaussian_filter(
         counts, (0.5 * speed_width / steps[0], 0.5 * turn_width / steps[1]), mode=("reflect", "constant"), truncate=4.0
@@ -228,8 +233,8 @@ def _sums(values: Floats, span: int) -> Floats:
     return totals[span:] - totals[:-span]
 
 
-def _histogram(speeds: Floats, speed_edges: Floats, turn_rates: Floats, turn_edges: Floats) -> Floats:
-    """Counts (V, O) in half-open cells [lower, upper)."""
+def cell_counts(speeds: Floats, speed_edges: Floats, turn_rates: Floats, turn_edges: Floats) -> Floats:
+    """How many of some windows lie in each cell (V, O), half-open [lower, upper); turn rates and edges in one unit."""
     v = np.searchsorted(speed_edges, speeds, side="right") - 1
     w = np.searchsorted(turn_edges, turn_rates, side="right") - 1
     shape = len(speed_edges) - 1, len(turn_edges) - 1

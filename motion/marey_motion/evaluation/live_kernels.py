@@ -1,0 +1,112 @@
+"""The compiled steps of `live_windows`, kept apart so that importing the rest of the package does not load numba.
+
+`take` and `filters` are the tuples of `live_windows`; everything in `take` is changed in place. Frames are handled one
+by one, so that what comes out does not depend on how they were cut into pieces.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+RECEIVED, SMOOTHED = 0, 1
+"""Places in `take.counters`."""
+
+_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+
+
+@_compiled
+def _estimate(take, smoother, frame, column):  # type: ignore[no-untyped-def]
+    """A column of the raw root at a frame, by the polynomial through the frames around it."""
+    width = smoother.shape[0]
+    first = max(min(frame - width // 2, take.counters[RECEIVED] - width), 0)
+    total = 0.0
+    for place in range(width):
+        total += smoother[frame - first, place] * take.raw[(first + place) % take.raw.shape[0], column]
+    return total
+
+
+@_compiled
+def _add_step(take, place, left, ahead, length):  # type: ignore[no-untyped-def]
+    """Put a step into the ring in place of the one a window ago. Sums are added up afresh with each round of it."""
+    for column, value in enumerate((length, ahead, left)):
+        take.sums[column] += value - take.steps[place, column]
+        take.steps[place, column] = value
+    if place == take.steps.shape[0] - 1:
+        for column in range(3):
+            total = 0.0
+            for step in range(take.steps.shape[0]):
+                total += take.steps[step, column]
+            take.sums[column] = total
+
+
+@_compiled
+def _move_to(take, x, z, heading):  # type: ignore[no-untyped-def]
+    """Take the smoothed root to its next frame."""
+    frame, span = take.counters[SMOOTHED], take.steps.shape[0]
+    if frame > 0:
+        heading += 2.0 * np.pi * np.round((take.root[2] - heading) / (2.0 * np.pi))
+        facing = 0.5 * (heading + take.root[2])
+        sine, cosine = np.sin(facing), np.cos(facing)
+        step_x, step_z = x - take.root[0], z - take.root[1]
+        ahead, left = step_x * sine + step_z * cosine, step_x * cosine - step_z * sine
+        _add_step(take, (frame - 1) % span, left, ahead, np.hypot(step_x, step_z))
+    take.root[0], take.root[1], take.root[2] = x, z, heading
+    take.headings[frame % (span + 1)] = heading
+    take.counters[SMOOTHED] = frame + 1
+
+
+@_compiled
+def _smooth(take, filters, frame, shortest_mean):  # type: ignore[no-untyped-def]
+    """Smooth the root at a frame and go there."""
+    x = _estimate(take, filters.positions, frame, 0)
+    z = _estimate(take, filters.positions, frame, 1)
+    facing_x = _estimate(take, filters.directions, frame, 2)
+    facing_z = _estimate(take, filters.directions, frame, 3)
+    if not np.hypot(facing_x, facing_z) > shortest_mean:
+        place = frame % take.raw.shape[0]
+        facing_x, facing_z = take.raw[place, 2], take.raw[place, 3]
+    _move_to(take, x, z, np.arctan2(facing_x, facing_z))
+
+
+@_compiled
+def newest_window(take, duration_s, window):  # type: ignore[no-untyped-def]
+    """Fill in speed, turn rate, forward and strafe of the last window; False where there is none yet."""
+    frame, span = take.counters[SMOOTHED] - 1, take.steps.shape[0]
+    if frame < span:
+        return False
+    window[0] = take.sums[0] / duration_s
+    window[1] = (take.root[2] - take.headings[(frame + 1) % (span + 1)]) / duration_s
+    window[2] = take.sums[1] / duration_s
+    window[3] = take.sums[2] / duration_s
+    return True
+
+
+@_compiled
+def receive(take, filters, frames, duration_s, shortest_mean, windows):  # type: ignore[no-untyped-def]
+    """Take raw frames (n, 4) in; return how many windows they complete, which are written to `windows`."""
+    width = take.raw.shape[0]
+    written = 0
+    for index in range(frames.shape[0]):
+        received = take.counters[RECEIVED] + 1
+        for column in range(4):
+            take.raw[(received - 1) % width, column] = frames[index, column]
+        take.counters[RECEIVED] = received
+        if received < width:
+            continue
+        for frame in range(take.counters[SMOOTHED], received - width // 2):
+            _smooth(take, filters, frame, shortest_mean)
+            if newest_window(take, duration_s, windows[written]):
+                written += 1
+    return written
+
+
+@_compiled
+def finish(take, filters, duration_s, shortest_mean, windows):  # type: ignore[no-untyped-def]
+    """Smooth the frames at the end of a take, which have none behind them to wait for; windows as in `receive`."""
+    written = 0
+    for frame in range(take.counters[SMOOTHED], take.counters[RECEIVED]):
+        _smooth(take, filters, frame, shortest_mean)
+        if newest_window(take, duration_s, windows[written]):
+            written += 1
+    return written

@@ -1,0 +1,167 @@
+"""The windows of `coverage.sliding_windows` while the frames still come in, at a constant cost per frame.
+
+A root is smoothed as `matching.simulation_root` smooths it. Its filters look half a second ahead, so what comes out is
+half a second late (`LiveWindows.delay_s`); when a take ends, its last frames are smoothed as those of a clip that ends
+there, and nothing is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.coverage import WINDOW_S, Windows
+from marey_motion.matching.simulation_root import (
+    DIRECTION_WINDOW_S,
+    FILTER_ORDER,
+    POSITION_WINDOW_S,
+    SHORTEST_MEAN,
+    SHORTEST_WINDOW,
+    window_frames,
+)
+
+Floats = NDArray[np.float64]
+
+LEAST_RATE_HZ, MOST_RATE_HZ = 10.0, 240.0
+
+
+class Take(NamedTuple):
+    """What is remembered of the take under way: rings in which frame f of the take is at f modulo their length.
+
+    Parameters
+    ----------
+    raw : (D, 4)    ground position (x, z) in metres and unit facing (x, z) of the newest frames, as they came
+    steps : (S, 3)    length, forward and leftward part of the newest steps of the smoothed root, metres
+    headings : (S + 1,)    its newest headings, radians, continuous
+    sums : (3,)    of `steps`
+    root : (3,)    position and heading of the smoothed root in the newest frame that has them
+    counters : (2,) int64    frames received and smoothed
+    """
+
+    raw: Floats
+    steps: Floats
+    headings: Floats
+    sums: Floats
+    root: Floats
+    counters: NDArray[np.int64]
+
+
+class Filters(NamedTuple):
+    """Smoothers of the position and of the direction, see `smoother`."""
+
+    positions: Floats
+    directions: Floats
+
+
+class LiveWindows:
+    """Windows of one second of a performance at `rate_hz`, take by take."""
+
+    def __init__(self, rate_hz: float) -> None:
+        if not LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ:
+            raise MotionError(
+                f"{rate_hz:g} frames per second, where {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g} are measured; "
+                "send every n-th frame of a faster recording",
+                where="frame_rate_hz",
+            )
+        self.rate_hz = rate_hz
+        self._span = round(WINDOW_S * rate_hz)
+        self._filters = Filters(
+            smoother(window_frames(POSITION_WINDOW_S, rate_hz)), smoother(window_frames(DIRECTION_WINDOW_S, rate_hz))
+        )
+        self._take = self._empty_take()
+
+    @property
+    def delay_s(self) -> float:
+        """How long a frame waits until it is part of a window: for the frames that smooth the direction."""
+        return len(self._filters.directions) // 2 / self.rate_hz
+
+    @property
+    def frame_count(self) -> int:
+        """Frames of the take so far."""
+        return int(self._take.counters[0])
+
+    @property
+    def newest_frame(self) -> Floats | None:
+        """(4,) position and facing of the newest frame as it came, None at the beginning of a take."""
+        return self._take.raw[(self.frame_count - 1) % len(self._take.raw)].copy() if self.frame_count else None
+
+    @property
+    def newest_window(self) -> Windows | None:
+        """The last window of the take under way, its values as numbers."""
+        from marey_motion.evaluation import live_kernels
+
+        window = np.empty(4)
+        if not live_kernels.newest_window(self._take, self._duration_s, window):
+            return None
+        return Windows(*window)
+
+    def receive(self, frames: Floats) -> Windows:
+        """Take in frames (n, 4) of ground position and unit facing; the windows that they complete."""
+        from marey_motion.evaluation import live_kernels
+
+        windows = np.empty((len(frames) + len(self._take.raw), 4))
+        frames = np.array(frames, dtype=np.float64, order="C")
+        count = live_kernels.receive(self._take, self._filters, frames, self._duration_s, SHORTEST_MEAN, windows)
+        return Windows(*windows[:count].T)
+
+    def end_take(self) -> Windows:
+        """The windows of the take's last frames. The next frame begins a new take."""
+        from marey_motion.evaluation import live_kernels
+
+        windows = np.empty((len(self._take.raw), 4))
+        filters = Filters(*(_shortened(one, self.frame_count) for one in self._filters))
+        count = live_kernels.finish(self._take, filters, self._duration_s, SHORTEST_MEAN, windows)
+        self._take = self._empty_take()
+        return Windows(*windows[:count].T)
+
+    def as_tree(self) -> dict[str, Any]:
+        """Everything that goes on from here."""
+        return {"rate_hz": self.rate_hz, **{name: value.copy() for name, value in self._take._asdict().items()}}
+
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any]) -> LiveWindows:
+        """What `as_tree` wrote goes on, to the same bits."""
+        live = cls(tree["rate_hz"])
+        for name, own in live._take._asdict().items():
+            own[...] = tree[name]
+        return live
+
+    @property
+    def _duration_s(self) -> float:
+        return self._span / self.rate_hz
+
+    def _empty_take(self) -> Take:
+        return Take(
+            raw=np.zeros((len(self._filters.directions), 4)),
+            steps=np.zeros((self._span, 3)),
+            headings=np.zeros(self._span + 1),
+            sums=np.zeros(3),
+            root=np.zeros(3),
+            counters=np.zeros(2, dtype=np.int64),
+        )
+
+
+@lru_cache(maxsize=32)
+def smoother(window: int) -> Floats:
+    """The matrix (window, window) of a Savitzky-Golay filter: row i estimates frame i of a window from all its frames.
+
+    The middle row is the filter; the rows above it belong to the beginning of a take and those below to its end, where
+    the polynomial of the outermost window goes on to the edge. A window too short for that leaves things as they are.
+    """
+    if window < SHORTEST_WINDOW:
+        basis = np.ones((1, 1))
+    else:
+        basis, _ = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, window), FILTER_ORDER))
+    matrix: Floats = np.ascontiguousarray(basis @ basis.T)
+    matrix.setflags(write=False)
+    return matrix
+
+
+def _shortened(matrix: Floats, frame_count: int) -> Floats:
+    """The smoother of a take that is shorter than the window, over the largest odd number of frames it has."""
+    return matrix if frame_count >= len(matrix) else smoother(frame_count - (frame_count + 1) % 2)

@@ -1,0 +1,232 @@
+"""Coverage while a performer records: what there is already, what is still missing, and where to go for it.
+
+A performance comes in as frames, in pieces of any size. For a whole clip, the windows counted are those that
+`coverage.measure_coverage` counts for it at the same frame rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.clip import Clip
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.coverage import (
+    SPEED_STEP_M_S,
+    TURN_RATE_STEP_DEG_S,
+    Hole,
+    Windows,
+    cell_counts,
+    cell_deficits,
+    cell_edges,
+)
+from marey_motion.evaluation.live_windows import LiveWindows
+from marey_motion.evaluation.result import Grid
+from marey_motion.evaluation.scenario import Reference, Trial, reference
+from marey_motion.kinematics import SHORTEST_LATERAL_M, forward_vectors
+from marey_motion.matching.body import MatchingBody
+from marey_motion.motion import Motion
+
+Floats = NDArray[np.float64]
+
+MOST_CELLS = 2000
+FARTHEST_M = 1e6
+"""From the origin; beyond it, positions are no longer exact enough to tell speeds, or are broken."""
+
+PATH_RATE_HZ = 5.0
+
+
+@dataclass(frozen=True)
+class Performer:
+    """Where the performer is in the newest frame, and how he moves by the newest window, which is None at first.
+
+    Ground position in metres, heading in radians, strafe positive to the left.
+    """
+
+    x_m: float
+    z_m: float
+    heading_rad: float
+    window: Windows | None
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A cell that lacks data, and the way to fill it.
+
+    `path` starts where the performer is and faces: (0, 0) at heading 0, x to the left and z ahead, metres.
+    """
+
+    hole: Hole
+    path: Reference
+
+
+class OnlineCoverage:
+    """Seconds of data in each cell of a grid, growing with a performance.
+
+    Parameters
+    ----------
+    rate_hz : of the performance's frames, 10 to 240
+    grid : the cells are those of `coverage.measure_coverage`
+    least_s : seconds wanted in each cell
+    seconds : (V, O) what there is already, for example an evaluation's `Coverage.seconds`
+
+    Attributes
+    ----------
+    frame_count : frames received, over all takes
+    counts : (V, O) int64    windows of this performance in each cell
+    """
+
+    def __init__(
+        self, rate_hz: float, grid: Grid | None = None, *, least_s: float = 1.0, seconds: Floats | None = None
+    ) -> None:
+        self.grid, self.least_s = grid or Grid(), least_s
+        self.speed_edges_m_s = cell_edges(self.grid.speeds_m_s, SPEED_STEP_M_S)
+        self.turn_rate_edges_deg_s = cell_edges(self.grid.turn_rates_deg_s, TURN_RATE_STEP_DEG_S)
+        shape = len(self.speed_edges_m_s) - 1, len(self.turn_rate_edges_deg_s) - 1
+        if shape[0] * shape[1] > MOST_CELLS:
+            raise MotionError(f"{shape[0]} x {shape[1]} cells, over {MOST_CELLS}", where="grid")
+        self._before = np.zeros(shape) if seconds is None else np.array(seconds, dtype=np.float64)
+        if self._before.shape != shape:
+            raise MotionError(f"shape {self._before.shape} where the grid has {shape} cells", where="seconds")
+        self._live = LiveWindows(rate_hz)
+        self.counts = np.zeros(shape, dtype=np.int64)
+        self.frame_count = 0
+
+    # -- what comes in -------------------------------------------------------------------------------------------------
+
+    def add_poses(self, body: MatchingBody, poses: NDArray[np.floating[Any]]) -> Windows:
+        """Take in frames (n, 3 + 4·J) of the body's skeleton, as in `Clip.poses`; the windows that they complete.
+
+        A take begins with the first frame in which hips and shoulders tell a direction. Raises `MotionError` where the
+        frames are no poses of the skeleton, and takes none of them.
+        """
+        clip = Clip(body.skeleton, self._live.rate_hz, np.asarray(poses, dtype=np.float32))
+        positions = Motion.of(clip).positions(body.skeleton)
+        facing = forward_vectors(positions, body.lefts, body.rights)
+        return self._add(positions[:, body.torso, ::2], facing)
+
+    def add_roots(self, positions: Floats, headings: Floats) -> Windows:
+        """Take in ground positions (n, 2) of the torso and the headings (n,) of the body, neither of them smoothed."""
+        if positions.shape != (len(headings), 2) or not np.all(np.isfinite(headings)):
+            raise MotionError(f"{len(headings)} headings for positions of shape {positions.shape}", where="roots")
+        return self._add(positions, np.stack((np.sin(headings), np.cos(headings)), axis=-1))
+
+    def end_take(self) -> Windows:
+        """The performance pauses, or frames were lost: no window goes on from here. The windows that were left."""
+        return self._count(self._live.end_take())
+
+    def _add(self, positions: Floats, facing: Floats) -> Windows:
+        if not float(np.max(np.abs(positions), initial=0.0)) <= FARTHEST_M:
+            raise MotionError(f"a frame lies more than {FARTHEST_M:g} m from the origin", where="positions")
+        newest = self._live.newest_frame
+        directions = _directions(facing, None if newest is None else newest[2:])
+        self.frame_count += len(positions)
+        begun = positions[len(positions) - len(directions) :]
+        return self._count(self._live.receive(np.hstack((begun, directions))))
+
+    def _count(self, windows: Windows) -> Windows:
+        counts = cell_counts(
+            windows.speed_m_s, self.speed_edges_m_s, np.degrees(windows.turn_rate_rad_s), self.turn_rate_edges_deg_s
+        )
+        self.counts += counts.astype(np.int64)
+        return windows
+
+    # -- what is known -------------------------------------------------------------------------------------------------
+
+    @property
+    def delay_s(self) -> float:
+        """How far windows lag behind the newest frame: half of the second over which directions are smoothed."""
+        return self._live.delay_s
+
+    @property
+    def seconds(self) -> Floats:
+        """(V, O) seconds of data in each cell."""
+        return self._before + self.counts / self._live.rate_hz
+
+    @property
+    def deficit_s(self) -> Floats:
+        """(V, O) seconds that each cell lacks."""
+        return cell_deficits(self.seconds, self.least_s, 1.0 / self._live.rate_hz)
+
+    @property
+    def index(self) -> float:
+        """Share of the cells with enough."""
+        return float(np.mean(self.deficit_s == 0.0))
+
+    @property
+    def performer(self) -> Performer | None:
+        """Where he is and how he moves; None where no take is under way."""
+        newest = self._live.newest_frame
+        if newest is None:
+            return None
+        x, z, facing_x, facing_z = newest.tolist()
+        return Performer(x, z, float(np.arctan2(facing_x, facing_z)), self._live.newest_window)
+
+    def targets(self, count: int, *, path_s: float = 4.0) -> tuple[Target, ...]:
+        """The cells that lack data and are nearest to how the performer moves, or to standing still, nearest first.
+
+        Distances are counted in cells. Each comes with a path of `path_s` seconds at its speed and turn rate.
+        """
+        seconds, deficits = self.seconds, self.deficit_s
+        speeds, turn_rates = np.unique(self.grid.speeds_m_s), np.unique(self.grid.turn_rates_deg_s)
+        window = self._live.newest_window
+        speed, turn_rate = (0.0, 0.0) if window is None else (window.speed_m_s, np.degrees(window.turn_rate_rad_s))
+        away = np.hypot(
+            ((speeds - speed) / np.median(np.diff(self.speed_edges_m_s)))[:, None],
+            (turn_rates - turn_rate) / np.median(np.diff(self.turn_rate_edges_deg_s)),
+        )
+        v, w = np.nonzero(deficits > 0.0)
+        nearest = np.lexsort((w, v, -deficits[v, w], away[v, w]))[:count]
+        return tuple(
+            _target(Hole(float(speeds[a]), float(turn_rates[b]), float(seconds[a, b]), float(deficits[a, b])), path_s)
+            for a, b in zip(v[nearest], w[nearest], strict=True)
+        )
+
+    # -- what is kept --------------------------------------------------------------------------------------------------
+
+    def as_tree(self) -> dict[str, Any]:
+        """Everything that goes on from here: plain values and arrays, less than 64 kB."""
+        return {
+            "speeds_m_s": list(self.grid.speeds_m_s),
+            "turn_rates_deg_s": list(self.grid.turn_rates_deg_s),
+            "least_s": self.least_s,
+            "before_s": self._before.copy(),
+            "counts": self.counts.astype(np.int32),
+            "frame_count": self.frame_count,
+            "live": self._live.as_tree(),
+        }
+
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any]) -> OnlineCoverage:
+        """What `as_tree` wrote goes on, to the same bits."""
+        grid = Grid(tuple(tree["speeds_m_s"]), tuple(tree["turn_rates_deg_s"]))
+        online = cls(tree["live"]["rate_hz"], grid, least_s=tree["least_s"], seconds=tree["before_s"])
+        online._live = LiveWindows.from_tree(tree["live"])
+        online.counts[...] = tree["counts"]
+        online.frame_count = tree["frame_count"]
+        return online
+
+
+def _directions(facing: Floats, before: Floats | None) -> Floats:
+    """Unit directions of facing (n, 2), those too short to tell taking that of the frame before them.
+
+    `before` (2,) is that of the frame before the first. Without it, frames before the first that tells one are left
+    out: the last m directions (m, 2) come back.
+    """
+    length = np.hypot(facing[:, 0], facing[:, 1])
+    known = length >= SHORTEST_LATERAL_M
+    directions: Floats = facing / np.where(known, length, 1.0)[:, None]
+    if before is not None:
+        known, directions = np.concatenate(([True], known)), np.vstack((before, directions))
+    last_known = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
+    directions = directions[last_known[last_known >= 0]]
+    return directions if before is None else directions[1:]
+
+
+def _target(hole: Hole, path_s: float) -> Target:
+    circle = Trial("circle", hole.speed_m_s, float(np.radians(hole.turn_rate_deg_s)), 0.0, path_s)
+    return Target(hole, reference(circle, PATH_RATE_HZ, look_ahead_s=1.0 / PATH_RATE_HZ))
