@@ -6,13 +6,11 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from marey_motion.errors import MotionError
 from marey_motion.evaluation.report import verdict
-from marey_motion.evaluation.result import EvaluationOptions, EvaluationResult
+from marey_motion.evaluation.result import EvaluationOptions
 from marey_motion.evaluation.result_documents import records_from_tree, records_to_tree, result_to_tree
 from marey_motion.evaluation.scenario import Trial, suite_trials
 from marey_motion.evaluation.suite import assemble, evaluate_baseline, run_suite
-from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import TrialRecord
 from marey_schemas.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.evaluation import EvaluateParams
@@ -22,7 +20,7 @@ from marey_worker.context import Context, JobRefused
 from marey_worker.kinds.evaluation_headline import headline_of
 from marey_worker.kinds.evaluation_options import options_of
 from marey_worker.kinds.evaluation_report import write_report
-from marey_worker.kinds.matching_clips import read_clips
+from marey_worker.kinds.matching_clips import read_clips, refusing_motion_errors
 
 GATHERING_STEPS = 4
 
@@ -33,19 +31,19 @@ def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
     trials = _trials(params, options)[context.task.position :: context.task.size]
     clips = read_clips(context, params, options.database)
     started = time.monotonic()
-    records = run_suite(
-        clips.database,
-        options,
-        trials=trials,
-        index=clips.index,
-        threads=context.threads,
-        progress=context.progress,
-    )
+    with refusing_motion_errors():
+        records = run_suite(
+            clips.database,
+            options,
+            trials=trials,
+            index=clips.index,
+            threads=context.threads,
+            progress=context.progress,
+        )
     file = context.scratch / "records.msgpack"
     file.write_bytes(encode_tree(records_to_tree(trials, records), MSGPACK, arrays="blocks"))
     return {
         "trials": len(trials),
-        "simulated_s": sum(len(record.rows) / record.rate_hz for record in records),
         "seconds": round(time.monotonic() - started, 4),
         "records": {"blob": context.put_file(file)},
     }
@@ -59,33 +57,34 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     trials = _trials(params, options)
     known = _read_records(context, results)
     records = [known[trial.name] for trial in trials]
-    try:
-        context.progress(1, GATHERING_STEPS, "measuring generated clips" if params.baseline else "")
-        baseline = evaluate_baseline(options, threads=context.threads) if params.baseline else None
+    with refusing_motion_errors():
+        baseline = None
+        if params.baseline:
+            context.progress(1, GATHERING_STEPS, "measuring generated clips")
+            baseline = evaluate_baseline(options, threads=context.threads)
         context.progress(2, GATHERING_STEPS, "measuring the trials")
         result = assemble(database, options, trials, records, baseline=baseline)
-    except MotionError as error:
-        raise JobRefused(error.code, str(error)) from error
-    parts = {
-        "evaluation": _evaluation_document(result, database),
-        "records": records_to_tree(trials, records),
+    evaluation = {
+        **result_to_tree(result),
+        "normaliser": database.normaliser.as_tree(),
+        "verdict": verdict(result),
+        "headline": headline_of(result),
     }
+    parts = {"evaluation": evaluation, "records": records_to_tree(trials, records)}
     if params.report:
         context.progress(3, GATHERING_STEPS, "writing the report")
         parts["report"] = write_report(context, result, params)
     context.stage(
         [StagedOutput(name=params.name, kind=Kind.EVALUATION, item_name=params.name, tags=params.tags, parts=parts)]
     )
-    return {
-        "verdict": parts["evaluation"]["verdict"],
-        **parts["evaluation"]["headline"],
-        "seconds": round(sum(one["seconds"] for one in results), 4),
-    }
+    simulating_s = round(sum(one["seconds"] for one in results), 4)
+    return {"verdict": evaluation["verdict"], **evaluation["headline"], "simulating_s": simulating_s}
 
 
 def _trials(params: EvaluateParams, options: EvaluationOptions) -> tuple[Trial, ...]:
     """Every trial of the suite; those that figures are asked of must be among them."""
-    trials = suite_trials(options)
+    with refusing_motion_errors():
+        trials = suite_trials(options)
     if unknown := set(params.trial_figures) - {trial.name for trial in trials}:
         named = f"{min(unknown)!r}; a name is like {trials[0].name!r}"
         raise JobRefused("unknown-trial", f"trial_figures: the suite has no trial {named}")
@@ -97,12 +96,3 @@ def _read_records(context: Context, results: Sequence[Mapping[str, Any]]) -> dic
     for result in results:
         known |= records_from_tree(decode_tree(context.blob(result["records"]["blob"]), MSGPACK))
     return known
-
-
-def _evaluation_document(result: EvaluationResult, database: MatchingDatabase) -> dict[str, Any]:
-    return {
-        **result_to_tree(result),
-        "normaliser": database.normaliser.as_tree(),
-        "verdict": verdict(result),
-        "headline": headline_of(result),
-    }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -55,8 +56,15 @@ def read_clips(context: Context, params: EvaluateParams, options: DatabaseOption
     pins = {name: [(pin.item, pin.revision) for pin in many] for name, many in context.inputs.items()}
     chosen = params.model_dump(mode="json", include={"database", "loops", "trims"})
     key = canonical_json({"inputs": pins, "params": chosen})
-    try:
+    with refusing_motion_errors():
         return _kept.get(key, lambda: MatchingClips(_build(context, params, options)))
+
+
+@contextmanager
+def refusing_motion_errors() -> Iterator[None]:
+    """What the mathematics refuses, no second try will change."""
+    try:
+        yield
     except MotionError as error:
         raise JobRefused(error.code, str(error)) from error
 
