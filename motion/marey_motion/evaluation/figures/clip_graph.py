@@ -34,7 +34,7 @@ MOST_CLIPS = 24
 MOST_LINES = 400
 BOW = 0.45  # how far a line is drawn towards the middle of the ring
 SIZES, LARGEST_DOT = 8, 90.0  # number of sizes of dots; area in square points
-LONGEST_NAME, LETTER_IN = 18, 0.066  # signs of a name, and how wide one is
+LONGEST_NAMES, LETTER_IN = (18, 13), 0.066  # signs of a name with one panel and with two, and how wide one is
 ABSENT = "(absent)"
 RADIAL_NAMES = 8  # more names than this run outwards, lest they meet
 
@@ -64,7 +64,8 @@ def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: Fig
     figure = new_figure(width, height + 0.3 * (len(subjects) > 1))
     across = width / len(subjects)
     names = [{clip.uid: clip.name for clip in subject.result.clips} for subject in subjects]
-    longest = max([0, *(len(shortened(each.get(uid, ABSENT), LONGEST_NAME)) for each in names for uid in uids)])
+    cut = LONGEST_NAMES[len(subjects) - 1]
+    longest = max([0, *(len(shortened(each.get(uid, ABSENT), cut)) for each in names for uid in uids)])
     for number, subject in enumerate(subjects):
         panel = add_panel(figure, Place(number * across, 0.0, across, height), grid=False)
         panel.axis("off")
@@ -72,7 +73,7 @@ def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: Fig
         _fit(panel, circles, longest, (across, height))
         _draw_lines(panel, circles, lines[number])
         _draw_dots(panel, circles, dots[number], most, options.logarithmic)
-        _draw_rings(panel, circles, names[number])
+        _draw_rings(panel, circles, names[number], cut)
     tables = {"frames": _frame_table(subjects, dots, circles), "transitions": _line_table(subjects, lines)}
     return Sketch(figure, tables, _caption(subjects, popularity, switches, circles, lines))
 
@@ -185,7 +186,7 @@ def _draw_dots(panel: Axes, circles: dict[str, Circle], dots: dict[str, Ints], m
             panel.scatter(place[mine, 0], place[mine, 1], s=area, c=look[mine], lw=0, alpha=0.9, zorder=3)
 
 
-def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str]) -> None:
+def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str], cut: int) -> None:
     """The outline of each clip, open above, and its name outside; dotted where this subject has no such clip."""
     from matplotlib.patches import Arc
 
@@ -206,7 +207,7 @@ def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str]) 
         else:
             look["ha"] = "left" if away[0] > 0.3 else "right" if away[0] < -0.3 else "center"
             look["va"] = "bottom" if away[1] > 0.3 else "top" if away[1] < -0.3 else "center"
-        write(panel, (float(x), float(y)), shortened(names.get(uid, ABSENT), LONGEST_NAME), **look)
+        write(panel, (float(x), float(y)), shortened(names.get(uid, ABSENT), cut), **look)
 
 
 def _colours(circles: dict[str, Circle]) -> dict[str, str]:

@@ -91,7 +91,7 @@ def _draw_one(families: Sequence[str], fields: Sequence[_Field], levels: Floats)
 def _draw_two(
     subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]], levels: Floats
 ) -> Figure:
-    width, height, gap = 2.62, 2.3, 0.3
+    width, height, gap = 2.54, 2.3, 0.42
     figure = new_figure(9.6, len(families) * (height + 0.85) + 0.95)
     changes = [_change(*row) for row in fields]
     upward = nice_levels(max(_largest(change) for change in changes))
