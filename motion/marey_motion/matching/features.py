@@ -17,10 +17,6 @@ from marey_motion.matching.simulation_root import SimulationRoot
 
 Floats = NDArray[np.float64]
 
-EXTRA_POSITION_WEIGHT = 0.75
-EXTRA_VELOCITY_WEIGHT = 1.0
-"""Of extra joints: as feet."""
-
 
 class FeatureGroup(NamedTuple):
     """Dimensions [start, stop) that share a scale. `joint` is the joint they describe, None for the trajectory."""
@@ -76,8 +72,8 @@ def feature_layout(options: DatabaseOptions, body: MatchingBody) -> FeatureLayou
         ("hip_velocity", "xyz", weights.hip_velocity, body.hips),
     ]
     for name in options.extra_joints:
-        blocks.append((f"{name}_position", "xyz", EXTRA_POSITION_WEIGHT, body.standard_joints[name]))
-        blocks.append((f"{name}_velocity", "xyz", EXTRA_VELOCITY_WEIGHT, body.standard_joints[name]))
+        joint = body.standard_joints[name]
+        blocks += [(f"{name}_{part}", "xyz", weights.extra_joints, joint) for part in ("position", "velocity")]
     points = [f"{horizon_s:.3f}s.{axis}" for horizon_s in options.horizons_s for axis in "xz"]
     blocks.append(("trajectory_positions", points, weights.trajectory_positions, None))
     blocks.append(("trajectory_directions", points, weights.trajectory_directions, None))

@@ -21,7 +21,7 @@ HORIZONS_S = (1 / 3, 2 / 3, 1.0)
 class FeatureWeights:
     """Weight of each group of features; the groups in the order of the 27 dimensions of the default layout.
 
-    A weight of 0 leaves the group out of all costs.
+    `extra_joints` is that of each position and each velocity of these. A weight of 0 leaves a group out of all costs.
     """
 
     left_foot_position: float = 0.75

@@ -1,0 +1,128 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from marey_motion import quaternions
+from marey_motion.clip import Clip
+from marey_motion.errors import MotionError
+from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
+from marey_motion.kinematics import global_positions
+from marey_motion.mirroring import mirror_clip
+from marey_motion.rigs import map_joints, symmetric_joints
+from marey_motion.skeleton import EndSite, Skeleton
+
+REFLECTED = np.array([-1.0, 1.0, 1.0])
+
+
+def partners_of(skeleton: Skeleton) -> NDArray[np.int32]:
+    return symmetric_joints(skeleton, map_joints(skeleton))
+
+
+def wild(skeleton: Skeleton, seed: int, *, translated: tuple[int, ...] = ()) -> Clip:
+    """Frames of arbitrary rotations, one per joint."""
+    rng = np.random.default_rng(seed)
+    rotations = rng.standard_normal((20, skeleton.joint_count, 4))
+    rotations /= np.linalg.norm(rotations, axis=-1, keepdims=True)
+    poses = np.concatenate((rng.standard_normal((20, 3)), rotations.reshape(20, -1)), axis=1).astype(np.float32)
+    moved = rng.standard_normal((20, len(translated), 3)).astype(np.float32) if translated else None
+    return Clip(skeleton, 60.0, poses, moved, translated)
+
+
+def same_motion(a: Clip, b: Clip) -> bool:
+    turned = quaternions.angle_between(a.rotations.astype(np.float64), b.rotations.astype(np.float64))
+    return bool(turned.max() < 1e-5) and np.allclose(global_positions(a), global_positions(b), atol=1e-5)
+
+
+def with_rest_pose(skeleton: Skeleton, turns: NDArray[np.float64]) -> Skeleton:
+    """The same bones with other local axes: each joint's frame turned by `turns` (J, 4)."""
+    parents = np.concatenate(([[1.0, 0.0, 0.0, 0.0]], turns[skeleton.parents[1:]]))
+    offsets = quaternions.rotate_vectors(quaternions.conjugate(parents), skeleton.offsets)
+    rest = quaternions.multiply(quaternions.multiply(quaternions.conjugate(parents), skeleton.rest_rotations), turns)
+    sites = tuple(
+        EndSite(s.joint, np.asarray(quaternions.rotate_vectors(quaternions.conjugate(turns[s.joint]), s.offset)))
+        for s in skeleton.end_sites
+    )
+    return replace(skeleton, offsets=np.asarray(offsets), rest_rotations=np.asarray(rest), end_sites=sites)
+
+
+def random_turns(count: int, seed: int) -> NDArray[np.float64]:
+    turns = np.random.default_rng(seed).standard_normal((count, 4))
+    return turns / np.linalg.norm(turns, axis=1, keepdims=True)
+
+
+def own_axes() -> Skeleton:
+    """The studio skeleton with arbitrary local axes, different on both sides."""
+    plain = studio_skeleton()
+    return with_rest_pose(plain, random_turns(plain.joint_count, 3))
+
+
+def raised_arm() -> Skeleton:
+    """The studio skeleton whose left arm points up and whose right leg points sideways at rest; axes as the world's."""
+    plain = studio_skeleton()
+    offsets = plain.offsets.copy()
+    quarter = quaternions.from_axis_angle((0.0, 0.0, 1.0), 0.5 * np.pi)
+    for top in ("LeftArm", "RightUpLeg"):
+        for joint in range(plain.index_of(top) + 1, plain.joint_count):
+            if plain.index_of(top) in plain.path_to_root(joint):
+                offsets[joint] = quaternions.rotate_vectors(quarter, offsets[joint])
+    return replace(plain, offsets=offsets)
+
+
+@pytest.mark.parametrize("make", [studio_skeleton, own_axes, raised_arm], ids=["plain", "own axes", "asymmetric rest"])
+def test_all_joints_are_where_the_mirror_shows_their_partners(make) -> None:
+    skeleton = make()
+    clip, partners = wild(skeleton, 1), partners_of(studio_skeleton())
+    mirrored = global_positions(mirror_clip(clip, partners))
+    np.testing.assert_allclose(mirrored, global_positions(clip)[:, partners] * REFLECTED, atol=2e-6)
+
+
+@pytest.mark.parametrize("make", [studio_skeleton, own_axes, raised_arm], ids=["plain", "own axes", "asymmetric rest"])
+def test_mirroring_twice_is_the_motion_itself(make) -> None:
+    clip, partners = wild(make(), 2), partners_of(studio_skeleton())
+    assert same_motion(mirror_clip(mirror_clip(clip, partners), partners), clip)
+
+
+def test_joints_without_a_counterpart_go_with_their_parent() -> None:
+    skeleton = game_skeleton()
+    partners = partners_of(skeleton)
+    weapon, hand = skeleton.index_of("weapon_r"), skeleton.index_of("hand_r")
+    clip = wild(skeleton, 4)
+    mirrored = mirror_clip(clip, partners)
+    both = [joint for joint in range(skeleton.joint_count) if joint != weapon]
+    expected = global_positions(clip)[:, partners] * REFLECTED
+    np.testing.assert_allclose(global_positions(mirrored)[:, both], expected[:, both], atol=2e-6)
+    assert quaternions.angle_between(mirrored.rotations[:, weapon], clip.rotations[:, weapon]).max() < 1e-3
+    assert skeleton.parents[weapon] == hand
+    assert same_motion(mirror_clip(mirrored, partners), clip)
+
+
+@pytest.mark.parametrize("make", [studio_skeleton, own_axes], ids=["plain", "own axes"])
+def test_translations_are_mirrored_even_where_only_one_side_has_them(make) -> None:
+    skeleton = make()
+    plain = studio_skeleton()
+    partners = partners_of(plain)
+    left = tuple(sorted(plain.index_of(name) for name in ("Spine1", "LeftArm", "LeftFoot")))
+    clip = wild(skeleton, 5, translated=left)
+    mirrored = mirror_clip(clip, partners)
+    assert set(mirrored.translated_joints) == {*left, plain.index_of("RightArm"), plain.index_of("RightFoot")}
+    np.testing.assert_allclose(global_positions(mirrored), global_positions(clip)[:, partners] * REFLECTED, atol=5e-6)
+    assert same_motion(mirror_clip(mirrored, partners), clip)
+
+
+def test_a_left_turn_in_the_mirror_is_a_right_turn() -> None:
+    left, right = generate_gait(1.2, 0.8, 4.0), generate_gait(1.2, -0.8, 4.0)
+    mirrored = mirror_clip(left, partners_of(left.skeleton))
+    np.testing.assert_allclose(mirrored.root_translations[:, [0, 2]], right.root_translations[:, [0, 2]], atol=1e-6)
+    assert np.linalg.norm(left.root_translations[-1, [0, 2]] - right.root_translations[-1, [0, 2]]) > 2.0
+
+
+@pytest.mark.parametrize(
+    ("partners", "message"),
+    [([0, 1], "one partner of its own"), ([0, 2, 2], "one partner of its own"), ([1, 0, 2], "root its own")],
+)
+def test_what_is_no_pairing_is_refused(partners, message) -> None:
+    skeleton = Skeleton(("a", "b", "c"), [-1, 0, 0], np.zeros((3, 3)), np.tile([1.0, 0, 0, 0], (3, 1)))
+    with pytest.raises(MotionError, match=message):
+        mirror_clip(wild(skeleton, 6), np.array(partners))
