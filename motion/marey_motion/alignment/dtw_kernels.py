@@ -175,13 +175,22 @@ def total_within(a, b, rest, limit):  # type: ignore[no-untyped-def]
 
 @_compiled
 def box_costs(a, low, high, out):  # type: ignore[no-untyped-def]
-    """Fill out (n,) with the mean distance of the points of each frame of a (n, P, 3) from boxes low, high (P, 3)."""
+    """Fill out (n,) with the mean distance of the points of each frame of a (n, P, 3) from the nearest of B boxes.
+
+    low, high (P, 3, B).
+    """
+    points, boxes = low.shape[0], low.shape[2]
+    costs = np.empty(boxes)
     for i in range(a.shape[0]):
-        cost = 0.0
-        for p in range(a.shape[1]):
-            square = 0.0
-            for c in range(3):
-                gap = max(low[p, c] - a[i, p, c], a[i, p, c] - high[p, c], 0.0)
-                square += gap * gap
-            cost += np.sqrt(square)
-        out[i] = cost / a.shape[1]
+        costs[:] = 0.0
+        for p in range(points):
+            x, y, z = a[i, p, 0], a[i, p, 1], a[i, p, 2]
+            for box in range(boxes):
+                dx = max(low[p, 0, box] - x, x - high[p, 0, box], 0.0)
+                dy = max(low[p, 1, box] - y, y - high[p, 1, box], 0.0)
+                dz = max(low[p, 2, box] - z, z - high[p, 2, box], 0.0)
+                costs[box] += np.sqrt(dx * dx + dy * dy + dz * dz)
+        least = costs[0]
+        for box in range(1, boxes):
+            least = min(least, costs[box])
+        out[i] = least / points

@@ -8,7 +8,9 @@ of clips with equal content.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,40 +59,58 @@ def find_near_duplicates(
     database: MatchingDatabase,
     *,
     threshold_cm: float = THRESHOLD_CM,
+    threads: int | None = None,
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> NearDuplicates:
     """All pairs of sources whose distance is at most the threshold; exact, whatever is passed over.
 
-    Most pairs are settled by a bound that is never above their distance. Progress counts sources.
+    Most pairs are settled by bounds that are never above their distance. Progress counts sources.
     """
     points = frame_points(database)
-    families = list(clips_by_source(database.clips).values())
-    limit = threshold_cm / 100.0
+    families = [[database.clips[index] for index in own] for own in clips_by_source(database.clips).values()]
     found: list[NearDuplicate] = []
     aligned = compared = 0
-    for number, own in enumerate(families):
-        if cancelled is not None and cancelled():
-            raise EvaluationCancelled(f"stopped with {number} of {len(families)} clips compared")
-        # That both are mirrored changes no distance, so one side is taken as it is.
-        one = database.clips[own[0]]
-        for others in families[number + 1 :]:
-            best: NearDuplicate | None = None
-            for other in (database.clips[index] for index in others):
-                compared += 1
-                sides = points[one.start : one.stop], points[other.start : other.stop]
-                if distance_bound(*sides) > limit:
-                    continue
-                aligned += 1
-                distance = warped_distance(*sides, limit=limit)
-                if distance <= limit and (best is None or 100.0 * distance < best.distance_cm):
-                    best = _pair(one, other, distance)
-            if best is not None:
-                found.append(best)
-        if progress is not None:
-            progress(number + 1, len(families), source_of(one))
+
+    def compare(number: int) -> tuple[list[NearDuplicate], int, int]:
+        return _compared(points, families[number][0], families[number + 1 :], threshold_cm)
+
+    with ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1, thread_name_prefix="pairs") as pool:
+        for number, (pairs, own_aligned, own_compared) in enumerate(pool.map(compare, range(len(families)))):
+            found += pairs
+            aligned, compared = aligned + own_aligned, compared + own_compared
+            if progress is not None:
+                progress(number + 1, len(families), source_of(families[number][0]))
+            if cancelled is not None and cancelled():
+                pool.shutdown(cancel_futures=True)
+                raise EvaluationCancelled(f"stopped with {number + 1} of {len(families)} clips compared")
     found.sort(key=lambda pair: (pair.distance_cm, pair.first, pair.second))
     return NearDuplicates(tuple(found), threshold_cm, aligned, compared)
+
+
+def _compared(
+    points: NDArray[np.float64], one: DatabaseClip, families: Sequence[Sequence[DatabaseClip]], threshold_cm: float
+) -> tuple[list[NearDuplicate], int, int]:
+    """Near-duplicates of a clip among other sources, how many clips were aligned with it, and how many there are.
+
+    That both are mirrored changes no distance, so one side is taken as it is.
+    """
+    own, limit = points[one.start : one.stop], threshold_cm / 100.0
+    found: list[NearDuplicate] = []
+    aligned = compared = 0
+    for family in families:
+        near: list[NearDuplicate] = []
+        for other in family:
+            compared += 1
+            theirs = points[other.start : other.stop]
+            if distance_bound(own, theirs, frames_per_box=None) > limit or distance_bound(own, theirs) > limit:
+                continue
+            aligned += 1
+            distance = warped_distance(own, theirs, limit=limit)
+            if distance <= limit:
+                near.append(_pair(one, other, distance))
+        found += sorted(near, key=lambda pair: pair.distance_cm)[:1]
+    return found, aligned, compared
 
 
 def frame_points(database: MatchingDatabase) -> NDArray[np.float64]:

@@ -111,11 +111,18 @@ class Resimulation:
 
     def seconds(self, removed: Collection[str] = NONE) -> float:
         """Seconds of data that are left, mirrored twins not counted."""
-        return sum(self.seconds_of(source) for source in self.sources if source not in removed)
+        return sum(self._frames(source) for source in self.sources if source not in removed) / self._rate_hz
 
     def seconds_of(self, source: str) -> float:
         """Seconds of one source, whether or not it is there mirrored, too."""
-        return max(self.database.clips[own].frame_count for own in self.sources[source]) / self.database.options.rate_hz
+        return self._frames(source) / self._rate_hz
+
+    @property
+    def _rate_hz(self) -> float:
+        return self.database.options.rate_hz
+
+    def _frames(self, source: str) -> int:
+        return max(self.database.clips[own].frame_count for own in self.sources[source])
 
     def _find(self, number: int, gone: Sources) -> Outcome | None:
         for removed, outcome in self._known[number]:

@@ -139,9 +139,10 @@ def test_the_bound_is_never_above_the_distance_and_tells_distant_motions_apart()
     for seed in range(30):
         a = walking_points(20 + seed, 1.0 + 0.05 * seed, seed=seed)
         b = walking_points(45 - seed, 1.4, 0.1 * seed, seed=seed + seed % 2)
-        assert 0.0 <= distance_bound(a, b) <= warped_distance(a, b)
-    apart = walking_points(30) + (0.0, 0.0, 10.0)
-    assert distance_bound(walking_points(30), apart) > 5.0
+        one_box, many = distance_bound(a, b, frames_per_box=None), distance_bound(a, b, frames_per_box=5)
+        assert 0.0 <= one_box <= many <= warped_distance(a, b)
+    apart = walking_points(30) + 10.0
+    assert distance_bound(walking_points(30), apart, frames_per_box=None) > 5.0
 
 
 def test_what_cannot_be_aligned_is_refused():

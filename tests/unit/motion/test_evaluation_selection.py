@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_databases import made_database
-from suggestion_cases import named, same_to_the_bit, simulated, wandering_tracks, with_mirrored
 
+from made_databases import made_database
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.selection import (
     clips_by_source,
@@ -16,6 +15,7 @@ from marey_motion.evaluation.selection import (
     without_rows,
     without_sources,
 )
+from suggestion_cases import named, same_to_the_bit, simulated, wandering_tracks, with_mirrored
 
 ROWS = ("features", "selectable", "root_positions", "root_headings", "pose_points", "poses", "contacts")
 

@@ -1,0 +1,112 @@
+"""Clips that show nearly the same motion are found, and no others."""
+
+from dataclasses import replace
+from math import radians
+
+import numpy as np
+import pytest
+
+from made_databases import made_database
+from marey_motion.alignment.dtw import warped_distance
+from marey_motion.evaluation.duplicates import find_near_duplicates, frame_points, spared_sources
+from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_motion.gait import generate_gait
+from marey_motion.gait.style import GaitStyle
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.building import build_database
+from marey_motion.matching.database import SourceClip
+from marey_motion.matching.options import DatabaseOptions
+from marey_motion.mirroring import mirror_clip
+from marey_motion.rigs import map_joints
+from suggestion_cases import named, wandering_tracks
+
+
+def gaits(mirroring="none", **clips):
+    skeleton = next(iter(clips.values())).skeleton
+    body = MatchingBody.from_mapping(skeleton, map_joints(skeleton))
+    sources = [SourceClip(uid, uid, clip, content=f"sha256:{uid}") for uid, clip in clips.items()]
+    return build_database(sources, body, DatabaseOptions(mirroring=mirroring))
+
+
+def walk(speed=1.3, turn_deg=0.0, seconds=4.0, seed=None):
+    return generate_gait(speed, radians(turn_deg), seconds, style=None if seed is None else GaitStyle.varied(seed))
+
+
+def pairs_of(database, **options):
+    return {(pair.first, pair.second) for pair in find_near_duplicates(database, **options).pairs}
+
+
+def test_the_same_walk_at_nearly_the_same_speed_is_a_near_duplicate_and_other_walks_are_not():
+    database = gaits(
+        walk=walk(),
+        again=walk(1.31),
+        faster=walk(1.6),
+        turning=walk(1.3, 25.0),
+        left=walk(1.3, 60.0),
+        right=walk(1.3, -60.0),
+        shorter=walk(seconds=2.5),
+        somebody=walk(seed=5),
+    )
+    assert pairs_of(database, threshold_cm=1.5) == {("again", "walk")}
+
+
+def test_a_copy_that_begins_elsewhere_on_the_ground_and_heads_elsewhere_is_found():
+    database = gaits(walk=walk(), turned=walk(), other=walk(2.0))
+    assert pairs_of(database, threshold_cm=0.01) == {("turned", "walk")}
+
+
+def test_a_mirror_image_counts_only_where_clips_are_mirrored():
+    left = walk(1.2, 50.0)
+    skeleton = left.skeleton
+    image = mirror_clip(left, MatchingBody.from_mapping(skeleton, map_joints(skeleton)).partners)
+    assert pairs_of(gaits(left=left, right=image)) == set()
+    (pair,) = find_near_duplicates(gaits("add", left=left, right=image)).pairs
+    assert pair.mirrored
+    assert pair.distance_cm < 0.01
+
+
+def test_no_pair_within_the_threshold_is_passed_over():
+    database = made_database(named(wandering_tracks(10)[:10]))
+    points = frame_points(database)
+    clips = database.clips
+    distances = {
+        (one.uid, other.uid): 100 * warped_distance(points[one.start : one.stop], points[other.start : other.stop])
+        for number, one in enumerate(clips)
+        for other in clips[number + 1 :]
+    }
+    threshold = float(np.median(list(distances.values())))
+    found = find_near_duplicates(database, threshold_cm=threshold)
+    expected = {pair: distance for pair, distance in distances.items() if distance <= threshold}
+    assert {(pair.first, pair.second): pair.distance_cm for pair in found.pairs} == pytest.approx(expected)
+    assert found.compared == len(distances)
+    assert [pair.distance_cm for pair in found.pairs] == sorted(expected.values())
+
+
+def test_equal_documents_are_told_apart_from_others_that_are_alike():
+    tracks = named(wandering_tracks()[:3])
+    database = made_database([*tracks, tracks[0]._replace(uid="copy"), tracks[1]._replace(uid="other_take")])
+    contents = {"clip_000": "a", "copy": "a", "clip_001": "b", "other_take": "c"}
+    clips = tuple(replace(clip, content=contents.get(clip.uid, "")) for clip in database.clips)
+    found = find_near_duplicates(replace(database, clips=clips), threshold_cm=0.1)
+    assert {(pair.first, pair.second): (pair.distance_cm, pair.same_content) for pair in found.pairs} == {
+        ("clip_000", "copy"): (0.0, True),
+        ("clip_001", "other_take"): (0.0, False),
+    }
+
+
+def test_of_each_pair_the_clip_that_is_used_less_goes_and_no_pair_is_left():
+    tracks = named(wandering_tracks()[:2])
+    copies = [tracks[0]._replace(uid="copy_1"), tracks[0]._replace(uid="copy_2")]
+    database = made_database([*tracks, *copies])
+    found = find_near_duplicates(database, threshold_cm=0.1)
+    gone = dict(spared_sources(database, found, {"clip_000": 5, "copy_1": 90, "copy_2": 5}))
+    assert set(gone) == {"clip_000", "copy_2"}
+
+
+def test_the_search_can_be_stopped_and_tells_its_progress():
+    database = made_database(named(wandering_tracks()[:4]))
+    told = []
+    find_near_duplicates(database, progress=lambda *step: told.append(step))
+    assert [step[:2] for step in told] == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    with pytest.raises(EvaluationCancelled):
+        find_near_duplicates(database, cancelled=lambda: True)

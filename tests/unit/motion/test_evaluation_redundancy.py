@@ -1,0 +1,120 @@
+"""Leaving clips out: what is predicted is what an evaluation of the clips that are left finds."""
+
+import pytest
+
+from made_databases import made_database
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.objective import HEADLINES, Objective, headline_means
+from marey_motion.evaluation.redundancy import leave_one_out, plan_removals
+from marey_motion.evaluation.resimulation import Resimulation
+from marey_motion.evaluation.selection import without_sources
+from marey_motion.evaluation.suite import EvaluationCancelled
+from suggestion_cases import OPTIONS, evaluated, named, wandering_tracks, with_mirrored
+
+
+@pytest.fixture(scope="module")
+def database():
+    return made_database(wandering_tracks())
+
+
+@pytest.fixture(scope="module")
+def result(database):
+    return evaluated(database)
+
+
+@pytest.fixture
+def simulation(database, result):
+    return Resimulation(database, OPTIONS, records=result.records)
+
+
+def test_trials_without_some_clips_are_those_of_a_database_made_without_them(database, simulation):
+    for removed in (["clip_001"], ["clip_000", "clip_004"], ["fast_000"], ["clip_002", "clip_003", "clip_005"]):
+        again = evaluated(without_sources(database, removed))
+        assert simulation.results(removed) == again.trials
+
+
+def test_the_order_in_which_parts_are_asked_for_does_not_matter(database, result):
+    parts = [["clip_001"], ["clip_001", "clip_004"], [], ["clip_004"], ["clip_000", "clip_001", "clip_004"]]
+    forwards, backwards = (Resimulation(database, OPTIONS) for _ in range(2))
+    found = {tuple(part): forwards.results(part) for part in parts}
+    assert found == {tuple(part): backwards.results(part) for part in reversed(parts)}
+    assert found[()] == result.trials
+
+
+def test_trials_that_do_not_need_a_clip_are_not_run_again(database, simulation):
+    needing = [outcome for outcome in simulation.outcomes() if "clip_001" in outcome.needed]
+    assert 0 < len(needing) < len(simulation.trials)
+    simulation.outcomes(["clip_001"])
+    assert simulation.simulated == len(needing)
+    simulation.outcomes(["clip_001", "fast_000"])
+    assert simulation.simulated == len(needing)
+
+
+def test_every_removal_is_told_with_the_change_that_an_evaluation_finds(database, result, simulation):
+    objective = Objective()
+    removals = leave_one_out(simulation, objective)
+    assert {removal.source for removal in removals} == simulation.needed()
+    before = headline_means(result.trials)
+    for removal in removals:
+        again = evaluated(without_sources(database, [removal.source]))
+        after = headline_means(again.trials)
+        assert removal.changes == {name: after[name] - before[name] for name in HEADLINES}
+        assert removal.harm == objective.value(again.trials, 0.0) - objective.value(result.trials, 0.0)
+    assert [removal.harm_per_s for removal in removals] == sorted(removal.harm_per_s for removal in removals)
+
+
+def test_a_plan_predicts_every_step_exactly(database, simulation):
+    plan = plan_removals(simulation, 4, Objective(), removed=["fast_000", "fast_001"])
+    gone = ["fast_000", "fast_001"]
+    for step in plan:
+        gone.append(step.removal.source)
+        again = evaluated(without_sources(database, gone))
+        assert step.metrics == headline_means(again.trials)
+        assert step.seconds_left == sum(clip.frame_count for clip in again.clips) / 60
+    assert len(plan) == len(set(gone)) - 2 == 4
+
+
+def test_a_plan_takes_the_least_harmful_removal_at_each_step(simulation):
+    plan = plan_removals(simulation, 3, Objective())
+    gone = []
+    for step in plan:
+        assert step.removal == leave_one_out(simulation, Objective(), removed=gone)[0]
+        gone.append(step.removal.source)
+
+
+def test_only_as_many_clips_are_tried_as_asked_for_those_first_that_few_trials_need(simulation):
+    few = leave_one_out(simulation, Objective(), consider=2)
+    everything = leave_one_out(simulation, Objective())
+    assert len(few) == 2
+    assert max(removal.trials for removal in few) <= sorted(removal.trials for removal in everything)[1]
+
+
+def test_a_clip_and_its_mirrored_twin_go_together():
+    database = with_mirrored(wandering_tracks(3))
+    simulation = Resimulation(database, OPTIONS)
+    again = evaluated(without_sources(database, ["clip_001"]))
+    assert simulation.results(["clip_001"]) == again.trials
+    assert simulation.seconds() == sum(clip.frame_count for clip in database.clips) / 60 / 2
+
+
+def test_the_last_clip_is_never_taken():
+    simulation = Resimulation(made_database(named(wandering_tracks(2)[:2])), OPTIONS)
+    assert len(plan_removals(simulation, 5, Objective())) <= 1
+
+
+def test_the_work_can_be_stopped(database):
+    stopped = Resimulation(database, OPTIONS, cancelled=lambda: True)
+    with pytest.raises(EvaluationCancelled):
+        leave_one_out(stopped, Objective())
+
+
+def test_progress_is_told_clip_by_clip(simulation):
+    told = []
+    leave_one_out(simulation, Objective(), progress=lambda *step: told.append(step))
+    assert [step[0] for step in told] == list(range(1, len(told) + 1))
+    assert {step[1] for step in told} == {len(told)}
+
+
+def test_weights_that_make_no_sense_are_refused():
+    with pytest.raises(MotionError, match="pose_cost"):
+        Objective(pose_cost=-1.0)
