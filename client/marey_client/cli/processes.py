@@ -70,7 +70,7 @@ def demo(
     serve_on: Annotated[bool, typer.Option("--serve", help="Keep serving when everything is done.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """From takes to retargeted clips on this machine: import, retarget, table, picture."""
+    """From takes to an evaluated dataset on this machine: import, retarget, evaluate; a table, a picture, a report."""
     from marey_client.demo import demonstrate
 
     demonstrate(motion, data=data, keep_serving=serve_on, as_json=as_json)
