@@ -5,6 +5,8 @@ The compiled code is kept on disk; later processes load it in a fraction of a se
 
 from __future__ import annotations
 
+import numpy as np
+
 _ASF = b""":version 1.10
 :units
   mass 1.0
@@ -33,10 +35,11 @@ _AMC = b":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 16 0 0 0 0\nfemur 10\n2\nroot 0 1
 
 
 def compile_kernels() -> None:
-    """Read, check, retarget and write a second of generated walking in every way that uses a kernel."""
+    """Read, check, retarget, write and search a second of generated walking in every way that uses a kernel."""
     from marey_motion.formats import ImportOptions, read_motion, write_motion
     from marey_motion.gait import game_skeleton, generate_gait
     from marey_motion.kinematics import global_rotations
+    from marey_motion.matching.search import build_index, find_best
     from marey_motion.retargeting import plan_retarget, retarget
     from marey_motion.rigs import guess_axes, map_joints
 
@@ -51,6 +54,8 @@ def compile_kernels() -> None:
         rigs.append((skeleton, mapping, guess_axes(skeleton, mapping)))
     result = retarget(read, plan_retarget(*rigs[0], *rigs[1]))
     global_rotations(result)
+    poses = clip.poses[:, :27].astype(float)
+    find_best(build_index(poses, np.array([0, len(poses)]), np.ones(len(poses), np.bool_)), poses[0], 1)
 
 
 if __name__ == "__main__":

@@ -98,7 +98,7 @@ def build_index(
         boxes=_boxes(low, high, group_blocks),
         group_blocks=group_blocks,
         group_boxes=_boxes(group_low, group_high, _by_sixteen(len(group_low))),
-        radius=float(np.sqrt(np.square(rows).sum(axis=1).max())),
+        radius=float(np.sqrt(np.einsum("nd,nd->n", rows, rows).max())),
         boxed=True,
     )
     boxed = _boxes_pay(index) if method == "auto" else method == "boxes"
@@ -117,9 +117,8 @@ def _check(rows: NDArray[np.float64], starts: NDArray[np.int64], selectable: NDA
             "no row can be chosen: every clip is shorter than what its last rows need to look ahead; add longer clips",
             code="nothing-selectable",
         )
-    unusable = np.argwhere(~(np.abs(rows) <= LARGEST))
-    if len(unusable):
-        row, dimension = unusable[0]
+    if not (rows.max() <= LARGEST and rows.min() >= -LARGEST):
+        row, dimension = np.argwhere(~(np.abs(rows) <= LARGEST))[0]
         raise MotionError(
             f"the value is {rows[row, dimension]}; normalised features are finite and at most {LARGEST:g}",
             where=f"row {row}, dimension {dimension}",
