@@ -123,13 +123,18 @@ def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):  
 
 
 @_compiled
-def distance_cost(index, points, row, other, query, first):  # type: ignore[no-untyped-def]
-    """Summed distance in metres between the pose joints of two rows, plus the trajectory cost of the `other`."""
+def _distance_cost(index, points, row, other, query, first, limit):  # type: ignore[no-untyped-def]
+    """Trajectory cost of the `other` row plus its pose joints' summed distance in metres to those of `row`.
+
+    Something above `limit` where the whole would be.
+    """
     cost = 0.0
     for d in range(first, query.shape[0]):
         difference = index.rows[other, d] - query[d]
         cost += difference * difference
     for p in range(points.shape[1]):
+        if cost > limit:
+            return cost
         square = 0.0
         for c in range(3):
             difference = np.float64(points[other, p, c]) - np.float64(points[row, p, c])
@@ -143,7 +148,7 @@ def _nearest_by_distance(index, points, row, query, first, skip_start, skip_stop
     best_row, best_cost = -1, np.inf
     for other in range(index.rows.shape[0]):
         if index.selectable[other] and not skip_start <= other < skip_stop:
-            cost = distance_cost(index, points, row, other, query, first)
+            cost = _distance_cost(index, points, row, other, query, first, best_cost)
             if cost < best_cost:
                 best_row, best_cost = other, cost
     return best_row, best_cost
