@@ -90,7 +90,7 @@ def load_chapter(result: EvaluationResult, figures: Figures) -> Section:
         if used
         else "No clip was displayed."
     )
-    rows = [_use_row(source) for source in used[:LOAD_CLIPS]]
+    rows = [_use_row(source, result) for source in used[:LOAD_CLIPS]]
     listing = table("The clips displayed most", USE_HEADS, rows, numbers=range(1, 5)) if rows else None
     return Section(
         "load",
@@ -169,7 +169,12 @@ def baseline_chapter(result: EvaluationResult) -> Section:
 def appendix_chapter(result: EvaluationResult) -> Section:
     """Every trial and every clip."""
     trials = table("All trials", TRIAL_HEADS, map(_trial_row, result.trials), numbers=range(1, 7))
-    clips = table("All clips", USE_HEADS, map(_use_row, _by_use(result, unused=True)), numbers=range(1, 5))
+    clips = table(
+        "All clips",
+        USE_HEADS,
+        (_use_row(source, result) for source in _by_use(result, unused=True)),
+        numbers=range(1, 5),
+    )
     return Section(
         "all",
         "All trials and clips",
@@ -208,12 +213,12 @@ def _trial_row(outcome: TrialResult) -> list[Cell]:
     ]
 
 
-def _use_row(source: SourceUsage) -> list[Cell]:
+def _use_row(source: SourceUsage, result: EvaluationResult) -> list[Cell]:
     shown_at_all = float(np.mean(source.popularity > 0)) if len(source.popularity) else 0.0
     return [
         element("span", source.name, title=source.uid),
         share(source.share),
-        number(len(source.popularity) / 60.0, 1),
+        number(len(source.popularity) / result.options.database.rate_hz, 1),
         share(shown_at_all),
         Number(source.entries, f"{source.entries:,}"),
     ]
