@@ -1,0 +1,134 @@
+"""Whether what covers a cell can be blended, against distances of all pairs of frames."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from made_databases import arc_track, made_database
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.coverage import measure_coverage
+from marey_motion.evaluation.similarity import (
+    accepted_distance,
+    measure_similarity,
+    nearest_poses,
+    source_of_rows,
+    window_cells,
+    window_rows,
+)
+from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_motion.matching.record import Status
+from suggestion_cases import OPTIONS, evaluated, named, wandering_tracks, with_mirrored
+
+
+def straight_walks(count=3, seconds=5.0, **given):
+    """Clips of one speed that differ in the phase of their gait, so that they fall into one cell."""
+    return named([arc_track(1.0, 0.0, seconds, phase=0.4 * number, **given) for number in range(count)])
+
+
+def brute_force(database, rows):
+    """Distance of each of these rows from the nearest of another source among them."""
+    points = database.pose_points[rows].astype(np.float64)
+    apart = np.linalg.norm(points[:, None] - points[None], axis=-1).sum(axis=-1)
+    sources = source_of_rows(database)[rows]
+    apart[sources[:, None] == sources[None]] = np.inf
+    return apart.min(axis=1)
+
+
+def test_the_nearest_pose_of_another_clip_is_found_for_every_frame():
+    database = made_database(wandering_tracks())
+    coverage = measure_coverage(database, OPTIONS)
+    rows = np.unique(window_rows(database, coverage))[::3]
+    sources = source_of_rows(database)[rows]
+    points = database.pose_points[rows]
+    assert np.allclose(nearest_poses(points, sources, points, sources), brute_force(database, rows), rtol=1e-12)
+
+
+def test_each_cell_is_measured_by_its_own_frames_alone():
+    database = made_database(wandering_tracks(12))
+    coverage = measure_coverage(database, OPTIONS)
+    found = measure_similarity(database, coverage, threshold_m=4.0)
+    rows, cells = window_rows(database, coverage), window_cells(coverage)
+    assert len(np.unique(cells[cells >= 0])) > 2
+    for cell in np.unique(cells[cells >= 0]).tolist():
+        own = rows[cells == cell]
+        place = divmod(cell, found.frames.shape[1])
+        distances = brute_force(database, own)
+        assert found.frames[place] == found.measured[place] == len(own)
+        assert found.sources[place] == len(np.unique(source_of_rows(database)[own]))
+        assert found.blendable_share[place] == np.mean(distances <= 4.0)
+        if found.sources[place] > 1:
+            assert found.distance_m[place] == pytest.approx(np.median(distances))
+        else:
+            assert np.isnan(found.distance_m[place])
+            assert found.blendable_share[place] == 0.0
+    assert np.isnan(found.blendable_share[found.frames == 0]).all()
+
+
+def test_a_window_belongs_to_the_frame_it_begins_with():
+    database = made_database(named([arc_track(1.0, 0.0, 3.0), arc_track(2.0, 50.0, 4.0)]))
+    rows = window_rows(database, measure_coverage(database, OPTIONS))
+    assert rows.tolist() == [*range(120), *range(180, 180 + 180)]
+
+
+def test_frames_within_the_threshold_are_counted_as_blendable():
+    database = made_database(straight_walks())
+    coverage = measure_coverage(database, OPTIONS)
+    cell = np.unravel_index(np.argmax(coverage.seconds), coverage.seconds.shape)
+    assert measure_similarity(database, coverage, threshold_m=1e3).blendable_share[cell] == 1.0
+    assert measure_similarity(database, coverage, threshold_m=1e-9).blendable_share[cell] == 0.0
+
+
+def test_a_cell_with_one_clip_has_nothing_to_blend_with_and_neither_has_its_mirrored_twin():
+    alone = made_database(straight_walks(1))
+    twins = with_mirrored(straight_walks(1))
+    for database in (alone, twins):
+        found = measure_similarity(database, measure_coverage(database, OPTIONS), threshold_m=1e3)
+        assert found.share == 0.0
+        assert np.isnan(found.distance_m).all()
+
+
+def test_dense_data_that_does_not_meet_is_told_from_data_that_does():
+    near = straight_walks(2)
+    far = [near[0], near[1]._replace(pose=near[1].pose + 2.0)]
+    threshold = 1.5
+    shares = []
+    for tracks in (near, far):
+        database = made_database(tracks)
+        shares.append(measure_similarity(database, measure_coverage(database, OPTIONS), threshold).share)
+    assert shares[0] == 1.0
+    assert shares[1] == 0.0
+
+
+def test_of_a_huge_cell_evenly_chosen_frames_are_measured_against_all():
+    database = made_database(straight_walks(3))
+    coverage = measure_coverage(database, OPTIONS)
+    few, all_frames = (measure_similarity(database, coverage, 1.0, most_frames=most) for most in (100, 10_000))
+    cell = np.unravel_index(np.argmax(all_frames.frames), all_frames.frames.shape)
+    assert few.frames[cell] == all_frames.frames[cell] > 100
+    assert 50 <= few.measured[cell] <= 100
+    own = window_rows(database, coverage)[window_cells(coverage) == np.ravel_multi_index(cell, few.frames.shape)]
+    step = -(-len(own) // 100)
+    assert few.blendable_share[cell] == np.mean(brute_force(database, own)[::step] <= 1.0)
+
+
+def test_the_usual_threshold_is_the_median_cost_of_the_switches_that_were_made():
+    result = evaluated(made_database(wandering_tracks()))
+    costs = [
+        record.pose_cost[tick - 1]
+        for record in result.records
+        for tick in range(1, len(record.rows))
+        if record.status[tick] == Status.REPLACING
+    ]
+    assert accepted_distance(result.records) == np.median(costs)
+    still = [replace(record, status=np.zeros_like(record.status)) for record in result.records]
+    assert accepted_distance(still) is None
+
+
+def test_thresholds_that_are_no_distance_are_refused_and_the_work_can_be_stopped():
+    database = made_database(straight_walks())
+    coverage = measure_coverage(database, OPTIONS)
+    with pytest.raises(MotionError, match="threshold_m"):
+        measure_similarity(database, coverage, 0.0)
+    with pytest.raises(EvaluationCancelled):
+        measure_similarity(database, coverage, 1.0, cancelled=lambda: True)
