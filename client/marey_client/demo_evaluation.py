@@ -61,7 +61,7 @@ def evaluate_locomotion(
             chosen.append(clip)
     if not chosen:
         return DemoEvaluation(len(clips), 0)
-    job = project.evaluate([clip.as_input() for clip in chosen], name=NAME, **OPTIONS)
+    job = project.evaluate(chosen, name=NAME, **OPTIONS)
     found = project.evaluation(job, on_progress=lambda now: _show(now.progress, advance))
     return DemoEvaluation(len(clips), len(chosen), found.summary(), found.save_report(folder / "evaluation.html"))
 

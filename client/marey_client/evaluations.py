@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_client.downloads import saved_atomically
+from marey_client.downloads import safe_file_name, saved_atomically
 from marey_client.items import ItemHandle
+from marey_client.motions import ClipHandle
 from marey_schemas.evaluation import EvaluateParams, EvaluationReport, StoredFigure
+from marey_schemas.items import Item
 from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
 
 if TYPE_CHECKING:
@@ -21,8 +23,10 @@ if TYPE_CHECKING:
 LOOP_TAG = "loop"
 COSTS = ("match_cost", "continuing_cost", "pose_cost")
 
-Places = str | CollectionInput | ItemInput | Sequence[str | CollectionInput | ItemInput]
-"""Folders by path, or folders and clips as inputs of jobs."""
+Place = str | CollectionInput | ItemInput | ClipHandle
+"""A folder by its path, a clip, or either as an input of jobs."""
+
+Places = Place | Sequence[Place]
 
 
 class EvaluationHandle(ItemHandle):
@@ -79,7 +83,8 @@ class EvaluationHandle(ItemHandle):
 
     def save_figures(self, folder: Path) -> list[Path]:
         """Write every figure to a folder, in every form."""
-        return [_saved(folder / name, data) for figure in self.figures() for name, data in self._files_of(figure)]
+        files = (file for figure in self.figures() for file in self._files_of(figure))
+        return [_saved(folder / safe_file_name(name), data) for name, data in files]
 
     def _files_of(self, figure: StoredFigure) -> Iterator[tuple[str, bytes]]:
         name = figure.name if figure.trial is None else f"{figure.name} {figure.trial}"
@@ -97,29 +102,33 @@ def evaluate_request(
     project: ProjectHandle, clips: Places, params: EvaluateParams, normaliser: str | None
 ) -> JobCreate:
     """The job that evaluates `clips`, with loops that are tagged so and the mapping of a skeleton that was edited."""
-    places = _places(clips)
-    inputs: dict[str, Any] = {"clips": places}
+    places = [clips] if isinstance(clips, str | CollectionInput | ItemInput | ClipHandle) else list(clips)
+    found = [item for place in places for item in items_at(project, place)]
+    inputs: dict[str, Any] = {"clips": tuple(map(_as_input, places))}
     if normaliser is not None:
         inputs["normaliser"] = ItemInput(item=normaliser)
-    if len(edited := project.edited_rigs(places)) == 1:
+    if len(edited := project.edited_rigs(found)) == 1:
         (inputs["rig"],) = edited
-    loops = tuple(dict.fromkeys((*params.loops, *_tagged_loops(project, places))))
-    given = params.model_copy(update={"loops": loops}).model_dump(mode="json", exclude_defaults=True)
+    loops = dict.fromkeys((*params.loops, *(item.id for item in found if LOOP_TAG in item.tags)))
+    given = params.model_copy(update={"loops": tuple(loops)}).model_dump(mode="json", exclude_defaults=True)
     return JobCreate(kind="evaluate", inputs=inputs, params=given)
 
 
-def _places(clips: Places) -> tuple[CollectionInput | ItemInput, ...]:
-    several = [clips] if isinstance(clips, str | CollectionInput | ItemInput) else clips
-    return tuple(CollectionInput(collection=one.strip("/")) if isinstance(one, str) else one for one in several)
+def _as_input(place: Place) -> CollectionInput | ItemInput:
+    if isinstance(place, str):
+        return CollectionInput(collection=place.strip("/"))
+    return place.as_input() if isinstance(place, ClipHandle) else place
 
 
-def _tagged_loops(project: ProjectHandle, places: Sequence[CollectionInput | ItemInput]) -> Iterator[str]:
-    for place in places:
-        if isinstance(place, CollectionInput):
-            found = project.clips.list(collection=place.collection, filters={"tag.in": LOOP_TAG})
-            yield from (clip.id for clip in found)
-        elif LOOP_TAG in project.clips.get(place.item).item.tags:
-            yield place.item
+def items_at(project: ProjectHandle, place: Place) -> Iterator[Item]:
+    """The clips that a place stands for, as they are now."""
+    if isinstance(place, ClipHandle):
+        yield place.item
+    elif isinstance(place, ItemInput):
+        yield project.clips.get(place.item).item
+    else:
+        folder = place.strip("/") if isinstance(place, str) else place.collection
+        yield from (clip.item for clip in project.clips.list(collection=folder))
 
 
 # -- documents as tables -----------------------------------------------------------------------------------------------

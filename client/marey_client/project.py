@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
 from marey_client.access import Members
 from marey_client.blobs import Blobs
-from marey_client.evaluations import EvaluationHandle, Places, evaluate_request
+from marey_client.coverage_streams import CoverageStreams
+from marey_client.evaluations import EvaluationHandle, Places, evaluate_request, items_at
 from marey_client.imports import Imports
 from marey_client.items import ItemHandle, Items
 from marey_client.jobs import Jobs
@@ -18,7 +19,7 @@ from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.access import Project, ProjectChange
 from marey_schemas.evaluation import EvaluateParams
-from marey_schemas.items import Collection, CollectionChange, CollectionCreate
+from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
 from marey_schemas.jobs import CollectionInput, ItemInput, Job, JobCreate, RetargetParams
 from marey_schemas.kinds import Kind
 
@@ -84,6 +85,11 @@ class ProjectHandle:
         return Collections(self.transport, self.name)
 
     @cached_property
+    def coverage_streams(self) -> CoverageStreams:
+        """Performances that are being measured while they are recorded."""
+        return CoverageStreams(self.transport, self.name)
+
+    @cached_property
     def members(self) -> Members:
         """Who may do what."""
         return Members(self.transport, self.name)
@@ -113,7 +119,7 @@ class ProjectHandle:
         Mappings of the clips' skeletons that were edited since the clips were imported are gone by.
         """
         inputs: dict[str, Any] = {"clips": tuple(clips), "skeleton": ItemInput(item=skeleton)}
-        if edited := self.edited_rigs(clips):
+        if edited := self.edited_rigs(item for place in clips for item in items_at(self, place)):
             inputs["rigs"] = edited
         given = (params or RetargetParams()).model_dump(exclude_unset=True)
         return self.submit(JobCreate(kind="retarget", inputs=inputs, params=given, into=into, priority=priority))
@@ -143,16 +149,9 @@ class ProjectHandle:
         (made,) = jobs.outputs(job.id)
         return self.evaluations.get(made.item)
 
-    def edited_rigs(self, clips: Sequence[ItemInput | CollectionInput]) -> tuple[ItemInput, ...]:
+    def edited_rigs(self, clips: Iterable[Item]) -> tuple[ItemInput, ...]:
         """The skeletons of clips that have more than their first revision: their mapping may have been edited."""
-        used: set[str] = set()
-        for place in clips:
-            found = (
-                self.clips.list(collection=place.collection)
-                if isinstance(place, CollectionInput)
-                else [self.clips.get(place.item)]
-            )
-            used.update(clip.item.summary["skeleton"] for clip in found)
+        used = {str(clip.summary["skeleton"]) for clip in clips}
         skeletons = map(self.skeletons.get, sorted(used))
         return tuple(ItemInput(item=one.id) for one in skeletons if one.item.revision > 1)
 

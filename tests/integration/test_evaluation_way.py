@@ -137,9 +137,8 @@ def test_clips_tagged_as_loops_are_looped_and_frames_can_be_trimmed(lab: Project
 def test_the_normaliser_of_another_evaluation_can_be_used(lab: ProjectHandle) -> None:
     first = lab.evaluation(lab.evaluate("walks", name="all", **SMALL))
     some = sorted(lab.clips.list(), key=lambda clip: clip.path)[:6]
-    inputs = [clip.as_input() for clip in some]
-    own = lab.evaluation(lab.evaluate(inputs, name="own", **SMALL))
-    pinned = lab.evaluation(lab.evaluate(inputs, name="pinned", normaliser=first.id, **SMALL))
+    own = lab.evaluation(lab.evaluate(some, name="own", **SMALL))
+    pinned = lab.evaluation(lab.evaluate(some, name="pinned", normaliser=first.id, **SMALL))
     scales = [found.document()["provenance"]["normaliser"] for found in (first, own, pinned)]
     assert scales[0] == scales[2] != scales[1]
     assert first.id in {edge.item for edge in pinned.lineage().inputs}
