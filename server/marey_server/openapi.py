@@ -38,6 +38,7 @@ PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
     "digest": ("Name of the bytes.", {"type": "string", "pattern": "^sha256:[0-9a-f]{64}$"}),
     "job": ("Id of the job.", _NAME),
     "job_kind": ("Name of the kind of job.", _NAME),
+    "stream": ("Id of the coverage stream.", _NAME),
     "fence": ("Fence of the attempt.", {"type": "integer", "minimum": 0, "maximum": 999_999_999}),
 }  # fmt: skip
 _OFFSET = {"type": "integer", "minimum": 0, "maximum": 10**12 - 1}

@@ -1,4 +1,5 @@
-"""Garbage collection: documents and blobs that nothing refers to, uploads nobody continues, keys that have expired.
+"""Garbage collection: documents and blobs that nothing refers to, uploads and coverage streams that nobody continues,
+keys that have expired.
 
 Candidates are looked for in a read. Each batch is then deleted in a transaction of its own that locks the rows and
 looks again. Whoever takes up a document or blob renews its row first: either he finds it gone, or we find it young.
@@ -16,6 +17,7 @@ from marey_server import faults
 from marey_server.access.principal import SYSTEM
 from marey_server.store import uploads
 from marey_server.store.blobs import GRACE_US
+from marey_server.store.coverage_streams import drop_old_streams
 from marey_server.store.database import Database
 from marey_server.store.idempotency import LIFETIME_US as KEY_LIFETIME_US
 from marey_server.store.tables import (
@@ -44,6 +46,7 @@ class Collected:
     stray_files: int
     uploads: int
     keys: int
+    coverage_streams: int = 0
 
 
 def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collected:
@@ -54,6 +57,7 @@ def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collecte
         stray_files=_sweep_strays(database, grace_us),
         uploads=database.write(SYSTEM, _drop_old_uploads),
         keys=database.write(SYSTEM, _drop_old_keys),
+        coverage_streams=database.write(SYSTEM, drop_old_streams),
     )
 
 

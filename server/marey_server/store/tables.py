@@ -418,6 +418,23 @@ upload_chunk = Table(
     Column("data", LargeBinary, nullable=False),
 )
 
+coverage_stream = Table(
+    "coverage_stream",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("project_id", ID, ForeignKey("project.id"), nullable=False, index=True),
+    Column("author_id", ID, ForeignKey("user.id")),
+    Column("settings", Document, nullable=False),
+    Column("rig", LargeBinary),  # skeleton and mapping of its poses
+    Column("state", LargeBinary, nullable=False),
+    Column("offset", BigInteger, nullable=False, default=0),  # frames
+    Column("said", DIGEST),  # of the last request
+    Column("answer", Document),  # what it was answered, for the same request again
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False, index=True),
+    Column("rev", Integer, nullable=False, default=1),
+)
+
 leader = Table(
     "leader",
     metadata,

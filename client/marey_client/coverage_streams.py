@@ -1,0 +1,102 @@
+"""Coverage while a performer records: send frames, hear what to record next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_client.paging import pages
+from marey_client.transport import Transport, read_model
+from marey_schemas.codecs import MSGPACK, encode_tree
+from marey_schemas.coverage_streams import (
+    CoverageProgress,
+    CoverageStream,
+    CoverageStreamCreate,
+    CoverageStreamState,
+)
+
+ROOT_COLUMNS = 3
+
+
+@dataclass(frozen=True)
+class CoverageStreams:
+    """The performances of a project that are being measured."""
+
+    transport: Transport
+    project: str
+
+    @property
+    def url(self) -> str:
+        """The path below the API's root."""
+        return f"/projects/{self.project}/coverage-streams"
+
+    def begin(
+        self, frame_rate_hz: float, *, skeleton: str | None = None, evaluation: str | None = None, **options: Any
+    ) -> CoverageStreamHandle:
+        """Begin to measure a performance.
+
+        `skeleton` is the id of the one whose poses will be sent; `evaluation` that of an evaluation whose coverage is
+        gone on from. `options` are those of `CoverageStreamCreate`, for example `turn_rates_deg_s=(-90, 0, 90)`.
+        """
+        request = CoverageStreamCreate.model_validate(
+            {"frame_rate_hz": frame_rate_hz, "skeleton": skeleton, "evaluation": evaluation, **options}
+        )
+        return CoverageStreamHandle(self.transport, self.url, self.transport.post(CoverageStream, self.url, request))
+
+    def get(self, stream_id: str) -> CoverageStreamHandle:
+        """Go on with a stream, perhaps in another process, where its last frame left it."""
+        return CoverageStreamHandle(
+            self.transport, self.url, self.transport.get(CoverageStream, f"{self.url}/{stream_id}")
+        )
+
+    def list(self) -> Iterator[CoverageStream]:
+        """Every stream that got frames within a day, the newest first."""
+        return pages(self.transport, CoverageStream, self.url)
+
+
+class CoverageStreamHandle:
+    """One performance that is being measured. `offset` counts the frames sent so far."""
+
+    def __init__(self, transport: Transport, streams_url: str, stream: CoverageStream) -> None:
+        self.transport = transport
+        self.url = f"{streams_url}/{stream.id}"
+        self.stream = stream
+        self.offset = stream.offset
+
+    @property
+    def id(self) -> str:
+        """Its id."""
+        return self.stream.id
+
+    def send(self, frames: NDArray[np.floating[Any]], *, ends_take: bool = False) -> CoverageProgress:
+        """Send the next frames: poses (n, 3 + 4·joints), or roots (n, 3) of x, z in metres and heading in radians.
+
+        At most 4096 at a time; a tenth of a second to a second is usual. Frames whose answer was lost on the way are
+        sent again and count once. Raises `Conflict` where somebody else sends to the stream, too.
+        """
+        kind = "roots" if frames.shape[-1] == ROOT_COLUMNS else "poses"
+        return self._send({"offset": self.offset, kind: frames, "ends_take": ends_take})
+
+    def end_take(self) -> CoverageProgress:
+        """The performer pauses, or frames were lost: what comes next is measured afresh."""
+        return self._send({"offset": self.offset, "ends_take": True})
+
+    def read(self) -> CoverageStreamState:
+        """The whole map, the performer, and what to record next."""
+        return self.transport.get(CoverageStreamState, self.url)
+
+    def delete(self) -> None:
+        """Drop the stream; the server does so by itself a day after its last frame."""
+        self.transport.send("DELETE", self.url)
+
+    def _send(self, said: dict[str, Any]) -> CoverageProgress:
+        response = self.transport.send(
+            "POST", f"{self.url}/frames", content=encode_tree(said, MSGPACK), media_type=MSGPACK, repeatable=True
+        )
+        progress = read_model(CoverageProgress, response)
+        self.offset = progress.offset
+        return progress

@@ -1,0 +1,105 @@
+"""Coverage while a performer records: frames in, what to record next out.
+
+Nothing is lost when a server dies: a stream is a row, and every request is in it before it is answered.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from marey_schemas.coverage_streams import (
+    CoverageFrames,
+    CoverageProgress,
+    CoverageStream,
+    CoverageStreamCreate,
+    CoverageStreamState,
+)
+from marey_server import covering
+from marey_server.handlers.declarations import MIB, Access, Body, reads, writes
+from marey_server.handlers.queries import PageQuery
+from marey_server.handlers.reply import Rendered, Reply
+from marey_server.handlers.resource import Resource
+from marey_server.store import coverage_streams
+from marey_server.store.coverage_streams import Step, Stream
+
+MOST_FRAMES_BYTES = 16 * MIB
+
+
+class CoverageStreams(Resource):
+    """The performances that are being measured."""
+
+    path = "/projects/{project}/coverage-streams"
+    tag = "Evaluations"
+
+    @reads(access=Access.READER, query=PageQuery, answer=CoverageStream, paged=True)
+    async def get(self, project: str, query: PageQuery) -> Rendered:
+        """The streams of a project, the newest first."""
+        return await self.answer(coverage_streams.list_streams, project, cursor=query.cursor, limit=query.limit)
+
+    @writes(
+        access=Access.CONTRIBUTOR,
+        body=CoverageStreamCreate,
+        answer=CoverageStreamState,
+        status=201,
+        etag=True,
+        idempotency="key",
+    )
+    async def post(self, project: str, body: CoverageStreamCreate) -> Rendered:
+        """Begin to measure the coverage of a performance, from nothing or from what an evaluation found.
+
+        A stream to which no frames come for a day is dropped; a project has at most 64.
+        """
+        given = await self.look_up(covering.read_given, project, body)
+        new, state = await self.compute(covering.begin, body, given)
+
+        def created(stream: Stream) -> Reply:
+            location = f"/projects/{project}/coverage-streams/{stream.id}"
+            return Reply(CoverageStreamState(**stream.shown(), **state), rev=stream.rev, location=location)
+
+        return await self.answer_with(created, coverage_streams.create_stream, project, new)
+
+
+class CoverageStreamResource(Resource):
+    """One performance that is being measured."""
+
+    path = "/projects/{project}/coverage-streams/{stream}"
+    tag = "Evaluations"
+
+    @reads(access=Access.READER, answer=CoverageStreamState, etag=True)
+    async def get(self, project: str, stream: str) -> Reply:
+        """A stream with its map, the performer, and what to record next."""
+        held = await self.look_up(coverage_streams.read_stream, project, stream)
+        state = await self.compute(covering.look, held)
+        return Reply(state, rev=held.rev)
+
+    @writes(access=Access.CONTRIBUTOR)
+    async def delete(self, project: str, stream: str) -> Rendered:
+        """Drop a stream."""
+        return await self.answer(coverage_streams.delete_stream, project, stream)
+
+
+class CoverageStreamFrames(Resource):
+    """The frames of a performance."""
+
+    path = "/projects/{project}/coverage-streams/{stream}/frames"
+    tag = "Evaluations"
+
+    @writes(access=Access.CONTRIBUTOR, body=Body(CoverageFrames, max_bytes=MOST_FRAMES_BYTES), answer=CoverageProgress)
+    async def post(self, project: str, stream: str, body: CoverageFrames) -> Rendered | Reply:
+        """Send the next frames, as poses of the stream's skeleton or as roots; hear what is still missing.
+
+        The same frames at the same offset again get the same answer. At another offset than the stream's the answer is
+        409 with the right one in the context.
+        """
+        held = await self.look_up(coverage_streams.read_to_advance, project, stream)
+        step = await self.compute(covering.advance, held, body)
+        if not isinstance(step, Step):
+            return _progress(step)
+        return await self.answer_with(_progress, coverage_streams.advance_stream, project, held, step)
+
+
+def _progress(answer: dict[str, Any]) -> Reply:
+    return Reply(CoverageProgress.model_validate(answer))
+
+
+RESOURCES: tuple[type[Resource], ...] = (CoverageStreams, CoverageStreamResource, CoverageStreamFrames)

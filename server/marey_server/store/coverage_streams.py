@@ -1,0 +1,190 @@
+"""Streams of frames whose coverage is measured while they come: one row each, moved on by compare-and-swap.
+
+A row holds all that is needed to go on. What the last request was answered is kept with it, so that a sender who did
+not hear the answer gets it by asking again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from sqlalchemy import ColumnElement, Row, delete, func, insert, select, update
+
+from marey_schemas.access import Role
+from marey_schemas.coverage_streams import CoverageStream
+from marey_schemas.items import Page
+from marey_server.errors import Conflict, NotFound
+from marey_server.store import listing, projects
+from marey_server.store.clock import datetime_of
+from marey_server.store.ids import new_id
+from marey_server.store.tables import coverage_stream
+from marey_server.store.transaction import Transaction
+
+MOST_STREAMS = 64
+"""In one project."""
+
+LIFETIME_US = 86400 * 1_000_000
+"""A stream that got no frames for so long is dropped."""
+
+Tree = dict[str, Any]
+
+
+class CoverageOffset(Conflict):
+    """The stream goes on at another offset."""
+
+    code = "coverage-offset"
+
+
+@dataclass(frozen=True, slots=True)
+class NewStream:
+    """What a stream begins with.
+
+    `settings` are the members of `CoverageStream` that never change; `rig` the skeleton of its poses.
+    """
+
+    settings: Tree
+    rig: bytes | None
+    state: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """A stream as it is kept."""
+
+    id: str
+    settings: Tree
+    rig: bytes | None
+    state: bytes
+    offset: int
+    said: str | None
+    answer: Tree | None
+    created_us: int
+    updated_us: int
+    rev: int
+
+    def shown(self) -> Tree:
+        """The members of `CoverageStream`."""
+        return {
+            **self.settings,
+            "id": self.id,
+            "offset": self.offset,
+            "created_at": datetime_of(self.created_us),
+            "updated_at": datetime_of(self.updated_us),
+            "expires_at": datetime_of(self.updated_us + LIFETIME_US),
+            "rev": self.rev,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Where a request takes a stream: the digest of what it said, its answer, and what is kept from then on."""
+
+    said: str
+    answer: Tree
+    offset: int
+    state: bytes
+
+
+def create_stream(tx: Transaction, project: str, new: NewStream) -> Stream:
+    """A new stream. Raises `Conflict` where the project has too many."""
+    project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    tx.lock(f"coverage:{project_row.id}")
+    count = select(func.count()).where(coverage_stream.c.project_id == project_row.id, ~_is_old(tx))
+    if tx.execute(count).scalar_one() >= MOST_STREAMS:
+        detail = f"A project has at most {MOST_STREAMS} coverage streams; delete those that are no longer used."
+        raise Conflict(detail, code="too-many-streams")
+    made = Stream(new_id("coverage"), new.settings, new.rig, new.state, 0, None, None, tx.now_us, tx.now_us, 1)
+    row = {field.name: getattr(made, field.name) for field in fields(made)}
+    tx.execute(insert(coverage_stream), {**row, "project_id": project_row.id, "author_id": tx.principal.user_id})
+    return made
+
+
+def list_streams(
+    tx: Transaction, project: str, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
+) -> Page:
+    """The streams of a project, the newest first."""
+    project_row = projects.require(tx, project)
+    statement = select(*_LISTED).where(coverage_stream.c.project_id == project_row.id, ~_is_old(tx))
+    order = listing.parse_order("-id", {"id": coverage_stream.c.id})
+    rows, next_cursor = listing.read_page(tx, statement, order, ["coverage", project_row.id], cursor, limit)
+    return Page(items=tuple(CoverageStream(**_listed(row)) for row in rows), next_cursor=next_cursor)
+
+
+def read_stream(tx: Transaction, project: str, stream_id: str) -> Stream:
+    """A stream, for who may read it. Raises `NotFound`."""
+    return _find(tx, projects.require(tx, project).id, stream_id)
+
+
+def read_to_advance(tx: Transaction, project: str, stream_id: str) -> Stream:
+    """A stream, for who may send frames to it. Raises `NotFound`."""
+    return _find(tx, projects.require(tx, project, Role.CONTRIBUTOR, "write").id, stream_id)
+
+
+def advance_stream(tx: Transaction, project: str, held: Stream, step: Step) -> Tree:
+    """Move a stream on from where `held` was, and return the answer.
+
+    Raises `CoverageOffset` with the true offset where somebody else moved it in between, `NotFound` where it is gone.
+    """
+    project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    where = coverage_stream.c.id == held.id, coverage_stream.c.rev == held.rev
+    kept = {"state": step.state, "offset": step.offset, "said": step.said, "answer": step.answer}
+    moved = update(coverage_stream).where(*where).values(**kept, updated_us=tx.now_us, rev=held.rev + 1)
+    if tx.execute(moved).rowcount == 1:
+        return step.answer
+    now = _find(tx, project_row.id, held.id)
+    answer = answered_before(now, step.said)
+    if answer is None:
+        raise _elsewhere(now)
+    return answer
+
+
+def answered_before(stream: Stream, said: str) -> Tree | None:
+    """What the last request was answered, if this is the same again."""
+    return stream.answer if stream.said == said else None
+
+
+def require_offset(stream: Stream, offset: int) -> None:
+    """Raises `CoverageOffset` with the true offset where the stream does not go on at this one."""
+    if stream.offset != offset:
+        raise _elsewhere(stream)
+
+
+def _elsewhere(stream: Stream) -> CoverageOffset:
+    detail = f"The stream has {stream.offset} frames; go on from there."
+    return CoverageOffset(detail, context={"offset": stream.offset})
+
+
+def delete_stream(tx: Transaction, project: str, stream_id: str) -> None:
+    """Drop a stream. Raises `NotFound`."""
+    project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    found = _find(tx, project_row.id, stream_id)
+    tx.execute(delete(coverage_stream).where(coverage_stream.c.id == found.id))
+
+
+def drop_old_streams(tx: Transaction) -> int:
+    """Drop what nobody has sent frames to for a day."""
+    return tx.execute(delete(coverage_stream).where(_is_old(tx))).rowcount
+
+
+_LISTED = [coverage_stream.c[name] for name in ("id", "settings", "offset", "created_us", "updated_us", "rev")]
+
+
+def _listed(row: Row[Any]) -> Tree:
+    no_state: Tree = {"rig": None, "state": b"", "said": None, "answer": None}
+    return Stream(**row._mapping, **no_state).shown()
+
+
+def _is_old(tx: Transaction) -> ColumnElement[bool]:
+    return coverage_stream.c.updated_us < tx.now_us - LIFETIME_US
+
+
+def _find(tx: Transaction, project_id: str, stream_id: str) -> Stream:
+    statement = select(coverage_stream).where(
+        coverage_stream.c.id == stream_id, coverage_stream.c.project_id == project_id, ~_is_old(tx)
+    )
+    row = tx.execute(statement).first()
+    if row is None:
+        detail = f"There is no coverage stream {stream_id!r} here; after a day without frames they are dropped."
+        raise NotFound(detail, code="no-stream")
+    return Stream(**{field.name: row._mapping[field.name] for field in fields(Stream)})
