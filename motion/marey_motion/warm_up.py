@@ -5,7 +5,9 @@ The compiled code is kept on disk; later processes load it in a fraction of a se
 
 from __future__ import annotations
 
-import numpy as np
+from pathlib import Path
+
+from marey_motion.clip import Clip
 
 _ASF = b""":version 1.10
 :units
@@ -34,12 +36,24 @@ _ASF = b""":version 1.10
 _AMC = b":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 16 0 0 0 0\nfemur 10\n2\nroot 0 16 0 0 0 0\nfemur 11.5\n"
 
 
+def discard_outdated_kernels() -> None:
+    """Remove compiled code that is older than any source of kernels.
+
+    The cache compares each kernel with its own file only, and a kernel holds a copy of those that it calls.
+    """
+    package = Path(__file__).parent
+    sources = [*package.rglob("*_kernels.py"), *package.rglob("*_lanes.py")]
+    changed = max(source.stat().st_mtime for source in sources)
+    for compiled in package.rglob("__pycache__/*.nb[ic]"):
+        if compiled.stat().st_mtime < changed:
+            compiled.unlink(missing_ok=True)
+
+
 def compile_kernels() -> None:
-    """Read, check, retarget, write and search a second of generated walking in every way that uses a kernel."""
+    """Read, check, retarget, write and match a second of generated walking in every way that uses a kernel."""
     from marey_motion.formats import ImportOptions, read_motion, write_motion
     from marey_motion.gait import game_skeleton, generate_gait
     from marey_motion.kinematics import global_rotations
-    from marey_motion.matching.search import build_index, find_best
     from marey_motion.retargeting import plan_retarget, retarget
     from marey_motion.rigs import guess_axes, map_joints
 
@@ -54,9 +68,33 @@ def compile_kernels() -> None:
         rigs.append((skeleton, mapping, guess_axes(skeleton, mapping)))
     result = retarget(read, plan_retarget(*rigs[0], *rigs[1]))
     global_rotations(result)
-    poses = clip.poses[:, :27].astype(float)
-    find_best(build_index(poses, np.array([0, len(poses)]), np.ones(len(poses), np.bool_)), poses[0], 1)
+    _match(clip)
+
+
+def _match(clip: Clip) -> None:
+    """Build a database of a clip, search it, play it, show and explain what was played."""
+    from marey_motion.evaluation.scenario import Trial, reference
+    from marey_motion.matching.body import MatchingBody
+    from marey_motion.matching.building import build_database
+    from marey_motion.matching.controller import run_trial
+    from marey_motion.matching.database import SourceClip
+    from marey_motion.matching.display import displayed_clip
+    from marey_motion.matching.explain import explain_choice
+    from marey_motion.matching.options import ControllerOptions
+    from marey_motion.matching.search import build_index, find_best
+    from marey_motion.rigs import map_joints
+
+    body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
+    database = build_database([SourceClip("walk", "walk", clip)], body)
+    normalised = database.normaliser.apply(database.features)
+    index = build_index(normalised, database.starts, database.selectable)
+    find_best(index, normalised[0], 1)
+    path, options = reference(Trial("circle", 1.3, 0.2, approach_s=0.5, duration_s=0.5)), ControllerOptions()
+    record = run_trial(database, index, path, options)
+    displayed_clip(database, record, options)
+    explain_choice(database, index, path, options, record, 6)
 
 
 if __name__ == "__main__":
+    discard_outdated_kernels()
     compile_kernels()
