@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,11 @@ from numpy.typing import NDArray
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.provenance import require_comparable
 from marey_motion.evaluation.result import EvaluationResult
+from marey_motion.matching.building import union_normaliser, with_normaliser
+from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import TrialRecord
+
+Policy = Literal["pinned", "union"]
 
 CONFIDENCE = 0.95
 RESAMPLES = 9_999
@@ -42,7 +47,7 @@ class MetricChange:
     before, after : means over the trials in which both sides define the metric, in the metric's own unit
     change : mean of after - before over these trials
     low, high : bounds of the mean change at `CONFIDENCE`, by bootstrap over trials (bias corrected and accelerated)
-    trials : how many trials that is
+    trials : how many trials that is; of a single one nothing is known about the spread, and the bounds are its change
     """
 
     metric: str
@@ -55,9 +60,11 @@ class MetricChange:
 
     @property
     def verdict(self) -> str:
-        """better, worse, changed (a metric without direction) or unclear (the interval holds 0)."""
-        if self.low <= 0.0 <= self.high:
-            return "unclear" if self.low != self.high else "same"
+        """same, better, worse, changed (a metric without direction) or unclear (the interval holds 0)."""
+        if self.low == self.high == 0.0:
+            return "same"
+        if self.low <= 0.0 <= self.high or self.trials < 2:
+            return "unclear"
         if self.metric not in LESS_IS_BETTER:
             return "changed"
         return "better" if self.change < 0.0 else "worse"
@@ -65,12 +72,16 @@ class MetricChange:
 
 @dataclass(frozen=True)
 class TrialChange:
-    """A trial that went another way: from which tick on, and its headline metrics on both sides."""
+    """A trial whose records differ in anything: from which tick on, and its mean offset on both sides.
+
+    `same_motion`: only other names were displayed, as of a clip that is there twice; every number stayed the same.
+    """
 
     trial: str
     first_tick: int
     offset_mean_before: float | None
     offset_mean_after: float | None
+    same_motion: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +127,19 @@ def compare_results(before: EvaluationResult, after: EvaluationResult) -> Compar
         newly_unused=tuple(sorted((used[0] - used[1]) & uids[1])),
         coverage_change_s=after.coverage.seconds - before.coverage.seconds,
     )
+
+
+def under_one_normaliser(
+    before: MatchingDatabase, after: MatchingDatabase, policy: Policy
+) -> tuple[MatchingDatabase, MatchingDatabase]:
+    """Both databases with equal costs, so that evaluations of them can be compared.
+
+    "pinned" gives the second one the first one's normaliser; "union" gives both one that is fitted to the rows of both.
+    """
+    if policy == "pinned":
+        return before, with_normaliser(after, before.normaliser)
+    union = union_normaliser((before, after))
+    return with_normaliser(before, union), with_normaliser(after, union)
 
 
 def paired_change(metric: str, before: Sequence[float], after: Sequence[float]) -> MetricChange:
@@ -168,11 +192,18 @@ def _trial_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[T
     places = _places((before, after))
     changes = []
     for index, trial in enumerate(before.trials):
-        tick = _first_difference((before.records[index], after.records[index]), (places[0][index], places[1][index]))
-        if tick is not None:
+        moved = _numbers_differ(before.records[index], after.records[index])
+        differs = moved | np.any(places[0][index] != places[1][index], axis=1)
+        if differs.any():
             metrics = trial.metrics, after.trials[index].metrics
             changes.append(
-                TrialChange(trial.trial.name, tick, metrics[0].get("offset_mean"), metrics[1].get("offset_mean"))
+                TrialChange(
+                    trial=trial.trial.name,
+                    first_tick=int(np.argmax(differs)),
+                    offset_mean_before=metrics[0].get("offset_mean"),
+                    offset_mean_after=metrics[1].get("offset_mean"),
+                    same_motion=not moved.any(),
+                )
             )
     return tuple(changes)
 
@@ -190,16 +221,14 @@ def _clip_frames(result: EvaluationResult, record: TrialRecord, numbers: dict[st
     return np.stack((known[clips], record.rows - starts[clips]), axis=1)
 
 
-def _first_difference(
-    records: tuple[TrialRecord, TrialRecord], places: tuple[NDArray[np.int64], NDArray[np.int64]]
-) -> int | None:
-    first, second = records
-    differs = (
-        np.any(places[0] != places[1], axis=1)
-        | np.any(first.positions != second.positions, axis=1)
-        | (first.headings != second.headings)
-    )
-    return int(np.argmax(differs)) if differs.any() else None
+def _numbers_differ(first: TrialRecord, second: TrialRecord) -> NDArray[np.bool_]:
+    """(T,) ticks at which two records differ in anything but the rows, whose numbers depend on the database."""
+    differs = np.any(first.positions != second.positions, axis=1)
+    for name in ("headings", "status", "match_cost", "continuing_cost", "pose_cost"):
+        one, other = getattr(first, name), getattr(second, name)
+        # A cost that is not defined is NaN on both sides.
+        differs |= (one != other) & ~(np.isnan(one) & np.isnan(other))
+    return differs
 
 
 def _used(result: EvaluationResult) -> set[str]:

@@ -102,20 +102,26 @@ def suggest(
 
     Raises `MotionError` when the evaluation is not one of this database, `EvaluationCancelled` when asked to stop.
     """
-    how = options or SuggestionOptions()
+    how, others = options or SuggestionOptions(), dict(collections or {})
     trials = [trial.trial for trial in result.trials]
     _require_same(database, result)
-    stages = _Stages(progress, ("unused", "duplicates", "similarity", "filling", "redundant", "plan"))
-    unused = find_unused(database, trials, result.records, result.options)
-    stages.ended("unused")
+    stages = _Stages(progress, ("duplicates", "similarity", "filling", "redundant", "plan"))
+    simulation = Resimulation(
+        database, result.options, trials=trials, records=result.records, threads=threads, cancelled=cancelled
+    )
+    unused = find_unused(database, trials, result.records, result.options, index=simulation.index)
+    gone = frozenset(clip.source for clip in unused.clips)
     duplicates = find_near_duplicates(
-        database, threshold_cm=how.duplicate_cm, progress=stages.within("duplicates"), cancelled=cancelled
+        database,
+        threshold_cm=how.duplicate_cm,
+        threads=threads,
+        progress=stages.within("duplicates"),
+        cancelled=cancelled,
     )
     threshold = how.blendable_m or accepted_distance(result.records) or USUAL_BLENDABLE_M
     similarity = measure_similarity(
         database, result.coverage, threshold, progress=stages.within("similarity"), cancelled=cancelled
     )
-    others = dict(collections or {})
     fillings = rank_fillings(
         database,
         result.coverage,
@@ -125,10 +131,6 @@ def suggest(
         progress=stages.within("filling"),
         cancelled=cancelled,
     )
-    simulation = Resimulation(
-        database, result.options, trials=trials, records=result.records, threads=threads, cancelled=cancelled
-    )
-    gone = frozenset(clip.source for clip in unused.clips)
     redundant = leave_one_out(
         simulation, how.objective, removed=gone, consider=how.consider, progress=stages.within("redundant")
     )
@@ -140,6 +142,7 @@ def suggest(
         consider=how.consider,
         progress=stages.within("plan"),
     )
+    ticks = {use.uid: use.ticks for use in sum_by_source(database.clips, result.usage)}
     return Suggestions(
         result=result,
         options=how,
@@ -147,9 +150,7 @@ def suggest(
         redundant=redundant,
         plan=plan,
         duplicates=duplicates,
-        spared=spared_sources(
-            database, duplicates, {use.uid: use.ticks for use in sum_by_source(database.clips, result.usage)}
-        ),
+        spared=spared_sources(database, duplicates, ticks),
         similarity=similarity,
         fillings=fillings,
         additions=plan_fillings(fillings, result.coverage, others, result.options),
@@ -185,7 +186,3 @@ class _Stages:
             self._tell(before + 1000 * done // max(total, 1), 1000 * len(self._names), f"{stage}: {note}")
 
         return tell
-
-    def ended(self, stage: str) -> None:
-        """A stage without steps is over."""
-        self.within(stage)(1, 1, "")

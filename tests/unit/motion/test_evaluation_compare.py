@@ -1,0 +1,134 @@
+"""Two evaluations of the same trials, told apart trial by trial."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from made_databases import arc_track, made_database
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.compare import compare_results, paired_change, under_one_normaliser
+from marey_motion.evaluation.selection import joined, without_sources
+from marey_motion.matching.building import union_normaliser
+from suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
+
+
+@pytest.fixture(scope="module")
+def database():
+    return made_database(wandering_tracks())
+
+
+@pytest.fixture(scope="module")
+def result(database):
+    return evaluated(database)
+
+
+def test_an_evaluation_compared_with_itself_has_not_changed(result):
+    found = compare_results(result, result)
+    assert found.changed == ()
+    assert {change.verdict for change in found.metrics} == {"same"}
+    assert all(change.low == change.change == change.high == 0.0 for change in found.metrics)
+    assert not found.coverage_change_s.any()
+    assert (found.removed, found.added, found.newly_unused) == ((), (), ())
+
+
+def test_removing_unused_clips_changes_no_trial_although_rows_are_numbered_anew(database, result):
+    after = evaluated(without_sources(database, UNWANTED))
+    found = compare_results(result, after)
+    assert found.changed == ()
+    assert found.removed == UNWANTED
+
+
+def test_only_trials_that_went_another_way_are_told_and_from_where_on(database, result):
+    after = evaluated(without_sources(database, ["clip_001"]))
+    found = compare_results(result, after)
+    changed = {change.trial: change for change in found.changed}
+    assert 0 < len(changed) < len(result.trials)
+    for one, other, trial in zip(result.records, after.records, result.trials, strict=True):
+        change = changed.get(trial.trial.name)
+        if change is None:
+            assert np.array_equal(one.positions, other.positions)
+        else:
+            assert np.array_equal(one.positions[: change.first_tick], other.positions[: change.first_tick])
+            assert not change.same_motion
+
+
+def test_a_copy_under_a_lower_uid_is_told_as_the_same_motion():
+    tracks = named(wandering_tracks()[:4])
+    database = made_database(tracks)
+    copies = [tracks[number]._replace(uid=f"a_{number}") for number in range(4)]
+    before, after = evaluated(database), evaluated(joined(database, made_database(copies)))
+    found = compare_results(before, after)
+    assert len(found.changed) == len(before.trials)
+    assert all(change.same_motion and change.first_tick == 0 for change in found.changed)
+    assert {change.verdict for change in found.metrics} == {"same"}
+    assert set(found.newly_unused) == {track.uid for track in tracks}
+    assert found.added == ("a_0", "a_1", "a_2", "a_3")
+
+
+def test_changes_of_metrics_are_means_over_paired_trials(database, result):
+    after = evaluated(without_sources(database, ["clip_003"]))
+    for change in compare_results(result, after).metrics:
+        pairs = [
+            (one.metrics[change.metric], other.metrics[change.metric])
+            for one, other in zip(result.trials, after.trials, strict=True)
+            if None not in (one.metrics[change.metric], other.metrics[change.metric])
+        ]
+        assert change.trials == len(pairs)
+        assert change.before == pytest.approx(np.mean([pair[0] for pair in pairs]))
+        assert change.change == pytest.approx(np.mean([pair[1] - pair[0] for pair in pairs]), abs=1e-12)
+        assert change.low <= change.change + 1e-12
+        assert change.change - 1e-12 <= change.high
+
+
+def test_the_interval_holds_the_true_change_about_as_often_as_it_says():
+    random = np.random.default_rng(1)
+    held = 0
+    for _ in range(60):
+        before = random.exponential(size=60)
+        after = before + 0.3 + random.normal(size=60)
+        change = paired_change("offset_mean", before, after)
+        held += change.low <= 0.3 <= change.high
+    assert 51 <= held <= 60
+
+
+def test_the_interval_is_the_same_every_time():
+    random = np.random.default_rng(2)
+    before, after = random.normal(size=40), random.normal(size=40)
+    assert paired_change("dse_v", before, after) == paired_change("dse_v", before, after)
+
+
+def test_a_verdict_needs_an_interval_without_zero_and_a_metric_with_a_direction():
+    before = np.linspace(1.0, 2.0, 30)
+    noise = np.random.default_rng(3).normal(size=30)
+    assert paired_change("offset_mean", before, before - 0.5 + 0.1 * noise).verdict == "better"
+    assert paired_change("offset_mean", before, before + 0.5 + 0.1 * noise).verdict == "worse"
+    assert paired_change("offset_mean", before, before + noise - noise.mean()).verdict == "unclear"
+    assert paired_change("transitions", before, before + 2.0 + 0.1 * noise).verdict == "changed"
+    assert paired_change("offset_mean", before, before).verdict == "same"
+    assert paired_change("offset_mean", [1.0], [0.5]).verdict == "unclear"
+
+
+def test_evaluations_under_other_conditions_are_refused_by_name(database, result):
+    fitted_anew = made_database(wandering_tracks()[:5])
+    with pytest.raises(MotionError, match="normaliser"):
+        compare_results(result, evaluated(fitted_anew))
+    other = replace(OPTIONS, controller=replace(OPTIONS.controller, follow="path"))
+    with pytest.raises(MotionError, match="options"):
+        compare_results(result, evaluated(database, other))
+    with pytest.raises(MotionError, match="scenarios"):
+        compare_results(result, evaluated(database, replace(OPTIONS, duration_s=5.0)))
+    with pytest.raises(MotionError, match="records"):
+        compare_results(result, replace(result, records=()))
+
+
+def test_one_normaliser_makes_two_databases_comparable():
+    tracks = wandering_tracks()
+    before, after = made_database(tracks[:6]), made_database([*tracks[2:6], arc_track(1.0, 50.0, 6.0, uid="turn")])
+    for policy in ("pinned", "union"):
+        one, other = under_one_normaliser(before, after, policy)
+        assert one.normaliser.digest == other.normaliser.digest
+        found = compare_results(evaluated(one), evaluated(other))
+        assert found.added == ("turn",)
+    assert under_one_normaliser(before, after, "pinned")[0] is before
+    assert one.normaliser.digest == union_normaliser((after, before)).digest
