@@ -45,7 +45,11 @@ format: $(VENV)/.installed-dev ## Put the code in house style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(VENV)/.installed-dev ## Speed against peers, as ratios
+$(VENV)/.installed-bench: $(VENV)/.installed-dev
+	$(PIP) install -c constraints.txt -e '.[bench]'
+	@touch $@
+
+bench: $(VENV)/.installed-bench ## Speed against peers, as ratios
 	$(BIN)/python -m benchmarks
 
 fuzz: $(VENV)/.installed-dev ## An hour of malformed motion files and twenty minutes of malformed requests

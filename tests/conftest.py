@@ -5,11 +5,18 @@ import sys
 from pathlib import Path
 
 import pytest
+from marey_motion.warm_up import discard_outdated_kernels
 
 sys.path.insert(0, str(Path(__file__).parent))
 pytest_plugins = ("database_fixtures", "store_fixtures", "queue_desk")
 
 MOCAP_VARIABLE = "MAREY_TEST_MOCAP"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Kernels are compiled anew when any of them has changed, once, before tests are spread over processes."""
+    if not hasattr(config, "workerinput"):
+        discard_outdated_kernels()
 
 
 def pytest_report_header() -> str:
