@@ -100,7 +100,7 @@ def _attempt_document(row: Row[Any]) -> Attempt:
 
 
 def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
-    """What a job published; for the sum of tasks what they did, task by task."""
+    """What a job published; where it is the sum of its tasks, what they published, task by task."""
     row, _ = _find(tx, job_id)
     if row.size is None or row.gathers:
         return Page(items=tuple(JobOutput(**output) for output in row.outputs or ()))
