@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from marey_motion.warm_up import discard_outdated_kernels
 
 sys.path.insert(0, str(Path(__file__).parent))
