@@ -75,15 +75,15 @@ def _sampled(motion: Motion, places: Floats) -> Motion:
 
 def _interpolated(values: Floats, places: Floats) -> Floats:
     """Cubic splines through `values` (F, ...), read at frame numbers `places` (n,): (n, ...)."""
-    from scipy.interpolate import CubicSpline
+    from scipy.interpolate import make_interp_spline
 
     columns = values.reshape(len(values), -1)
     if len(values) == 1:
         return np.repeat(values, len(places), axis=0)
     sampled = np.empty((len(places), columns.shape[1]))
     frames = np.arange(len(values), dtype=np.float64)
+    degree = min(3, len(values) - 1)  # three frames have a parabola, two a line
     for start in range(0, columns.shape[1], CHANNELS):
         channels = slice(start, start + CHANNELS)
-        # Few frames have no cubic: the library takes the parabola through three and the line through two.
-        sampled[:, channels] = CubicSpline(frames, columns[:, channels])(places)
+        sampled[:, channels] = make_interp_spline(frames, columns[:, channels], k=degree)(places)
     return sampled.reshape(len(places), *values.shape[1:])

@@ -86,7 +86,8 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
 def symmetric_joints(skeleton: Skeleton, mapping: JointMapping) -> NDArray[np.int32]:
     """(J,) index of each joint's partner on the other side; its own for joints of the centre.
 
-    From the mapping where it knows both sides, else from names that differ in their side alone.
+    From the mapping where it knows both sides, else from names that differ in their side alone, else from the hierarchy:
+    joints that carry partners are partners.
     """
     partners = np.arange(skeleton.joint_count, dtype=np.int32)
     by_name = {parse_name(name): index for index, name in enumerate(skeleton.joint_names)}
@@ -98,6 +99,10 @@ def symmetric_joints(skeleton: Skeleton, mapping: JointMapping) -> NDArray[np.in
         other_name = mapping.joints.get(mirrored(standard))
         if other_name is not None:
             partners[skeleton.index_of(name)] = skeleton.index_of(other_name)
+    for joint in range(skeleton.joint_count - 1, 0, -1):
+        parent, other = skeleton.parents[joint], skeleton.parents[partners[joint]]
+        if parent != other and parent == partners[parent] and other >= 0 and other == partners[other]:
+            partners[[parent, other]] = other, parent
     return partners
 
 

@@ -78,6 +78,19 @@ def test_all_joints_are_where_the_mirror_shows_their_partners(make) -> None:
     np.testing.assert_allclose(mirrored, global_positions(clip)[:, partners] * REFLECTED, atol=2e-6)
 
 
+def test_joints_whose_names_tell_no_side_are_found_by_what_they_carry() -> None:
+    """Hip joints between root and thighs, as in the laboratory files that call them lhipjoint and rhipjoint."""
+    plain = studio_skeleton()
+    names = [{"LeftShoulder": "lyoke", "RightShoulder": "ryoke"}.get(name, name) for name in plain.joint_names]
+    skeleton = replace(plain, joint_names=tuple(names), display_names=())
+    left, right = names.index("lyoke"), names.index("ryoke")
+    mapping = map_joints(plain)
+    known = {standard: name for standard, name in mapping.joints.items() if name in names}
+    partners = symmetric_joints(skeleton, replace(mapping, joints=known))
+    assert (partners[left], partners[right]) == (right, left)
+    assert np.array_equal(np.delete(partners, [left, right]), np.delete(partners_of(plain), [left, right]))
+
+
 @pytest.mark.parametrize("make", [studio_skeleton, own_axes, raised_arm], ids=["plain", "own axes", "asymmetric rest"])
 def test_mirroring_twice_is_the_motion_itself(make) -> None:
     clip, partners = wild(make(), 2), partners_of(studio_skeleton())
