@@ -7,14 +7,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.evaluation.scenario import Trial, reference
+from marey_motion.evaluation.scenario import Reference, Trial, reference
 from marey_motion.gait import studio_skeleton
 from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.controller import run_trial
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 from marey_motion.matching.normaliser import Normaliser
-from marey_motion.matching.options import DatabaseOptions
+from marey_motion.matching.options import ControllerOptions, DatabaseOptions
+from marey_motion.matching.record import Status, TrialRecord
 from marey_motion.matching.search import SearchIndex, build_index
 from marey_motion.rigs import map_joints
+
+FOLLOWS = ("time", "path", "open_loop")
+EXACT = ControllerOptions(root_inertialisation=False)
+"""Nothing blended: what a root does is what the rows say."""
 
 HORIZONS = (20, 40, 60)
 POSE_DIMENSIONS = 15
@@ -178,3 +184,31 @@ def _unwound(track: Track) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         places.append(places[-1] + shift)
         headings.append(headings[-1] + turn)
     return np.array(places), np.array(headings)
+
+
+def circle(speed: float, turn_rate_deg: float, **options: float) -> Trial:
+    return Trial("circle", speed, float(np.radians(turn_rate_deg)), **options)
+
+
+def play(database: MatchingDatabase, trial: Trial | Reference, options: ControllerOptions = EXACT) -> TrialRecord:
+    path = reference(trial) if isinstance(trial, Trial) else trial
+    return run_trial(database, index_of(database), path, options)
+
+
+def offsets(record: TrialRecord, trial: Trial) -> np.ndarray:
+    return np.linalg.norm(record.positions - reference(trial).positions[: len(record.rows)], axis=1)
+
+
+def switches(record: TrialRecord) -> int:
+    return int(np.count_nonzero(record.status == Status.REPLACING))
+
+
+def on_the_circle(record: TrialRecord) -> tuple[np.ndarray, np.ndarray]:
+    """Speeds in m/s and turn rates in deg/s after the approach."""
+    speed = np.linalg.norm(np.diff(record.positions, axis=0), axis=1) * 60
+    turn_rate = np.degrees(np.diff(record.headings)) * 60
+    return speed[180:], turn_rate[180:]
+
+
+def database_clips(database: MatchingDatabase, rows: np.ndarray) -> np.ndarray:
+    return np.searchsorted(database.starts, rows, side="right") - 1

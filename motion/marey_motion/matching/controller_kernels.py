@@ -185,7 +185,7 @@ def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def first_row(index, playback, rules, wish, root, query):  # type: ignore[no-untyped-def]
+def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-untyped-def]
     """The row a trial starts with: nearest to the wished trajectory whatever its pose."""
     fill_query(index, playback, rules, wish, 0, 0.0, root[0], root[1], root[2], query)
     weights = np.ones(query.shape[0])
@@ -241,7 +241,7 @@ def run(index, playback, wish, rules, record):  # type: ignore[no-untyped-def]
     query = np.empty(index.rows.shape[1])
     offsets = np.zeros((2, 3))
     root = np.array([wish.positions[0, 0], wish.positions[0, 1], wish.headings[0]])
-    row, first_cost = first_row(index, playback, rules, wish, root, query)
+    row, first_cost = _first_row(index, playback, rules, wish, root, query)
     status = FORCED
     before = when = 0.0
     forced_at = -rules.period
