@@ -1,0 +1,188 @@
+"""What an evaluation suggests holds: on clips made by hand, and on real ones."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from made_databases import arc_track, made_database
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.compare import compare_results
+from marey_motion.evaluation.coverage import measure_coverage
+from marey_motion.evaluation.objective import headline_means
+from marey_motion.evaluation.result import EvaluationOptions, Grid
+from marey_motion.evaluation.selection import joined, without_rows, without_sources
+from marey_motion.evaluation.similarity import accepted_distance
+from marey_motion.evaluation.suggest import SuggestionOptions, suggest
+from marey_motion.evaluation.suggestion_documents import comparison_to_tree, suggestions_to_tree
+from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_motion.formats import read_motion
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.building import build_database
+from marey_motion.matching.database import SourceClip
+from marey_motion.rigs import map_joints
+from suggestion_cases import (
+    UNWANTED,
+    evaluated,
+    named,
+    same_to_the_bit,
+    simulated,
+    wandering_tracks,
+)
+
+
+@pytest.fixture(scope="module")
+def database():
+    tracks = wandering_tracks()
+    return made_database([*tracks, tracks[0]._replace(uid="copy_of_clip_000")])
+
+
+@pytest.fixture(scope="module")
+def outside():
+    return made_database(named([arc_track(1.0, 50.0, 5.0), arc_track(2.0, -50.0, 5.0)], "turn"))
+
+
+@pytest.fixture(scope="module")
+def found(database, outside):
+    options = SuggestionOptions(removals=3, blendable_m=3.0)
+    return suggest(database, evaluated(database), collections={"turns": outside}, options=options)
+
+
+def test_every_kind_of_suggestion_is_made(found):
+    assert set(UNWANTED) <= {clip.source for clip in found.unused.clips}
+    assert found.unused.ranges
+    assert len(found.plan) == 3
+    assert found.tried == (len(found.redundant), len(found.redundant))
+    assert {(pair.first, pair.second) for pair in found.duplicates.pairs} == {("clip_000", "copy_of_clip_000")}
+    assert [source for source, _ in found.spared] == ["copy_of_clip_000"]
+    assert {filling.source for filling in found.fillings} <= {"turn_000", "turn_001"}
+    assert found.similarity.threshold_m == 3.0
+
+
+def test_the_threshold_is_the_suites_own_when_none_is_given(database):
+    result = evaluated(database)
+    found = suggest(database, result, options=SuggestionOptions(removals=0, consider=0))
+    assert found.similarity.threshold_m == accepted_distance(result.records)
+    assert found.plan == found.redundant == found.fillings == ()
+
+
+def test_the_document_holds_everything_with_a_reason_and_travels(found):
+    tree = suggestions_to_tree(found)
+    listed = json.loads(json.dumps(tree, default=np.ndarray.tolist, allow_nan=False))
+    assert listed["schema"] == "marey/suggestions@1"
+    lists = (
+        listed["unused"]["clips"],
+        listed["unused"]["ranges"],
+        listed["redundant"]["clips"],
+        listed["redundant"]["plan"],
+        listed["near_duplicates"]["spared"],
+        listed["fillings"],
+        listed["additions"],
+    )
+    for entries in lists:
+        assert entries
+        for entry in entries:
+            assert entry["reason"].endswith(".")
+            assert "“" in entry["reason"]
+    assert listed["redundant"]["plan"][0]["metrics"] == found.plan[0].metrics
+
+
+def test_reasons_name_the_clip_and_what_it_does(found):
+    tree = suggestions_to_tree(found)
+    unused = {clip["source"]: clip["reason"] for clip in tree["unused"]["clips"]}
+    assert "“fast_000”: without its 4.0 s every trial stays exactly the same" in unused["fast_000"]
+    (spared,) = tree["near_duplicates"]["spared"]
+    assert "nearly the same motion as “clip_000”" in spared["reason"]
+    assert "turns has" in tree["fillings"][0]["reason"]
+
+
+def test_suggesting_twice_says_the_same(database, outside, found):
+    again = suggest(database, evaluated(database), collections={"turns": outside}, options=found.options, threads=1)
+    first, second = (
+        json.dumps(suggestions_to_tree(one), default=np.ndarray.tolist, sort_keys=True) for one in (found, again)
+    )
+    assert first == second
+
+
+def test_a_comparison_travels(database):
+    before, after = evaluated(database), evaluated(without_sources(database, ["clip_001"]))
+    tree = comparison_to_tree(compare_results(before, after))
+    listed = json.loads(json.dumps(tree, default=np.ndarray.tolist, allow_nan=False))
+    assert listed["removed"] == ["clip_001"]
+    assert {change["metric"] for change in listed["metrics"]} >= {"offset_mean", "abs_se_v"}
+
+
+def test_an_evaluation_of_another_set_is_refused(database):
+    result = evaluated(database)
+    with pytest.raises(MotionError, match="dataset"):
+        suggest(without_sources(database, ["clip_001"]), result)
+    with pytest.raises(MotionError, match="records"):
+        suggest(database, replace(result, records=()))
+
+
+def test_progress_only_rises_and_the_work_can_be_stopped(database):
+    told, result = [], evaluated(database)
+    options = SuggestionOptions(removals=2)
+    suggest(database, result, options=options, progress=lambda *step: told.append(step))
+    assert [done for done, _, _ in told] == sorted(done for done, _, _ in told)
+    assert told[-1][0] == told[-1][1]
+    with pytest.raises(EvaluationCancelled):
+        suggest(database, result, options=options, cancelled=lambda: True)
+
+
+REAL = EvaluationOptions(
+    grid=Grid((1.0, 1.5, 2.0, 3.0), (-100.0, -50.0, 0.0, 50.0, 100.0)), duration_s=15.0, families=("circle",)
+)
+
+
+@pytest.fixture(scope="module")
+def bandai(mocap):
+    """Walks, runs and others that hardly turn; and turns of another collection, on the body of the first."""
+    straight, turns = (
+        [SourceClip(path.stem, path.stem, read_motion(path.read_bytes(), path.name).clip) for path in paths]
+        for paths in (
+            sorted((mocap / "bandai-namco-1").glob("*.bvh")),
+            sorted((mocap / "bandai-namco-2").glob("*turn*_00[12].bvh")),
+        )
+    )
+    skeleton = straight[0].clip.skeleton
+    body = MatchingBody.from_mapping(skeleton, map_joints(skeleton))
+    return build_database(straight, body), build_database(turns, body)
+
+
+@pytest.fixture(scope="module")
+def real(bandai):
+    options = SuggestionOptions(removals=10, consider=12)
+    return suggest(bandai[0], evaluated(bandai[0], REAL), collections={"turns": bandai[1]}, options=options)
+
+
+def test_on_real_clips_all_safe_removals_leave_every_record_bit_identical(bandai, real):
+    database = bandai[0]
+    assert len(real.unused.clips) > 5
+    assert real.unused.ranges
+    less = without_rows(database, real.unused.rows)
+    assert same_to_the_bit(database, real.result.records, less, simulated(less, REAL))
+
+
+def test_on_real_clips_ten_removals_do_what_was_predicted(bandai, real):
+    assert len(real.plan) == 10
+    gone = {clip.source for clip in real.unused.clips} | {step.removal.source for step in real.plan}
+    again = evaluated(without_sources(bandai[0], gone), REAL)
+    assert real.plan[-1].metrics == headline_means(again.trials)
+
+
+def test_on_real_clips_turns_are_found_for_a_set_that_hardly_turns_and_help_where_predicted(bandai, real):
+    database, turns = bandai
+    assert all("turn" in filling.source for filling in real.fillings[:10])
+    chosen = [step.filling.source for step in real.additions]
+    union = joined(database, without_sources(turns, [clip.uid for clip in turns.clips if clip.uid not in chosen]))
+    assert measure_coverage(union, REAL).index == real.additions[-1].coverage_index > real.result.coverage.index
+    filled = {(cell.speed_m_s, cell.turn_rate_deg_s) for step in real.additions for cell in step.filling.cells}
+    changes = [
+        after.metrics["offset_mean"] - before.metrics["offset_mean"]
+        for before, after in zip(real.result.trials, evaluated(union, REAL).trials, strict=True)
+        if (before.trial.speed_m_s, round(np.degrees(before.trial.turn_rate_rad_s), 6)) in filled
+    ]
+    assert len(changes) > 2
+    assert np.mean(changes) < -0.1

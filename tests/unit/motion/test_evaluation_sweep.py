@@ -1,0 +1,110 @@
+"""Other weights give what a database built with them gives, and groups are ranked by what they do."""
+
+from dataclasses import replace
+from math import radians
+
+import numpy as np
+import pytest
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.metrics import pooled_metrics
+from marey_motion.evaluation.objective import Objective
+from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_motion.evaluation.sweep import (
+    GROUPS,
+    SweepRow,
+    group_influences,
+    reweighted,
+    sweep_weights,
+    vary_each_group,
+)
+from marey_motion.gait import generate_gait
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.building import build_database
+from marey_motion.matching.database import SourceClip
+from marey_motion.matching.options import DatabaseOptions, FeatureWeights
+from marey_motion.rigs import map_joints
+from suggestion_cases import OPTIONS, evaluated
+
+
+def walks(weights=None):
+    clips = [
+        SourceClip(f"walk_{speed}_{turn}", "walk", generate_gait(speed, radians(turn), 3.0))
+        for speed in (1.0, 2.0)
+        for turn in (-50, 0, 50)
+    ]
+    skeleton = clips[0].clip.skeleton
+    body = MatchingBody.from_mapping(skeleton, map_joints(skeleton))
+    return build_database(clips, body, DatabaseOptions(weights=weights or FeatureWeights()))
+
+
+@pytest.fixture(scope="module")
+def database():
+    return walks()
+
+
+OTHER = FeatureWeights(trajectory_directions=0.3, hip_velocity=2.0, left_foot_position=1.1)
+
+
+def test_other_weights_are_those_of_a_database_built_with_them(database):
+    built, changed = walks(OTHER), reweighted(database, OTHER)
+    assert np.allclose(changed.normaliser.scale, built.normaliser.scale, rtol=1e-14)
+    assert np.array_equal(changed.features, built.features)
+    assert changed.options == built.options
+
+
+def test_a_group_without_weight_plays_no_part_and_cannot_be_brought_back(database):
+    silent = reweighted(database, replace(FeatureWeights(), hip_velocity=0.0))
+    own = next(group for group in silent.layout.groups if group.name == "hip_velocity")
+    assert np.abs(silent.normaliser.apply(silent.features)[:, own.start : own.stop]).max() < 1e-12
+    with pytest.raises(MotionError, match="hip_velocity"):
+        reweighted(silent, FeatureWeights())
+
+
+def test_each_row_of_a_sweep_is_an_evaluation_with_these_weights(database):
+    rows = sweep_weights(database, OPTIONS, [FeatureWeights(), OTHER])
+    for row in rows:
+        result = evaluated(reweighted(database, row.weights))
+        assert row.metrics == pooled_metrics(result.trials)
+        assert row.objective == Objective().value(result.trials, 0.0)
+    assert rows[0].objective != rows[1].objective
+
+
+def test_each_group_is_varied_alone():
+    settings = vary_each_group(FeatureWeights(), (0.5, 4.0))
+    assert len(settings) == 1 + 2 * len(GROUPS)
+    assert settings[0] == FeatureWeights()
+    for setting in settings[1:]:
+        different = [group for group in GROUPS if getattr(setting, group) != getattr(FeatureWeights(), group)]
+        assert len(different) == 1
+
+
+def test_the_group_whose_weight_changes_most_is_the_most_influential():
+    base = FeatureWeights()
+
+    def row(objective, **weights):
+        return SweepRow(replace(base, **weights), {}, {}, objective)
+
+    found = group_influences(
+        [
+            row(1.0),
+            row(1.1, hip_velocity=2.0),
+            row(0.9, hip_velocity=0.5),
+            row(1.5, trajectory_positions=0.5),
+            row(0.2, trajectory_positions=2.0, hip_velocity=2.0),
+        ]
+    )
+    assert [influence.group for influence in found] == ["trajectory_positions", "hip_velocity"]
+    assert found[1].spread == pytest.approx(0.2)
+    assert (found[1].best_weight, found[0].best_weight) == (0.5, 1.0)
+    assert found[1].gain == pytest.approx(0.1)
+    assert found[0].gain == 0.0
+
+
+def test_a_sweep_tells_its_progress_and_can_be_stopped(database):
+    told = []
+    sweep_weights(database, OPTIONS, [FeatureWeights(), OTHER], progress=lambda *step: told.append(step[:2]))
+    assert told[-1] == (12, 12)
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    with pytest.raises(EvaluationCancelled):
+        sweep_weights(database, OPTIONS, [OTHER], cancelled=lambda: True)
