@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,14 +72,24 @@ class CoverageStreamHandle:
         """Its id."""
         return self.stream.id
 
-    def send(self, frames: NDArray[np.floating[Any]], *, ends_take: bool = False) -> CoverageProgress:
+    def send(
+        self,
+        frames: NDArray[np.floating[Any]],
+        *,
+        translations: NDArray[np.floating[Any]] | None = None,
+        translated_joints: Sequence[str] = (),
+        ends_take: bool = False,
+    ) -> CoverageProgress:
         """Send the next frames: poses (n, 3 + 4·joints), or roots (n, 3) of x, z in metres and heading in radians.
 
-        At most 4096 at a time; a tenth of a second to a second is usual. Frames whose answer was lost on the way are
-        sent again and count once. Raises `Conflict` where somebody else sends to the stream, too.
+        `translations` (n, k, 3) go with poses whose joints move in their parents, too. At most 4096 frames at a time; a
+        tenth of a second to a second is usual. Frames whose answer was lost on the way are sent again and count once.
+        Raises `Conflict` where somebody else sends to the stream, too.
         """
-        kind = "roots" if frames.shape[-1] == ROOT_COLUMNS else "poses"
-        return self._send({"offset": self.offset, kind: frames, "ends_take": ends_take})
+        said: dict[str, Any] = {"poses" if frames.shape[-1] != ROOT_COLUMNS else "roots": frames}
+        if translations is not None:
+            said |= {"translations": translations, "translated_joints": list(translated_joints)}
+        return self._send({"offset": self.offset, "ends_take": ends_take, **said})
 
     def end_take(self) -> CoverageProgress:
         """The performer pauses, or frames were lost: what comes next is measured afresh."""

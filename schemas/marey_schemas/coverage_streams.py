@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Answer, Request
-from marey_schemas.documents import RevisionRef
+from marey_schemas.documents import MAX_JOINTS, JointName, RevisionRef
 from marey_schemas.evaluation import ItemId, Speed, TurnRate
 
 LEAST_FRAME_RATE_HZ, MOST_FRAME_RATE_HZ = 10.0, 240.0
@@ -69,6 +69,10 @@ class CoverageFrames(Request):
     poses: Annotated[NDArray[Any], ArrayOf(ndim=2)] | None = Field(
         None, description="[frames, 3 + 4*joints]: root translation (m), then local quaternions w,x,y,z."
     )
+    translations: Annotated[NDArray[Any], ArrayOf(ndim=3, columns=3)] | None = Field(
+        None, description="[frames, k, 3]: local translations (m) that replace offsets, with poses."
+    )
+    translated_joints: tuple[JointName, ...] = Field((), max_length=MAX_JOINTS, description="The k joints they move.")
     roots: Annotated[NDArray[Any], ArrayOf(ndim=2, columns=3)] | None = Field(
         None,
         description="[frames, 3]: x and z of the torso on the ground (m), heading of the body (rad), not smoothed.",
@@ -79,7 +83,9 @@ class CoverageFrames(Request):
     def _check_frames(self) -> Self:
         if self.poses is not None and self.roots is not None:
             raise ValueError("send poses or roots, not both")
-        for name in ("poses", "roots"):
+        if self.poses is None and (self.translations is not None or self.translated_joints):
+            raise ValueError("translations come with poses")
+        for name in ("poses", "translations", "roots"):
             frames = getattr(self, name)
             if frames is not None and not np.issubdtype(frames.dtype, np.floating):
                 raise ValueError(f"{name}: dtype {frames.dtype.str}, where <f4 or <f8 is needed")

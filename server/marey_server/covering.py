@@ -26,7 +26,7 @@ from marey_schemas.coverage_streams import (
     MeasuredCoverage,
     Performer,
 )
-from marey_schemas.documents import SkeletonHierarchy, SkeletonMapping
+from marey_schemas.documents import Motion, SkeletonHierarchy, SkeletonMapping
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
 from marey_server.errors import Invalid, NotFound
@@ -126,12 +126,8 @@ def advance(held: Stream, frames: CoverageFrames) -> Step | Tree:
     online = OnlineCoverage.from_tree(decode_tree(held.state, MSGPACK))
     before = online.counts.copy()
     windows = 0
-    if frames.poses is not None:
-        if held.rig is None:
-            detail = "The stream was made without a skeleton; send roots, or make one with it."
-            raise Invalid(detail, code="no-skeleton", errors=[_fault("/poses", "no-skeleton", detail)])
-        with refusing("poses"):
-            windows += len(online.add_poses(body_of(held.rig), frames.poses).speed_m_s)
+    if frames.poses is not None and frames.frame_count:
+        windows += _add_poses(online, held, frames)
     if frames.roots is not None:
         roots = frames.roots.astype(np.float64)
         with refusing("roots"):
@@ -145,6 +141,33 @@ def advance(held: Stream, frames: CoverageFrames) -> Step | Tree:
         **_now(online, held.settings),
     )
     return Step(said, progress.model_dump(mode="json"), online.frame_count, _packed(online))
+
+
+def _add_poses(online: OnlineCoverage, held: Stream, frames: CoverageFrames) -> int:
+    """How many windows the poses of a request complete."""
+    from marey_motion.documents import clip_from_document
+
+    if held.rig is None:
+        detail = "The stream was made without a skeleton; send roots, or make one with it."
+        raise Invalid(detail, code="no-skeleton", errors=[_fault("/poses", "no-skeleton", detail)])
+    with refusing("poses"):
+        body = body_of(held.rig)
+        motion = {
+            "skeleton": held.settings["skeleton"],
+            "frame_rate_hz": held.settings["frame_rate_hz"],
+            "joints": body.skeleton.joint_names,
+            "poses": _single(frames.poses),
+            "translations": _single(frames.translations),
+            "translated_joints": frames.translated_joints,
+        }
+        clip = clip_from_document(Motion.model_validate(motion), body.skeleton)
+        return len(online.add_frames(body, clip).speed_m_s)
+
+
+def _single(array: NDArray[Any] | None) -> NDArray[np.float32] | None:
+    """In single precision, as clips are kept; what is too large for it becomes infinite and is refused as such."""
+    with np.errstate(over="ignore"):
+        return None if array is None else array.astype(np.float32)
 
 
 @lru_cache(maxsize=CACHED_BODIES)
@@ -164,12 +187,14 @@ def body_of(rig: bytes) -> MatchingBody:
 
 def _load_kernels(body: MatchingBody | None) -> None:
     """Load compiled code that the first frames would wait for otherwise."""
+    from marey_motion.clip import Clip
     from marey_motion.evaluation.online import OnlineCoverage
 
     trial = OnlineCoverage(MOST_FRAME_RATE_HZ)
     trial.add_roots(np.zeros((1, 2)), np.zeros(1))
     if body is not None:
-        trial.add_poses(body, np.array([[0.0] * 3 + [1.0, 0.0, 0.0, 0.0] * body.skeleton.joint_count]))
+        pose = np.array([[0.0] * 3 + [1.0, 0.0, 0.0, 0.0] * body.skeleton.joint_count], dtype=np.float32)
+        trial.add_frames(body, Clip(body.skeleton, MOST_FRAME_RATE_HZ, pose))
     trial.end_take()
 
 
@@ -190,6 +215,9 @@ def refusing(field: str) -> Iterator[None]:
         yield
     except MotionError as error:
         raise Invalid(str(error), code=error.code, errors=[_fault(f"/{field}", error.code, str(error))]) from error
+    except ValidationError as error:
+        detail = error.errors()[0]["msg"].removeprefix("Value error, ")
+        raise Invalid(f"{field}: {detail}", errors=[_fault(f"/{field}", "invalid", detail)]) from error
 
 
 def _fault(pointer: str, code: str, detail: str) -> FieldError:
@@ -203,7 +231,8 @@ def _packed(online: OnlineCoverage) -> bytes:
 def _said(frames: CoverageFrames) -> str:
     """The digest of a request: the same frames at the same offset, in whatever media type they came."""
     hashed = hashlib.sha256(f"{frames.offset} {frames.ends_take}".encode())
-    for name in ("poses", "roots"):
+    hashed.update("/".join(frames.translated_joints).encode())
+    for name in ("poses", "translations", "roots"):
         given = getattr(frames, name)
         if given is not None:
             hashed.update(f" {name} {given.dtype.str} {given.shape} ".encode())

@@ -38,6 +38,8 @@ FARTHEST_M = 1e6
 """From the origin; beyond it, positions are no longer exact enough to tell speeds, or are broken."""
 
 PATH_RATE_HZ = 5.0
+AWAY_DECIMALS = 1
+"""A tenth of a cell is no difference between two targets; of such two, the one that lacks more comes first."""
 
 
 @dataclass(frozen=True)
@@ -98,19 +100,19 @@ class OnlineCoverage:
 
     # -- what comes in -------------------------------------------------------------------------------------------------
 
-    def add_poses(self, body: MatchingBody, poses: NDArray[np.floating[Any]]) -> Windows:
-        """Take in frames (n, 3 + 4·J) of the body's skeleton, as in `Clip.poses`; the windows that they complete.
+    def add_frames(self, body: MatchingBody, clip: Clip) -> Windows:
+        """Take in the next frames, as a clip of the body's skeleton at this rate; the windows that they complete.
 
-        A take begins with the first frame in which hips and shoulders tell a direction. Raises `MotionError` where the
-        frames are no poses of the skeleton, and takes none of them.
+        A take begins with the first frame in which hips and shoulders tell a direction.
         """
-        clip = Clip(body.skeleton, self._live.rate_hz, np.asarray(poses, dtype=np.float32))
         positions = Motion.of(clip).positions(body.skeleton)
-        facing = forward_vectors(positions, body.lefts, body.rights)
-        return self._add(positions[:, body.torso, ::2], facing)
+        return self._add(positions[:, body.torso, ::2], forward_vectors(positions, body.lefts, body.rights))
 
     def add_roots(self, positions: Floats, headings: Floats) -> Windows:
-        """Take in ground positions (n, 2) of the torso and the headings (n,) of the body, neither of them smoothed."""
+        """Take in ground positions (n, 2) of the torso and headings (n,) of the body, neither of them smoothed.
+
+        Raises `MotionError` where they are no places on the ground, and takes none of them.
+        """
         if positions.shape != (len(headings), 2) or not np.all(np.isfinite(headings)):
             raise MotionError(f"{len(headings)} headings for positions of shape {positions.shape}", where="roots")
         return self._add(positions, np.stack((np.sin(headings), np.cos(headings)), axis=-1))
@@ -180,7 +182,7 @@ class OnlineCoverage:
             (turn_rates - turn_rate) / np.median(np.diff(self.turn_rate_edges_deg_s)),
         )
         v, w = np.nonzero(deficits > 0.0)
-        nearest = np.lexsort((w, v, -deficits[v, w], away[v, w]))[:count]
+        nearest = np.lexsort((w, v, -deficits[v, w], np.round(away[v, w], AWAY_DECIMALS)))[:count]
         return tuple(
             _target(Hole(float(speeds[a]), float(turn_rates[b]), float(seconds[a, b]), float(deficits[a, b])), path_s)
             for a, b in zip(v[nearest], w[nearest], strict=True)
