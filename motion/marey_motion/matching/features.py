@@ -72,8 +72,8 @@ def feature_layout(options: DatabaseOptions, body: MatchingBody) -> FeatureLayou
         ("hip_velocity", "xyz", weights.hip_velocity, body.hips),
     ]
     for name in options.extra_joints:
-        joint = body.standard_joints[name]
-        blocks += [(f"{name}_{part}", "xyz", weights.extra_joints, joint) for part in ("position", "velocity")]
+        extra = body.standard_joints[name]
+        blocks += [(f"{name}_{part}", "xyz", weights.extra_joints, extra) for part in ("position", "velocity")]
     points = [f"{horizon_s:.3f}s.{axis}" for horizon_s in options.horizons_s for axis in "xz"]
     blocks.append(("trajectory_positions", points, weights.trajectory_positions, None))
     blocks.append(("trajectory_directions", points, weights.trajectory_directions, None))

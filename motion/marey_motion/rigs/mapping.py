@@ -86,8 +86,8 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
 def symmetric_joints(skeleton: Skeleton, mapping: JointMapping) -> NDArray[np.int32]:
     """(J,) index of each joint's partner on the other side; its own for joints of the centre.
 
-    From the mapping where it knows both sides, else from names that differ in their side alone, else from the hierarchy:
-    joints that carry partners are partners.
+    From the mapping where it knows both sides, else from names that differ in their side alone, else from what joints
+    carry: the parents of partners are partners.
     """
     partners = np.arange(skeleton.joint_count, dtype=np.int32)
     by_name = {parse_name(name): index for index, name in enumerate(skeleton.joint_names)}
