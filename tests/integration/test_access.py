@@ -59,6 +59,8 @@ BODIES = {
     "FailRequest": {"write_id": "12345678", "code": "x"},
     "BlobsQuery": {"digests": [SECRET_DIGEST]},
     "UploadCreate": {"length": 5},
+    "CoverageStreamCreate": {"frame_rate_hz": 60},
+    "CoverageFrames": {"offset": 0, "ends_take": True},
 }
 """A body for every model that a route takes; a route with a new one fails here until it gets one."""
 
@@ -97,6 +99,8 @@ def house(server: Server) -> House:
         "/projects/lab/jobs", json={"kind": "export", "inputs": {"clips": [{"item": made.json()["id"]}]}}
     )
     assert job.status_code == 202, job.text
+    stream = contributor.post("/projects/lab/coverage-streams", json=BODIES["CoverageStreamCreate"])
+    assert stream.status_code == 201, stream.text
     worker = server.client(server.make_user("worker", administrator=True, scopes=("work",)))
     lease = worker.post("/leases", json={"worker": "w", "kinds": ["export"]}).json()["leases"][0]
     assert owner.post("/projects", json={"name": "gone"}).is_success
@@ -106,7 +110,8 @@ def house(server: Server) -> House:
     variables = {
         "project": "lab", "collection": collection, "kind": "clips", "item": made.json()["id"], "part": "info",
         "revision": "1", "user": "reader", "job": lease["job"], "fence": str(lease["fence"]), "digest": SECRET_DIGEST,
-        "job_kind": "import", "figure": "offsets", "token": "token_of_nobody", "upload": "upload_of_nobody",
+        "job_kind": "import", "figure": "offsets", "stream": stream.json()["id"],
+        "token": "token_of_nobody", "upload": "upload_of_nobody",
     }  # fmt: skip
     return House(server, tokens, variables)
 

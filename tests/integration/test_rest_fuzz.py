@@ -63,9 +63,10 @@ def furnish(server: Server, token: str) -> dict[str, object]:
     body = {"name": CANARY, "collection": CANARY, "parts": {"hierarchy": hierarchy}}
     made = owner.post("/projects/lab/skeletons", json=body, headers={"Idempotency-Key": "furnish"})
     collections = owner.get("/projects/lab/collections").json()["items"]
+    stream = owner.post("/projects/lab/coverage-streams", json={"frame_rate_hz": 60})
     return {
         "project": "lab", "kind": "skeletons", "item": made.json()["id"], "part": "hierarchy", "revision": 1,
-        "collection": collections[0]["id"], "user": "reader", "job_kind": "import",
+        "collection": collections[0]["id"], "user": "reader", "job_kind": "import", "stream": stream.json()["id"],
     }  # fmt: skip
 
 
