@@ -13,6 +13,9 @@ from marey_motion.evaluation.result import ClipUsage
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import Status, TrialRecord
 
+TREADING_S = 1 / 3
+"""A switch back to a moment so near the one that was left goes nowhere."""
+
 
 class Jumps(NamedTuple):
     """Where a character left the course of a clip.
@@ -126,3 +129,18 @@ def sum_by_source(clips: Sequence[DatabaseClip], usage: Sequence[ClipUsage]) -> 
 def unused_clips(usage: Sequence[ClipUsage]) -> tuple[int, ...]:
     """Indices of the clips that were never displayed."""
     return tuple(index for index, own in enumerate(usage) if own.ticks == 0)
+
+
+def treading_share(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> float | None:
+    """Share of the chosen jumps that land within `TREADING_S` of where they left, in the same clip; None without any.
+
+    A character that finds nothing to go on with comes back to nearly the same frame at every search, and glides.
+    """
+    made = back = 0
+    for record in records:
+        jumps = find_jumps(clips, record)
+        left, entered = jumps.left[~jumps.forced], jumps.entered[~jumps.forced]
+        same = clips_of_rows(clips, left) == clips_of_rows(clips, entered)
+        made += len(left)
+        back += int(np.count_nonzero(same & (np.abs(entered - left) <= TREADING_S * record.rate_hz)))
+    return back / made if made else None

@@ -16,7 +16,7 @@ from marey_motion.evaluation.baseline import baseline_database
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.metrics import measure_trial, offset_asymmetry, pooled_metrics
 from marey_motion.evaluation.provenance import provenance_of
-from marey_motion.evaluation.relevance import count_switches, measure_usage, unused_clips
+from marey_motion.evaluation.relevance import count_switches, measure_usage, treading_share, unused_clips
 from marey_motion.evaluation.result import EvaluationOptions, EvaluationResult, TrialResult
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials
 from marey_motion.matching.controller import run_trial
@@ -143,7 +143,11 @@ def assemble(
         provenance=provenance_of(database, options, trials),
         clips=database.clips,
         trials=results,
-        suite=_suite_metrics(results, options) | {"unused_clips": float(len(unused_clips(usage)))},
+        suite={
+            **_suite_metrics(results, options),
+            "unused_clips": float(len(unused_clips(usage))),
+            "treading_share": treading_share(database.clips, records),
+        },
         usage=usage,
         switches=count_switches(database.clips, records),
         coverage=measure_coverage(database, options),

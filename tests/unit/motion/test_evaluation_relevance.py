@@ -10,6 +10,7 @@ from marey_motion.evaluation.relevance import (
     find_jumps,
     measure_usage,
     sum_by_source,
+    treading_share,
     unused_clips,
 )
 from marey_motion.matching.record import Status
@@ -103,3 +104,12 @@ def test_a_mirror_image_without_its_source_stands_for_the_source():
     (only,) = sum_by_source(clips, measure_usage(clips, [walked_record([0, 1])]))
 
     assert (only.uid, only.clips, only.ticks) == ("a", (0,), 2)
+
+
+def test_jumps_back_to_nearly_the_same_frame_are_treading_and_those_across_a_seam_of_clips_are_not():
+    clips = clips_of(100, 100)
+    back, far, across = [50, 48, 49], [50, 80, 81], [99, 105, 106]
+
+    assert treading_share(clips, [walked_record(back)]) == 1.0
+    assert treading_share(clips, [walked_record(back), walked_record(far), walked_record(across)]) == 1 / 3
+    assert treading_share(clips, [walked_record([1, 2, 3])]) is None

@@ -41,6 +41,9 @@ METRICS = {
     "transitions_per_s": Metric(
         "transitions", "1/s", 2, "how often the character switches to another place in the clips"
     ),
+    "treading_share": Metric(
+        "treading", "", 2, "share of the transitions that go back to nearly the same frame, for want of another"
+    ),
     "clip_ends": Metric("clip ends met", "", 0, "how often a clip ended before the search chose to leave it"),
     "offset_asymmetry": Metric(
         "left-right difference", "m", 2, "mean difference of the distance between a left turn and the same right turn"
