@@ -11,7 +11,7 @@ from marey_motion.gait import generate_gait
 from marey_motion.rigs import guess_axes, map_joints
 from marey_schemas.access import Role
 from marey_schemas.codecs import BSON, JSON, MSGPACK, encode_tree
-from rest_server import Server
+from rest_server import Server, running
 
 STREAMS = "/projects/lab/coverage-streams"
 RATE_HZ = 60.0
@@ -68,3 +68,207 @@ def test_a_performance_fills_its_cell_and_the_next_target_lies_beside_it(owner, 
     nearest = progress["targets"][0]
     assert abs(nearest["speed_m_s"] - 1.5) + abs(nearest["turn_rate_deg_s"] - 50.0) / 100.0 == pytest.approx(0.25)
     assert nearest["path"][0] == [0.0, 0.0, 0.0]
+
+
+def circling(speed_m_s: float, turn_rate_deg_s: float, seconds: float):
+    """Roots (n, 3) that go where they face."""
+    headings = math.radians(turn_rate_deg_s) * np.arange(round(seconds * RATE_HZ) + 1) / RATE_HZ
+    steps = speed_m_s / RATE_HZ * np.stack((np.sin(headings), np.cos(headings)), axis=-1)
+    return np.column_stack((np.cumsum(steps, axis=0) - steps, headings))
+
+
+def problem(answer: httpx.Response, status: int) -> dict:
+    assert answer.status_code == status, answer.text
+    return answer.json()
+
+
+@pytest.mark.parametrize("media_type", [JSON, MSGPACK, BSON])
+def test_frames_come_in_every_media_type(owner, media_type) -> None:
+    stream = begin(owner)
+    roots = circling(2.0, -50.0, 3.0)
+    progress = send(owner, stream, media_type, offset=0, roots=roots, ends_take=True).json()
+    assert (progress["offset"], progress["windows"]) == (181, 121)
+    (cell,) = progress["changed"]
+    assert (cell["speed_m_s"], cell["turn_rate_deg_s"]) == (2.0, -50.0)
+    assert cell["seconds"] == pytest.approx(121 / 60)
+    assert progress["performer"] is None
+
+
+def test_the_map_is_there_for_who_looks_on(owner, server) -> None:
+    stream = begin(owner, speeds_m_s=[2.0, 1.0], turn_rates_deg_s=[-50.0, 0.0, 50.0], least_s=2.0, target_count=1)
+    assert (stream["speeds_m_s"], stream["delay_s"], stream["missing_s"]) == ([1.0, 2.0], 0.5, 12.0)
+    send(owner, stream, offset=0, roots=circling(2.0, -50.0, 3.0), ends_take=True)
+    shown = owner.get(f"{STREAMS}/{stream['id']}")
+    state = shown.json()
+    assert state["offset"] == 181
+    assert state["seconds"][1][0] == pytest.approx(121 / 60)
+    assert state["deficit_s"] == [[2.0, 2.0, 2.0], [0.0, 2.0, 2.0]]
+    assert state["index"] == pytest.approx(1 / 6)
+    assert len(state["targets"]) == 1
+    unchanged = owner.get(f"{STREAMS}/{stream['id']}", headers={"If-None-Match": shown.headers["ETag"]})
+    assert unchanged.status_code == 304
+    (listed,) = owner.get(STREAMS).json()["items"]
+    assert (listed["id"], listed["offset"]) == (stream["id"], 181)
+
+
+def test_the_same_frames_again_get_the_same_answer_and_count_once(owner) -> None:
+    stream = begin(owner)
+    roots = circling(2.0, 50.0, 3.0)
+    first = send(owner, stream, offset=0, roots=roots[:100])
+    again = send(owner, stream, JSON, offset=0, roots=roots[:100])  # in other words
+    assert again.json() == first.json()
+    onward = send(owner, stream, offset=100, roots=roots[100:])
+    assert onward.json()["offset"] == 181
+    late = problem(send(owner, stream, offset=0, roots=roots[:100]), 409)
+    assert (late["code"], late["context"]) == ("coverage-offset", {"offset": 181})
+
+
+def test_frames_that_leave_a_gap_are_told_where_to_go_on(owner) -> None:
+    stream = begin(owner)
+    roots = circling(2.0, 50.0, 1.0)
+    send(owner, stream, offset=0, roots=roots[:10])
+    for offset in (0, 9, 11, 1000):
+        refused = problem(send(owner, stream, offset=offset, roots=roots[10:20]), 409)
+        assert refused["context"] == {"offset": 10}
+    assert send(owner, stream, offset=10, roots=roots[10:20]).json()["offset"] == 20
+
+
+def test_a_pause_begins_a_new_take(owner) -> None:
+    stream = begin(owner)
+    roots = circling(2.0, 0.0, 1.5)
+    send(owner, stream, offset=0, roots=roots)
+    ended = send(owner, stream, offset=91, ends_take=True).json()
+    assert (ended["offset"], ended["windows"], ended["performer"]) == (91, 30, None)
+    assert send(owner, stream, offset=91, ends_take=True).json() == ended
+    later = send(owner, stream, offset=91, roots=roots + np.array([100.0, 0.0, 0.0]), ends_take=True).json()
+    assert (later["offset"], later["windows"]) == (182, 31)
+    assert len(later["changed"]) == 1
+
+
+def test_any_server_goes_on_where_another_one_left_off(owner, server: Server, open_database, tmp_path, walk, skeleton):
+    straight, moved = begin(owner, skeleton=skeleton), begin(owner, skeleton=skeleton)
+    token = owner.headers["Authorization"].removeprefix("Bearer ")
+    with running(open_database(), tmp_path / "other") as other:
+        for offset in range(0, walk.frame_count, 25):
+            poses = walk.poses[offset : offset + 25]
+            expected = send(owner, straight, offset=offset, poses=poses).json()
+            either = (owner, other.client(token))[offset // 25 % 2]
+            assert send(either, moved, offset=offset, poses=poses).json() == expected
+
+
+def test_it_goes_on_from_what_an_evaluation_found(owner) -> None:
+    measured = {
+        "options": {"grid": {"speeds_m_s": [1.0, 2.0], "turn_rates_deg_s": [0.0]}, "coverage_least_s": 3.0},
+        "coverage": {"seconds": {"dtype": "<f8", "shape": [2, 1], "data": [[5.0], [1.5]]}},
+    }
+    document = {"schema": "marey/evaluation@1", "verdict": "Good.", "headline": {}, **measured}
+    made = owner.post("/projects/lab/evaluations", json={"name": "walks-eval", "parts": {"evaluation": document}})
+    stream = begin(owner, evaluation=made.json()["id"])
+    assert stream["evaluation"] == {"item": made.json()["id"], "revision": 1}
+    assert (stream["least_s"], stream["index"], stream["missing_s"]) == (3.0, 0.5, 1.5)
+    progress = send(owner, stream, offset=0, roots=circling(2.0, 0.0, 2.5), ends_take=True).json()
+    assert progress["changed"][0]["seconds"] == pytest.approx(1.5 + 91 / 60)
+    assert (progress["index"], progress["targets"]) == (1.0, [])
+    both = owner.post(STREAMS, json={"frame_rate_hz": 60, "evaluation": made.json()["id"], "least_s": 1})
+    assert "leave one of them out" in problem(both, 422)["detail"]
+
+
+def test_an_evaluation_without_a_map_is_refused(owner) -> None:
+    document = {"schema": "marey/evaluation@1", "verdict": "Good.", "headline": {}}
+    made = owner.post("/projects/lab/evaluations", json={"name": "bare", "parts": {"evaluation": document}})
+    refused = owner.post(STREAMS, json={"frame_rate_hz": 60, "evaluation": made.json()["id"]})
+    assert problem(refused, 422)["code"] == "no-coverage"
+
+
+def test_a_skeleton_that_tells_no_direction_is_refused(owner) -> None:
+    chain = {"schema": "marey/skeleton@1", "joints": [{"name": "j", "parent": -1, "offset": [0, 1, 0]}]}
+    made = owner.post("/projects/lab/skeletons", json={"name": "chain", "parts": {"hierarchy": chain}})
+    refused = problem(owner.post(STREAMS, json={"frame_rate_hz": 60, "skeleton": made.json()["id"]}), 422)
+    assert refused["errors"][0]["pointer"] == "/skeleton"
+    assert "ankle" in refused["detail"]
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ({"frame_rate_hz": 5}, "greater than or equal to 10"),
+        ({"frame_rate_hz": 1000}, "less than or equal to 240"),
+        ({"frame_rate_hz": 60, "speeds_m_s": [1, 1]}, "stands twice"),
+        ({"frame_rate_hz": 60, "speeds_m_s": list(range(1, 21)), "turn_rates_deg_s": list(range(150))}, "3000 cells"),
+        ({"frame_rate_hz": 60, "target_count": 17}, "less than or equal to 16"),
+        ({}, "required"),
+    ],
+)
+def test_streams_that_make_no_sense_are_refused(owner, body, said) -> None:
+    assert said in problem(owner.post(STREAMS, json=body), 422)["detail"]
+
+
+def test_a_grid_of_which_one_side_is_given_has_its_limit_too(owner) -> None:
+    refused = owner.post(STREAMS, json={"frame_rate_hz": 60, "turn_rates_deg_s": [step / 4 for step in range(200)]})
+    assert refused.status_code == 201
+    speeds = [0.05 * step for step in range(1, 201)]
+    turn_rates = [float(step) for step in range(11)]
+    too_many = owner.post(STREAMS, json={"frame_rate_hz": 60, "speeds_m_s": speeds, "turn_rates_deg_s": turn_rates})
+    assert "2200 cells" in problem(too_many, 422)["detail"]
+
+
+def test_frames_that_make_no_sense_are_refused_and_change_nothing(owner, skeleton, walk) -> None:
+    stream, rootless = begin(owner, skeleton=skeleton), begin(owner)
+    poses = np.array(walk.poses[:10])
+    long = poses.copy()
+    long[3, 7:11] *= 2.0
+    far = np.zeros((2, 3))
+    far[1, 0] = 1e9
+    wrong = [
+        (stream, {"poses": long}, "frame 3 has a rotation of length 2"),
+        (stream, {"poses": poses[:, :-4]}, "columns"),
+        (stream, {"poses": poses.astype(np.float64) * 1e300}, "only finite numbers"),
+        (stream, {"poses": poses.astype(np.int32)}, "<f4 or <f8"),
+        (stream, {"poses": np.zeros((5000, poses.shape[1]), np.float32)}, "at most 4096"),
+        (stream, {"poses": poses, "roots": np.zeros((10, 3))}, "not both"),
+        (stream, {"poses": poses, "translated_joints": ["Hips"]}, "go together"),
+        (stream, {"roots": far}, "from the origin"),
+        (stream, {"roots": np.zeros((2, 4))}, "3 columns"),
+        (stream, {"roots": np.zeros((0, 3))}, "no frames"),
+        (stream, {}, "no frames"),
+        (rootless, {"poses": poses}, "without a skeleton"),
+    ]  # fmt: skip
+    for to, frames, said in wrong:
+        assert said in problem(send(owner, to, offset=0, **frames), 422)["detail"], frames
+    for one in (stream, rootless):
+        assert owner.get(f"{STREAMS}/{one['id']}").json()["rev"] == 1
+
+
+def test_joints_that_move_in_their_parents_count(owner, skeleton, walk) -> None:
+    child = walk.skeleton.joint_names[1]
+    shifted = np.broadcast_to(walk.skeleton.offsets[1], (walk.frame_count, 1, 3)).astype(np.float32)
+    plain, moved = begin(owner, skeleton=skeleton), begin(owner, skeleton=skeleton)
+    wanted = send(owner, plain, offset=0, poses=walk.poses).json()
+    found = send(owner, moved, offset=0, poses=walk.poses, translations=shifted, translated_joints=[child]).json()
+    assert found["changed"] == wanted["changed"]
+    slides = shifted.copy()
+    slides[:, 0, 0] += 2.0 * np.arange(walk.frame_count) / RATE_HZ
+    sliding = begin(owner, skeleton=skeleton)
+    answer = send(owner, sliding, offset=0, poses=walk.poses, translations=slides, translated_joints=[child])
+    assert answer.json()["performer"]["x_m"] != pytest.approx(wanted["performer"]["x_m"], abs=0.1)
+
+
+def test_a_stream_is_made_once_per_key_and_deleted_for_good(owner) -> None:
+    key = {"Idempotency-Key": "stream-1"}
+    first, again = (owner.post(STREAMS, json={"frame_rate_hz": 60}, headers=key) for _ in range(2))
+    assert again.json() == first.json()
+    assert first.headers["Location"] == f"/api/v1{STREAMS}/{first.json()['id']}"
+    url = f"{STREAMS}/{first.json()['id']}"
+    assert owner.delete(url).status_code == 204
+    assert problem(owner.get(url), 404)["code"] == "no-stream"
+    assert problem(owner.delete(url), 404)["code"] == "no-stream"
+
+
+def test_readers_look_on_and_cannot_send(server: Server) -> None:
+    reader = server.make_user("reader")
+    owner = server.client(server.make_project("lab", reader=Role.READER))
+    stream = begin(owner)
+    guest = server.client(reader)
+    assert guest.get(f"{STREAMS}/{stream['id']}").status_code == 200
+    refused = send(guest, stream, offset=0, roots=circling(1.0, 0.0, 0.1))
+    assert problem(refused, 403)["code"] == "insufficient-role"
