@@ -26,7 +26,7 @@ $(VENV)/.installed-dev: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m marey_motion.warm_up
 	@touch $@ $(VENV)/.installed-all
 
-demo: $(VENV)/.installed-all ## From takes to retargeted clips; DATA=folder for your own motion
+demo: $(VENV)/.installed-all ## From takes to an evaluated, reported dataset; DATA=folder for your own motion
 	$(BIN)/marey demo $(if $(DATA),"$(DATA)")
 
 dev: $(VENV)/.installed-dev ## A server and a worker on this machine, with data in ./marey-data
