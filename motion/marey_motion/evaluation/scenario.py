@@ -1,7 +1,7 @@
 """The trials of an evaluation and the trajectories they ask for.
 
 A trial starts at the origin facing +z, goes straight for its approach and then turns at a constant rate. Its speed is
-constant, or switches between two values at fixed intervals; the turn rate stays, so the path is a chain of tangent arcs.
+constant, or switches between two values at fixed intervals; the turn rate stays: the path is a chain of tangent arcs.
 """
 
 from __future__ import annotations
