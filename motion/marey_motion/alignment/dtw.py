@@ -117,9 +117,12 @@ def _box_costs(a: Floats, b: NDArray[np.floating], frames_per_box: int | None) -
     from marey_motion.alignment import dtw_kernels as kernels
 
     starts = np.arange(0, len(b), frames_per_box or len(b))
-    low, high = (edge.reduceat(b, starts, axis=0) for edge in (np.minimum, np.maximum))
+    low, high = (
+        np.ascontiguousarray(edge.reduceat(b, starts, axis=0).transpose(1, 2, 0), dtype=np.float64)
+        for edge in (np.minimum, np.maximum)
+    )
     costs = np.empty(len(a))
-    kernels.box_costs(a, *(np.ascontiguousarray(side.transpose(1, 2, 0), np.float64) for side in (low, high)), costs)
+    kernels.box_costs(a, low, high, costs)
     return costs
 
 

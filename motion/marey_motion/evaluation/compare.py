@@ -223,7 +223,7 @@ def _clip_frames(result: EvaluationResult, record: TrialRecord, numbers: dict[st
 
 def _numbers_differ(first: TrialRecord, second: TrialRecord) -> NDArray[np.bool_]:
     """(T,) ticks at which two records differ in anything but the rows, whose numbers depend on the database."""
-    differs = np.any(first.positions != second.positions, axis=1)
+    differs: NDArray[np.bool_] = np.any(first.positions != second.positions, axis=1)
     for name in ("headings", "status", "match_cost", "continuing_cost", "pose_cost"):
         one, other = getattr(first, name), getattr(second, name)
         # A cost that is not defined is NaN on both sides.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.result import Coverage, EvaluationOptions
 from marey_motion.evaluation.selection import clips_by_source, same_skeleton
-from marey_motion.evaluation.similarity import nearest_poses, window_cells, window_rows
+from marey_motion.evaluation.similarity import every_kth, nearest_poses, window_cells, window_rows
 from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
 
@@ -103,7 +103,7 @@ def rank_fillings(
             filled = np.minimum(own, coverage.deficit_s)
             if source not in present and filled.any():
                 useful = rows[np.isin(cells, np.flatnonzero(filled))]
-                chosen = useful[:: max(1, -(-len(useful) // most_frames))] if comparable else useful[:0]
+                chosen = every_kth(useful, most_frames) if comparable else useful[:0]
                 share = _blendable_share(database, other, chosen, threshold_m) if comparable else None
                 found.append(_filling(name, other, source, own, coverage, options, share, len(chosen)))
             done += 1

@@ -68,27 +68,19 @@ def leave_one_out(
     """
     gone = frozenset(removed)
     outcomes = simulation.outcomes(gone)
-    before = headline_means([outcome.result for outcome in outcomes])
-    value = objective.value([outcome.result for outcome in outcomes], 0.0)
+    whole = [outcome.result for outcome in outcomes]
+    before, value = headline_means(whole), objective.value(whole, 0.0)
     counts = Counter(source for outcome in outcomes for source in outcome.needed)
-    candidates = sorted(counts, key=lambda source: (counts[source], source))
-    candidates = [source for source in candidates if simulation.leaves_rows(gone | {source})][:consider]
+    rarest = sorted(counts, key=lambda source: (counts[source], source))
+    candidates = [source for source in rarest if simulation.leaves_rows(gone | {source})][:consider]
     found = []
     for done, source in enumerate(candidates):
         results = simulation.results(gone | {source})
         seconds = simulation.seconds_of(source)
         harm = objective.value(results, 0.0) - value
-        found.append(
-            Removal(
-                source=source,
-                name=name_of(simulation, source),
-                seconds=seconds,
-                trials=counts[source],
-                changes=headline_changes(before, headline_means(results)),
-                harm=harm,
-                harm_per_s=harm / seconds,
-            )
-        )
+        changes = headline_changes(before, headline_means(results))
+        name = name_of(simulation, source)
+        found.append(Removal(source, name, seconds, counts[source], changes, harm, harm / seconds))
         if progress is not None:
             progress(done + 1, len(candidates), source)
     return tuple(sorted(found, key=lambda removal: (removal.harm_per_s, removal.source)))

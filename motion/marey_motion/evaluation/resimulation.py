@@ -27,7 +27,7 @@ from marey_motion.evaluation.suite import CancelCallback, run_suite
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.display import switched_rows
 from marey_motion.matching.record import TrialRecord
-from marey_motion.matching.search import SearchIndex, build_index
+from marey_motion.matching.search import Method, SearchIndex, build_index
 
 Sources = frozenset[str]
 NONE: Sources = frozenset()
@@ -134,7 +134,7 @@ class Resimulation:
         if not gone:
             return self.index
         selectable = self.database.selectable & ~rows_of_sources(self.database.clips, gone)
-        method = "boxes" if self.index.boxed else "scan"
+        method: Method = "boxes" if self.index.boxed else "scan"
         return build_index(self.index.rows, self.database.starts, selectable, method=method)
 
     def _keep(

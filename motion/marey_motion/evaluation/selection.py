@@ -86,7 +86,7 @@ def _gathered(database: MatchingDatabase, clips: Sequence[DatabaseClip], kept: M
     )
 
 
-def _by_row(database: MatchingDatabase) -> dict[str, NDArray[Any]]:
+def _by_row(database: MatchingDatabase) -> dict[str, Any]:
     """The arrays that have one entry per row."""
     values = {field.name: getattr(database, field.name) for field in fields(database)}
     return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
@@ -112,12 +112,10 @@ def joined(first: MatchingDatabase, second: MatchingDatabase) -> MatchingDatabas
     order = np.concatenate(rows)
     joints = tuple(sorted({*first.translated_joints, *second.translated_joints}))
     first, second = _translating(first, joints), _translating(second, joints)
-    return replace(
-        first,
-        clips=tuple(clips),
-        notes=tuple(dict.fromkeys((*first.notes, *second.notes))),
-        **{name: np.concatenate((rows, getattr(second, name)))[order] for name, rows in _by_row(first).items()},
-    )
+    arrays: dict[str, Any] = {
+        name: np.concatenate((rows, getattr(second, name)))[order] for name, rows in _by_row(first).items()
+    }
+    return replace(first, clips=tuple(clips), notes=tuple(dict.fromkeys((*first.notes, *second.notes))), **arrays)
 
 
 def _translating(database: MatchingDatabase, joints: tuple[int, ...]) -> MatchingDatabase:

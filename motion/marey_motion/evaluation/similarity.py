@@ -80,27 +80,23 @@ def measure_similarity(
     for done, cell in enumerate(filled.tolist()):
         if cancelled is not None and cancelled():
             raise EvaluationCancelled(f"stopped with {done} of {len(filled)} cells compared")
-        own = rows[cells == cell]
-        place = divmod(cell, shape[1])
-        chosen = own[:: max(1, -(-len(own) // most_frames))]
-        frames[place], sources[place] = len(own), len(np.unique(groups[own]))
-        measured[place] = len(chosen)
+        own, place = rows[cells == cell], divmod(cell, shape[1])
+        chosen = every_kth(own, most_frames)
         found = nearest_poses(database.pose_points[chosen], groups[chosen], database.pose_points[own], groups[own])
+        frames[place], sources[place], measured[place] = len(own), len(np.unique(groups[own])), len(chosen)
+        share[place] = np.mean(found <= threshold_m)
         if sources[place] > 1:
             distance[place] = np.median(found)
-        share[place] = np.mean(found <= threshold_m)
         if progress is not None:
             progress(done + 1, len(filled), "")
     total = int(frames.sum())
-    return PoseSimilarity(
-        threshold_m=threshold_m,
-        frames=frames,
-        sources=sources,
-        measured=measured,
-        distance_m=distance,
-        blendable_share=share,
-        share=float(np.nansum(share * frames) / total) if total else None,
-    )
+    overall = float(np.nansum(share * frames) / total) if total else None
+    return PoseSimilarity(threshold_m, frames, sources, measured, distance, share, overall)
+
+
+def every_kth(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """Every k-th of the rows, k the least that leaves at most `most`."""
+    return rows[:: max(1, -(-len(rows) // most))]
 
 
 def window_rows(database: MatchingDatabase, coverage: Coverage) -> NDArray[np.int64]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.duplicates import (
@@ -103,46 +104,22 @@ def suggest(
     Raises `MotionError` when the evaluation is not one of this database, `EvaluationCancelled` when asked to stop.
     """
     how, others = options or SuggestionOptions(), dict(collections or {})
-    trials = [trial.trial for trial in result.trials]
     _require_same(database, result)
-    stages = _Stages(progress, ("duplicates", "similarity", "filling", "redundant", "plan"))
+    trials, records = [trial.trial for trial in result.trials], result.records
+    stages = _Stages(progress, cancelled)
     simulation = Resimulation(
-        database, result.options, trials=trials, records=result.records, threads=threads, cancelled=cancelled
+        database, result.options, trials=trials, records=records, threads=threads, cancelled=cancelled
     )
-    unused = find_unused(database, trials, result.records, result.options, index=simulation.index)
-    gone = frozenset(clip.source for clip in unused.clips)
+    unused = find_unused(database, trials, records, result.options, index=simulation.index)
     duplicates = find_near_duplicates(
-        database,
-        threshold_cm=how.duplicate_cm,
-        threads=threads,
-        progress=stages.within("duplicates"),
-        cancelled=cancelled,
-    )
-    threshold = how.blendable_m or accepted_distance(result.records) or USUAL_BLENDABLE_M
-    similarity = measure_similarity(
-        database, result.coverage, threshold, progress=stages.within("similarity"), cancelled=cancelled
-    )
-    fillings = rank_fillings(
-        database,
-        result.coverage,
-        others,
-        result.options,
-        threshold,
-        progress=stages.within("filling"),
-        cancelled=cancelled,
-    )
-    redundant = leave_one_out(
-        simulation, how.objective, removed=gone, consider=how.consider, progress=stages.within("redundant")
-    )
-    plan = plan_removals(
-        simulation,
-        how.removals,
-        how.objective,
-        removed=gone,
-        consider=how.consider,
-        progress=stages.within("plan"),
+        database, threshold_cm=how.duplicate_cm, threads=threads, **stages.watch("duplicates")
     )
     ticks = {use.uid: use.ticks for use in sum_by_source(database.clips, result.usage)}
+    threshold = how.blendable_m or accepted_distance(records) or USUAL_BLENDABLE_M
+    similarity = measure_similarity(database, result.coverage, threshold, **stages.watch("similarity"))
+    fillings = rank_fillings(database, result.coverage, others, result.options, threshold, **stages.watch("filling"))
+    gone = frozenset(clip.source for clip in unused.clips)
+    redundant, plan = _redundancy(simulation, how, gone, stages)
     return Suggestions(
         result=result,
         options=how,
@@ -156,6 +133,24 @@ def suggest(
         additions=plan_fillings(fillings, result.coverage, others, result.options),
         tried=(len(redundant), len(simulation.needed(gone))),
     )
+
+
+def _redundancy(
+    simulation: Resimulation, how: SuggestionOptions, gone: frozenset[str], stages: _Stages
+) -> tuple[tuple[Removal, ...], tuple[PlannedRemoval, ...]]:
+    """Both lists start from the set without what is unused."""
+    found = leave_one_out(
+        simulation, how.objective, removed=gone, consider=how.consider, progress=stages.within("leaving out")
+    )
+    plan = plan_removals(
+        simulation,
+        how.removals,
+        how.objective,
+        removed=gone,
+        consider=how.consider,
+        progress=stages.within("planning"),
+    )
+    return found, plan
 
 
 def _require_same(database: MatchingDatabase, result: EvaluationResult) -> None:
@@ -174,15 +169,21 @@ def _require_same(database: MatchingDatabase, result: EvaluationResult) -> None:
 class _Stages:
     """Progress over several stages as one count: a thousand for each."""
 
-    def __init__(self, progress: ProgressCallback | None, names: tuple[str, ...]) -> None:
+    NAMES = ("duplicates", "similarity", "filling", "leaving out", "planning")
+
+    def __init__(self, progress: ProgressCallback | None, cancelled: CancelCallback | None) -> None:
         self._tell = progress or (lambda _done, _total, _note: None)
-        self._names = names
+        self._cancelled = cancelled
 
     def within(self, stage: str) -> ProgressCallback:
         """The progress callback of a stage."""
-        before = 1000 * self._names.index(stage)
+        before = 1000 * self.NAMES.index(stage)
 
         def tell(done: int, total: int, note: str) -> None:
-            self._tell(before + 1000 * done // max(total, 1), 1000 * len(self._names), f"{stage}: {note}")
+            self._tell(before + 1000 * done // max(total, 1), 1000 * len(self.NAMES), f"{stage}: {note}")
 
         return tell
+
+    def watch(self, stage: str) -> dict[str, Any]:
+        """The callbacks of a stage as keywords."""
+        return {"progress": self.within(stage), "cancelled": self._cancelled}

@@ -12,6 +12,7 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation import reasons
 from marey_motion.evaluation.compare import Comparison
 from marey_motion.evaluation.optimise import Optimisation, OptimisationStep
+from marey_motion.evaluation.redundancy import PlannedRemoval, Removal
 from marey_motion.evaluation.similarity import PoseSimilarity
 from marey_motion.evaluation.suggest import Suggestions
 
@@ -40,7 +41,7 @@ def comparison_to_tree(comparison: Comparison) -> Tree:
 
 def suggestions_to_tree(suggestions: Suggestions) -> Tree:
     """All proposals with their reasons, in one document."""
-    found, trials = suggestions, len(suggestions.result.trials)
+    found = suggestions
     return {
         "schema": SUGGESTIONS_SCHEMA,
         "dataset": found.result.provenance.dataset,
@@ -54,14 +55,7 @@ def suggestions_to_tree(suggestions: Suggestions) -> Tree:
             ],
             "seconds": found.unused.seconds,
         },
-        "redundant": {
-            "tried": found.tried[0],
-            "needed": found.tried[1],
-            "clips": [
-                {**_plain(removal), "reason": reasons.why_redundant(removal, trials)} for removal in found.redundant
-            ],
-            "plan": [{**_plain(step), "reason": reasons.why_redundant(step.removal, trials)} for step in found.plan],
-        },
+        "redundant": _redundant_to_tree(found),
         "near_duplicates": {
             "threshold_cm": found.duplicates.threshold_cm,
             "pairs": [asdict(pair) for pair in found.duplicates.pairs],
@@ -81,6 +75,20 @@ def suggestions_to_tree(suggestions: Suggestions) -> Tree:
             }
             for step in found.additions
         ],
+    }
+
+
+def _redundant_to_tree(suggestions: Suggestions) -> Tree:
+    trials = len(suggestions.result.trials)
+
+    def told(entry: Removal | PlannedRemoval, removal: Removal) -> Tree:
+        return {**_plain(entry), "reason": reasons.why_redundant(removal, trials)}
+
+    return {
+        "tried": suggestions.tried[0],
+        "needed": suggestions.tried[1],
+        "clips": [told(removal, removal) for removal in suggestions.redundant],
+        "plan": [told(step, step.removal) for step in suggestions.plan],
     }
 
 

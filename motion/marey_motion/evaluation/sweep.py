@@ -16,7 +16,7 @@ from marey_motion.evaluation.suite import CancelCallback, run_suite
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.features import feature_layout
 from marey_motion.matching.normaliser import UNMATCHED_SCALE
-from marey_motion.matching.options import FeatureWeights
+from marey_motion.matching.options import DatabaseOptions, FeatureWeights
 
 ProgressCallback = Callable[[int, int, str], None]
 
@@ -50,11 +50,13 @@ class Influence:
     gain: float
 
 
-def vary_each_group(weights: FeatureWeights, factors: Sequence[float] = (0.5, 2.0)) -> tuple[FeatureWeights, ...]:
-    """The weights as they are, then each group's weight times each factor with all others as they are."""
+def vary_each_group(options: DatabaseOptions, factors: Sequence[float] = (0.5, 2.0)) -> tuple[FeatureWeights, ...]:
+    """The options' weights, then each group's weight times each factor with all others as they are."""
+    weights = options.weights
+    groups = [group for group in GROUPS if group != "extra_joints" or options.extra_joints]
     return (
         weights,
-        *(replace(weights, **{group: getattr(weights, group) * factor}) for group in GROUPS for factor in factors),
+        *(replace(weights, **{group: getattr(weights, group) * factor}) for group in groups for factor in factors),
     )
 
 

@@ -71,8 +71,10 @@ def test_each_row_of_a_sweep_is_an_evaluation_with_these_weights(database):
 
 
 def test_each_group_is_varied_alone():
-    settings = vary_each_group(FeatureWeights(), (0.5, 4.0))
-    assert len(settings) == 1 + 2 * len(GROUPS)
+    settings = vary_each_group(DatabaseOptions(), (0.5, 4.0))
+    assert len(settings) == 1 + 2 * (len(GROUPS) - 1)
+    assert {setting.extra_joints for setting in settings} == {1.0}
+    assert len(vary_each_group(DatabaseOptions(extra_joints=("head",)), (0.5, 4.0))) == 1 + 2 * len(GROUPS)
     assert settings[0] == FeatureWeights()
     for setting in settings[1:]:
         different = [group for group in GROUPS if getattr(setting, group) != getattr(FeatureWeights(), group)]
