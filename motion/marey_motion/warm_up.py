@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from marey_motion.clip import Clip
 
 _ASF = b""":version 1.10
@@ -69,6 +72,7 @@ def compile_kernels() -> None:
     result = retarget(read, plan_retarget(*rigs[0], *rigs[1]))
     global_rotations(result)
     _match(clip)
+    _measure(clip)
 
 
 def _match(clip: Clip) -> None:
@@ -93,6 +97,30 @@ def _match(clip: Clip) -> None:
     record = run_trial(database, index, path, options)
     displayed_clip(database, record, options)
     explain_choice(database, index, path, options, record, 6)
+    _compare(database.pose_points)
+
+
+def _compare(points: NDArray[np.float32]) -> None:
+    """Align a motion with itself in every way, and look for its poses among themselves."""
+    from marey_motion.alignment.dtw import align, distances, warped_distance
+    from marey_motion.evaluation.similarity import nearest_poses
+
+    groups = np.arange(len(points))
+    align(distances(points, points))
+    align(distances(points, points), max_run=2)
+    warped_distance(points, points)
+    nearest_poses(points, groups, points, groups)
+
+
+def _measure(clip: Clip) -> None:
+    """Measure the coverage of a clip as if it were being recorded."""
+    from marey_motion.evaluation.online import OnlineCoverage
+    from marey_motion.matching.body import MatchingBody
+    from marey_motion.rigs import map_joints
+
+    online = OnlineCoverage(clip.frame_rate_hz)
+    online.add_frames(MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton)), clip)
+    online.end_take()
 
 
 if __name__ == "__main__":
