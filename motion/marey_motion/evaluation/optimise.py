@@ -98,10 +98,13 @@ def optimise(
 
     Raises `MotionError` for a log that does not come from this database, these trials and this objective.
     """
-    steps = list(log) or [_start(simulation, options, frozenset(absent))]
-    _require_same(simulation, options, steps[-1])
-    if not log and made is not None:
-        made(steps[0])
+    steps = list(log)
+    if steps:
+        _require_same(simulation, options, steps[-1])
+    else:
+        steps.append(_step(simulation, options, 0, "start", (), frozenset(absent), 0, 0))
+        if made is not None:
+            made(steps[0])
     search = _Search(simulation, options, steps[-1].evaluations)
     while len(steps) - 1 < options.max_steps:
         step = search.best_step(steps[-1], progress)
@@ -111,10 +114,6 @@ def optimise(
         if made is not None:
             made(step)
     return Optimisation(tuple(steps), "steps")
-
-
-def _start(simulation: Resimulation, options: OptimisationOptions, absent: Sources) -> OptimisationStep:
-    return _step(simulation, options, 0, "start", (), absent, 0, 0)
 
 
 def _step(
@@ -143,9 +142,6 @@ def _step(
 
 
 def _require_same(simulation: Resimulation, options: OptimisationOptions, last: OptimisationStep) -> None:
-    unknown = sorted(set(last.absent) - set(simulation.sources))
-    if unknown:
-        raise MotionError(f"the log speaks of a clip that is not there, {unknown[0]}", where=f"step {last.number}")
     value = options.objective.value(simulation.results(last.absent), simulation.seconds(last.absent))
     if value != last.objective:
         raise MotionError(

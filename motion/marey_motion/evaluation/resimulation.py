@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from marey_motion.evaluation.metrics import measure_trial
 from marey_motion.evaluation.result import EvaluationOptions, TrialResult
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials
-from marey_motion.evaluation.selection import clips_by_source, rows_of_sources, source_of
+from marey_motion.evaluation.selection import clips_by_source, require_sources, rows_of_sources, source_of
 from marey_motion.evaluation.suite import CancelCallback, run_suite
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.display import switched_rows
@@ -77,9 +77,11 @@ class Resimulation:
     def outcomes(self, removed: Collection[str] = NONE) -> tuple[Outcome, ...]:
         """One per trial, in their order, without the clips of the sources `removed`.
 
-        Raises `MotionError` when nothing that can be chosen is left, `EvaluationCancelled` when asked to stop.
+        Raises `MotionError` for an unknown source and when nothing that can be chosen is left, `EvaluationCancelled`
+        when asked to stop.
         """
         gone = frozenset(removed)
+        require_sources(self.sources, gone)
         found = [self._find(number, gone) for number in range(len(self.trials))]
         ahead = [number for number, outcome in enumerate(found) if outcome is None]
         if ahead:

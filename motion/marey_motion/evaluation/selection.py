@@ -34,11 +34,16 @@ def clips_by_source(clips: Sequence[DatabaseClip]) -> dict[str, tuple[int, ...]]
     return {source: tuple(own) for source, own in sorted(families.items())}
 
 
-def rows_of_sources(clips: Sequence[DatabaseClip], sources: Collection[str]) -> Mask:
-    """(N,) rows of the clips of these sources. Raises `MotionError` for a source that has no clip."""
-    unknown = sorted(set(sources) - {source_of(clip) for clip in clips})
+def require_sources(known: Collection[str], wanted: Collection[str]) -> None:
+    """Raise `MotionError` naming the first wanted source that is not known."""
+    unknown = sorted(set(wanted) - set(known))
     if unknown:
         raise MotionError(f"there is no clip {unknown[0]}", code="unknown-clip", where=unknown[0])
+
+
+def rows_of_sources(clips: Sequence[DatabaseClip], sources: Collection[str]) -> Mask:
+    """(N,) rows of the clips of these sources. Raises `MotionError` for a source that has no clip."""
+    require_sources({source_of(clip) for clip in clips}, sources)
     rows = np.zeros(clips[-1].stop if clips else 0, dtype=np.bool_)
     for clip in clips:
         if source_of(clip) in sources:

@@ -102,6 +102,11 @@ def test_the_last_clip_is_never_taken():
     assert len(plan_removals(simulation, 5, Objective())) <= 1
 
 
+def test_a_clip_that_is_not_there_cannot_be_left_out(simulation):
+    with pytest.raises(MotionError, match="no clip nobody"):
+        simulation.results(["nobody"])
+
+
 def test_the_work_can_be_stopped(database):
     stopped = Resimulation(database, OPTIONS, cancelled=lambda: True)
     with pytest.raises(EvaluationCancelled):
