@@ -19,6 +19,7 @@ from marey_schemas.evaluation import ItemId, Speed, TurnRate
 
 LEAST_FRAME_RATE_HZ, MOST_FRAME_RATE_HZ = 10.0, 240.0
 MOST_CELLS = 2000
+MOST_SECONDS = 1e9
 MOST_FRAMES = 4096
 """In one request; the chunks of a live performance have a tenth of a second to a second."""
 
@@ -182,21 +183,27 @@ class CoverageStreamState(CoverageStream, CoverageNow):
 class MeasuredGrid(Answer):
     """The speeds and turn rates of an evaluation."""
 
-    speeds_m_s: tuple[float, ...] = Field(min_length=1)
-    turn_rates_deg_s: tuple[float, ...] = Field(min_length=1)
+    speeds_m_s: tuple[Speed, ...] = Field(min_length=1)
+    turn_rates_deg_s: tuple[TurnRate, ...] = Field(min_length=1)
 
 
 class MeasuredOptions(Answer):
     """The options of an evaluation that its coverage depends on."""
 
     grid: MeasuredGrid
-    coverage_least_s: float
+    coverage_least_s: float = Field(gt=0, le=3600)
 
 
 class MeasuredCells(Answer):
     """The map of an evaluation."""
 
     seconds: Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=2)]
+
+    @model_validator(mode="after")
+    def _check_seconds(self) -> Self:
+        if not np.all((self.seconds >= 0.0) & (self.seconds <= MOST_SECONDS)):
+            raise ValueError(f"seconds: a cell holds 0 to {MOST_SECONDS:g} s")
+        return self
 
 
 class MeasuredCoverage(Answer):

@@ -84,10 +84,11 @@ def begin(request: CoverageStreamCreate, given: Given) -> tuple[NewStream, Tree]
     grid = Grid(request.speeds_m_s or grid.speeds_m_s, request.turn_rates_deg_s or grid.turn_rates_deg_s)
     least_s, seconds = request.least_s or 1.0, None
     if given.evaluation is not None:
-        found = _measured(given.measured)
+        with refusing("evaluation"):
+            found = MeasuredCoverage.model_validate(given.measured)
         grid = Grid(found.options.grid.speeds_m_s, found.options.grid.turn_rates_deg_s)
         least_s, seconds = found.options.coverage_least_s, found.coverage.seconds
-    with refusing("evaluation" if given.evaluation is not None else ""):
+    with refusing("evaluation"):  # a grid that the request gives has been checked
         online = OnlineCoverage(request.frame_rate_hz, grid, least_s=least_s, seconds=seconds)
     with refusing("skeleton"):
         _load_kernels(None if given.rig is None else body_of(given.rig))
@@ -95,8 +96,8 @@ def begin(request: CoverageStreamCreate, given: Given) -> tuple[NewStream, Tree]
         "frame_rate_hz": request.frame_rate_hz,
         "skeleton": given.skeleton,
         "evaluation": given.evaluation,
-        "speeds_m_s": sorted(grid.speeds_m_s),
-        "turn_rates_deg_s": sorted(grid.turn_rates_deg_s),
+        "speeds_m_s": np.unique(grid.speeds_m_s).tolist(),
+        "turn_rates_deg_s": np.unique(grid.turn_rates_deg_s).tolist(),
         "least_s": least_s,
         "target_count": request.target_count,
         "path_s": request.path_s,
@@ -148,8 +149,12 @@ def _add_poses(online: OnlineCoverage, held: Stream, frames: CoverageFrames) -> 
     from marey_motion.documents import clip_from_document
 
     if held.rig is None:
-        detail = "The stream was made without a skeleton; send roots, or make one with it."
-        raise Invalid(detail, code="no-skeleton", errors=[_fault("/poses", "no-skeleton", detail)])
+        fault = _fault("/poses", "no-skeleton", "These need a skeleton.")
+        raise Invalid(
+            "The stream was made without a skeleton; send roots, or make one with it.",
+            code="no-skeleton",
+            errors=[fault],
+        )
     with refusing("poses"):
         body = body_of(held.rig)
         motion = {
@@ -198,17 +203,9 @@ def _load_kernels(body: MatchingBody | None) -> None:
     trial.end_take()
 
 
-def _measured(tree: Tree | None) -> MeasuredCoverage:
-    try:
-        return MeasuredCoverage.model_validate(tree)
-    except ValidationError as error:
-        detail = f"The evaluation holds no coverage to begin with: {error.errors()[0]['msg']}"
-        raise Invalid(detail, code="no-coverage", errors=[_fault("/evaluation", "no-coverage", detail)]) from error
-
-
 @contextmanager
 def refusing(field: str) -> Iterator[None]:
-    """Turn what the numbers' own checks refuse into an answer about a field of the request."""
+    """Turn what is refused inside the block into an answer about a field of the request."""
     from marey_motion.errors import MotionError
 
     try:
@@ -216,7 +213,8 @@ def refusing(field: str) -> Iterator[None]:
     except MotionError as error:
         raise Invalid(str(error), code=error.code, errors=[_fault(f"/{field}", error.code, str(error))]) from error
     except ValidationError as error:
-        detail = error.errors()[0]["msg"].removeprefix("Value error, ")
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        detail = ": ".join((*map(str, first["loc"]), first["msg"].removeprefix("Value error, ")))
         raise Invalid(f"{field}: {detail}", errors=[_fault(f"/{field}", "invalid", detail)]) from error
 
 

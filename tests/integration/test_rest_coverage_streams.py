@@ -173,11 +173,28 @@ def test_it_goes_on_from_what_an_evaluation_found(owner) -> None:
     assert "leave one of them out" in problem(both, 422)["detail"]
 
 
-def test_an_evaluation_without_a_map_is_refused(owner) -> None:
-    document = {"schema": "marey/evaluation@1", "verdict": "Good.", "headline": {}}
-    made = owner.post("/projects/lab/evaluations", json={"name": "bare", "parts": {"evaluation": document}})
-    refused = owner.post(STREAMS, json={"frame_rate_hz": 60, "evaluation": made.json()["id"]})
-    assert problem(refused, 422)["code"] == "no-coverage"
+@pytest.mark.parametrize(
+    ("seconds", "least_s", "said"),
+    [
+        ([[5.0]], 1.0, "1 cells"),
+        ([[5.0], [-1.0]], 1.0, "coverage: seconds: a cell holds"),
+        ([[5.0], [1e300]], 1.0, "coverage: seconds: a cell holds"),
+        ([[5.0], [1.0]], 0.0, "options: coverage_least_s"),
+        (None, 1.0, "coverage: Field required"),
+    ],
+)
+def test_an_evaluation_without_a_map_that_makes_sense_is_refused(owner, seconds, least_s, said) -> None:
+    grid = {"speeds_m_s": [1.0, 2.0], "turn_rates_deg_s": [0.0]}
+    document = {
+        "schema": "marey/evaluation@1", "verdict": "", "headline": {},
+        "options": {"grid": grid, "coverage_least_s": least_s},
+    }  # fmt: skip
+    if seconds is not None:
+        document["coverage"] = {"seconds": {"dtype": "<f8", "shape": [len(seconds), 1], "data": seconds}}
+    made = owner.post("/projects/lab/evaluations", json={"name": "odd", "parts": {"evaluation": document}})
+    refused = problem(owner.post(STREAMS, json={"frame_rate_hz": 60, "evaluation": made.json()["id"]}), 422)
+    assert refused["errors"][0]["pointer"] == "/evaluation"
+    assert said in refused["detail"].replace("(1, 1)", "1 cells")
 
 
 def test_a_skeleton_that_tells_no_direction_is_refused(owner) -> None:
@@ -228,6 +245,8 @@ def test_frames_that_make_no_sense_are_refused_and_change_nothing(owner, skeleto
         (stream, {"poses": poses, "roots": np.zeros((10, 3))}, "not both"),
         (stream, {"poses": poses, "translated_joints": ["Hips"]}, "go together"),
         (stream, {"roots": far}, "from the origin"),
+        (stream, {"poses": poses * np.float32(1e30)}, "rotation of length"),
+        (stream, {"poses": np.hstack((poses[:, :3] + 1e30, poses[:, 3:]))}, "from the origin"),
         (stream, {"roots": np.zeros((2, 4))}, "3 columns"),
         (stream, {"roots": np.zeros((0, 3))}, "no frames"),
         (stream, {}, "no frames"),

@@ -103,18 +103,21 @@ class OnlineCoverage:
     def add_frames(self, body: MatchingBody, clip: Clip) -> Windows:
         """Take in the next frames, as a clip of the body's skeleton at this rate; the windows that they complete.
 
-        A take begins with the first frame in which hips and shoulders tell a direction.
+        A take begins with the first frame in which hips and shoulders tell a direction. Raises `MotionError` where the
+        frames lie too far away, and takes none of them.
         """
         positions = Motion.of(clip).positions(body.skeleton)
+        _require_near(positions)
         return self._add(positions[:, body.torso, ::2], forward_vectors(positions, body.lefts, body.rights))
 
     def add_roots(self, positions: Floats, headings: Floats) -> Windows:
         """Take in ground positions (n, 2) of the torso and headings (n,) of the body, neither of them smoothed.
 
-        Raises `MotionError` where they are no places on the ground, and takes none of them.
+        Raises `MotionError` where they are no such places, and takes none of them.
         """
         if positions.shape != (len(headings), 2) or not np.all(np.isfinite(headings)):
             raise MotionError(f"{len(headings)} headings for positions of shape {positions.shape}", where="roots")
+        _require_near(positions)
         return self._add(positions, np.stack((np.sin(headings), np.cos(headings)), axis=-1))
 
     def end_take(self) -> Windows:
@@ -122,8 +125,6 @@ class OnlineCoverage:
         return self._count(self._live.end_take())
 
     def _add(self, positions: Floats, facing: Floats) -> Windows:
-        if not float(np.max(np.abs(positions), initial=0.0)) <= FARTHEST_M:
-            raise MotionError(f"a frame lies more than {FARTHEST_M:g} m from the origin", where="positions")
         newest = self._live.newest_frame
         directions = _directions(facing, None if newest is None else newest[2:])
         self.frame_count += len(positions)
@@ -211,6 +212,11 @@ class OnlineCoverage:
         online.counts[...] = tree["counts"]
         online.frame_count = tree["frame_count"]
         return online
+
+
+def _require_near(positions: Floats) -> None:
+    if not float(np.max(np.abs(positions), initial=0.0)) <= FARTHEST_M:
+        raise MotionError(f"a frame lies more than {FARTHEST_M:g} m from the origin", where="positions")
 
 
 def _directions(facing: Floats, before: Floats | None) -> Floats:

@@ -92,8 +92,10 @@ def create_stream(tx: Transaction, project: str, new: NewStream) -> Stream:
     tx.lock(f"coverage:{project_row.id}")
     count = select(func.count()).where(coverage_stream.c.project_id == project_row.id, ~_is_old(tx))
     if tx.execute(count).scalar_one() >= MOST_STREAMS:
-        detail = f"A project has at most {MOST_STREAMS} coverage streams; delete those that are no longer used."
-        raise Conflict(detail, code="too-many-streams")
+        raise Conflict(
+            f"A project has at most {MOST_STREAMS} coverage streams; delete those that are no longer used.",
+            code="too-many-streams",
+        )
     made = Stream(new_id("coverage"), new.settings, new.rig, new.state, 0, None, None, tx.now_us, tx.now_us, 1)
     row = {field.name: getattr(made, field.name) for field in fields(made)}
     tx.execute(insert(coverage_stream), {**row, "project_id": project_row.id, "author_id": tx.principal.user_id})
@@ -185,6 +187,8 @@ def _find(tx: Transaction, project_id: str, stream_id: str) -> Stream:
     )
     row = tx.execute(statement).first()
     if row is None:
-        detail = f"There is no coverage stream {stream_id!r} here; after a day without frames they are dropped."
-        raise NotFound(detail, code="no-stream")
+        raise NotFound(
+            f"There is no coverage stream {stream_id!r} here; after a day without frames they are dropped.",
+            code="no-stream",
+        )
     return Stream(**{field.name: row._mapping[field.name] for field in fields(Stream)})
