@@ -18,7 +18,7 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.figures import FIGURES, FigureOptions, draw_figure, draw_figures
 from marey_motion.evaluation.figures.clip_graph_layout import MOST_DOTS, arrange
 from marey_motion.evaluation.figures.mixtures import fit_one, fit_two
-from marey_motion.evaluation.figures.paper import nice_levels, shortened
+from marey_motion.evaluation.figures.paper import nice_levels, shortened, without_shared_folder
 from marey_motion.evaluation.result import EvaluationOptions, Grid
 from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.matching.database import DatabaseClip
@@ -430,3 +430,10 @@ def test_names_of_clips_are_drawn_as_they_are_but_for_signs_that_cannot_be():
         is_sound(figure)
         assert "<b>" not in figure.svg
     assert shortened("a" * 20 + "b" * 20, 11) == "aaaaa…bbbbb"[:11]
+
+
+def test_labels_leave_out_the_folder_that_all_clips_lie_in():
+    assert without_shared_folder(["lab/walks/a_01", "lab/walks/a_02"]) == ["a_01", "a_02"]
+    assert without_shared_folder(["lab/walks/a", "lab/runs/a"]) == ["walks/a", "runs/a"]
+    assert without_shared_folder(["walk", "wander"]) == ["walk", "wander"]
+    assert without_shared_folder([]) == []

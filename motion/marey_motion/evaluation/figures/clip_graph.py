@@ -19,6 +19,7 @@ from marey_motion.evaluation.figures.paper import (
     add_panel,
     new_figure,
     shortened,
+    without_shared_folder,
     write,
 )
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
@@ -63,7 +64,7 @@ def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: Fig
     width, height = (8.6, 6.6) if len(subjects) == 1 else (9.6, 4.7)
     figure = new_figure(width, height + 0.3 * (len(subjects) > 1))
     across = width / len(subjects)
-    names = [{clip.uid: clip.name for clip in subject.result.clips} for subject in subjects]
+    names = [_labels(subject) for subject in subjects]
     cut = LONGEST_NAMES[len(subjects) - 1]
     longest = max([0, *(len(shortened(each.get(uid, ABSENT), cut)) for each in names for uid in uids)])
     for number, subject in enumerate(subjects):
@@ -184,6 +185,12 @@ def _draw_dots(panel: Axes, circles: dict[str, Circle], dots: dict[str, Ints], m
         if mine.any():
             area = LARGEST_DOT * size / SIZES
             panel.scatter(place[mine, 0], place[mine, 1], s=area, c=look[mine], lw=0, alpha=0.9, zorder=3)
+
+
+def _labels(subject: Subject) -> dict[str, str]:
+    clips = subject.result.clips
+    names = without_shared_folder([clip.name for clip in clips])
+    return {clip.uid: name for clip, name in zip(clips, names, strict=True)}
 
 
 def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str], cut: int) -> None:

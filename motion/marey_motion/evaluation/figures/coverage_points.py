@@ -25,6 +25,7 @@ from marey_motion.evaluation.figures.paper import (
     plain,
     reach,
     shortened,
+    without_shared_folder,
 )
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
 
@@ -118,6 +119,7 @@ def _draw_keys(panel: Axes, subjects: Sequence[Subject], chosen: Sequence[_Point
         for clip in points.named
     }
     keys, labels = [], []
+    names = dict(zip(names, without_shared_folder(list(names.values())), strict=True))
     for uid, style in styles.items():
         look = _look(style)
         keys.append(Line2D([], [], ls="", color=look["c"], marker=look["marker"], markersize=5, markeredgewidth=0))

@@ -7,6 +7,7 @@ have no other way, one figure at a time; threads may draw at once.
 from __future__ import annotations
 
 import io
+import os
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -113,7 +114,7 @@ def add_keys(axes: Axes, **options: Any) -> None:
 
 def name_ticks(axes: Axes, places: Sequence[float], names: Sequence[str]) -> None:
     """Names, as clips have, down the vertical axis."""
-    axes.set_yticks(list(places), [plain(shortened(name)) for name in names], parse_math=False)
+    axes.set_yticks(list(places), [plain(shortened(name)) for name in without_shared_folder(names)], parse_math=False)
     axes.tick_params(axis="y", length=0, labelcolor=INK)
 
 
@@ -127,6 +128,12 @@ def mark_sides(axes: Axes) -> None:
 def plain(text: str) -> str:
     """A name on one line, without signs that cannot be drawn or written to an SVG."""
     return "".join(sign if sign.isprintable() else "�" for sign in text)
+
+
+def without_shared_folder(names: Sequence[str]) -> list[str]:
+    """Names as they read within the folder that all of them lie in."""
+    shared = os.path.commonprefix(list(names)).rpartition("/")
+    return [name[len(shared[0]) + len(shared[1]) :] for name in names]
 
 
 def shortened(name: str, longest: int = LONGEST_NAME) -> str:
