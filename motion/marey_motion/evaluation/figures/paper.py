@@ -7,10 +7,10 @@ have no other way, one figure at a time; threads may draw at once.
 from __future__ import annotations
 
 import io
-import os
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -132,8 +132,10 @@ def plain(text: str) -> str:
 
 def without_shared_folder(names: Sequence[str]) -> list[str]:
     """Names as they read within the folder that all of them lie in."""
-    shared = os.path.commonprefix(list(names)).rpartition("/")
-    return [name[len(shared[0]) + len(shared[1]) :] for name in names]
+    places = [name.split("/") for name in names]
+    levels = zip(*(folders for *folders, _ in places), strict=False)
+    shared = sum(1 for _ in takewhile(lambda level: len(set(level)) == 1, levels))
+    return ["/".join(place[shared:]) for place in places]
 
 
 def shortened(name: str, longest: int = LONGEST_NAME) -> str:
