@@ -1,14 +1,17 @@
 """Coverage of performances over HTTP: frames in any media type, what is missing out, each answer once and for all."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import httpx
 import numpy as np
 import pytest
 
 from marey_motion.documents import mapping_to_document, skeleton_to_document
+from marey_motion.evaluation import live_windows, online
 from marey_motion.gait import generate_gait
 from marey_motion.rigs import guess_axes, map_joints
+from marey_schemas import coverage_streams
 from marey_schemas.access import Role
 from marey_schemas.codecs import BSON, JSON, MSGPACK, encode_tree
 from rest_server import Server, running
@@ -291,3 +294,20 @@ def test_readers_look_on_and_cannot_send(server: Server) -> None:
     assert guest.get(f"{STREAMS}/{stream['id']}").status_code == 200
     refused = send(guest, stream, offset=0, roots=circling(1.0, 0.0, 0.1))
     assert problem(refused, 403)["code"] == "insufficient-role"
+
+
+def test_of_senders_who_send_at_once_one_is_taken(owner) -> None:
+    stream = begin(owner)
+    roots = circling(1.0, 0.0, 1.0)
+    with ThreadPoolExecutor(8) as pool:
+        answers = list(pool.map(lambda n: send(owner, stream, offset=0, roots=roots[: 10 + n]), range(8)))
+    assert sorted(answer.status_code for answer in answers) == [200] + [409] * 7
+    (taken,) = (answer.json()["offset"] for answer in answers if answer.status_code == 200)
+    told = {answer.json()["context"]["offset"] for answer in answers if answer.status_code == 409}
+    assert told == {taken}
+    assert owner.get(f"{STREAMS}/{stream['id']}").json()["offset"] == taken
+
+
+def test_what_is_published_as_a_limit_is_the_limit_of_the_numbers() -> None:
+    published = coverage_streams.LEAST_FRAME_RATE_HZ, coverage_streams.MOST_FRAME_RATE_HZ, coverage_streams.MOST_CELLS
+    assert published == (live_windows.LEAST_RATE_HZ, live_windows.MOST_RATE_HZ, online.MOST_CELLS)
