@@ -41,7 +41,20 @@ def test_help_loads_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True)
     assert done.stderr.strip() == "[]"
-    for command in ("serve", "worker", "demo", "db", "upload", "download", "retarget", "evaluate", "report", "skeleton", "job", "why"):
+    for command in (
+        "serve",
+        "worker",
+        "demo",
+        "db",
+        "upload",
+        "download",
+        "retarget",
+        "evaluate",
+        "report",
+        "skeleton",
+        "job",
+        "why",
+    ):
         assert command in done.stdout
 
 
