@@ -11,9 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_client.downloads import safe_file_name, saved_atomically
+from marey_client.findings import Findings, OnProgress, find_out
 from marey_client.items import ItemHandle
 from marey_client.motions import ClipHandle
+from marey_schemas.base import Request
 from marey_schemas.evaluation import EvaluateParams, EvaluationReport, StoredFigure
+from marey_schemas.improvement import CompareParams, OptimiseParams, SuggestParams, SweepParams
 from marey_schemas.items import Item
 from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
 
@@ -86,6 +89,48 @@ class EvaluationHandle(ItemHandle):
         files = (file for figure in self.figures() for file in self._files_of(figure))
         return [_saved(folder / safe_file_name(name), data) for name, data in files]
 
+    # -- what follows from it: each hands in a job, waits for it, and raises `JobUnsuccessful` where it is refused --
+
+    def compare(self, after: EvaluationHandle, *, on_progress: OnProgress | None = None, **options: Any) -> Findings:
+        """What changed from this evaluation to another one of the same trials, under the same normaliser.
+
+        `options` are those of `CompareParams`.
+        """
+        inputs = {"before": self.as_input(), "after": after.as_input()}
+        return self._find_out("compare", inputs, CompareParams.model_validate(options), on_progress)
+
+    def suggest(self, candidates: Places = (), *, on_progress: OnProgress | None = None, **options: Any) -> Findings:
+        """Which clips can go, and which of the candidates, folders and clips, would fill holes.
+
+        `options` are those of `SuggestParams`.
+        """
+        params = SuggestParams.model_validate(options)
+        return self._find_out("suggest", self._with_candidates(candidates), params, on_progress)
+
+    def optimise(self, candidates: Places = (), *, on_progress: OnProgress | None = None, **options: Any) -> Findings:
+        """Clips taken away and candidates added, one step after another, while that lowers the objective.
+
+        `options` are those of `OptimiseParams`.
+        """
+        params = OptimiseParams.model_validate(options)
+        return self._find_out("optimise", self._with_candidates(candidates), params, on_progress)
+
+    def sweep(self, *, on_progress: OnProgress | None = None, **options: Any) -> Findings:
+        """The same trials under other weights of the features; `options` are those of `SweepParams`."""
+        params = SweepParams.model_validate(options)
+        return self._find_out("sweep", {"evaluation": self.as_input()}, params, on_progress)
+
+    def _with_candidates(self, candidates: Places) -> dict[str, Any]:
+        inputs: dict[str, Any] = {"evaluation": self.as_input()}
+        if places := _as_places(candidates):
+            inputs["candidates"] = tuple(map(_as_input, places))
+        return inputs
+
+    def _find_out(
+        self, kind: str, inputs: Mapping[str, Any], params: Request, on_progress: OnProgress | None
+    ) -> Findings:
+        return find_out(self.transport, self.project, kind, inputs, params, on_progress)
+
     def _files_of(self, figure: StoredFigure) -> Iterator[tuple[str, bytes]]:
         name = figure.name if figure.trial is None else f"{figure.name} {figure.trial}"
         for form in ("png", "svg", "json"):
@@ -102,7 +147,7 @@ def evaluate_request(
     project: ProjectHandle, clips: Places, params: EvaluateParams, normaliser: str | None
 ) -> JobCreate:
     """The job that evaluates `clips`, with loops that are tagged so and the mapping of a skeleton that was edited."""
-    places = [clips] if isinstance(clips, str | CollectionInput | ItemInput | ClipHandle) else list(clips)
+    places = _as_places(clips)
     found = [item for place in places for item in items_at(project, place)]
     inputs: dict[str, Any] = {"clips": tuple(map(_as_input, places))}
     if normaliser is not None:
@@ -112,6 +157,10 @@ def evaluate_request(
     loops = dict.fromkeys((*params.loops, *(item.id for item in found if LOOP_TAG in item.tags)))
     given = params.model_copy(update={"loops": tuple(loops)}).model_dump(mode="json", exclude_defaults=True)
     return JobCreate(kind="evaluate", inputs=inputs, params=given)
+
+
+def _as_places(places: Places) -> list[Place]:
+    return [places] if isinstance(places, str | CollectionInput | ItemInput | ClipHandle) else list(places)
 
 
 def _as_input(place: Place) -> CollectionInput | ItemInput:

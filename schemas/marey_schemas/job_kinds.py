@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from marey_schemas.base import Request
 from marey_schemas.evaluation import EvaluateParams, count_evaluation_tasks
+from marey_schemas.improvement import CompareParams, OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
 from marey_schemas.jobs import ExportParams, ImportParams, InputSpec, JobKind, RetargetParams
 from marey_schemas.kinds import Kind
 
@@ -119,7 +120,7 @@ EXPORT = KindDeclaration(
     description="Writes clips as files of one format into one archive.",
     params=ExportParams,
     implementation="marey_worker.kinds.export:run",
-    version=1,
+    version=2,
     inputs={"clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to write.")},
     outputs={"archive": "file"},
 )
@@ -131,7 +132,7 @@ EVALUATE = KindDeclaration(
     implementation="marey_worker.kinds.evaluate:run",
     gathering="marey_worker.kinds.evaluate:gather",
     task_count=count_evaluation_tasks,
-    version=1,
+    version=2,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to evaluate, all of one skeleton."),
         "rig": InputSpec(
@@ -148,7 +149,57 @@ EVALUATE = KindDeclaration(
     outputs={"evaluation": Kind.EVALUATION},
 )
 
-BUILT_IN = (IMPORT, RETARGET, EXPORT, EVALUATE)
+COMPARE = KindDeclaration(
+    name="compare",
+    description="Tells what changed between two evaluations, trial by trial, and how sure that is.",
+    params=CompareParams,
+    implementation="marey_worker.kinds.compare:run",
+    version=1,
+    inputs={
+        "before": InputSpec(kind=Kind.EVALUATION, description="The evaluation to compare with."),
+        "after": InputSpec(kind=Kind.EVALUATION, description="One of the same trials, under the same normaliser."),
+    },
+    outputs={"document": "file", "report": "file"},
+)
+
+_EVALUATED = InputSpec(kind=Kind.EVALUATION, description="The evaluation; its clips are read as they were then.")
+_CANDIDATES = InputSpec(
+    kind=Kind.CLIP, many=True, required=False, description="Clips that may be added, those of the set left out."
+)
+
+SUGGEST = KindDeclaration(
+    name="suggest",
+    description="Tells which clips of an evaluated set can go, and which others would fill its holes.",
+    params=SuggestParams,
+    implementation="marey_worker.kinds.suggest:run",
+    version=1,
+    inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES},
+    outputs={"document": "file"},
+)
+
+OPTIMISE = KindDeclaration(
+    name="optimise",
+    description="Takes clips away from an evaluated set and adds others, one step after another, while that helps.",
+    params=OptimiseParams,
+    implementation="marey_worker.kinds.optimise:run",
+    version=1,
+    inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES},
+    outputs={"document": "file"},
+)
+
+SWEEP = KindDeclaration(
+    name="sweep",
+    description="Evaluates a set again under other weights of the features, and tells which of them matter.",
+    params=SweepParams,
+    implementation="marey_worker.kinds.sweep:run",
+    gathering="marey_worker.kinds.sweep:gather",
+    task_count=count_sweep_tasks,
+    version=1,
+    inputs={"evaluation": _EVALUATED},
+    outputs={"document": "file"},
+)
+
+BUILT_IN = (IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, SUGGEST, OPTIMISE, SWEEP)
 
 
 class UnknownKindError(LookupError):

@@ -273,7 +273,7 @@ def test_an_archive_holds_every_clip_and_is_the_same_each_time(project, marey, t
             cache="off",
         )
         ended = marey.jobs.wait(project.submit(wanted).id, timeout_s=60)
-        digests.append(ended.result["archive"])
+        digests.append(ended.result["archive"]["blob"])
     assert digests[0] == digests[1]
     archive = marey.blobs.fetch_to(digests[0], tmp_path / "clips.zip")
     with zipfile.ZipFile(archive) as held:

@@ -84,7 +84,7 @@ def evaluate(
         project = marey.project(addresses[0].project)
         loops = [one.id for place in loop or () for one in _clips_in(marey, Address.parse(place))]
         trims = dict(_trim(marey, text) for text in trim or ())
-        pinned = _evaluation_at(marey, normaliser).id if normaliser else None
+        pinned = evaluation_at(marey, normaliser).id if normaliser else None
         submitted = project.evaluate(
             [clips_at(marey, address) for address in addresses],
             into=folder if into is None else into.strip("/"),
@@ -117,7 +117,7 @@ def report(
 ) -> None:
     """Write the report of an evaluation to a file."""
     with connect(context) as marey:
-        found = _evaluation_at(marey, place)
+        found = evaluation_at(marey, place)
         found.save_report(out)
         drawn = found.save_figures(figures) if figures is not None else []
     typer.echo(out)
@@ -151,7 +151,8 @@ def _trim(marey: Marey, text: str) -> tuple[str, tuple[int, int]]:
     return require_item(marey, Address.parse(place), [Kind.CLIP]).id, (int(first), int(stop))
 
 
-def _evaluation_at(marey: Marey, place: str) -> EvaluationHandle:
+def evaluation_at(marey: Marey, place: str) -> EvaluationHandle:
+    """The evaluation at a place. Raises `WrongUsage` where there is none."""
     from marey_schemas.kinds import Kind
 
     found: EvaluationHandle = require_item(marey, Address.parse(place), [Kind.EVALUATION])

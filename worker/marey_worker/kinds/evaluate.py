@@ -20,7 +20,7 @@ from marey_worker.context import Context, JobRefused
 from marey_worker.kinds.evaluation_headline import headline_of
 from marey_worker.kinds.evaluation_options import options_of
 from marey_worker.kinds.evaluation_report import write_report
-from marey_worker.kinds.matching_clips import read_clips, refusing_motion_errors
+from marey_worker.kinds.matching_clips import read_clips, refusing_motion_errors, wanted_clips
 
 GATHERING_STEPS = 4
 
@@ -67,6 +67,7 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     evaluation = {
         **result_to_tree(result),
         "normaliser": database.normaliser.as_tree(),
+        "clip_set": wanted_clips(context, params).as_tree(),
         "verdict": verdict(result),
         "headline": headline_of(result),
     }

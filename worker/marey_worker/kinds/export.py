@@ -13,6 +13,7 @@ from marey_motion.exporting import write_clip_file
 from marey_motion.skeleton import Skeleton
 from marey_schemas import codecs
 from marey_schemas.documents import Motion, RevisionRef, SkeletonHierarchy
+from marey_schemas.evaluation import StoredFile
 from marey_schemas.jobs import ExportParams, PinnedInput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused, NoSuchThing
@@ -37,7 +38,7 @@ class _File(NamedTuple):
 
 
 def run(context: Context, params: ExportParams) -> dict[str, Any]:
-    """Write the archive; the result names its digest. A clip that cannot be written is a refusal in the result."""
+    """Write the archive; the result names it, which keeps it. A clip that cannot be written is a refusal in there."""
     exporting = _Exporting(context, params)
     archive = context.scratch / "archive.zip"
     refused: list[dict[str, Any]] = []
@@ -57,7 +58,8 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
     if not written:
         raise JobRefused("nothing-to-export", f"none of {len(pins)} clips can be written as {params.format}")
     size = archive.stat().st_size
-    return {"archive": context.put_file(archive), "clips": len(written), "bytes": size, "refused": refused}
+    stored = StoredFile(blob=context.put_file(archive), size_bytes=size)
+    return {"archive": stored.model_dump(mode="json"), "clips": len(written), "refused": refused}
 
 
 class _Exporting:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 from marey_motion import documents
 from marey_motion.errors import MotionError
@@ -47,6 +48,41 @@ class MatchingClips:
 _kept: Kept[bytes, MatchingClips] = Kept(MOST_KEPT)
 
 
+@dataclass(frozen=True)
+class ClipSet:
+    """Which clips, and what of them: all that decides a database beside its options and normaliser."""
+
+    clips: tuple[PinnedInput, ...]
+    rig: PinnedInput | None = None
+    loops: tuple[str, ...] = ()
+    trims: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+
+    def as_tree(self) -> dict[str, Any]:
+        """To be kept with an evaluation."""
+        return {
+            "clips": [pin.model_dump(mode="json") for pin in self.clips],
+            "rig": None if self.rig is None else self.rig.model_dump(mode="json"),
+            "loops": list(self.loops),
+            "trims": {item: list(frames) for item, frames in self.trims.items()},
+        }
+
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any]) -> ClipSet:
+        """What `as_tree` wrote."""
+        return cls(
+            clips=tuple(map(PinnedInput.model_validate, tree["clips"])),
+            rig=None if tree["rig"] is None else PinnedInput.model_validate(tree["rig"]),
+            loops=tuple(tree["loops"]),
+            trims={item: (start, stop) for item, (start, stop) in tree["trims"].items()},
+        )
+
+
+def wanted_clips(context: Context, params: EvaluateParams) -> ClipSet:
+    """The clips that the job shall evaluate."""
+    (rig,) = context.inputs.get("rig", ()) or (None,)
+    return ClipSet(context.inputs["clips"], rig, params.loops, params.trims)
+
+
 def read_clips(context: Context, params: EvaluateParams, options: DatabaseOptions) -> MatchingClips:
     """The job's clips, ready to be matched.
 
@@ -55,9 +91,29 @@ def read_clips(context: Context, params: EvaluateParams, options: DatabaseOption
     """
     pins = {name: [(pin.item, pin.revision) for pin in many] for name, many in context.inputs.items()}
     chosen = params.model_dump(mode="json", include={"database", "loops", "trims"})
-    key = canonical_json({"inputs": pins, "params": chosen})
+    wanted = wanted_clips(context, params)
     with refusing_motion_errors():
-        return _kept.get(key, lambda: MatchingClips(_build(context, params, options)))
+        return _kept.get(
+            canonical_json({"inputs": pins, "params": chosen}),
+            lambda: MatchingClips(build_set(context, wanted, options, _pinned_normaliser(context))),
+        )
+
+
+def read_evaluated_clips(
+    context: Context, evaluation: PinnedInput, document: Mapping[str, Any], options: DatabaseOptions
+) -> MatchingClips:
+    """The clips of an evaluation as they were, under its normaliser. Raises `JobRefused` for one that names none."""
+    if "clip_set" not in document:
+        raise JobRefused(
+            "clips-unknown", f"{place_of(evaluation)} does not tell which clips it is of; evaluate them again"
+        )
+    wanted = ClipSet.from_tree(document["clip_set"])
+    normaliser = Normaliser.from_tree(document["normaliser"])
+    with refusing_motion_errors():
+        return _kept.get(
+            canonical_json({"evaluation": [evaluation.item, evaluation.revision]}),
+            lambda: MatchingClips(build_set(context, wanted, options, normaliser)),
+        )
 
 
 @contextmanager
@@ -69,43 +125,60 @@ def refusing_motion_errors() -> Iterator[None]:
         raise JobRefused(error.code, str(error)) from error
 
 
-def _build(context: Context, params: EvaluateParams, options: DatabaseOptions) -> MatchingDatabase:
-    pins = context.inputs["clips"]
-    motions = list(_read_motions(context, pins))
-    rig = _common_rig(context, pins, motions)
-    rigged = read_rigged(context, rig)
-    infos = context.documents(pins, "info", required=False)
-    loops = set(params.loops)
+def build_set(
+    context: Context, wanted: ClipSet, options: DatabaseOptions, normaliser: Normaliser | None
+) -> MatchingDatabase:
+    """The database of clips of one skeleton. Raises `JobRefused`, `MotionError`."""
+    motions = list(read_motions(context, wanted.clips))
+    rigged = read_rigged(context, _common_rig(context, wanted, motions))
+    body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
+    return build_clips(context, wanted, motions, body, options, normaliser)
+
+
+def build_clips(
+    context: Context,
+    wanted: ClipSet,
+    motions: Sequence[tuple[str, Motion]],
+    body: MatchingBody,
+    options: DatabaseOptions,
+    normaliser: Normaliser | None,
+) -> MatchingDatabase:
+    """The database of clips whose motions, one for each with its digest, are at hand."""
+    infos = context.documents(wanted.clips, "info", required=False)
     clips = [
         SourceClip(
-            uid=f"{pin.item}@{pin.revision}",
-            name=_place(pin),
-            clip=documents.clip_from_document(motion, rigged.skeleton),
+            uid=uid_of(pin),
+            name=place_of(pin),
+            clip=documents.clip_from_document(motion, body.skeleton),
             content=content,
-            loop=pin.item in loops or LOOP_TAG in (info or {}).get("tags", ()),
-            frames=_trim(pin, motion, params),
+            loop=pin.item in wanted.loops or LOOP_TAG in (info or {}).get("tags", ()),
+            frames=_trim(pin, motion, wanted.trims),
             tags=tuple((info or {}).get("tags", ())),
         )
         for (pin, info), (content, motion) in zip(infos, motions, strict=True)
     ]
     context.progress(0, None, f"building a database of {len(clips)} clips")
-    body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
-    return build_database(clips, body, options, normaliser=_pinned_normaliser(context))
+    return build_database(clips, body, options, normaliser=normaliser)
 
 
-def _read_motions(context: Context, pins: Sequence[PinnedInput]) -> Iterator[tuple[str, Motion]]:
+def uid_of(pin: PinnedInput) -> str:
+    """What a database calls a clip."""
+    return f"{pin.item}@{pin.revision}"
+
+
+def read_motions(context: Context, pins: Sequence[PinnedInput]) -> Iterator[tuple[str, Motion]]:
     """Each clip's motion and its digest."""
     for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
         context.progress(0, None, f"reading clip {done + 1} of {len(pins)}, {pin.name}")
         yield document_digest(tree), Motion.model_validate(tree)
 
 
-def _common_rig(context: Context, pins: Sequence[PinnedInput], motions: Sequence[tuple[str, Motion]]) -> Rig:
+def _common_rig(context: Context, wanted: ClipSet, motions: Sequence[tuple[str, Motion]]) -> Rig:
     """The skeleton of all clips, at the newest revision in use. Raises `JobRefused` where there are several."""
     used = [RevisionRef.model_validate(motion.skeleton.model_dump()) for _, motion in motions]
     (most, count), *others = Counter(ref.item for ref in used).most_common()
     if others:
-        odd = [_place(pin) for pin, ref in zip(pins, used, strict=True) if ref.item != most]
+        odd = [place_of(pin) for pin, ref in zip(wanted.clips, used, strict=True) if ref.item != most]
         commonest = context.item(Kind.SKELETON, most)
         place = f"{commonest.collection}/{commonest.name}".lstrip("/")
         raise JobRefused(
@@ -114,18 +187,18 @@ def _common_rig(context: Context, pins: Sequence[PinnedInput], motions: Sequence
             "move all to one of them first, with marey retarget",
         )
     skeleton = max(used, key=lambda ref: ref.revision)
-    edited = context.inputs.get("rig", ())
-    if edited and edited[0].item != most:
-        raise JobRefused("wrong-rig", f"the input rig is {edited[0].item}; the clips move {most}")
-    mapping = RevisionRef(item=edited[0].item, revision=edited[0].revision) if edited else skeleton
+    edited = wanted.rig
+    if edited is not None and edited.item != most:
+        raise JobRefused("wrong-rig", f"the input rig is {edited.item}; the clips move {most}")
+    mapping = skeleton if edited is None else RevisionRef(item=edited.item, revision=edited.revision)
     return Rig(skeleton, mapping)
 
 
-def _trim(pin: PinnedInput, motion: Motion, params: EvaluateParams) -> tuple[int, int] | None:
-    trim = params.trims.get(pin.item)
+def _trim(pin: PinnedInput, motion: Motion, trims: Mapping[str, tuple[int, int]]) -> tuple[int, int] | None:
+    trim = trims.get(pin.item)
     if trim is not None and trim[1] > len(motion.poses):
         frames = len(motion.poses)
-        raise JobRefused("bad-trim", f"{_place(pin)}: the frames {trim[0]}:{trim[1]} are not there; it has {frames}")
+        raise JobRefused("bad-trim", f"{place_of(pin)}: the frames {trim[0]}:{trim[1]} are not there; it has {frames}")
     return trim
 
 
@@ -137,7 +210,8 @@ def _pinned_normaliser(context: Context) -> Normaliser | None:
     return None
 
 
-def _place(pin: PinnedInput) -> str:
+def place_of(pin: PinnedInput) -> str:
+    """Folder and name."""
     return f"{pin.collection}/{pin.name}".lstrip("/")
 
 

@@ -1,0 +1,327 @@
+"""`compare`, `suggest`, `optimise` and `sweep`."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marey_client.cli.addresses import Address
+from marey_client.cli.evaluations import evaluation_at
+from marey_client.cli.failures import WrongUsage
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.jobs import clips_at, show_progress
+from marey_client.cli.output import print_json, print_table, progress, tell
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from marey_client.evaluations import EvaluationHandle
+    from marey_client.findings import Findings
+    from marey_client.marey import Marey
+    from marey_schemas.jobs import CollectionInput, ItemInput, Job
+
+SHOWN = 10
+TOLD_FIRST = (
+    ("offset_mean", "offset m"),
+    ("abs_se_v", "speed error m/s"),
+    ("abs_se_omega_deg", "turn error degrees/s"),
+    ("pose_cost_mean", "pose cost m"),
+    ("transitions_per_s", "switches 1/s"),
+)
+"""The metrics that people are told; --json and the report have all."""
+
+Evaluation = Annotated[str, typer.Argument(help="An evaluation: project/folder/name, or project/id.")]
+From = Annotated[
+    list[str] | None,
+    typer.Option("--from", help="A folder or clip of the same project that may be added; may be repeated."),
+]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    for command in (compare, suggest, optimise, sweep):
+        app.command()(command)
+
+
+def compare(
+    context: typer.Context,
+    before: Evaluation,
+    after: Annotated[str, typer.Argument(help="One of the same trials, evaluated with --normaliser BEFORE.")],
+    out: Annotated[Path | None, typer.Option(help="Write the report to this file.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell what changed between two evaluations, trial by trial."""
+    with connect(context) as marey:
+        first, second = evaluation_at(marey, before), evaluation_at(marey, after)
+        if first.project != second.project:
+            raise WrongUsage("both evaluations must be in one project")
+        with _following() as on_progress:
+            found = first.compare(second, on_progress=on_progress)
+        document = found.document()
+        if out is not None:
+            found.save_report(out)
+    if as_json:
+        return print_json({"summary": found.summary, **_plain(document)})
+    _print_comparison(document)
+    if out is not None:
+        tell(f"report: {out}")
+    return None
+
+
+def suggest(
+    context: typer.Context,
+    evaluation: Evaluation,
+    candidates: From = None,
+    removals: Annotated[int, typer.Option(min=0, help="How many removals of used clips to plan.")] = 10,
+    consider: Annotated[
+        int, typer.Option(min=0, help="Try only so many used clips, those that the fewest trials need.")
+    ] = 50,
+    duplicate_cm: Annotated[float, typer.Option(min=0, help="How far apart near-duplicates may be, per frame.")] = 3.0,
+    remove_out: Annotated[
+        Path | None, typer.Option(help="Write the clips that can go without any change to this file, a path a line.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell which clips of an evaluated set can go, and which others would fill its holes."""
+    with connect(context) as marey:
+        found = _found(
+            marey,
+            evaluation,
+            lambda handle, on_progress: handle.suggest(
+                _places(marey, handle, candidates),
+                on_progress=on_progress,
+                removals=removals,
+                consider=consider,
+                duplicate_cm=duplicate_cm,
+            ),
+        )
+        document = found.document()
+    if remove_out is not None:
+        names = [f"{clip['name']}\n" for clip in document["unused"]["clips"]]
+        remove_out.write_text("".join(names), encoding="utf-8")
+        tell(f"{len(names)} clips that can go: {remove_out}")
+    if as_json:
+        return print_json({"summary": found.summary, **_plain(document)})
+    return _print_suggestions(document)
+
+
+def optimise(
+    context: typer.Context,
+    evaluation: Evaluation,
+    candidates: From = None,
+    max_steps: Annotated[int, typer.Option(min=1, help="End after so many steps.")] = 50,
+    max_evaluations: Annotated[int | None, typer.Option(min=1, help="End after so many sets were tried.")] = None,
+    max_data_s: Annotated[float | None, typer.Option(help="Add nothing that makes the set longer, seconds.")] = None,
+    least_gain: Annotated[float, typer.Option(min=0, help="Metres that a step must gain.")] = 1e-4,
+    consider: Annotated[int, typer.Option(min=1, help="Try so many removals and additions in each step.")] = 20,
+    weight: Annotated[
+        list[str] | None, typer.Option(help="Of the objective: offset=1, seconds=0.0001, …; may be repeated.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Take clips away and add others, one step after another, while that makes the set better."""
+    objective = _weights(weight)
+    with connect(context) as marey:
+        found = _found(
+            marey,
+            evaluation,
+            lambda handle, on_progress: handle.optimise(
+                _places(marey, handle, candidates),
+                on_progress=on_progress,
+                objective=objective,
+                max_steps=max_steps,
+                max_evaluations=max_evaluations,
+                max_data_s=max_data_s,
+                least_gain=least_gain,
+                consider=consider,
+            ),
+        )
+        document = found.document()
+    if as_json:
+        return print_json({"summary": found.summary, **_plain(document)})
+    return _print_steps(document)
+
+
+def sweep(
+    context: typer.Context,
+    evaluation: Evaluation,
+    factors: Annotated[str, typer.Option(help="Each weight times each of these: a,b,c.")] = "0.5,2",
+    weight: Annotated[
+        list[str] | None, typer.Option(help="Of the objective: offset=1, pose_cost=0.5, …; may be repeated.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Evaluate again under other weights of the features, and tell which of them matter."""
+    objective = _weights(weight)
+    values = tuple(_value(text, factors) for text in factors.split(","))
+    with connect(context) as marey:
+        found = _found(
+            marey,
+            evaluation,
+            lambda handle, on_progress: handle.sweep(on_progress=on_progress, objective=objective, factors=values),
+        )
+        document = found.document()
+    if as_json:
+        return print_json({"summary": found.summary, **_plain(document)})
+    return _print_sweep(document)
+
+
+# -- asking -----------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _following() -> Iterator[Callable[[Job], None]]:
+    """A bar that follows a job."""
+    with progress() as advance:
+        yield lambda now: show_progress(now, advance)
+
+
+def _found(marey: Marey, place: str, ask: Callable[[EvaluationHandle, Callable[[Job], None]], Findings]) -> Findings:
+    handle = evaluation_at(marey, place)
+    with _following() as on_progress:
+        return ask(handle, on_progress)
+
+
+def _places(
+    marey: Marey, handle: EvaluationHandle, candidates: Sequence[str] | None
+) -> list[CollectionInput | ItemInput]:
+    addresses = [Address.parse(place) for place in candidates or ()]
+    for address in addresses:
+        if address.project != handle.project:
+            raise WrongUsage(f"{address}: candidates must be in the project of the evaluation, {handle.project}")
+    return [clips_at(marey, address) for address in addresses]
+
+
+def _weights(given: Sequence[str] | None) -> dict[str, float]:
+    """`name=value` of the objective's weights."""
+    from marey_schemas.improvement import ObjectiveParams
+
+    weights = {}
+    for text in given or ():
+        name, _, value = text.partition("=")
+        if name not in ObjectiveParams.model_fields:
+            known = ", ".join(ObjectiveParams.model_fields)
+            raise WrongUsage(f"{text!r}: write name=value with one of {known}")
+        weights[name] = _value(value, text)
+    return weights
+
+
+def _value(number: str, text: str) -> float:
+    try:
+        return float(number)
+    except ValueError:
+        raise WrongUsage(f"{text!r}: {number!r} is no number") from None
+
+
+# -- telling ----------------------------------------------------------------------------------------------------------
+
+
+def _print_comparison(document: Mapping[str, Any]) -> None:
+    changed = document["changed"]
+    moved = [one for one in changed if not one["same_motion"]]
+    if not changed:
+        typer.echo(f"No trial changed: all {document['trials']} are the same to the last bit.")
+    elif not moved:
+        typer.echo(f"No trial moves otherwise; {len(changed)} of {document['trials']} show the motion of other clips.")
+    else:
+        typer.echo(f"{len(moved)} of {document['trials']} trials changed.")
+    metrics = {one["metric"]: one for one in document["metrics"]}
+    rows = [
+        (label, f"{one['before']:.4f}", f"{one['after']:.4f}", f"{one['change']:+.4f}",
+         f"{one['low']:+.4f} to {one['high']:+.4f}", one["verdict"])
+        for name, label in TOLD_FIRST if (one := metrics.get(name)) is not None
+    ]  # fmt: skip
+    columns = ("metric", "before", "after", "change", "95 % interval", "verdict")
+    print_table(columns, rows, right=columns[1:5])
+    if moved:
+        worst = sorted(moved, key=lambda one: -_rise(one))[:SHOWN]
+        rows_of_trials = [
+            (one["trial"], _metres(one["offset_mean_before"]), _metres(one["offset_mean_after"])) for one in worst
+        ]
+        columns_of_trials = ("changed trials, the worst first", "offset before m", "after m")
+        print_table(columns_of_trials, rows_of_trials, right=columns_of_trials[1:])
+    for name, label in (("removed", "removed"), ("added", "added"), ("newly_unused", "newly unused")):
+        if document[name]:
+            typer.echo(f"{label}: {len(document[name])} clips")
+
+
+def _rise(one: Mapping[str, Any]) -> float:
+    return float((one["offset_mean_after"] or 0.0) - (one["offset_mean_before"] or 0.0))
+
+
+def _metres(value: float | None) -> str:
+    return "" if value is None else f"{value:.3f}"
+
+
+def _print_suggestions(document: Mapping[str, Any]) -> None:
+    unused, redundant = document["unused"], document["redundant"]
+    sections = (
+        (f"Can go without any change: {len(unused['clips'])} clips, {len(unused['ranges'])} stretches of others, "
+         f"{unused['seconds']:.1f} s", [*unused["clips"], *unused["ranges"]]),
+        (f"Can go with little harm: one after another, {len(redundant['plan'])} planned; "
+         f"{redundant['tried']} of {redundant['needed']} used clips tried", redundant["plan"]),
+        (f"Is there twice: {len(document['near_duplicates']['pairs'])} pairs within "
+         f"{document['near_duplicates']['threshold_cm']:g} cm", document["near_duplicates"]["spared"]),
+        (f"Would fill holes: {len(document['fillings'])} clips", document["fillings"]),
+        ("In this order", document["additions"]),
+    )  # fmt: skip
+    for heading, entries in sections:
+        if entries:
+            typer.echo(f"{heading}.")
+            for entry in entries[:SHOWN]:
+                typer.echo(f"  {entry['reason']}")
+            if len(entries) > SHOWN:
+                typer.echo(f"  … and {len(entries) - SHOWN} more; --json has all.")
+            typer.echo("")
+    for one in document["unusable"]:
+        tell(f"{one['folder']}: {one['clips']} clips cannot be matched: {one['detail']} ({one['code']})")
+    if not any(entries for _, entries in sections):
+        typer.echo("Every clip is needed, and nothing was found that would fill a hole.")
+
+
+def _print_steps(document: Mapping[str, Any]) -> None:
+    names = document["names"]
+    rows = [
+        (step["number"], step["action"], ", ".join(names.get(source, source) for source in step["sources"]),
+         f"{step['objective']:.4f}", f"{step['metrics']['offset_mean']:.4f}", f"{step['data_s']:.1f}",
+         step["changed_trials"])
+        for step in document["steps"]
+    ]  # fmt: skip
+    columns = ("step", "action", "clips", "objective m", "offset m", "data s", "trials changed")
+    print_table(columns, rows, right=columns[3:])
+    typer.echo({"no gain": "No further step gains enough.", "steps": "Ended after the most steps that were allowed.",
+                "evaluations": "Ended after the most sets that were to be tried."}[document["ended"]])  # fmt: skip
+
+
+def _print_sweep(document: Mapping[str, Any]) -> None:
+    base = document["settings"][0]["weights"]
+    rows = [
+        (
+            one["group"],
+            f"{base[one['group']]:g}",
+            f"{one['best_weight']:g}",
+            f"{one['gain']:.4f}",
+            f"{one['spread']:.4f}",
+        )
+        for one in document["influences"]
+    ]
+    columns = ("features", "weight", "best", "gain m", "spread m")
+    print_table(columns, rows, right=columns[1:])
+    typer.echo(f"The objective is {document['settings'][0]['objective']:.4f} m with the weights of the evaluation.")
+
+
+def _plain(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Arrays as lists."""
+    import numpy as np
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            return value.tolist()
+        if isinstance(value, dict):
+            return {name: plain(one) for name, one in value.items()}
+        return [plain(one) for one in value] if isinstance(value, list) else value
+
+    return {name: plain(value) for name, value in document.items()}

@@ -1,0 +1,64 @@
+"""What jobs found out about evaluations: numbers, a document with everything, and sometimes a report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from marey_client.blobs import Blobs
+from marey_client.jobs import Jobs
+from marey_client.transport import Transport
+from marey_schemas.base import Request
+from marey_schemas.codecs import JSON, decode_tree
+from marey_schemas.jobs import CollectionInput, ItemInput, Job, JobCreate
+
+OnProgress = Callable[[Job], None]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What one job found out; `job.result` counts it."""
+
+    transport: Transport
+    job: Job
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The numbers that lists show."""
+        return {name: value for name, value in (self.job.result or {}).items() if name not in ("document", "report")}
+
+    def document(self) -> dict[str, Any]:
+        """Everything that was found; arrays are numpy arrays."""
+        return dict(decode_tree(Blobs(self.transport).fetch(self._blob("document")), JSON))
+
+    def report(self) -> bytes:
+        """The report, where there is one: one page of HTML that needs nothing else."""
+        return Blobs(self.transport).fetch(self._blob("report"))
+
+    def save_report(self, path: Path) -> Path:
+        """Write the report to a file."""
+        return Blobs(self.transport).fetch_to(self._blob("report"), path)
+
+    def _blob(self, name: str) -> str:
+        result = self.job.result or {}
+        if name not in result:
+            raise LookupError(f"job {self.job.id} made no {name}")
+        return str(result[name]["blob"])
+
+
+def find_out(
+    transport: Transport,
+    project: str,
+    kind: str,
+    inputs: Mapping[str, ItemInput | Sequence[ItemInput | CollectionInput]],
+    params: Request,
+    on_progress: OnProgress | None,
+) -> Findings:
+    """Hand in a job about an evaluation and wait until it has ended. Raises `JobUnsuccessful`."""
+    pinned = {name: one if isinstance(one, ItemInput) else tuple(one) for name, one in inputs.items()}
+    given = params.model_dump(mode="json", exclude_defaults=True)
+    jobs = Jobs(transport)
+    submitted = jobs.submit(project, JobCreate(kind=kind, inputs=pinned, params=given))
+    return Findings(transport, jobs.wait(submitted.id, on_progress=on_progress))

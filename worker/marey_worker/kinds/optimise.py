@@ -1,0 +1,91 @@
+"""A set of clips made better step by step, with a line in the log for every step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from marey_motion.evaluation.optimise import OptimisationOptions, OptimisationStep, optimise
+from marey_motion.evaluation.resimulation import Resimulation
+from marey_motion.evaluation.selection import joined, same_skeleton, source_of
+from marey_motion.evaluation.suggestion_documents import optimisation_to_tree
+from marey_motion.matching.database import MatchingDatabase
+from marey_schemas.improvement import OptimiseParams
+from marey_worker.context import Context, JobRefused
+from marey_worker.kinds.candidates import Candidates, read_candidates
+from marey_worker.kinds.evaluated_set import EvaluatedSet, objective_of, read_evaluated_set, store_document
+from marey_worker.kinds.matching_clips import refusing_motion_errors
+
+
+def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
+    """Remove and add clips while that helps; the result names the document with every step."""
+    evaluated = read_evaluated_set(context)
+    candidates = read_candidates(context, evaluated)
+    with refusing_motion_errors():
+        database = _with_candidates(evaluated.clips.database, candidates)
+        simulation = _simulation(context, evaluated, database)
+        own = {source_of(clip) for clip in evaluated.clips.database.clips}
+        names = {source_of(clip): clip.name for clip in database.clips if clip.mirrored_from is None}
+        options = OptimisationOptions(
+            objective=objective_of(params.objective),
+            **params.model_dump(include={"least_gain", "max_steps", "max_evaluations", "max_data_s", "consider"}),
+        )
+        steps: list[OptimisationStep] = []
+
+        def made(step: OptimisationStep) -> None:
+            steps.append(step)
+            context.log(_told(step, names))
+
+        found = optimise(
+            simulation,
+            options,
+            absent=simulation.sources.keys() - own,
+            made=made,
+            progress=lambda done, total, uid: context.progress(
+                done, total, f"step {len(steps)}: trying {names.get(uid, uid)}"
+            ),
+        )
+    context.log(f"ended: {found.ended}")
+    first, last = found.steps[0], found.steps[-1]
+    return {
+        "steps": len(found.steps) - 1,
+        "ended": found.ended,
+        "objective_before": first.objective,
+        "objective_after": last.objective,
+        "data_s_before": first.data_s,
+        "data_s_after": last.data_s,
+        "document": store_document(context, {**optimisation_to_tree(found), "names": names}),
+    }
+
+
+def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> MatchingDatabase:
+    """The set and everything that may be added. Raises `JobRefused` for candidates that cannot be mixed with it."""
+    unusable = [f"{one.folder} ({one.detail})" for one in candidates.unusable]
+    strangers = [name for name, other in candidates.databases.items() if not same_skeleton(database, other)]
+    if unusable or strangers:
+        raise JobRefused(
+            "skeleton-mismatch",
+            f"the clips in {', '.join([*strangers, *unusable])} cannot be mixed with those of the evaluation; "
+            "move them to its skeleton first, with marey retarget, or leave them out",
+        )
+    for other in candidates.databases.values():
+        database = joined(database, other)
+    return database
+
+
+def _simulation(context: Context, evaluated: EvaluatedSet, database: MatchingDatabase) -> Resimulation:
+    """What the trials did over the set alone is known, but over a larger database its rows have other numbers."""
+    alone = database is evaluated.clips.database
+    return Resimulation(
+        database,
+        evaluated.result.options,
+        trials=evaluated.trials,
+        records=evaluated.result.records if alone else None,
+        threads=context.threads,
+    )
+
+
+def _told(step: OptimisationStep, names: dict[str, str]) -> str:
+    did = {"start": "the set as it is", "remove": "without", "add": "with"}[step.action]
+    clips = ", ".join(names.get(source, source) for source in step.sources)
+    told = f"objective {step.objective:.4f} m, offset {step.metrics['offset_mean']:.4f} m, {step.data_s:.1f} s of data"
+    return f"step {step.number}: {did} {clips}".rstrip() + f": {told}, {step.changed_trials} trials changed"

@@ -1,0 +1,50 @@
+"""What an evaluated set of clips could do without, and what would fill its holes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from marey_motion.evaluation.suggest import SuggestionOptions, Suggestions, suggest
+from marey_motion.evaluation.suggestion_documents import suggestions_to_tree
+from marey_schemas.improvement import SuggestParams
+from marey_worker.context import Context
+from marey_worker.kinds.candidates import read_candidates
+from marey_worker.kinds.evaluated_set import objective_of, read_evaluated_set, store_document
+from marey_worker.kinds.matching_clips import refusing_motion_errors
+
+
+def run(context: Context, params: SuggestParams) -> dict[str, Any]:
+    """Look for suggestions; the result counts them and names the document that has them all."""
+    evaluated = read_evaluated_set(context)
+    candidates = read_candidates(context, evaluated)
+    options = SuggestionOptions(
+        objective=objective_of(params.objective),
+        removals=params.removals,
+        consider=params.consider,
+        duplicate_cm=params.duplicate_cm,
+        blendable_m=params.blendable_m,
+    )
+    with refusing_motion_errors():
+        found = suggest(
+            evaluated.clips.database,
+            evaluated.result,
+            collections=candidates.databases,
+            options=options,
+            threads=context.threads,
+            progress=context.progress,
+        )
+    document = {**suggestions_to_tree(found), "unusable": [one._asdict() for one in candidates.unusable]}
+    return {**_counts(found), "unusable": len(candidates.unusable), "document": store_document(context, document)}
+
+
+def _counts(found: Suggestions) -> dict[str, Any]:
+    return {
+        "unused_clips": len(found.unused.clips),
+        "unused_s": found.unused.seconds,
+        "removals": len(found.plan),
+        "near_duplicates": len(found.duplicates.pairs),
+        "fillings": len(found.fillings),
+        "needing_retarget": sum(one.needs_retarget for one in found.fillings),
+        "coverage_index": found.result.coverage.index,
+        "coverage_index_filled": found.additions[-1].coverage_index if found.additions else found.result.coverage.index,
+    }

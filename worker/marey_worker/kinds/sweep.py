@@ -1,0 +1,66 @@
+"""The trials of an evaluation under other weights of the features: a task for each setting."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from marey_motion.evaluation.sweep import SweepRow, group_influences, sweep_weights, vary_each_group
+from marey_motion.matching.options import FeatureWeights
+from marey_schemas.improvement import SweepParams
+from marey_worker.context import Context
+from marey_worker.kinds.evaluated_set import objective_of, read_evaluated_set, store_document
+from marey_worker.kinds.matching_clips import refusing_motion_errors
+
+SWEEP_SCHEMA = "marey/sweep@1"
+
+
+def run(context: Context, params: SweepParams) -> dict[str, Any]:
+    """Evaluate under this task's share of the settings."""
+    evaluated = read_evaluated_set(context)
+    settings = vary_each_group(evaluated.result.options.database, params.factors)
+    with refusing_motion_errors():
+        rows = sweep_weights(
+            evaluated.clips.database,
+            evaluated.result.options,
+            settings[context.task.position :: context.task.size],
+            objective=objective_of(params.objective),
+            trials=evaluated.trials,
+            threads=context.threads,
+            progress=context.progress,
+        )
+    return {"rows": [_row(row) for row in rows]}
+
+
+def gather(context: Context, params: SweepParams, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """All settings in order, and which groups of features matter."""
+    # Task i of n has made the settings i, i + n, i + 2n and so on.
+    longest = max(len(result["rows"]) for result in results)
+    found = [result["rows"][turn] for turn in range(longest) for result in results if turn < len(result["rows"])]
+    rows = [SweepRow(**{**row, "weights": FeatureWeights(**row["weights"])}) for row in found]
+    influences = [asdict(influence) for influence in group_influences(rows)]
+    document = {
+        "schema": SWEEP_SCHEMA,
+        "objective": params.objective.model_dump(),
+        "settings": found,
+        "influences": influences,
+    }
+    best = min(rows, key=lambda row: row.objective)
+    return {
+        "settings": len(rows),
+        "objective": rows[0].objective,
+        "best_objective": best.objective,
+        "best_weights": asdict(best.weights),
+        "influences": influences,
+        "document": store_document(context, document),
+    }
+
+
+def _row(row: SweepRow) -> dict[str, Any]:
+    return {
+        "weights": asdict(row.weights),
+        "metrics": dict(row.metrics),
+        "headlines": row.headlines,
+        "objective": row.objective,
+    }
