@@ -1,80 +1,15 @@
 """The function behind `evaluate`, with a project in memory instead of a server."""
 
-import hashlib
-from dataclasses import dataclass, field
 from math import radians
 
 import numpy as np
 import pytest
 
-from marey_motion.documents import clip_to_document, skeleton_to_document
 from marey_motion.gait import generate_gait
 from marey_motion.matching.database import MatchingDatabase
-from marey_schemas.documents import RevisionRef
-from marey_schemas.evaluation import EvaluateParams
-from marey_schemas.items import Item
-from marey_schemas.jobs import PinnedInput
-from marey_schemas.kinds import Kind
-from marey_worker.context import JobRefused, NoSuchThing, Task
+from marey_worker.context import JobRefused, Task
 from marey_worker.kinds import evaluate, matching_clips
-
-NOW = "2026-01-01T00:00:00Z"
-PARAMS = EvaluateParams(
-    speeds_m_s=(1.0, 1.5), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=4.0, baseline=False, report=False
-)
-
-
-@dataclass
-class ProjectInMemory:
-    """What a job may use of its project: a context without a pipe."""
-
-    scratch: object
-    task: Task = field(default_factory=lambda: Task(0, 1))
-    threads: int = 1
-    inputs: dict = field(default_factory=dict)
-    parts: dict = field(default_factory=dict)
-    blobs: dict = field(default_factory=dict)
-    staged: list = field(default_factory=list)
-    told: list = field(default_factory=list)
-
-    def document(self, kind, item, revision, part):
-        if (item, revision, part) not in self.parts:
-            raise NoSuchThing(f"{item} has no {part}")
-        return self.parts[item, revision, part]
-
-    def documents(self, pins, part, *, required=True):
-        for pin in pins:
-            held = self.parts.get((pin.item, pin.revision, part))
-            assert held is not None or not required
-            yield pin, held
-
-    def item(self, kind, item):
-        return Item(
-            id=item, kind=kind, name=item.upper(), collection="rigs", revision=1, created_at=NOW, updated_at=NOW, rev=1
-        )
-
-    def blob(self, digest):
-        return self.blobs[digest]
-
-    def put_file(self, path):
-        data = path.read_bytes()
-        digest = f"sha256:{hashlib.sha256(data).hexdigest()}"
-        self.blobs[digest] = data
-        return digest
-
-    def stage(self, outputs):
-        self.staged += outputs
-
-    def progress(self, done, total=None, note=""):
-        self.told.append((done, total, note))
-
-
-def add_clip(project, name, clip, skeleton="skeleton_a"):
-    ref = RevisionRef(item=skeleton, revision=1)
-    project.parts[skeleton, 1, "hierarchy"] = skeleton_to_document(clip.skeleton).model_dump(by_alias=True)
-    project.parts[f"clip_{name}", 1, "motion"] = clip_to_document(clip, ref).model_dump(by_alias=True)
-    pin = PinnedInput(item=f"clip_{name}", revision=1, kind=Kind.CLIP, name=name, collection="walks")
-    project.inputs["clips"] = (*project.inputs.get("clips", ()), pin)
+from project_in_memory import PARAMS, ProjectInMemory, add_clip
 
 
 @pytest.fixture

@@ -51,7 +51,7 @@ def read_candidates(context: Context, evaluated: EvaluatedSet) -> Candidates:
     pins = [pin for pin in context.inputs.get("candidates", ()) if uid_of(pin) not in known]
     groups: dict[tuple[str, str], _Group] = defaultdict(lambda: _Group([], []))
     for pin, motion in zip(pins, read_motions(context, pins), strict=True):
-        group = groups[pin.collection, str(motion[1].skeleton.item)]
+        group = groups[pin.collection, _skeleton_of(motion).item]
         group.pins.append(pin)
         group.motions.append(motion)
     found = Candidates()
@@ -73,9 +73,13 @@ def _named(context: Context, groups: dict[tuple[str, str], _Group]) -> Iterator[
 
 def _build(context: Context, group: _Group, database: MatchingDatabase) -> MatchingDatabase:
     """The group's database, with the very body of the set where it is of the set's skeleton."""
-    newest = max((motion.skeleton for _, motion in group.motions), key=lambda ref: ref.revision)
-    rigged = read_rigged(context, Rig.as_stored(RevisionRef.model_validate(newest.model_dump())))
+    newest = max(map(_skeleton_of, group.motions), key=lambda ref: ref.revision)
+    rigged = read_rigged(context, Rig.as_stored(newest))
     body = database.body
     if not same_hierarchy(rigged.skeleton, body.skeleton, tolerance_m=SAME_OFFSET_M):
         body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
     return build_clips(context, ClipSet(tuple(group.pins)), group.motions, body, database.options, database.normaliser)
+
+
+def _skeleton_of(motion: tuple[str, Motion]) -> RevisionRef:
+    return RevisionRef.model_validate(motion[1].skeleton.model_dump())

@@ -29,8 +29,8 @@ def run(context: Context, params: CompareParams) -> dict[str, Any]:
     try:
         comparison = compare_results(before, after)
     except MotionError as error:
-        advice = f"evaluate again with `marey evaluate … --normaliser {place_of(first)}`, its project before it,"
-        raise JobRefused(error.code, f"{error}; {advice} and with the options of that evaluation") from error
+        again = f"`marey evaluate … --normaliser PROJECT/{place_of(first)}` and its options make one that can be"
+        raise JobRefused(error.code, f"{error}; {again}") from error
     document = {**comparison_to_tree(comparison), "names": {"before": place_of(first), "after": place_of(second)}}
     result = {**_counts(comparison), "document": store_document(context, document)}
     if params.report:

@@ -1,0 +1,182 @@
+"""From an evaluation to a better set of clips, as users walk it: command line and SDK, a real server, a real worker."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evaluation_takes import write_walks
+from marey_client import Marey
+from marey_client.errors import JobUnsuccessful
+from marey_client.evaluations import EvaluationHandle
+from marey_client.imports import find_files
+from marey_client.project import ProjectHandle
+from marey_schemas.access import Login, ProjectCreate, Role, UserCreate
+from marey_schemas.imports import ImportOptions
+from marey_schemas.jobs import CollectionInput, JobCreate
+from server_process import ServerProcess
+
+pytestmark = pytest.mark.timeout(300)
+
+SMALL: dict[str, Any] = {
+    "speeds_m_s": (1.0, 1.5), "turn_rates_deg_s": (-50.0, 0.0, 50.0), "families": ("circle",), "duration_s": 6.0,
+    "baseline": False, "report": False,
+}  # fmt: skip
+
+
+@pytest.fixture
+def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
+    process = ServerProcess(tmp_path, database_url)
+    process.start(workers=1)
+    yield process
+    process.stop()
+
+
+@pytest.fixture
+def marey(server: ServerProcess) -> Iterator[Marey]:
+    with server.client() as client:
+        yield client
+
+
+@pytest.fixture
+def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
+    """A project with nine walks, three of which are faster than any trial asks for."""
+    project = marey.create_project(ProjectCreate(name="lab"))
+    files = find_files([write_walks(tmp_path / "takes")]).files
+    project.imports.upload(files, ImportOptions(collection="walks"))
+    return project
+
+
+@pytest.fixture
+def run(server: ServerProcess, tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs the command line against the server, in a folder of its own."""
+
+    def run(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
+        surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
+        known = {"MAREY_URL": server.url, "MAREY_DATA": str(server.data), "HOME": str(tmp_path)}
+        done = subprocess.run(
+            [sys.executable, "-m", "marey_client.cli", *map(str, arguments)],
+            env={**surroundings, **known, "XDG_CONFIG_HOME": str(tmp_path)},
+            capture_output=True, text=True, cwd=tmp_path, timeout=240,
+        )  # fmt: skip
+        assert done.returncode == status, done.stdout + done.stderr
+        return done
+
+    return run
+
+
+def evaluated(lab: ProjectHandle, clips: Any = "walks", **options: Any) -> EvaluationHandle:
+    return lab.evaluation(lab.evaluate(clips, **{**SMALL, **options}))
+
+
+def test_without_all_that_can_go_no_trial_changes(lab: ProjectHandle, run: Callable[..., Any], tmp_path: Path) -> None:
+    first = evaluated(lab, name="first")
+    told = run("suggest", "lab/first", "--removals", 1, "--remove-out", "names.txt").stdout
+    names = (tmp_path / "names.txt").read_text(encoding="utf-8").splitlines()
+    unused = {clip["clip"] for clip in first.clips() if clip["ticks"] == 0}
+    assert names
+    assert set(names) <= unused
+    assert "Can go without any change" in told
+    kept = [clip for clip in lab.clips.list() if clip.path not in names]
+    evaluated(lab, kept, name="second", normaliser=first.id)
+
+    told = run("compare", "lab/first", "lab/second", "--out", "compared.html").stdout
+    assert "No trial changed: all 6 are the same to the last bit." in told
+    assert f"removed: {len(names)} clips" in told
+    page = (tmp_path / "compared.html").read_text(encoding="utf-8")
+    assert page.startswith("<!DOCTYPE html>")
+    assert "https://" not in page.partition("</head>")[0]
+    found = json.loads(run("compare", "lab/first", "lab/second", "--json").stdout)
+    assert found["changed"] == []
+    assert {one["verdict"] for one in found["metrics"]} == {"same"}
+
+
+def test_a_used_clip_that_goes_is_found_to_change_trials(lab: ProjectHandle) -> None:
+    first = evaluated(lab, name="first")
+    most = max(first.clips(), key=lambda clip: clip["ticks"])["clip"]
+    second = evaluated(
+        lab, [clip for clip in lab.clips.list() if clip.path != most], name="second", normaliser=first.id
+    )
+    compared = first.compare(second)
+    document = compared.document()
+    assert compared.summary["changed_trials"] == len(document["changed"]) > 0
+    assert len(document["removed"]) == 1
+    own = next(change for change in document["metrics"] if change["metric"] == "offset_mean")
+    assert own["low"] <= own["change"] <= own["high"]
+    assert compared.report().startswith(b"<!DOCTYPE html>")
+
+
+def test_evaluations_under_their_own_normalisers_are_refused_with_the_way_out(
+    lab: ProjectHandle, run: Callable[..., Any]
+) -> None:
+    first = evaluated(lab, name="first")
+    some = sorted(lab.clips.list(), key=lambda clip: clip.path)[:6]
+    second = evaluated(lab, some, name="second")
+    with pytest.raises(
+        JobUnsuccessful, match=r"normalisers differ.*`marey evaluate … --normaliser PROJECT/first`"
+    ) as refused:
+        first.compare(second)
+    assert refused.value.job.failure is not None
+    assert refused.value.job.failure.code == "not-comparable"
+    assert "--normaliser" in run("compare", "lab/first", "lab/second", status=1).stderr
+
+
+def test_clips_of_another_folder_fill_the_holes_of_a_set(
+    lab: ProjectHandle, marey: Marey, run: Callable[..., Any]
+) -> None:
+    straight = [clip for clip in lab.clips.list() if clip.name.endswith(" 0")]
+    first = evaluated(lab, straight, name="straight")
+    found = first.suggest("walks", removals=0, consider=0).document()
+    names = {one["name"] for one in found["fillings"]}
+    assert names
+    assert all("60" in name for name in names)
+    assert not any(one["needs_retarget"] for one in found["fillings"])
+    told = run("suggest", "lab/straight", "--from", "lab/walks", "--removals", 0, "--consider", 0).stdout
+    assert f"Would fill holes: {len(found['fillings'])} clips." in told
+    assert "can be blended with the set" in told
+
+    run("optimise", "lab/straight", "--from", "lab/walks", "--max-steps", 2, "--consider", 3)
+    (job,) = [one for one in lab.jobs() if one.kind == "optimise"]
+    log = b"".join(marey.jobs.log(job.id))
+    steps = [line for line in log.decode().splitlines() if line.startswith("step ")]
+    assert len(steps) == job.result["steps"] + 1
+    assert job.result["objective_after"] < job.result["objective_before"]
+
+
+def test_weights_are_swept_over_tasks(lab: ProjectHandle, run: Callable[..., Any]) -> None:
+    first = evaluated(lab, name="first")
+    found = first.sweep(factors=(0.5,))
+    assert found.job.size == 8
+    document = found.document()
+    weights = [setting["weights"] for setting in document["settings"]]
+    differing = [[name for name in weights[0] if one[name] != weights[0][name]] for one in weights]
+    assert differing[0] == []
+    assert all(len(names) == 1 for names in differing[1:])
+    assert {one["group"] for one in document["influences"]} == {name for (name,) in differing[1:]}
+    assert "The objective is" in run("sweep", "lab/first", "--factors", "0.5").stdout
+
+
+def test_who_may_read_the_project_may_read_the_files_that_its_results_name(
+    lab: ProjectHandle, marey: Marey, server: ServerProcess
+) -> None:
+    """That is because the jobs hold them: a reader has sent none of these bytes."""
+    first = evaluated(lab, name="first")
+    exported = lab.submit(JobCreate(kind="export", inputs={"clips": (CollectionInput(collection="walks"),)}))
+    archive = marey.jobs.wait(exported.id).result
+    compared = first.compare(first)
+    assert archive is not None
+    marey.users.create(UserCreate(name="rita", password="a password of rita"))
+    lab.members.put("rita", Role.READER)
+    with Marey(server.url) as nobody:
+        token = nobody.sign_in(Login(name="rita", password="a password of rita")).secret
+    with Marey(server.url, token) as rita:
+        assert len(rita.blobs.fetch(archive["archive"]["blob"])) == archive["archive"]["size_bytes"]
+        for name in ("document", "report"):
+            rita.blobs.fetch(compared.job.result[name]["blob"])

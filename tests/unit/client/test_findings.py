@@ -1,0 +1,65 @@
+"""What jobs found out about evaluations, as the SDK asks for it and the command line tells it."""
+
+import json
+
+import httpx
+import pytest
+
+from marey_client.blobs import digest_of
+from marey_client.cli.failures import WrongUsage
+from marey_client.cli.improvements import _print_comparison, _weights
+from marey_client.evaluations import EvaluationHandle
+from marey_schemas.items import Item
+
+NOW = "2026-01-01T00:00:00Z"
+DOCUMENT = json.dumps({"schema": "marey/suggestions@1"}).encode()
+
+
+def evaluation(script, name):
+    item = Item(
+        id=f"evaluation_{name}", kind="evaluation", name=name, revision=2, created_at=NOW, updated_at=NOW, rev=1
+    )
+    return EvaluationHandle(script.marey().transport, "lab", item)
+
+
+def answer(request):
+    if "/blobs/" in request.url.path:
+        return httpx.Response(200, content=DOCUMENT)
+    job = {
+        "id": "job_1", "project": "lab", "kind": "suggest", "state": "succeeded", "params": {}, "inputs": {},
+        "into": "", "priority": 0, "seed": 0, "attempt": 1, "fence": 1, "max_attempts": 3, "author": "ann",
+        "created_at": NOW, "run_at": NOW, "rev": 1,
+        "result": {"fillings": 3, "document": {"blob": digest_of(DOCUMENT), "size_bytes": len(DOCUMENT)}},
+    }  # fmt: skip
+    return httpx.Response(200, json=job)
+
+
+def test_suggestions_are_asked_for_by_the_revision_that_was_read_and_with_what_was_given(script):
+    script.answers = [answer] * 3
+    found = evaluation(script, "first").suggest("others", removals=3)
+    assert json.loads(script.requests[0].content) == {
+        "kind": "suggest",
+        "inputs": {
+            "evaluation": {"item": "evaluation_first", "revision": 2},
+            "candidates": [{"collection": "others"}],
+        },
+        "params": {"removals": 3},
+    }
+    assert found.summary == {"fillings": 3}
+    assert found.document() == {"schema": "marey/suggestions@1"}
+    with pytest.raises(LookupError, match="made no report"):
+        found.report()
+
+
+def test_a_comparison_in_which_nothing_changed_says_so(capsys):
+    lists = dict.fromkeys(("changed", "metrics", "removed", "added", "newly_unused"), [])
+    _print_comparison({**lists, "trials": 162})
+    assert "No trial changed: all 162 are the same to the last bit." in capsys.readouterr().out
+
+
+def test_weights_of_the_objective_are_read_by_name():
+    assert _weights(["seconds=0.001", "offset=2"]) == {"seconds": 0.001, "offset": 2.0}
+    with pytest.raises(WrongUsage, match="with one of offset, "):
+        _weights(["length=1"])
+    with pytest.raises(WrongUsage, match="'much' is no number"):
+        _weights(["seconds=much"])

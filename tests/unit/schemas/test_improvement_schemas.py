@@ -1,0 +1,33 @@
+"""Parameters of comparisons, suggestions, optimisations and sweeps."""
+
+import pytest
+from pydantic import ValidationError
+
+from marey_schemas.improvement import ObjectiveParams, OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
+from marey_schemas.job_kinds import MOST_TASKS, find_kind
+
+
+def test_a_sweep_has_a_task_for_every_setting_and_never_too_many():
+    assert count_sweep_tasks(SweepParams()) == 15
+    assert count_sweep_tasks(SweepParams(factors=tuple(float(n) for n in range(20)))) <= MOST_TASKS
+
+
+@pytest.mark.parametrize(
+    ("params", "given"),
+    [
+        (ObjectiveParams, {"offset": -1}),
+        (ObjectiveParams, {"seconds": float("nan")}),
+        (OptimiseParams, {"max_steps": 0}),
+        (SuggestParams, {"removals": 1001}),
+        (SweepParams, {"factors": ()}),
+    ],
+)
+def test_what_makes_no_sense_is_refused_by_its_name(params, given):
+    with pytest.raises(ValidationError, match=next(iter(given))):
+        params.model_validate(given)
+
+
+@pytest.mark.parametrize("kind", ["compare", "suggest", "optimise", "sweep"])
+def test_every_parameter_is_described(kind):
+    for name, field in find_kind(kind).params.model_fields.items():
+        assert field.description or name == "objective"

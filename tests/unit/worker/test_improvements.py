@@ -1,0 +1,112 @@
+"""The functions behind `compare`, `suggest`, `optimise` and `sweep`, with a project in memory instead of a server."""
+
+import json
+from dataclasses import replace
+from math import radians
+
+import pytest
+
+from marey_motion.gait import generate_gait
+from marey_schemas.codecs import JSON, decode_tree
+from marey_schemas.improvement import CompareParams, OptimiseParams, SuggestParams, SweepParams
+from marey_schemas.jobs import PinnedInput
+from marey_schemas.kinds import Kind
+from marey_worker.context import JobRefused, Task
+from marey_worker.kinds import compare, evaluate, matching_clips, optimise, suggest, sweep
+from project_in_memory import PARAMS, ProjectInMemory, add_clip
+
+
+class LoggedProject(ProjectInMemory):
+    """A project that keeps what jobs log."""
+
+    def log(self, text):
+        self.lines = [*getattr(self, "lines", []), text]
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """Three walks and one that no trial asks for; nothing is kept of earlier tests."""
+    monkeypatch.setattr(matching_clips, "_kept", matching_clips.Kept(1))
+    made = LoggedProject(tmp_path)
+    for speed, turn_rate in ((1.25, -50), (1.25, 0), (1.25, 50), (4.0, 0)):
+        add_clip(made, f"walk {speed} {turn_rate}", generate_gait(speed, radians(turn_rate), 5.0))
+    return made
+
+
+def evaluated(project, name, clips):
+    """An evaluation of some clips, as the project keeps it."""
+    every = project.inputs.get("clips", ())
+    project.inputs["clips"] = clips
+    evaluate.gather(project, PARAMS, [evaluate.run(project, PARAMS)])
+    project.inputs["clips"] = every
+    for part, tree in project.staged[-1].parts.items():
+        project.parts[name, 1, part] = tree
+    return PinnedInput(item=name, revision=1, kind=Kind.EVALUATION, name=name, collection="results")
+
+
+def of_taller_person(clip):
+    """The same motion with longer bones."""
+    poses = clip.poses.copy()
+    poses[:, 1] *= 1.1  # the hips' height; the path on the ground stays
+    return replace(clip, skeleton=replace(clip.skeleton, offsets=clip.skeleton.offsets * 1.1), poses=poses)
+
+
+def document_of(project, result):
+    return decode_tree(project.blobs[result["document"]["blob"]], JSON)
+
+
+def test_an_evaluation_and_itself_differ_in_nothing(project):
+    own = evaluated(project, "first", project.inputs["clips"])
+    project.inputs = {"before": (own,), "after": (own,)}
+    result = compare.run(project, CompareParams(report=False))
+    assert (result["changed_trials"], result["better"], result["worse"]) == (0, [], [])
+    assert "report" not in result
+    assert document_of(project, result)["names"] == {"before": "results/first", "after": "results/first"}
+
+
+def test_evaluations_under_two_normalisers_are_refused_with_what_to_type(project):
+    clips = project.inputs["clips"]
+    first, second = evaluated(project, "first", clips), evaluated(project, "second", clips[:2])
+    project.inputs = {"before": (first,), "after": (second,)}
+    with pytest.raises(JobRefused, match="`marey evaluate … --normaliser PROJECT/results/first`") as refused:
+        compare.run(project, CompareParams())
+    assert refused.value.code == "not-comparable"
+
+
+def test_what_can_go_is_named_and_clips_of_other_skeletons_need_to_be_retargeted(project):
+    clips = project.inputs["clips"]
+    own = evaluated(project, "first", clips[1:2])
+    add_clip(project, "tall", of_taller_person(generate_gait(1.25, radians(50), 5.0)), skeleton="skeleton_b")
+    project.inputs = {"evaluation": (own,), "candidates": project.inputs["clips"]}
+    result = suggest.run(project, SuggestParams(removals=0, consider=0))
+    fillings = {one["name"]: one["needs_retarget"] for one in document_of(project, result)["fillings"]}
+    assert fillings["walks/tall"]
+    assert not fillings["walks/walk 1.25 50"]
+    assert clips[1].name not in " ".join(fillings)
+    assert result["needing_retarget"] == 1
+
+
+def test_every_step_of_an_optimisation_is_logged_and_kept(project):
+    clips = project.inputs["clips"]
+    own = evaluated(project, "first", clips[1:2])
+    project.inputs = {"evaluation": (own,), "candidates": clips}
+    result = optimise.run(project, OptimiseParams(max_steps=2))
+    steps = document_of(project, result)["steps"]
+    assert len(steps) == result["steps"] + 1
+    assert [line.split(":")[0] for line in project.lines] == [*(f"step {step['number']}" for step in steps), "ended"]
+    objectives = [step["objective"] for step in steps]
+    assert objectives == sorted(objectives, reverse=True)
+    assert objectives[-1] < objectives[0]
+
+
+def test_a_sweep_is_the_same_however_many_tasks_it_is_spread_over(project):
+    own = evaluated(project, "first", project.inputs["clips"])
+    project.inputs = {"evaluation": (own,)}
+    params = SweepParams(factors=(0.5,))
+    whole = sweep.gather(project, params, [sweep.run(project, params)])
+    results = []
+    for position in range(3):
+        project.task = Task(position, 3)
+        results.append(json.loads(json.dumps(sweep.run(project, params))))
+    assert sweep.gather(project, params, results) == whole
+    assert whole["settings"] == 8
