@@ -30,6 +30,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at a terminal reaches the supervisor, which decides
     faulthandler.enable()
     pipe = Connection(int(sys.argv[1]))
+    process = os.getpid()
     load(sys.argv[2:])
     pipe.send(Ready())
     while True:
@@ -41,6 +42,8 @@ def main() -> None:
             continue
         write_output_to(run.log_path)
         end = run_job(run, pipe)
+        if os.getpid() != process:  # forked by the job, and not to answer for it
+            os._exit(1)
         sys.stdout.flush()
         sys.stderr.flush()
         pipe.send(end)

@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import resource
 import sys
 import time
 
@@ -30,6 +31,7 @@ def add(context, params):
 def misbehave(context, params):
     return {
         "raise": _raise, "refuse": _refuse, "segfault": _segfault, "exit": _exit, "eat": _eat, "hoard": _hoard,
+        "fork-and-raise": _fork_and_raise,
         "sleep": lambda: _sleep(params.seconds), "shout": _shout, "ignore-term": lambda: _ignore_term(params.seconds),
         "give-up-early": lambda: _give_up_early(context), "put": lambda: _put(context),
     }[params.how]()  # fmt: skip
@@ -56,13 +58,22 @@ def _eat():
 
 
 def _hoard():
-    """Memory in small helpings, which no single allocation gives away; in a process of its own."""
+    """Memory in small helpings, which no single allocation gives away; in a process of its own that lifts its limit."""
     if os.fork() == 0:
+        resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         hoard = []
         while True:
             hoard.append(b"x" * (4 << 20))
             time.sleep(0.001)
     time.sleep(60)
+
+
+def _fork_and_raise():
+    """The copy of this process gets as far as its end, and must not be taken for the job."""
+    if os.fork() == 0:
+        raise ArithmeticError("raised in a copy")
+    time.sleep(1)
+    return {"survived": True}
 
 
 def _sleep(seconds):
