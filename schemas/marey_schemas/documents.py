@@ -217,6 +217,12 @@ SCHEMAS: dict[str, type[Request]] = {
     "marey/evaluation@1": EvaluationDocument,
     "marey/evaluation-records@1": EvaluationRecords,
     "marey/evaluation-report@1": EvaluationReport,
+    "marey/edit@1": OpenDocument,
+    "marey/alignment@1": OpenDocument,
+    "marey/motion-primitive@1": OpenDocument,
+    "marey/sample-tree@1": OpenDocument,
+    "marey/model-report@1": OpenDocument,
+    "marey/model-graph@1": OpenDocument,
     "marey/document@1": OpenDocument,
 }
 """Model by schema name."""
