@@ -59,7 +59,7 @@ SUM = KindDeclaration(
     params=Params,
     implementation="tests:sum",
     version=1,
-    outputs={"sums": Kind.PROCESSED},
+    outputs={"sums": Kind.STUDY},
 )
 SQUARE = KindDeclaration(
     name="square",
@@ -68,10 +68,10 @@ SQUARE = KindDeclaration(
     implementation="tests:square",
     version=1,
     inputs={
-        "things": InputSpec(kind=Kind.PROCESSED, many=True),
-        "ruler": InputSpec(kind=Kind.PROCESSED, required=False),
+        "things": InputSpec(kind=Kind.STUDY, many=True),
+        "ruler": InputSpec(kind=Kind.STUDY, required=False),
     },
-    outputs={"squares": Kind.PROCESSED},
+    outputs={"squares": Kind.STUDY},
     fan_out="things",
     batch_size=2,
 )
@@ -81,8 +81,8 @@ SURVEY = KindDeclaration(
     params=Params,
     implementation="tests:survey",
     version=1,
-    inputs={"things": InputSpec(kind=Kind.PROCESSED, many=True)},
-    outputs={"survey": Kind.PROCESSED},
+    inputs={"things": InputSpec(kind=Kind.STUDY, many=True)},
+    outputs={"survey": Kind.STUDY},
     task_count=lambda params: params.number,
     gathering="tests:gather",
 )
@@ -137,7 +137,7 @@ class Desk:
     def things(self, count: int, collection: str = "raw") -> list[str]:
         """Make things to work on; their item ids."""
         drafts = [
-            Draft(f"thing{n}", Kind.PROCESSED, f"thing{n}", {"motion": document(number=n)}, collection)
+            Draft(f"thing{n}", Kind.STUDY, f"thing{n}", {"study": document(number=n)}, collection)
             for n in range(count)
         ]
         return [one.item for one in self.publish(*drafts)]
@@ -223,8 +223,8 @@ def output(
     name: str, *, collection: str = "", facts: Mapping[str, Any] = MappingProxyType({}), **fields: Any
 ) -> StagedOutput:
     """A staged result that is a small document."""
-    parts = {"motion": document(name=name, **facts)}
-    return StagedOutput(name=name, kind=Kind.PROCESSED, item_name=name, collection=collection, parts=parts, **fields)
+    parts = {"study": document(name=name, **facts)}
+    return StagedOutput(name=name, kind=Kind.STUDY, item_name=name, collection=collection, parts=parts, **fields)
 
 
 @pytest.fixture

@@ -62,8 +62,8 @@ def attempt(server: Server, lease: Any) -> httpx.Client:
 
 
 def thing(name: str, value: Any = 1) -> dict[str, Any]:
-    parts = {"motion": {"schema": "marey/document@1", "value": value}}
-    return {"name": name, "kind": "processed", "item_name": name, "parts": parts}
+    parts = {"study": {"schema": "marey/document@1", "value": value}}
+    return {"name": name, "kind": "study", "item_name": name, "parts": parts}
 
 
 def test_a_job_goes_from_its_submission_to_its_outputs(
@@ -91,7 +91,7 @@ def test_a_job_goes_from_its_submission_to_its_outputs(
     assert (tried["worker"], tried["outcome"]) == ("w", "succeeded")
     told = [one["kind"] for one in ok(owner.get(f"/jobs/{job['id']}/events"))["items"]]
     assert told == ["job.submitted", "job.started", "job.succeeded"]
-    made = ok(owner.get("/projects/lab/processed", params={"collection": "made"}))["items"]
+    made = ok(owner.get("/projects/lab/studies", params={"collection": "made"}))["items"]
     assert sorted(one["name"] for one in made) == ["a", "b"]
 
 

@@ -79,7 +79,7 @@ def test_a_job_can_only_come_after_jobs_of_its_project(desk: Desk) -> None:
 def test_inputs_are_pinned_to_the_revisions_of_the_moment(desk: Desk) -> None:
     (thing,) = desk.things(1)
     job = desk.submit("square", inputs={"things": {"item": thing}})
-    desk.publish(Draft("again", Kind.PROCESSED, "thing0", {"motion": document(number=77)}, "raw"))
+    desk.publish(Draft("again", Kind.STUDY, "thing0", {"study": document(number=77)}, "raw"))
     newer = desk.submit("square", inputs={"things": {"item": thing}})
     older = desk.submit("square", inputs={"things": [{"item": thing, "revision": 1}]}, seed=5)
     revisions = {lease.job: lease.inputs["things"][0].revision for lease in desk.claim_many()}
@@ -101,7 +101,7 @@ def test_a_collection_stands_for_all_items_of_the_kind_in_it_and_below(desk: Des
     ("inputs", "pointer", "code"),
     [
         ({}, "/inputs", "missing-input"),
-        ({"things": {"item": "processed_none"}}, "/inputs/things/item", "unknown-item"),
+        ({"things": {"item": "study_none"}}, "/inputs/things/item", "unknown-item"),
         ({"things": [{"collection": "empty"}]}, "/inputs/things/0/collection", "empty-collection"),
         ({"things": {"collection": "raw"}, "others": {"collection": "raw"}}, "/inputs/others", "unknown-input"),
         ({"things": {"collection": "raw"}, "ruler": {"collection": "raw"}}, "/inputs/ruler", "one-item"),
@@ -260,7 +260,7 @@ def test_a_task_cancelled_before_its_job_begins_is_not_waited_for(desk: Desk) ->
 
 
 def a_survey(desk: Desk, tasks: int = 3, **fields: Any) -> str:
-    if not desk.database.read(desk.user, items.list_items, "lab", Kind.PROCESSED).items:
+    if not desk.database.read(desk.user, items.list_items, "lab", Kind.STUDY).items:
         desk.things(2)
     return desk.submit("survey", inputs={"things": {"collection": "raw"}}, params={"number": tasks}, **fields)
 
@@ -298,7 +298,7 @@ def test_when_all_tasks_have_succeeded_a_worker_gathers_what_they_brought(desk: 
     desk.complete(gathering, result={"verdict": "fine"})
     assert (desk.state(job), desk.job(job).result) == ("succeeded", {"verdict": "fine", "outputs": 1})
     (made,) = desk.outputs(job)
-    lineage = desk.database.read(desk.user, items.read_lineage, "lab", Kind.PROCESSED, made.item)
+    lineage = desk.database.read(desk.user, items.read_lineage, "lab", Kind.STUDY, made.item)
     assert sorted(edge.name for edge in lineage.inputs) == ["thing0", "thing1"]
 
 
@@ -525,7 +525,7 @@ def test_a_changed_input_or_a_new_version_of_the_kind_is_computed_again(
     desk.submit("square", inputs=inputs)
     desk.complete(desk.claim())
     assert desk.state(desk.submit("square", inputs=inputs)) == "succeeded"
-    desk.publish(Draft("again", Kind.PROCESSED, "thing0", {"motion": document(number=77)}, "raw"))
+    desk.publish(Draft("again", Kind.STUDY, "thing0", {"study": document(number=77)}, "raw"))
     assert desk.state(desk.submit("square", inputs=inputs)) == "queued"
 
     desk.submit("sum")
@@ -537,7 +537,7 @@ def test_a_changed_input_or_a_new_version_of_the_kind_is_computed_again(
 
 def test_results_know_exactly_which_revisions_they_were_made_from(desk: Desk) -> None:
     (thing,) = desk.things(1)
-    desk.publish(Draft("again", Kind.PROCESSED, "thing0", {"motion": document(number=77)}, "raw"))
+    desk.publish(Draft("again", Kind.STUDY, "thing0", {"study": document(number=77)}, "raw"))
     both: Any = {"things": [{"item": thing, "revision": 1}, {"item": thing, "revision": 2}]}
     desk.submit("square", inputs=both)
     lease = desk.claim()
@@ -554,7 +554,7 @@ def test_results_know_exactly_which_revisions_they_were_made_from(desk: Desk) ->
             one.name: [
                 edge.revision
                 for edge in desk.database.read(
-                    desk.user, items.read_lineage, "lab", Kind.PROCESSED, one.item, revision_number=one.revision
+                    desk.user, items.read_lineage, "lab", Kind.STUDY, one.item, revision_number=one.revision
                 ).inputs
             ]
             for one in desk.outputs(job)
@@ -609,7 +609,7 @@ def test_a_result_whose_documents_are_gone_is_computed_again(desk: Desk) -> None
 
     def forget(tx: Transaction) -> None:
         draft = tx.execute(select(staged_output.c.draft)).scalar_one()
-        tx.execute(update(staged_output).values(draft=draft | {"parts": {"motion": f"sha256:{'0' * 64}"}}))
+        tx.execute(update(staged_output).values(draft=draft | {"parts": {"study": f"sha256:{'0' * 64}"}}))
 
     desk.database.write(SYSTEM, forget)
     assert desk.state(desk.submit("sum")) == "queued"

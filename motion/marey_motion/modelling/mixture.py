@@ -1,0 +1,88 @@
+"""A mixture of normal distributions over the latent vectors of a model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LatentMixture:
+    """K normal distributions with full covariances in L dimensions; L may be 0, where there is nothing to vary.
+
+    Parameters
+    ----------
+    weights : (K,) positive, of sum 1
+    means : (K, L)
+    covariances : (K, L, L) symmetric, positive definite
+    """
+
+    weights: Floats
+    means: Floats
+    covariances: Floats
+
+    def __post_init__(self) -> None:
+        count, dimensions = self.means.shape
+        if not count or self.weights.shape != (count,) or self.covariances.shape != (count, dimensions, dimensions):
+            shapes = f"{self.weights.shape}, {self.means.shape}, {self.covariances.shape}"
+            raise MotionError(f"weights, means and covariances of shapes {shapes} do not belong together")
+        if not ((self.weights > 0).all() and abs(self.weights.sum() - 1.0) < 1e-6):
+            raise MotionError("the weights of a mixture are positive and add up to 1")
+
+    @property
+    def dimensions(self) -> int:
+        """L."""
+        return int(self.means.shape[1])
+
+    @cached_property
+    def cholesky(self) -> Floats:
+        """(K, L, L) lower triangular factors of the covariances."""
+        try:
+            return np.asarray(np.linalg.cholesky(self.covariances), dtype=np.float64)
+        except np.linalg.LinAlgError:
+            raise MotionError("a covariance of the mixture is not positive definite") from None
+
+    @cached_property
+    def whitening(self) -> Floats:
+        """(K, L, L) inverses of the Cholesky factors: `whitening[k] @ (s - means[k])` has unit covariance."""
+        return np.asarray(np.linalg.inv(self.cholesky), dtype=np.float64)
+
+    @cached_property
+    def log_peaks(self) -> Floats:
+        """(K,) ln of weight times density at the mean of each component."""
+        log_roots = np.log(np.diagonal(self.cholesky, axis1=1, axis2=2)).sum(axis=1)
+        return np.asarray(np.log(self.weights) - log_roots - 0.5 * self.dimensions * np.log(2.0 * np.pi))
+
+    def component_log_densities(self, latents: Floats) -> Floats:
+        """ln(pi_k N_k(s)) as (n, K) of latent vectors (n, L)."""
+        away = np.einsum("kij,nkj->nki", self.whitening, latents[:, None, :] - self.means)
+        return np.asarray(self.log_peaks - 0.5 * np.einsum("nki,nki->nk", away, away))
+
+    def log_density(self, latents: Floats) -> Floats:
+        """ln p(s) as (n,) of latent vectors (n, L)."""
+        each = self.component_log_densities(latents)
+        highest = each.max(axis=1)
+        return np.asarray(highest + np.log(np.exp(each - highest[:, None]).sum(axis=1)))
+
+    def sample(self, count: int, seed: int) -> Floats:
+        """Latent vectors (count, L), the same for the same seed; the first are those of a smaller count."""
+        generator = np.random.Generator(np.random.Philox(seed))
+        # One stream of rows: what a row holds must not depend on how many follow.
+        draws = generator.standard_normal((count, self.dimensions + 1))
+        chosen = np.searchsorted(np.cumsum(self.weights)[:-1], _as_share(draws[:, 0]), side="right")
+        turned = np.einsum("nij,nj->ni", self.cholesky[chosen], draws[:, 1:])
+        return np.asarray(self.means[chosen] + turned, dtype=np.float64)
+
+
+def _as_share(normal: Floats) -> Floats:
+    """Standard normal numbers as numbers evenly spread over 0 to 1."""
+    from scipy.special import ndtr
+
+    return np.asarray(ndtr(normal), dtype=np.float64)

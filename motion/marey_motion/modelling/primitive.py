@@ -1,0 +1,169 @@
+"""A motion primitive: a generative model of one action, from latent vectors to motions and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.modelling.mixture import LatentMixture
+from marey_motion.modelling.splines import SplineBasis
+from marey_motion.motion import Motion
+from marey_motion.skeleton import Skeleton
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FunctionalComponents:
+    """Functions of canonical time with D channels, as a mean and k principal functions in n spline coefficients.
+
+    Parameters
+    ----------
+    basis : of the functions
+    mean : (n, D) coefficients
+    directions : (k, n, D) what one unit of each score adds to the coefficients; any scaling is undone in them
+    projections : (k, n, D) what takes the scores off coefficients again: their inner products with directions are the
+        identity
+    variances : (k,) of the training examples' scores
+    energy : (k,) share of the variance that the first 1, 2, ... components hold, of that of all components
+    """
+
+    basis: SplineBasis
+    mean: Floats
+    directions: Floats
+    projections: Floats
+    variances: Floats
+    energy: Floats
+
+    def __post_init__(self) -> None:
+        shape = (self.basis.count, self.mean.shape[1] if self.mean.ndim == 2 else -1)
+        if self.mean.shape != shape or self.directions.shape[1:] != shape:
+            raise MotionError(f"mean {self.mean.shape} and directions {self.directions.shape} do not fit {shape}")
+        if self.projections.shape != self.directions.shape:
+            raise MotionError(f"projections {self.projections.shape} do not fit directions {self.directions.shape}")
+
+    @property
+    def count(self) -> int:
+        """k."""
+        return len(self.directions)
+
+    def coefficients(self, scores: Floats) -> Floats:
+        """Spline coefficients (m, n, D) of scores (m, k)."""
+        return np.asarray(self.mean + np.tensordot(scores, self.directions, axes=1), dtype=np.float64)
+
+    def scores(self, coefficients: Floats) -> Floats:
+        """Scores (m, k) of spline coefficients (m, n, D)."""
+        return np.asarray(np.tensordot(coefficients - self.mean, self.projections, axes=([1, 2], [1, 2])))
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPrimitive:
+    """A model of one action (Min and Chai 2012; Herrmann et al. 2019, section 3).
+
+    A latent vector holds the scores of the spatial components, then `temporal_weight` times those of the temporal ones.
+
+    Parameters
+    ----------
+    name : of the action
+    skeleton : that moves, J joints
+    frame_rate_hz : of canonical frames
+    spatial : 3 + 4·J channels over canonical frames 0 to N - 1: root translation in metres in the canonical frame, then
+        local quaternions, not of unit length until they are evaluated
+    temporal : one channel over the N - 1 steps between canonical frames: the natural logarithm of how many frames of
+        real time, at `frame_rate_hz`, pass in each
+    temporal_weight : positive
+    mixture : of latent vectors
+    keyframes : canonical frame by label
+    """
+
+    name: str
+    skeleton: Skeleton
+    frame_rate_hz: float
+    spatial: FunctionalComponents
+    temporal: FunctionalComponents
+    temporal_weight: float
+    mixture: LatentMixture
+    keyframes: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.spatial.mean.shape[1] != 3 + 4 * self.skeleton.joint_count:
+            raise MotionError(f"{self.spatial.mean.shape[1]} channels do not fit {self.skeleton.joint_count} joints")
+        if self.temporal.basis.frame_count != self.frame_count - 1:
+            raise MotionError(f"{self.frame_count} canonical frames have {self.frame_count - 1} steps between them")
+        if self.mixture.dimensions != self.dimensions:
+            raise MotionError(f"the mixture has {self.mixture.dimensions} dimensions, the components {self.dimensions}")
+        if not (np.isfinite(self.temporal_weight) and self.temporal_weight > 0):
+            raise MotionError("the temporal weight is a positive number", where="temporal_weight")
+
+    @property
+    def frame_count(self) -> int:
+        """N, canonical frames."""
+        return self.spatial.basis.frame_count
+
+    @property
+    def dimensions(self) -> int:
+        """L, numbers of a latent vector."""
+        return self.spatial.count + self.temporal.count
+
+    # -- from latent vectors -------------------------------------------------------------------------------------------
+
+    def sample(self, count: int, seed: int) -> Floats:
+        """Latent vectors (count, L) drawn from the mixture."""
+        return self.mixture.sample(count, seed)
+
+    def poses(self, latents: Floats, times: ArrayLike | None = None) -> Floats:
+        """Poses (m, T, 3 + 4·J) of latent vectors (m, L) at canonical times (T,), with unit quaternions.
+
+        Without times: at every canonical frame.
+        """
+        values = self.spatial.basis.at_frames if times is None else self.spatial.basis.matrix(times)
+        poses = values @ self.spatial.coefficients(latents[:, : self.spatial.count])
+        rotations = poses[..., 3:].reshape(*poses.shape[:-1], -1, 4)
+        rotations /= np.sqrt(np.einsum("...c,...c->...", rotations, rotations))[..., None]
+        return np.asarray(poses, dtype=np.float64)
+
+    def time_functions(self, latents: Floats) -> Floats:
+        """Frames of real time (m, N), at `frame_rate_hz`, that have passed at each canonical frame; the first is 0."""
+        scores = latents[:, self.spatial.count :] / self.temporal_weight
+        log_slopes = (self.temporal.basis.at_frames @ self.temporal.coefficients(scores))[..., 0]
+        passed = np.zeros((len(latents), self.frame_count))
+        np.cumsum(np.exp(log_slopes), axis=1, out=passed[:, 1:])
+        return passed
+
+    def durations_s(self, latents: Floats) -> Floats:
+        """How long the motions (m,) last."""
+        return np.asarray(self.time_functions(latents)[:, -1] / self.frame_rate_hz)
+
+    def motions(self, latents: Floats) -> list[Motion]:
+        """Motions in real time at `frame_rate_hz`; each lasts a whole number of frames, at most half a frame off."""
+        made = []
+        for latent, passed in zip(latents, self.time_functions(latents), strict=True):
+            steps = max(1, round(float(passed[-1])))
+            times = np.interp(np.linspace(0.0, passed[-1], steps + 1), passed, np.arange(self.frame_count))
+            made.append(_as_motion(self.poses(latent[None], times)[0]))
+        return made
+
+    # -- to latent vectors ---------------------------------------------------------------------------------------------
+
+    def latents_of(self, poses: Floats, time_functions: Floats) -> Floats:
+        """Latent vectors (m, L) of aligned poses (m, N, 3 + 4·J) and their time functions (m, N).
+
+        Quaternions must have the signs of the training examples (dot products with the mean motion not negative).
+        """
+        scores = self.spatial.scores(self.spatial.basis.fit(poses))
+        slopes = np.log(np.diff(time_functions, axis=1))[..., None]
+        temporal = self.temporal.scores(self.temporal.basis.fit(slopes))
+        return np.concatenate((scores, self.temporal_weight * temporal), axis=1)
+
+    def log_density(self, latents: Floats) -> Floats:
+        """ln p(s) as (m,) of latent vectors (m, L)."""
+        return self.mixture.log_density(latents)
+
+
+def _as_motion(poses: Floats) -> Motion:
+    frames = len(poses)
+    return Motion(poses[:, :3].copy(), poses[:, 3:].reshape(frames, -1, 4).copy(), np.zeros((frames, 0, 3)), ())
