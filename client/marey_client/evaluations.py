@@ -144,14 +144,14 @@ class EvaluationHandle(ItemHandle):
 
 
 def evaluate_request(
-    project: ProjectHandle, clips: Places, params: EvaluateParams, normaliser: str | None
+    project: ProjectHandle, clips: Places, params: EvaluateParams, normaliser: EvaluationHandle | str | None
 ) -> JobCreate:
     """The job that evaluates `clips`, with loops that are tagged so and the mapping of a skeleton that was edited."""
     places = _as_places(clips)
     found = [item for place in places for item in items_at(project, place)]
     inputs: dict[str, Any] = {"clips": tuple(map(_as_input, places))}
     if normaliser is not None:
-        inputs["normaliser"] = ItemInput(item=normaliser)
+        inputs["normaliser"] = ItemInput(item=normaliser) if isinstance(normaliser, str) else normaliser.as_input()
     if len(edited := project.edited_rigs(found)) == 1:
         (inputs["rig"],) = edited
     loops = dict.fromkeys((*params.loops, *(item.id for item in found if LOOP_TAG in item.tags)))

@@ -129,7 +129,7 @@ class ProjectHandle:
         clips: Places,
         *,
         into: str = "",
-        normaliser: str | None = None,
+        normaliser: EvaluationHandle | str | None = None,
         priority: int = 0,
         cache: Literal["use", "refresh", "off"] = "use",
         **options: Any,
@@ -137,7 +137,7 @@ class ProjectHandle:
         """Hand in the evaluation of clips of one skeleton: a folder by its path, or folders and clips.
 
         `options` are those of `EvaluateParams`, for example `name="walks-eval"` or `database={"mirroring": "add"}`;
-        `normaliser` is the id of an evaluation that the result shall be comparable with.
+        `normaliser` is an evaluation, or its id, that the result shall be comparable with.
         """
         request = evaluate_request(self, clips, EvaluateParams.model_validate(options), normaliser)
         return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))

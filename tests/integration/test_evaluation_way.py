@@ -138,7 +138,7 @@ def test_the_normaliser_of_another_evaluation_can_be_used(lab: ProjectHandle) ->
     first = lab.evaluation(lab.evaluate("walks", name="all", **SMALL))
     some = sorted(lab.clips.list(), key=lambda clip: clip.path)[:6]
     own = lab.evaluation(lab.evaluate(some, name="own", **SMALL))
-    pinned = lab.evaluation(lab.evaluate(some, name="pinned", normaliser=first.id, **SMALL))
+    pinned = lab.evaluation(lab.evaluate(some, name="pinned", normaliser=first, **SMALL))
     scales = [found.document()["provenance"]["normaliser"] for found in (first, own, pinned)]
     assert scales[0] == scales[2] != scales[1]
     assert first.id in {edge.item for edge in pinned.lineage().inputs}
