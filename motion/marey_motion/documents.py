@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,7 @@ from marey_motion.errors import ClipError, MappingError
 from marey_motion.rigs import STANDARD_JOINTS, JointAxes, JointMapping
 from marey_motion.skeleton import EndSite, Skeleton
 from marey_schemas import documents as schemas
+from marey_schemas.editing import EditDocument
 
 
 def skeleton_to_document(skeleton: Skeleton) -> schemas.SkeletonHierarchy:
@@ -119,6 +122,27 @@ def mapping_from_document(
         document.rig, dict(document.joints), document.confidence, document.method, tuple(document.notes)
     )
     return mapping, axes
+
+
+def commands_of_edit(edit: EditDocument) -> tuple[tuple[str, dict[str, Any]], ...]:
+    """Names and parameters as `editing.registry` takes them: angles in radians, `_rad` where documents say `_deg`."""
+    trees = (command.model_dump() for command in edit.commands)
+    return tuple((str(tree.pop("command")), _in_radians(tree)) for tree in trees)
+
+
+def _in_radians(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        return dict(_angle_in_radians(name, value) for name, value in tree.items())
+    if isinstance(tree, tuple | list):
+        return tuple(map(_in_radians, tree))
+    return tree
+
+
+def _angle_in_radians(name: str, value: Any) -> tuple[str, Any]:
+    if not name.endswith("_deg"):
+        return name, _in_radians(value)
+    angles = tuple(map(math.radians, value)) if isinstance(value, tuple | list) else value
+    return f"{name.removesuffix('_deg')}_rad", math.radians(angles) if isinstance(angles, float | int) else angles
 
 
 def _orthonormal(joint: str, axes: schemas.JointAxes) -> JointAxes:

@@ -74,6 +74,18 @@ class MappingError(MotionError):
     default_code = "mapping-invalid"
 
 
+class AnnotationError(MotionError):
+    """The segments or keyframes do not fit the clip or each other."""
+
+    default_code = "annotation-invalid"
+
+
+class EditError(MotionError):
+    """The command cannot be applied to this motion."""
+
+    default_code = "edit-invalid"
+
+
 # Files
 
 

@@ -14,8 +14,9 @@ from pydantic import Field, model_validator
 
 from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Answer, Request
-from marey_schemas.documents import MAX_JOINTS, JointName, RevisionRef
+from marey_schemas.documents import MAX_JOINTS, RevisionRef
 from marey_schemas.evaluation import ItemId, Speed, TurnRate
+from marey_schemas.names import JointName
 
 LEAST_FRAME_RATE_HZ, MOST_FRAME_RATE_HZ = 10.0, 240.0
 MOST_CELLS = 2000

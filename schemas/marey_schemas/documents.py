@@ -12,13 +12,13 @@ from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Request
+from marey_schemas.editing import EditDocument
 from marey_schemas.evaluation import EvaluationDocument, EvaluationRecords, EvaluationReport
-from marey_schemas.names import Digest, Tag
+from marey_schemas.names import Digest, JointName, Tag
 
 MAX_JOINTS = 4096
 MAX_FRAME_RATE_HZ = 100_000.0
 
-JointName = Annotated[str, StringConstraints(min_length=1, max_length=1024)]
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
@@ -217,7 +217,7 @@ SCHEMAS: dict[str, type[Request]] = {
     "marey/evaluation@1": EvaluationDocument,
     "marey/evaluation-records@1": EvaluationRecords,
     "marey/evaluation-report@1": EvaluationReport,
-    "marey/edit@1": OpenDocument,
+    "marey/edit@1": EditDocument,
     "marey/alignment@1": OpenDocument,
     "marey/motion-primitive@1": OpenDocument,
     "marey/sample-tree@1": OpenDocument,

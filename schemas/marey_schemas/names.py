@@ -23,3 +23,5 @@ Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
 """The name of bytes: `sha256:` and 64 hexadecimal digits."""
 
 Message = Annotated[str, StringConstraints(max_length=2000)]
+
+JointName = Annotated[str, StringConstraints(min_length=1, max_length=1024)]

@@ -1,0 +1,118 @@
+"""Every command by its name, and lists of commands applied to clips.
+
+A command is a function of a take and its parameters by name, and gives the take that comes of it, or several. It is
+pure: the same take and parameters give the same bytes. Its parameters are plain trees in SI units, as
+`documents.commands_of_edit` makes them of a document's; the schemas have the same names and defaults, with degrees
+(`_deg`) for radians (`_rad`).
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from marey_motion.clip import Clip
+from marey_motion.editing.ranges import split, trim
+from marey_motion.editing.take import MOST_NUMBERS, EditedBody, Finding, Take
+from marey_motion.errors import EditError, MotionError
+from marey_motion.motion import Motion, unit_and_continuous
+
+Command = Callable[..., Take | tuple[Take, ...]]
+NamedCommand = tuple[str, Mapping[str, Any]]
+
+COMMANDS: Mapping[str, Command] = {
+    "trim": trim,
+    "split": split,
+}
+"""By name. A new one gets its line here and its schema in `marey_schemas.editing`."""
+
+
+@dataclass(frozen=True, eq=False)
+class EditedClip:
+    """One result of an edit.
+
+    Parameters
+    ----------
+    clip : the motion
+    pieces : which piece it is, from 1, of each split it went through
+    findings : what commands found out
+    """
+
+    clip: Clip
+    pieces: tuple[int, ...]
+    findings: tuple[Finding, ...]
+
+
+def edit_clip(
+    clip: Clip,
+    commands: Sequence[NamedCommand],
+    *,
+    body: EditedBody | None = None,
+    sources: Mapping[str, Clip] | None = None,
+    most_numbers: int = MOST_NUMBERS,
+) -> tuple[EditedClip, ...]:
+    """Everything that comes of a clip: one, or several where it was split.
+
+    Computed in double precision throughout and rounded once, at the end.
+
+    Parameters
+    ----------
+    clip : stays as it is
+    commands : names and parameters, in order; after a split, the rest applies to each piece
+    body : which joints are which; by default as their names and build suggest
+    sources : other clips by the names that the commands call them
+    most_numbers : size that the motion may grow to
+
+    Raises
+    ------
+    MotionError    where a command cannot be applied; `where` tells which and what of it
+    """
+    takes: tuple[Take, ...] = (
+        Take(
+            Motion.of(clip), clip.frame_rate_hz, body or EditedBody(clip.skeleton), sources or {}, (), (), most_numbers
+        ),
+    )
+    for number, (name, parameters) in enumerate(commands):
+        try:
+            takes = tuple(one for take in takes for one in apply_command(take, name, parameters))
+        except MotionError as error:
+            place = f"commands[{number}] ({name})"
+            error.where = place if error.where is None else f"{place}, {error.where}"
+            raise
+    return tuple(
+        EditedClip(take.motion.as_clip(take.skeleton, take.frame_rate_hz), take.pieces, take.findings) for take in takes
+    )
+
+
+def apply_edit(clip: Clip, commands: Sequence[NamedCommand], **given: Any) -> Clip:
+    """The one clip that comes of it; as `edit_clip`. Raises `EditError` where there are several."""
+    edited = edit_clip(clip, commands, **given)
+    if len(edited) > 1:
+        raise EditError(f"the commands make {len(edited)} clips of one", code="several-clips")
+    return edited[0].clip
+
+
+def apply_command(take: Take, name: str, parameters: Mapping[str, Any]) -> tuple[Take, ...]:
+    """What one command makes of a take, with rotations of unit length and continuous signs. Raises `MotionError`."""
+    command = COMMANDS.get(name)
+    if command is None:
+        raise EditError(f"no command is called {name!r}; there are {', '.join(COMMANDS)}", code="command-unknown")
+    try:
+        inspect.signature(command).bind(take, **parameters)
+    except TypeError as error:
+        raise EditError(f"{error}", code="command-invalid") from None
+    made = command(take, **parameters)
+    return tuple(map(_checked, made if isinstance(made, tuple) else (made,)))
+
+
+def _checked(take: Take) -> Take:
+    motion = take.motion
+    for numbers in (motion.root_translations, motion.rotations, motion.translations):
+        finite = np.isfinite(numbers).all(axis=tuple(range(1, numbers.ndim)))
+        if not finite.all():
+            raise EditError(f"frame {int(np.argmin(finite))} gets a number that is not finite", code="edit-not-finite")
+    return replace(take, motion=motion._replace(rotations=unit_and_continuous(motion.rotations.copy())))

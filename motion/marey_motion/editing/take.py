@@ -1,0 +1,151 @@
+"""What the commands of an edit work on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.clip import Clip
+from marey_motion.errors import EditError
+from marey_motion.motion import Motion
+from marey_motion.rigs import JointMapping, map_joints, symmetric_joints
+from marey_motion.skeleton import Skeleton
+
+Floats = NDArray[np.float64]
+
+MOST_NUMBERS = 200_000_000
+"""Numbers of the motion that a command may make: 1.6 GB, or two and a half hours of 60 joints at 90 Hz."""
+
+
+@dataclass(frozen=True, eq=False)
+class EditedBody:
+    """A skeleton and which of its joints are which, found out when a command first asks.
+
+    Parameters
+    ----------
+    skeleton : what the motion moves
+    find_mapping : gives the standard joints; may raise `MappingError`
+    """
+
+    skeleton: Skeleton
+    find_mapping: Callable[[Skeleton], JointMapping] = map_joints
+
+    @cached_property
+    def mapping(self) -> JointMapping:
+        """Joint by standard name."""
+        return self.find_mapping(self.skeleton)
+
+    @cached_property
+    def partners(self) -> NDArray[np.int32]:
+        """(J,) each joint's partner on the other side, its own index for joints of the centre."""
+        return symmetric_joints(self.skeleton, self.mapping)
+
+    @cached_property
+    def pelvis(self) -> int:
+        """The joint that stands for where the body is; the root where no pelvis is known."""
+        return self.skeleton.index_of(self.mapping.joints.get("pelvis", self.skeleton.joint_names[0]))
+
+    @cached_property
+    def sides(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Left and right hips and shoulders, whose difference tells where the body faces. Raises `MappingError`."""
+        lefts = self.mapping.indices(self.skeleton, ("left_hip", "left_shoulder"))
+        return lefts, self.mapping.indices(self.skeleton, ("right_hip", "right_shoulder"))
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a command found out about the motion as it was when its turn came.
+
+    Parameters
+    ----------
+    command : name of the command
+    values : plain tree of text and numbers
+    """
+
+    command: str
+    values: Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """A motion on its way through the commands of an edit, in double precision.
+
+    Parameters
+    ----------
+    motion : the frames
+    frame_rate_hz : frames per second
+    body : what moves
+    sources : other clips that commands name
+    findings : what commands found out so far
+    pieces : for each split that this take went through, which of its pieces it is, from 1
+    most_numbers : numbers that its motion may grow to
+    """
+
+    motion: Motion
+    frame_rate_hz: float
+    body: EditedBody
+    sources: Mapping[str, Clip] = field(default_factory=lambda: MappingProxyType({}))
+    findings: tuple[Finding, ...] = ()
+    pieces: tuple[int, ...] = ()
+    most_numbers: int = MOST_NUMBERS
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The skeleton of the body."""
+        return self.body.skeleton
+
+    @property
+    def frame_count(self) -> int:
+        """Frames of the motion."""
+        return self.motion.frame_count
+
+    def moved(self, motion: Motion) -> Take:
+        """With another motion of the same body and frame rate."""
+        return replace(self, motion=motion)
+
+    def with_finding(self, finding: Finding) -> Take:
+        """With one finding more."""
+        return replace(self, findings=(*self.findings, finding))
+
+    def source(self, name: str) -> Clip:
+        """Another clip, by the name that a command calls it. Raises `EditError`."""
+        if name not in self.sources:
+            known = ", ".join(sorted(self.sources)) or "none"
+            raise EditError(f"no source is called {name!r}; there is {known}", code="source-missing", where="source")
+        return self.sources[name]
+
+    def frames(self, bounds: tuple[int, int | None] | None) -> tuple[int, int]:
+        """Start and stop of a half-open range of frames; None is all of them, and as a stop the end.
+
+        Raises `EditError` where the take has no such frames.
+        """
+        start, stop = bounds or (0, None)
+        stop = self.frame_count if stop is None else stop
+        if not 0 <= start < stop <= self.frame_count:
+            raise EditError(
+                f"the frames {start}:{stop} are not there; there are {self.frame_count}", code="frames-missing"
+            )
+        return start, stop
+
+    def joint(self, name: str) -> int:
+        """Index of a joint by its name; `UnknownJoint` with the nearest names."""
+        return self.skeleton.index_of(name)
+
+    def count_frames(self, seconds: float) -> int:
+        """The frames nearest to a time."""
+        return round(seconds * self.frame_rate_hz)
+
+    def require_room(self, frames: int) -> None:
+        """Refuse to grow to so many frames where that is over the limit. Raises `EditError`."""
+        most = self.most_numbers // (3 + 4 * self.skeleton.joint_count + 3 * len(self.motion.translated_joints))
+        if frames > most:
+            raise EditError(
+                f"the result would have {frames:,} frames; of this skeleton {most:,} are possible",
+                code="edit-too-large",
+            )

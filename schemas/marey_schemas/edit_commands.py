@@ -1,0 +1,278 @@
+"""The commands of an edit: one model each, discriminated by `command`.
+
+Frames count from 0 and ranges are half-open; a stop of null is the end. Lengths are metres, times seconds, angles
+degrees where a name ends in `_deg`. Directions and positions are those of the world: right-handed, Y up.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from marey_schemas.base import Request
+from marey_schemas.evaluation import ItemId
+from marey_schemas.names import JointName
+
+MOST_FRAME = 100_000_000
+MOST_LISTED = 4096
+
+Frame = Annotated[int, Field(ge=0, le=MOST_FRAME)]
+
+
+def _require_order(frames: tuple[int, int | None]) -> tuple[int, int | None]:
+    if frames[1] is not None and frames[1] <= frames[0]:
+        raise ValueError(f"the stop {frames[1]} must lie after the start {frames[0]}")
+    return frames
+
+
+Frames = Annotated[tuple[Frame, Frame | None], AfterValidator(_require_order)]
+Metres = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Shift = tuple[Metres, Metres, Metres]
+Degrees = Annotated[float, Field(ge=-36_000, le=36_000, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=0, le=600, allow_inf_nan=False)]
+Joints = Annotated[tuple[JointName, ...], Field(min_length=1, max_length=MOST_LISTED)]
+
+
+def _require_direction(axis: tuple[float, float, float]) -> tuple[float, float, float]:
+    if max(map(abs, axis)) < 1e-6:
+        raise ValueError("an axis needs a direction; all three numbers are zero")
+    return axis
+
+
+Axis = Annotated[tuple[Metres, Metres, Metres], AfterValidator(_require_direction)]
+
+WHOLE_OR_RANGE = "Half-open range of frames; absent: all."
+
+
+# Frames and time
+
+
+class Trim(Request):
+    """Keep a range of frames."""
+
+    command: Literal["trim"]
+    start: Frame = Field(0, description="The first frame to keep.")
+    stop: Frame | None = Field(None, description="The frame after the last one to keep; absent: up to the end.")
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        if self.stop is not None and self.stop <= self.start:
+            raise ValueError(f"the stop {self.stop} must lie after the start {self.start}")
+        return self
+
+
+class Split(Request):
+    """Cut into several clips; the commands that follow apply to each."""
+
+    command: Literal["split"]
+    at: tuple[Annotated[int, Field(ge=1, le=MOST_FRAME)], ...] = Field(
+        min_length=1, max_length=1000, description="Cut before each of these frames, in increasing order."
+    )
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        if any(after <= before for before, after in pairwise(self.at)):
+            raise ValueError("at: the frames must increase")
+        return self
+
+
+class Concatenate(Request):
+    """Append another clip of the same skeleton."""
+
+    command: Literal["concatenate"]
+    source: ItemId = Field(description="The clip to append.")
+    place: Literal["seam", "keep"] = Field(
+        "seam",
+        description="seam: turned and shifted on the ground so that it goes on where the motion ends; keep: as it is.",
+    )
+    blend: Literal["inertialise", "slerp"] = Field(
+        "inertialise",
+        description="inertialise: the difference at the seam dies away in the appended clip, no frame is lost; slerp: "
+        "the end of the one is faded over into the start of the other, which overlap.",
+    )
+    blend_s: Seconds = Field(0.3, description="How long that takes; 0: a hard cut.")
+
+
+class Resample(Request):
+    """The same motion at another frame rate."""
+
+    command: Literal["resample"]
+    frame_rate_hz: float = Field(ge=0.1, le=100_000, allow_inf_nan=False)
+
+
+class Retime(Request):
+    """Faster or slower at the same frame rate."""
+
+    command: Literal["retime"]
+    speed: float = Field(ge=0.01, le=100, allow_inf_nan=False, description="2: twice as fast, in half the time.")
+
+
+class CloseLoop(Request):
+    """Make the last frame lead into the first one."""
+
+    command: Literal["close_loop"]
+    in_place: bool = Field(
+        False, description="Take the travel and turn of a round out, so that each starts where the last one did."
+    )
+    blend_s: Seconds | None = Field(
+        None, description="How far from either end poses may change; absent: up to the middle of the clip."
+    )
+
+
+# Where the body is
+
+
+class Translate(Request):
+    """Shift the whole motion."""
+
+    command: Literal["translate"]
+    shift_m: Shift = Field(description="Metres along x, y and z.")
+
+
+class Rotate(Request):
+    """Turn the whole motion about an axis of the world."""
+
+    command: Literal["rotate"]
+    angle_deg: Degrees = Field(description="About the vertical, positive is to the left.")
+    axis: Axis = Field((0.0, 1.0, 0.0), description="Direction of the axis.")
+    pivot: Literal["origin", "body"] = Field(
+        "origin", description="Which point stays: the origin, or the ground under the body in the first frame."
+    )
+
+
+class Face(Request):
+    """Turn the whole motion about the vertical so that a frame faces a given way."""
+
+    command: Literal["face"]
+    heading_deg: Degrees = Field(0.0, description="0 faces +z; positive is to the left.")
+    frame: Frame = Field(0, description="The frame that shall face there; its body stays in place.")
+
+
+class MoveToOrigin(Request):
+    """Shift the whole motion on the ground so that the body is above the origin in a frame; heights stay."""
+
+    command: Literal["move_to_origin"]
+    frame: Frame = 0
+
+
+class Scale(Request):
+    """Scale where the body goes, heights too. The skeleton is an item of its own and keeps its size."""
+
+    command: Literal["scale"]
+    factor: float = Field(ge=1e-4, le=1e4, allow_inf_nan=False, description="About the origin.")
+    translations: bool = Field(False, description="Scale the translations of other joints, where there are any, too.")
+
+
+SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+
+
+class FlipAxes(Request):
+    """Turn a world whose axes stand otherwise, such as Blender's with Z up, to Y up."""
+
+    command: Literal["flip_axes"]
+    up: SignedAxis = Field("+z", description="The axis that points up now.")
+    forward: SignedAxis = Field("-y", description="The axis that shall become +z, across the one that points up.")
+
+    @model_validator(mode="after")
+    def _check_axes(self) -> Self:
+        if self.up[1] == self.forward[1]:
+            raise ValueError(f"up {self.up} and forward {self.forward} lie on one axis")
+        return self
+
+
+class FixDrift(Request):
+    """Spread a wanted shift and turn of the body over a range of frames; those after it get all of it."""
+
+    command: Literal["fix_drift"]
+    shift_m: Shift = Field((0.0, 0.0, 0.0), description="What the end of the range is shifted by.")
+    turn_deg: Degrees = Field(0.0, description="What it is turned by about the vertical, positive to the left.")
+    frames: Frames | None = Field(None, description=WHOLE_OR_RANGE)
+    profile: Literal["linear", "smooth"] = Field(
+        "linear", description="linear: the same share per frame; smooth: starting and ending gently."
+    )
+
+
+# The ground
+
+
+class MoveToGround(Request):
+    """Bring the ground to height zero."""
+
+    command: Literal["move_to_ground"]
+    height_m: Metres | None = Field(
+        None, description="Where the ground is now; absent: estimated from the feet while they stand."
+    )
+
+
+class FindGround(Request):
+    """Estimate the height of the ground from the feet while they stand; changes nothing."""
+
+    command: Literal["find_ground"]
+
+
+class FindContacts(Request):
+    """Find when the feet stand; changes nothing."""
+
+    command: Literal["find_contacts"]
+    speed_limit_m_s: float = Field(
+        0.15, gt=0, le=100, allow_inf_nan=False, description="A foot that stands is slower than this."
+    )
+    height_limit_m: float | None = Field(
+        0.1, gt=0, le=100, allow_inf_nan=False, description="And nearer to the ground; null: at any height."
+    )
+    window_s: float = Field(
+        0.1, gt=0, le=10, allow_inf_nan=False, description="Each frame follows the majority of so much time around it."
+    )
+
+
+# The pose
+
+
+class Mirror(Request):
+    """Swap left and right, by the skeleton's own symmetry."""
+
+    command: Literal["mirror"]
+
+
+class Smooth(Request):
+    """Smooth rotations and translations over time; the first and last frame stay."""
+
+    command: Literal["smooth"]
+    method: Literal["savitzky_golay", "gaussian"] = Field(
+        "savitzky_golay", description="savitzky_golay keeps peaks, gaussian flattens them."
+    )
+    window_s: float = Field(
+        0.25, gt=0, le=60, allow_inf_nan=False, description="Time that each frame is a weighted mean of."
+    )
+    order: int = Field(3, ge=0, le=9, description="Degree of the polynomials of savitzky_golay.")
+    joints: Joints | None = Field(None, description="Which joints; absent: all.")
+    root_translation: bool = Field(True, description="Smooth the path of the root, too.")
+    frames: Frames | None = Field(None, description=WHOLE_OR_RANGE)
+    border_s: Seconds = Field(0.2, description="Time over which a range goes over into what is around it.")
+
+
+class RotateJoint(Request):
+    """Add a rotation to a joint."""
+
+    command: Literal["rotate_joint"]
+    joint: JointName
+    angle_deg: Degrees
+    axis: Axis
+    space: Literal["joint", "parent", "world"] = Field(
+        "joint", description="Whose axes `axis` is given in: the joint's own, its parent's, or the world's."
+    )
+    frames: Frames | None = Field(None, description=WHOLE_OR_RANGE)
+    border_s: Seconds = Field(0.2, description="Time over which a range goes over into what is around it.")
+
+
+class Paste(Request):
+    """Put the motion of joints of another clip in place of their own, stretched in time to fit."""
+
+    command: Literal["paste"]
+    source: ItemId = Field(description="The clip to copy from.")
+    joints: Joints = Field(description="Joints that both skeletons have, with the same axes.")
+    source_frames: Frames | None = Field(None, description="What to copy: half-open; absent: the whole clip.")
+    frames: Frames | None = Field(None, description="Where to put it: half-open; absent: the whole motion.")
+    border_s: Seconds = Field(0.2, description="Time within the range over which it goes over from what was there.")

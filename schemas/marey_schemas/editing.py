@@ -1,0 +1,75 @@
+"""Edits: lists of commands that are saved, applied to any clips, and replayed exactly."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, get_args
+
+from pydantic import Field
+
+from marey_schemas.base import Request
+from marey_schemas.edit_commands import (
+    CloseLoop,
+    Concatenate,
+    Face,
+    FindContacts,
+    FindGround,
+    FixDrift,
+    FlipAxes,
+    Mirror,
+    MoveToGround,
+    MoveToOrigin,
+    Paste,
+    Resample,
+    Retime,
+    Rotate,
+    RotateJoint,
+    Scale,
+    Smooth,
+    Split,
+    Translate,
+    Trim,
+)
+
+MOST_COMMANDS = 256
+
+AnyCommand = (
+    Trim
+    | Split
+    | Concatenate
+    | Resample
+    | Retime
+    | CloseLoop
+    | Translate
+    | Rotate
+    | Face
+    | MoveToOrigin
+    | Scale
+    | FlipAxes
+    | FixDrift
+    | MoveToGround
+    | FindGround
+    | FindContacts
+    | Mirror
+    | Smooth
+    | RotateJoint
+    | Paste
+)
+EditCommand = Annotated[AnyCommand, Field(discriminator="command")]
+
+COMMAND_MODELS: dict[str, type[Request]] = {
+    get_args(model.model_fields["command"].annotation)[0]: model for model in get_args(AnyCommand)
+}
+"""Model by the name of the command."""
+
+
+class EditDocument(Request):
+    """Part `edit`: commands in the order in which they are applied."""
+
+    schema_: Literal["marey/edit@1"] = Field("marey/edit@1", alias="schema")
+    title: str = Field("", max_length=200, description="What the edit is for.")
+    commands: tuple[EditCommand, ...] = Field(min_length=1, max_length=MOST_COMMANDS)
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Ids of the clips that the commands name."""
+        return tuple(dict.fromkeys(str(one.source) for one in self.commands if isinstance(one, Concatenate | Paste)))
