@@ -1,0 +1,95 @@
+"""When feet stand, found so that neither noise nor the rolling of the foot makes them flicker."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from marey_motion import kinematics
+from marey_motion.clip import Clip
+from marey_motion.errors import MotionError
+from marey_motion.matching.body import MatchingBody
+
+Floats = NDArray[np.float64]
+
+LEAVING_FACTOR = 1.6
+SMOOTHING_S = 0.045
+
+
+@dataclass(frozen=True)
+class ContactOptions:
+    """What counts as standing.
+
+    Parameters
+    ----------
+    speed_m_s : a foot slower than this begins to stand; it leaves when it is faster than `LEAVING_FACTOR` times that
+    shortest_swing_s, shortest_stance_s : anything shorter is noise
+    """
+
+    speed_m_s: float = 0.5
+    shortest_swing_s: float = 0.1
+    shortest_stance_s: float = 0.06
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value > 0):
+                raise MotionError(f"{value} must be a positive number", code="option-invalid", where=name)
+
+
+class Stance(NamedTuple):
+    """The frames [start, end) for which a foot stands."""
+
+    start: int
+    end: int
+
+
+def find_stances(clip: Clip, body: MatchingBody, options: ContactOptions | None = None) -> tuple[list[Stance], ...]:
+    """When the left and when the right foot of a clip stands, in order; a stance may begin or end with the clip."""
+    positions = kinematics.global_positions(clip)
+    feet = [positions[:, list(pair)] for pair in zip(body.feet, body.toes, strict=True)]
+    rate = clip.frame_rate_hz
+    return tuple(_stances(foot_speed(foot, rate), rate, options or ContactOptions()) for foot in feet)
+
+
+def foot_speed(points: NDArray[np.floating], frame_rate_hz: float) -> Floats:
+    """Speed (F,) in m/s of the slowest of a foot's points (F, k, 3), freed of outliers.
+
+    While a foot rolls, its heel turns about the point that stands and its toe lies still, or the other way round: the
+    slower of ankle and toe stays slow from the strike of the heel until the toe leaves the ground.
+    """
+    speed = np.linalg.norm(kinematics.velocities(points, frame_rate_hz), axis=-1).min(axis=1)
+    width = 2 * int(0.5 * SMOOTHING_S * frame_rate_hz) + 1
+    return np.asarray(median_filter(speed.astype(np.float64), size=width, mode="nearest"))
+
+
+def _stances(speed: Floats, frame_rate_hz: float, options: ContactOptions) -> list[Stance]:
+    standing = _with_hysteresis(speed, options.speed_m_s, LEAVING_FACTOR * options.speed_m_s)
+    standing = ~_without_short(~standing, options.shortest_swing_s * frame_rate_hz)
+    return [Stance(*one) for one in runs(_without_short(standing, options.shortest_stance_s * frame_rate_hz))]
+
+
+def _with_hysteresis(values: Floats, low: float, high: float) -> NDArray[np.bool_]:
+    """True (F,) from where the values fall below `low` until they rise above `high`."""
+    decided = (values < low) | (values > high)
+    latest = np.maximum.accumulate(np.where(decided, np.arange(len(values)), -1))
+    return np.asarray(np.where(latest >= 0, values[latest] < low, values < high))
+
+
+def _without_short(states: NDArray[np.bool_], shortest: float) -> NDArray[np.bool_]:
+    """The states (F,) without runs shorter than so many frames; those at the ends may go on outside, and stay."""
+    kept = states.copy()
+    for start, end in runs(states):
+        if end - start < shortest and start > 0 and end < len(states):
+            kept[start:end] = False
+    return kept
+
+
+def runs(states: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """The ranges [start, end) in which states (F,) are true."""
+    padded = np.concatenate(([False], states, [False]))
+    starts, ends = np.flatnonzero(~padded[:-1] & padded[1:]), np.flatnonzero(padded[:-1] & ~padded[1:])
+    return list(zip(starts.tolist(), ends.tolist(), strict=True))

@@ -1,0 +1,162 @@
+"""Where motion pauses, and where a hand arrives: proposals of segments and keyframes, for people to look over."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import find_peaks
+
+from marey_motion import kinematics
+from marey_motion.clip import Clip
+from marey_motion.editing.annotations import Keyframe, Layer, Segment
+from marey_motion.editing.contacts import runs
+from marey_motion.errors import MappingError, MotionError
+from marey_motion.matching.body import SIDES, MatchingBody
+
+Floats = NDArray[np.float64]
+
+PAUSE = "pause"
+MOVEMENT = "movement"
+CONTACT = "contact"
+RELEASE = "release"
+REST_S = 0.1
+OUT_OF_REST = 0.25
+"""Share of the farthest reach from which on a hand is on its way."""
+
+
+@dataclass(frozen=True)
+class PauseOptions:
+    """What counts as a pause.
+
+    Parameters
+    ----------
+    smoothing_s : deviation of the Gaussian that the speed is smoothed with, seconds
+    least_depth : how deep a minimum of the speed is below the lower of the maxima beside it, as a share of the highest
+        speed in the clip
+    least_apart_s : seconds between pauses; of nearer ones the deepest are kept
+    """
+
+    smoothing_s: float = 0.05
+    least_depth: float = 0.1
+    least_apart_s: float = 0.2
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "smoothing_s", "least_depth", "least_apart_s")
+
+
+def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: PauseOptions | None = None) -> Layer:
+    """A keyframe `pause` at each minimum of the joints' mean speed, and a segment `movement` from one to the next.
+
+    The first segment starts and the last ends with the clip. Without `joints`, the speed of the whole body counts.
+    """
+    options = options or PauseOptions()
+    positions = kinematics.global_positions(clip)
+    moving = positions[:, list(joints)] if joints else positions
+    speed = np.linalg.norm(kinematics.velocities(moving, clip.frame_rate_hz), axis=-1).mean(axis=1)
+    speed = _smooth(speed, options.smoothing_s, clip.frame_rate_hz)
+    highest = float(speed.max())
+    if highest <= 0.0:
+        return Layer(clip.frame_count)
+    pauses, _ = find_peaks(
+        -speed,
+        prominence=options.least_depth * highest,
+        distance=max(1.0, options.least_apart_s * clip.frame_rate_hz),
+    )
+    bounds = [0, *pauses.tolist(), clip.frame_count]
+    segments = tuple(Segment(MOVEMENT, *pair) for pair in pairwise(bounds))
+    return Layer(clip.frame_count, segments, tuple(Keyframe(PAUSE, frame) for frame in bounds[1:-1]))
+
+
+@dataclass(frozen=True)
+class ReachOptions:
+    """What counts as a reach of a hand.
+
+    Parameters
+    ----------
+    hand : which one, or the one of the two that reaches farther
+    least_reach_m : metres from the place of rest; less is no reach
+    arrived : share of the farthest place of a reach from which on the hand has arrived
+    release : mark the last frame at the far place, too
+    """
+
+    hand: Literal["left", "right", "either"] = "either"
+    least_reach_m: float = 0.2
+    arrived: float = 0.95
+    release: bool = False
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "least_reach_m", "arrived")
+        if not OUT_OF_REST < self.arrived <= 1.0:
+            raise MotionError(
+                f"{self.arrived} must be above {OUT_OF_REST} and at most 1", code="option-invalid", where="arrived"
+            )
+
+
+def propose_reaches(clip: Clip, body: MatchingBody, options: ReachOptions | None = None) -> Layer:
+    """A segment `reach_left` or `reach_right` each time a wrist goes far from its place of rest and comes back.
+
+    The place of rest is where the wrist is when the clip begins, as seen from the hips in the direction that the body
+    faces, with height above the ground. A segment lasts from the nearest frame to rest before to the nearest one after.
+    The keyframe `contact` marks the frame at which the hand arrives at its far place, `release` the last one there.
+    """
+    options = options or ReachOptions()
+    distances = {side: _distance_from_rest(clip, body, side) for side in SIDES if options.hand in (side, "either")}
+    side = max(distances, key=lambda name: float(distances[name].max()))
+    distance, farthest = distances[side], float(distances[side].max())
+    if farthest < options.least_reach_m:
+        return Layer(clip.frame_count)
+    segments: list[Segment] = []
+    keyframes: list[Keyframe] = []
+    for start, end in runs(distance >= max(OUT_OF_REST * farthest, 1e-9)):
+        there = distance[start:end] >= options.arrived * float(distance[start:end].max())
+        if float(distance[start:end].max()) < options.least_reach_m:
+            continue
+        left = _downhill(distance, start, -1, segments[-1].end if segments else 0)
+        right = _downhill(distance, end - 1, 1, clip.frame_count - 1)
+        segments.append(Segment(f"reach_{side}", left, right + 1))
+        frames = np.flatnonzero(there) + start
+        keyframes.append(Keyframe(CONTACT, int(frames[0])))
+        if options.release:
+            keyframes.append(Keyframe(RELEASE, int(frames[-1])))
+    return Layer(clip.frame_count, tuple(segments), tuple(keyframes))
+
+
+def _distance_from_rest(clip: Clip, body: MatchingBody, side: str) -> Floats:
+    """How far (F,) the wrist of a side is from where it was when the clip began, in metres."""
+    wrist = body.standard_joints.get(f"{side}_wrist")
+    if wrist is None:
+        raise MappingError("the skeleton's mapping has no such joint", where=f"{side}_wrist")
+    positions = kinematics.global_positions(clip).astype(np.float64)
+    forward = kinematics.forward_directions(positions, body.lefts, body.rights)
+    x, z = (positions[:, wrist] - positions[:, body.hips])[:, (0, 2)].T
+    seen = np.stack(
+        (z * forward[:, 0] - x * forward[:, 1], positions[:, wrist, 1], x * forward[:, 0] + z * forward[:, 1]), axis=1
+    )
+    seen = _smooth(seen, 0.5 * REST_S, clip.frame_rate_hz)
+    at_rest = seen[: max(1, round(REST_S * clip.frame_rate_hz))].mean(axis=0)
+    return np.asarray(np.linalg.norm(seen - at_rest, axis=1))
+
+
+def _downhill(values: Floats, frame: int, step: Literal[-1, 1], last: int) -> int:
+    """The frame at which the values stop to fall, looked for from `frame` on up to `last`."""
+    way = values[last : frame + 1][::-1] if step == -1 else values[frame : last + 1]
+    rising = np.diff(way) >= 0.0
+    return frame + step * (int(np.argmax(rising)) if rising.any() else len(way) - 1)
+
+
+def _smooth(values: Floats, deviation_s: float, frame_rate_hz: float) -> Floats:
+    smoothed = gaussian_filter1d(values.astype(np.float64), deviation_s * frame_rate_hz, axis=0, mode="nearest")
+    return np.asarray(smoothed)
+
+
+def _require_positive(options: PauseOptions | ReachOptions, *names: str) -> None:
+    for name in names:
+        value = getattr(options, name)
+        if not (np.isfinite(value) and value > 0):
+            raise MotionError(f"{value} must be a positive number", code="option-invalid", where=name)

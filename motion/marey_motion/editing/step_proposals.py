@@ -1,0 +1,181 @@
+"""A walk or run cut into its steps: proposals of segments, for people to look over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from math import cos, degrees, radians
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import kinematics
+from marey_motion.clip import Clip
+from marey_motion.editing.annotations import Keyframe, Layer, Segment
+from marey_motion.editing.contacts import ContactOptions, Stance, find_stances
+from marey_motion.errors import MotionError
+from marey_motion.matching.body import SIDES, MatchingBody
+
+STANDING = "standing"
+PASSING = "passing"
+SHORTEST_FLIGHT_S = 0.04
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """What counts as a step.
+
+    Parameters
+    ----------
+    contacts : what counts as a foot's contact
+    shortest_s, longest_s : seconds of a step
+    shortest_m : way of the hips over the ground
+    most_turn_deg : change of heading; steps that turn more are steps of a turn, and get no label
+    most_aside_deg : between the way of the hips and the heading; steps aside and backward get no label
+    standing_s : both feet on the ground for so long are somebody who stands
+    """
+
+    contacts: ContactOptions = field(default_factory=ContactOptions)
+    shortest_s: float = 0.2
+    longest_s: float = 1.5
+    shortest_m: float = 0.2
+    most_turn_deg: float = 30.0
+    most_aside_deg: float = 45.0
+    standing_s: float = 0.6
+
+    def __post_init__(self) -> None:
+        for name in ("shortest_s", "longest_s", "shortest_m", "most_turn_deg", "most_aside_deg", "standing_s"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise MotionError(f"{value} must be a number and not negative", code="option-invalid", where=name)
+        if self.longest_s <= self.shortest_s:
+            raise MotionError(
+                f"{self.longest_s} s must be more than shortest_s, {self.shortest_s} s",
+                code="option-invalid",
+                where="longest_s",
+            )
+
+
+def propose_steps(clip: Clip, body: MatchingBody, options: StepOptions | None = None) -> Layer:
+    """Segments from the contact of one foot to the next contact of the other, named after the foot that swings.
+
+    `step_left` and `step_right` are steps of a walk, `run_left` and `run_right` those in which no foot touches the
+    ground for a time. A step out of standing is a `start_`, which begins where the foot leaves the ground, one into
+    standing a `stop_`, and one that is both a `single_`. `standing` is its own label. Steps that the clip does not hold
+    whole, turns on the spot, jumps, and steps aside and backward get none. The keyframe `passing` marks the frame of
+    each step at which the swinging foot passes the other, where it does.
+    """
+    options = options or StepOptions()
+    stances = find_stances(clip, body, options.contacts)
+    standing = _standing(stances, clip, options.standing_s)
+    travel = _Travel.of(clip, body)
+    steps = [step for step in _steps(stances, standing) if travel.is_step(step, options)]
+    flying = _flying(stances, clip.frame_count)
+    labels = [_label(step, _has_flight(step, flying, clip.frame_rate_hz)) for step in steps]
+    named = [(label, step) for label, step in zip(labels, steps, strict=True) if label]
+    passing = [frame for _, step in named if (frame := travel.passing(step)) is not None]
+    return Layer(
+        clip.frame_count,
+        (
+            *(Segment(label, step.start, step.end) for label, step in named),
+            *(Segment(STANDING, *one) for one in standing),
+        ),
+        tuple(Keyframe(PASSING, frame) for frame in passing),
+    )
+
+
+class _Step(NamedTuple):
+    """Foot `side` swings, and touches the ground at `end`."""
+
+    side: int
+    start: int
+    end: int
+    from_standing: bool
+    to_standing: bool
+
+
+def _standing(stances: tuple[list[Stance], ...], clip: Clip, standing_s: float) -> list[Stance]:
+    """When both feet stand for long."""
+    both = [Stance(max(a.start, b.start), min(a.end, b.end)) for a in stances[0] for b in stances[1]]
+    return sorted(one for one in both if one.end - one.start >= max(1.0, standing_s * clip.frame_rate_hz))
+
+
+def _steps(stances: tuple[list[Stance], ...], standing: list[Stance]) -> list[_Step]:
+    """From each contact to the next one where that is of the other foot; where one stood between, from lift to contact.
+
+    A stance that begins with the clip has no contact in it.
+    """
+    begins, ends = {one.start for one in standing}, {one.end for one in standing}
+    lifts = [{after.start: before.end for before, after in pairwise(of_side)} for of_side in stances]
+    strikes = sorted((one.start, side) for side, of_side in enumerate(stances) for one in of_side if one.start > 0)
+    found: list[_Step] = []
+    for number, (strike, side) in enumerate(strikes):
+        lift, before = lifts[side].get(strike), strikes[number - 1] if number else None
+        if lift in ends:
+            found.append(_Step(side, lift, strike, True, strike in begins))
+        elif lift is not None and before is not None and before[1] != side and before[0] < strike:
+            found.append(_Step(side, before[0], strike, False, strike in begins))
+    return [step for step in found if not any(one.start < step.end and step.start < one.end for one in standing)]
+
+
+def _flying(stances: tuple[list[Stance], ...], frame_count: int) -> NDArray[np.bool_]:
+    """Whether no foot touches the ground (F,)."""
+    flying = np.ones(frame_count, dtype=np.bool_)
+    for stance in (one for of_side in stances for one in of_side):
+        flying[stance.start : stance.end] = False
+    return flying
+
+
+def _has_flight(step: _Step, flying: NDArray[np.bool_], frame_rate_hz: float) -> bool:
+    return int(flying[step.start : step.end].sum()) >= max(1.0, SHORTEST_FLIGHT_S * frame_rate_hz)
+
+
+def _label(step: _Step, has_flight: bool) -> str | None:
+    """None for a jump: a flight out of standing."""
+    if has_flight:
+        manner = None if step.from_standing else "run"
+    elif step.from_standing:
+        manner = "single" if step.to_standing else "start"
+    else:
+        manner = "stop" if step.to_standing else "step"
+    return manner and f"{manner}_{SIDES[step.side]}"
+
+
+class _Travel(NamedTuple):
+    """Where hips (F, 2) and ankles (F, 2, 2) are on the ground, where the body heads (F,), and frames per second."""
+
+    hips: NDArray[np.float64]
+    ankles: NDArray[np.float64]
+    heading: NDArray[np.float64]
+    frame_rate_hz: float
+
+    @classmethod
+    def of(cls, clip: Clip, body: MatchingBody) -> _Travel:
+        positions = kinematics.global_positions(clip).astype(np.float64)
+        directions = kinematics.forward_directions(positions, body.lefts, body.rights)
+        ground = kinematics.ground_projection(positions)
+        heading = kinematics.headings(directions)
+        return cls(ground[:, body.hips], ground[:, list(body.feet)], heading, clip.frame_rate_hz)
+
+    def is_step(self, step: _Step, options: StepOptions) -> bool:
+        """Whether this is one step ahead, and no turn."""
+        if not options.shortest_s <= (step.end - step.start) / self.frame_rate_hz <= options.longest_s:
+            return False
+        way = self.hips[step.end] - self.hips[step.start]
+        length = float(np.hypot(*way))
+        if length < max(options.shortest_m, 1e-6):
+            return False
+        heading = self.heading[step.start : step.end + 1]
+        middle = float(heading.mean())
+        ahead = float(way @ (np.sin(middle), np.cos(middle))) / length
+        turned = degrees(abs(heading[-1] - heading[0]))
+        return ahead >= cos(radians(options.most_aside_deg)) and turned <= options.most_turn_deg
+
+    def passing(self, step: _Step) -> int | None:
+        """The first frame at which the swinging foot has passed the other; None where it is ahead before or stays."""
+        swing, stand = (self.ankles[step.start : step.end, side] for side in (step.side, 1 - step.side))
+        ahead = (swing - stand) @ (self.hips[step.end] - self.hips[step.start]) > 0.0
+        if ahead[0] or not ahead.any():
+            return None
+        return step.start + int(np.argmax(ahead))
