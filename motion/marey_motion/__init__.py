@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from marey_motion.clip import Clip as Clip
+    from marey_motion.drawing.contact_sheet import contact_sheet as contact_sheet
     from marey_motion.errors import AmbiguousUnits as AmbiguousUnits
     from marey_motion.errors import ClipError as ClipError
     from marey_motion.errors import FormatError as FormatError
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from marey_motion.errors import SkeletonError as SkeletonError
     from marey_motion.errors import UnknownFormat as UnknownFormat
     from marey_motion.errors import UnknownJoint as UnknownJoint
-    from marey_motion.figures import contact_sheet as contact_sheet
     from marey_motion.formats import read_motion as read_motion
     from marey_motion.formats import write_motion as write_motion
     from marey_motion.gait import game_skeleton as game_skeleton
@@ -63,7 +63,7 @@ _HOMES = {
         "UnknownFormat",
         "UnknownJoint",
     ),
-    "figures": ("contact_sheet",),
+    "drawing.contact_sheet": ("contact_sheet",),
     "formats": ("read_motion", "write_motion"),
     "gait": ("game_skeleton", "generate_dataset", "generate_gait", "studio_skeleton"),
     "kinematics": (

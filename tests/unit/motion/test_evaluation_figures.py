@@ -14,11 +14,11 @@ import pytest
 from matplotlib.image import imread
 
 from evaluation_results import SMALL, evaluated, made_up, some_coverage, wandering
+from marey_motion.drawing.paper import nice_levels, shortened, without_shared_folder
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.figures import FIGURES, FigureOptions, draw_figure, draw_figures
 from marey_motion.evaluation.figures.clip_graph_layout import MOST_DOTS, arrange
 from marey_motion.evaluation.figures.mixtures import fit_one, fit_two
-from marey_motion.evaluation.figures.paper import nice_levels, shortened, without_shared_folder
 from marey_motion.evaluation.result import EvaluationOptions, Grid
 from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.matching.database import DatabaseClip

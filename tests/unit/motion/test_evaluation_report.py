@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from evaluation_results import made_up
+from marey_motion.drawing.markup import element, text
+from marey_motion.drawing.words import amount, duration
 from marey_motion.evaluation.compare import compare_results
 from marey_motion.evaluation.figures import FIGURES, draw_figures
 from marey_motion.evaluation.judgement import is_followed, judge, mean_speed_m_s
 from marey_motion.evaluation.report import compared, render_comparison, render_report, verdict
 from marey_motion.evaluation.report.definitions import METRICS
-from marey_motion.evaluation.report.markup import element, text
-from marey_motion.evaluation.report.words import amount, demand, duration, find_holes
+from marey_motion.evaluation.report.words import demand, find_holes
 from marey_motion.evaluation.result import EvaluationOptions, Grid, TrialResult
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.evaluation.suite import evaluate

@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from marey_motion.drawing.drawn import DrawnFigure, Sketch, finish
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.figures.clip_graph import draw_clip_graph
 from marey_motion.evaluation.figures.clip_usage import draw_usage
 from marey_motion.evaluation.figures.coverage_points import draw_points
 from marey_motion.evaluation.figures.density import draw_density, draw_directions
-from marey_motion.evaluation.figures.drawn import DrawnFigure, Sketch, finish
 from marey_motion.evaluation.figures.errors import draw_errors
 from marey_motion.evaluation.figures.frame_use import draw_frame_use
 from marey_motion.evaluation.figures.holes import draw_holes

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.evaluation.figures.clip_graph_layout import OPEN, Circle, arrange
-from marey_motion.evaluation.figures.drawn import Sketch
-from marey_motion.evaluation.figures.paper import (
+from marey_motion.drawing.drawn import Sketch
+from marey_motion.drawing.paper import (
     COLOURS,
     HEADING,
     QUIET,
@@ -22,6 +21,7 @@ from marey_motion.evaluation.figures.paper import (
     without_shared_folder,
     write,
 )
+from marey_motion.evaluation.figures.clip_graph_layout import OPEN, Circle, arrange
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
 from marey_motion.evaluation.relevance import clips_of_rows
 

@@ -8,25 +8,23 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.evaluation.figures.drawn import Sketch
-from marey_motion.evaluation.figures.paper import (
+from marey_motion.drawing.drawn import Sketch
+from marey_motion.drawing.paper import (
     COLOURS,
     INK,
     MARKERS,
     QUIET,
     REFERENCE,
-    SPEED,
-    TURN_RATE,
     Place,
     add_keys,
     add_panel,
-    mark_sides,
     new_figure,
     plain,
     reach,
     shortened,
     without_shared_folder,
 )
+from marey_motion.evaluation.figures.axes import SPEED, TURN_RATE, mark_sides
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
 
 if TYPE_CHECKING:

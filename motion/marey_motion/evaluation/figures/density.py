@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.evaluation.figures.drawn import Sketch
-from marey_motion.evaluation.figures.paper import (
+from marey_motion.drawing.drawn import Sketch
+from marey_motion.drawing.paper import (
     LIGHT,
     MORE_IS_DENSER,
-    SPEED,
-    TURN_RATE,
     Place,
     add_colour_bar,
     add_panel,
@@ -23,6 +21,7 @@ from marey_motion.evaluation.figures.paper import (
     square_root_ticks,
     write,
 )
+from marey_motion.evaluation.figures.axes import SPEED, TURN_RATE
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
 from marey_motion.evaluation.result import Coverage
 

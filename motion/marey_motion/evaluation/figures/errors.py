@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.errors import MotionError
-from marey_motion.evaluation.figures.drawn import Sketch
-from marey_motion.evaluation.figures.mixtures import Normals, fit_one, fit_two
-from marey_motion.evaluation.figures.paper import (
+from marey_motion.drawing.drawn import Sketch
+from marey_motion.drawing.paper import (
     COLOURS,
     QUIET,
     REFERENCE,
@@ -20,6 +18,8 @@ from marey_motion.evaluation.figures.paper import (
     add_panel,
     new_figure,
 )
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.figures.mixtures import Normals, fit_one, fit_two
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject, TrialView, choose_trial, view_trial
 
 if TYPE_CHECKING:

@@ -8,25 +8,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.evaluation.figures.drawn import Sketch
-from marey_motion.evaluation.figures.paper import (
+from marey_motion.drawing.drawn import Sketch
+from marey_motion.drawing.paper import (
     DARK,
     INK,
     LIGHT,
     QUIET,
     SMALL,
-    SPEED,
-    TURN_RATE,
     Place,
     add_colour_bar,
     add_panel,
     luminance,
-    mark_sides,
     new_figure,
     plain,
     warm_colours,
     write,
 )
+from marey_motion.evaluation.figures.axes import SPEED, TURN_RATE, mark_sides
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
 
 if TYPE_CHECKING:

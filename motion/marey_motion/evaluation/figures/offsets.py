@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.evaluation.figures.drawn import Sketch
-from marey_motion.evaluation.figures.paper import (
+from marey_motion.drawing.drawn import Sketch
+from marey_motion.drawing.paper import (
     CHANGE,
     DARK,
     LIGHT,
     MORE_IS_WORSE,
     SMALL,
-    SPEED,
-    TURN_RATE,
     Place,
     add_colour_bar,
     add_panel,
@@ -25,6 +23,7 @@ from marey_motion.evaluation.figures.paper import (
     nice_levels,
     write,
 )
+from marey_motion.evaluation.figures.axes import SPEED, TURN_RATE
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from marey_motion.evaluation.figures.drawn import Sketch
-from marey_motion.evaluation.figures.paper import (
+from marey_motion.drawing.drawn import Sketch
+from marey_motion.drawing.paper import (
     COLOURS,
     REFERENCE,
     Place,

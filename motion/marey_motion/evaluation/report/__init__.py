@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from marey_motion.drawing.markup import element
+from marey_motion.drawing.page import Section, page
 from marey_motion.evaluation.compare import Comparison
 from marey_motion.evaluation.figures import DrawnFigure, draw_figures
 from marey_motion.evaluation.report.chapters import (
@@ -26,8 +28,6 @@ from marey_motion.evaluation.report.comparison import (
     trial_chapter,
 )
 from marey_motion.evaluation.report.definitions import definitions
-from marey_motion.evaluation.report.markup import element
-from marey_motion.evaluation.report.page import Section, page
 from marey_motion.evaluation.report.provenance import provenance
 from marey_motion.evaluation.report.verdict import verdict
 from marey_motion.evaluation.result import EvaluationResult

@@ -6,14 +6,15 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from marey_motion.drawing.markup import Content, Html, element, joined
+from marey_motion.drawing.page import Section, shown
+from marey_motion.drawing.tables import Cell, Number, facts, folded, number, share, table
+from marey_motion.drawing.words import amount, duration
 from marey_motion.evaluation.figures import DrawnFigure
 from marey_motion.evaluation.judgement import is_followed, judge, strain
 from marey_motion.evaluation.relevance import SourceUsage, sum_by_source
 from marey_motion.evaluation.report.definitions import METRICS
-from marey_motion.evaluation.report.markup import Content, Html, element, joined
-from marey_motion.evaluation.report.page import Section, shown
-from marey_motion.evaluation.report.tables import Cell, Number, facts, folded, number, share, table
-from marey_motion.evaluation.report.words import amount, demand, duration, find_holes
+from marey_motion.evaluation.report.words import demand, find_holes
 from marey_motion.evaluation.result import EvaluationResult, TrialResult
 
 Figures = Mapping[str, DrawnFigure]

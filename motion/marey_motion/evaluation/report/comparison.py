@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from marey_motion.drawing.markup import Content, Html, element
+from marey_motion.drawing.page import Section, shown
+from marey_motion.drawing.tables import Cell, Number, facts, folded, number, table
+from marey_motion.drawing.words import amount
 from marey_motion.evaluation.compare import Comparison, MetricChange
 from marey_motion.evaluation.figures import DrawnFigure
 from marey_motion.evaluation.judgement import Judgement, is_followed, judge
 from marey_motion.evaluation.report.definitions import METRICS
-from marey_motion.evaluation.report.markup import Content, Html, element
-from marey_motion.evaluation.report.page import Section, shown
-from marey_motion.evaluation.report.tables import Cell, Number, facts, folded, number, table
-from marey_motion.evaluation.report.words import amount, demand
+from marey_motion.evaluation.report.words import demand
 from marey_motion.evaluation.result import EvaluationResult, TrialResult
 
 Figures = Mapping[str, DrawnFigure]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from marey_motion.evaluation.report.markup import Html, element, joined
-from marey_motion.evaluation.report.tables import table
+from marey_motion.drawing.markup import Html, element, joined
+from marey_motion.drawing.tables import table
 
 
 class Metric(NamedTuple):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 
-from marey_motion.evaluation.report.markup import Html, element, joined
-from marey_motion.evaluation.report.tables import Cell, folded, table
+from marey_motion.drawing.markup import Html, element, joined
+from marey_motion.drawing.tables import Cell, folded, table
 from marey_motion.evaluation.result import EvaluationResult
 
 DIGESTS = ("dataset", "normaliser", "options", "scenarios")

@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 
+from marey_motion.drawing.words import amount
 from marey_motion.evaluation.judgement import judge, strain
 from marey_motion.evaluation.relevance import sum_by_source
-from marey_motion.evaluation.report.words import amount, demand
+from marey_motion.evaluation.report.words import demand
 from marey_motion.evaluation.result import EvaluationResult, TrialResult
 
 

@@ -1,4 +1,4 @@
-"""Speeds, turn rates and amounts as an animator says them."""
+"""Speeds, turn rates and what is missing as an animator says them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.drawing.words import span
 from marey_motion.evaluation.result import Coverage
 from marey_motion.evaluation.scenario import Trial
 
@@ -71,11 +72,6 @@ def turning(low_deg_s: float, high_deg_s: float) -> str:
     return f"{side} turns of {span(least, most)} degrees a second"
 
 
-def span(low: float, high: float) -> str:
-    """A range of numbers, or the one number."""
-    return f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.4g} to {high:.4g}"
-
-
 def demand(trial: Trial) -> str:
     """What a trial asks for."""
     turn = float(np.degrees(trial.turn_rate_rad_s))
@@ -85,22 +81,6 @@ def demand(trial: Trial) -> str:
     if abs(turn) <= STRAIGHT_DEG_S:
         return f"straight line at {speed}"
     return f"{'left' if turn > 0 else 'right'} turn of {abs(turn):.4g} deg/s at {speed}"
-
-
-def amount(count: int, thing: str) -> str:
-    """A number of things: one clip, 2 clips, 3 trajectories."""
-    if count == 1:
-        return f"1 {thing}"
-    plural = f"{thing[:-1]}ies" if thing.endswith("y") else f"{thing}s"
-    return f"{count:,} {plural}"
-
-
-def duration(seconds: float) -> str:
-    """Seconds, or minutes and seconds."""
-    if seconds < 9.95:
-        return f"{seconds:.1f} s"
-    whole = round(seconds)
-    return f"{whole} s" if whole < 120 else f"{whole // 60} min {whole % 60} s"
 
 
 def _centres(edges: Floats) -> Floats:

@@ -10,11 +10,21 @@ from matplotlib.image import imread
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
+from marey_motion.drawing.contact_sheet import (
+    DPI,
+    HEADER,
+    MARGIN,
+    PAGE_WIDTH,
+    ROW,
+    STAGE,
+    TITLE,
+    TakePair,
+    contact_sheet,
+)
+from marey_motion.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, body_of, stances_at
 from marey_motion.errors import MotionError
-from marey_motion.figures import DPI, HEADER, MARGIN, PAGE_WIDTH, ROW, STAGE, TITLE, TakePair, contact_sheet
 from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
 from marey_motion.skeleton import EndSite, Skeleton
-from marey_motion.stick_figures import CENTRE, LEFT, RIGHT, Camera, body_of, stances_at
 
 BLUE, ORANGE = (0x1F, 0x6F, 0xB2), (0xE0, 0x7B, 0x1A)
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.clip import Clip
+from marey_motion.drawing.stick_figures import CENTRE, LEFT, RIGHT, Body, Camera, Stances, body_of, stances_at
 from marey_motion.errors import MotionError
-from marey_motion.stick_figures import CENTRE, LEFT, RIGHT, Body, Camera, Stances, body_of, stances_at
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

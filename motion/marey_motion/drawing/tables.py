@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from marey_motion.evaluation.report.markup import Content, Html, element
+from marey_motion.drawing.markup import Content, Html, element
 
 
 class Number(NamedTuple):

@@ -8,9 +8,9 @@ from functools import cache
 from importlib.resources import files
 from typing import NamedTuple
 
-from marey_motion.evaluation.figures import DrawnFigure
-from marey_motion.evaluation.figures.paper import COLOURS, HAIRLINE, INK, PAPER, QUIET
-from marey_motion.evaluation.report.markup import Content, Html, element, joined
+from marey_motion.drawing.drawn import DrawnFigure
+from marey_motion.drawing.markup import Content, Html, element, joined
+from marey_motion.drawing.paper import COLOURS, HAIRLINE, INK, PAPER, QUIET
 
 # The colours of figures that follow the page's theme.
 _THEMED = {
@@ -49,7 +49,7 @@ def page(title: str, lead: Content, sections: Sequence[Section], ending: Content
         element("meta", name="viewport", content="width=device-width, initial-scale=1"),
         element("meta", http_equiv="Content-Security-Policy", content=_POLICY),
         element("title", title),
-        element("style", Html(_part("report.css"))),
+        element("style", Html(_part("page.css"))),
     )
     body = element(
         "body",
@@ -57,7 +57,7 @@ def page(title: str, lead: Content, sections: Sequence[Section], ending: Content
         element("nav", element("ol", links), aria_label="Contents"),
         element("main", [_section(section) for section in sections]),
         element("footer", ending),
-        element("script", Html(_part("report.js"))),
+        element("script", Html(_part("page.js"))),
     )
     return f'<!DOCTYPE html>\n<html lang="en">\n{head}\n{body}\n</html>\n'
 
@@ -98,4 +98,4 @@ def _inline(figure: DrawnFigure, prefix: str) -> Html:
 
 @cache
 def _part(name: str) -> str:
-    return files("marey_motion.evaluation.report").joinpath(name).read_text(encoding="utf-8")
+    return files("marey_motion.drawing").joinpath(name).read_text(encoding="utf-8")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from marey_motion.evaluation.figures.paper import to_png, to_svg
+from marey_motion.drawing.paper import to_png, to_svg
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,11 +33,11 @@ class Sketch(NamedTuple):
 
 @dataclass(frozen=True)
 class DrawnFigure:
-    """A figure of an evaluation.
+    """A figure.
 
     Parameters
     ----------
-    name : key of `FIGURES`
+    name : what it is asked for by
     number : the paper's number, or "" for those it has not
     caption : what is to be seen, for people who read it and for those who cannot see it
     tables : what was drawn, see `Tables`

@@ -1,4 +1,4 @@
-"""The look that all figures of an evaluation share, and how a figure becomes a PNG and an SVG.
+"""The look that all figures share, and how a figure becomes a PNG and an SVG.
 
 Only matplotlib's object interface is used, and its settings are touched for nothing but the few of the SVG writer that
 have no other way, one figure at a time; threads may draw at once.
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
-# These four follow the theme of the page that a figure is shown in; see `marey_motion.evaluation.report`.
+# These four follow the theme of the page that a figure is shown in; see `marey_motion.drawing.page`.
 INK, QUIET, HAIRLINE, PAPER = "#1f2430", "#5c6472", "#d5dae1", "#ffffff"
 # On coloured ground, in any theme.
 DARK, LIGHT = "#111318", "#fafbfc"
@@ -39,8 +39,6 @@ CHANGE = "RdBu_r"
 
 TEXT, SMALL, HEADING = 9.0, 8.0, 10.5
 DPI = 144
-SPEED = "speed (m/s)"
-TURN_RATE = "turn rate (deg/s, left positive)"
 LONGEST_NAME = 30
 
 _SVG_SETTINGS = {"svg.hashsalt": "marey", "svg.fonttype": "none", "svg.image_inline": True, "svg.id": None}
@@ -116,13 +114,6 @@ def name_ticks(axes: Axes, places: Sequence[float], names: Sequence[str]) -> Non
     """Names, as clips have, down the vertical axis."""
     axes.set_yticks(list(places), [plain(shortened(name)) for name in without_shared_folder(names)], parse_math=False)
     axes.tick_params(axis="y", length=0, labelcolor=INK)
-
-
-def mark_sides(axes: Axes) -> None:
-    """Say which half of an axis of turn rates is which, in the corners above the panel's ground."""
-    look = {"transform": axes.transAxes, "color": QUIET, "fontsize": SMALL, "va": "bottom"}
-    write(axes, (0.0, 1.005), "← right turns", ha="left", **look)
-    write(axes, (1.0, 1.005), "left turns →", ha="right", **look)
 
 
 def plain(text: str) -> str:
