@@ -1,15 +1,16 @@
-"""Skeletons, mappings and clips to and from the documents that travel."""
+"""Skeletons, mappings, clips and annotations to and from the documents that travel."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.clip import Clip
+from marey_motion.editing.annotations import Keyframe, Layer, Segment
 from marey_motion.errors import ClipError, MappingError
 from marey_motion.rigs import STANDARD_JOINTS, JointAxes, JointMapping
 from marey_motion.skeleton import EndSite, Skeleton
@@ -87,6 +88,31 @@ def clip_from_document(document: schemas.Motion, skeleton: Skeleton) -> Clip:
         translated = [translated[index] for index in order]
         translations = translations[:, order]
     return Clip(skeleton, document.frame_rate_hz, poses, translations, tuple(translated))
+
+
+def layer_to_document(
+    layer: Layer,
+    clip: schemas.RevisionRef | schemas.OutputRef,
+    name: str,
+    made_by: Literal["person", "algorithm"] = "person",
+) -> schemas.Annotation:
+    """Part `annotation` of a layer of this name over a clip that is stored as `clip`."""
+    return schemas.Annotation(
+        clip=clip,
+        layer=name,
+        made_by=made_by,
+        segments=tuple(schemas.Segment(**segment._asdict()) for segment in layer.segments),
+        keyframes=tuple(schemas.Keyframe(**keyframe._asdict()) for keyframe in layer.keyframes),
+    )
+
+
+def layer_from_document(document: schemas.Annotation, frame_count: int) -> Layer:
+    """The layer of an `annotation` part over a clip of so many frames; `AnnotationError` where it goes beyond them."""
+    return Layer(
+        frame_count,
+        tuple(Segment(one.label, one.start, one.end) for one in document.segments),
+        tuple(Keyframe(one.label, one.frame) for one in document.keyframes),
+    )
 
 
 def mapping_to_document(mapping: JointMapping, axes: Mapping[str, JointAxes]) -> schemas.SkeletonMapping:

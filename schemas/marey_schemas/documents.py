@@ -4,6 +4,7 @@ Every document carries its `schema`. Lengths are metres, angles radians, times s
 axes are right-handed with Y up (docs/explanation/conventions.md).
 """
 
+from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -188,14 +189,26 @@ class Keyframe(Request):
 
 
 class Annotation(Request):
-    """Part `annotation`: one layer over a clip, by one author or algorithm."""
+    """Part `annotation`: one layer over a clip, by one author or algorithm. Segments do not overlap."""
 
     schema_: Literal["marey/annotation@1"] = Field("marey/annotation@1", alias="schema")
-    clip: RevisionRef
+    clip: RevisionRef | OutputRef
     layer: str = "default"
     made_by: Literal["person", "algorithm"] = "person"
-    segments: tuple[Segment, ...] = ()
-    keyframes: tuple[Keyframe, ...] = ()
+    segments: tuple[Segment, ...] = Field((), description="In the order of time.")
+    keyframes: tuple[Keyframe, ...] = Field((), description="In the order of time.")
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        for index, (before, after) in enumerate(pairwise(self.segments), start=1):
+            if after.start < before.end:
+                place = f"segments[{index}] ({after.label!r} {after.start}:{after.end})"
+                raise ValueError(f"{place} must start at {before.end} or later, where {before.label!r} ends")
+        for index, (earlier, later) in enumerate(pairwise(self.keyframes), start=1):
+            if (later.frame, later.label) <= (earlier.frame, earlier.label):
+                place = f"keyframes[{index}] ({later.label!r} at frame {later.frame})"
+                raise ValueError(f"{place} must come after {earlier.label!r} at frame {earlier.frame}")
+        return self
 
 
 class OpenDocument(Request):

@@ -12,6 +12,7 @@ from importlib.metadata import entry_points
 from types import MappingProxyType
 from typing import Any, Literal
 
+from marey_schemas.annotations import AnnotateParams, CutParams
 from marey_schemas.base import Request
 from marey_schemas.evaluation import EvaluateParams, count_evaluation_tasks
 from marey_schemas.improvement import CompareParams, OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
@@ -199,7 +200,47 @@ SWEEP = KindDeclaration(
     outputs={"document": "file"},
 )
 
-BUILT_IN = (IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, SUGGEST, OPTIMISE, SWEEP)
+ANNOTATE = KindDeclaration(
+    name="annotate",
+    description="Proposes segments and keyframes of clips: steps, pauses, or reaches of a hand.",
+    params=AnnotateParams,
+    implementation="marey_worker.kinds.annotate:run",
+    version=1,
+    inputs={
+        "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to annotate."),
+        "rigs": InputSpec(
+            kind=Kind.SKELETON,
+            many=True,
+            required=False,
+            description="Skeletons of the clips whose mapping was edited since, at the revision to go by.",
+        ),
+    },
+    outputs={"annotations": Kind.ANNOTATION},
+    fan_out="clips",
+    batch_size=16,
+)
+
+CUT = KindDeclaration(
+    name="cut",
+    description="Cuts clips along the segments of their annotations, and keeps the keyframes of each piece.",
+    params=CutParams,
+    implementation="marey_worker.kinds.cut:run",
+    version=1,
+    inputs={
+        "annotations": InputSpec(
+            kind=Kind.ANNOTATION, many=True, description="The annotations; each names its clip and that revision."
+        ),
+        "clips": InputSpec(
+            kind=Kind.CLIP,
+            many=True,
+            required=False,
+            description="The clips of the annotations at those revisions, so that the history of the pieces names them.",
+        ),
+    },
+    outputs={"clips": Kind.CLIP, "annotations": Kind.ANNOTATION},
+)
+
+BUILT_IN = (IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, SUGGEST, OPTIMISE, SWEEP, ANNOTATE, CUT)
 
 
 class UnknownKindError(LookupError):

@@ -219,15 +219,18 @@ COMMANDS: Mapping[str, Callable[..., Layer]] = {
 """Every command by its name; each takes a layer and answers with the changed one."""
 
 
-def piece_of(layer: Layer, start: int, end: int) -> Layer:
-    """What the layer says of the frames [start, end), counted from `start`: segments cut off there, and keyframes."""
-    if not 0 <= start < end <= layer.frame_count:
-        raise AnnotationError(f"the clip has the frames 0:{layer.frame_count}", where=f"frames {start}:{end}")
-    within = [(one.label, max(one.start, start) - start, min(one.end, end) - start) for one in layer.segments]
+def piece_of(layer: Layer, segment: Segment, start: int, end: int) -> Layer:
+    """What the layer says of one of its segments, in a clip of the frames [start, end) that hold it."""
+    if not 0 <= start <= segment.start < segment.end <= end <= layer.frame_count:
+        raise _wrong(segment, "outside-clip", f"the frames {start}:{end} of {layer.frame_count} do not hold it")
     return Layer(
         end - start,
-        tuple(Segment(*one) for one in within if one[1] < one[2]),
-        tuple(Keyframe(one.label, one.frame - start) for one in layer.keyframes if start <= one.frame < end),
+        (Segment(segment.label, segment.start - start, segment.end - start),),
+        tuple(
+            Keyframe(one.label, one.frame - start)
+            for one in layer.keyframes
+            if segment.start <= one.frame < segment.end
+        ),
     )
 
 

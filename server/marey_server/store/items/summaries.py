@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from marey_schemas.kinds import Kind
+
+LABELS_SHOWN = 32
+"""Of an annotation, those of most segments."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +28,8 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
         return Summary({"joints": len(bodies["hierarchy"]["joints"])})
     if kind is Kind.EVALUATION:
         return Summary({"verdict": bodies["evaluation"]["verdict"], **bodies["evaluation"]["headline"]})
+    if kind is Kind.ANNOTATION:
+        return Summary(_said(bodies["annotation"]))
     if kind is not Kind.CLIP:
         return Summary({})
     motion, info = bodies["motion"], bodies.get("info", {})
@@ -37,3 +43,17 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
         "warnings": sorted({check["code"] for check in info.get("checks", ())}),
     }
     return Summary(shown, frames, motion["skeleton"]["item"])
+
+
+def _said(annotation: Mapping[str, Any]) -> dict[str, Any]:
+    clip, segments = annotation["clip"], annotation.get("segments", ())
+    labels = Counter(segment["label"] for segment in segments)
+    return {
+        "clip": clip["item"],
+        "clip_revision": clip["revision"],
+        "layer": annotation.get("layer", "default"),
+        "made_by": annotation.get("made_by", "person"),
+        "segments": len(segments),
+        "keyframes": len(annotation.get("keyframes", ())),
+        "labels": dict(labels.most_common(LABELS_SHOWN)),
+    }

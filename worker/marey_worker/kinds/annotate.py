@@ -1,0 +1,148 @@
+"""Segments and keyframes of clips, proposed by algorithms."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from marey_motion import documents
+from marey_motion.clip import Clip
+from marey_motion.editing.annotations import Layer
+from marey_motion.editing.contacts import ContactOptions
+from marey_motion.editing.speed_proposals import PauseOptions, ReachOptions, propose_pauses, propose_reaches
+from marey_motion.editing.step_proposals import StepOptions, propose_steps
+from marey_motion.errors import AnnotationError, MotionError, UnknownJoint
+from marey_motion.matching.body import MatchingBody
+from marey_schemas.annotations import (
+    MAX_NAME_LENGTH,
+    AnnotateParams,
+    StepsProposal,
+    VelocityMinimaProposal,
+    WristContactProposal,
+)
+from marey_schemas.documents import Motion, RevisionRef
+from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
+from marey_schemas.kinds import Kind
+from marey_worker.context import Context, JobRefused
+from marey_worker.kinds.rigged import Rig, Rigged, read_rigged
+
+OUTPUTS_PER_STAGE = 64
+
+Propose = Callable[[Clip, Rigged], Layer]
+
+
+def run(context: Context, params: AnnotateParams) -> dict[str, Any]:
+    """Annotate every clip of the job.
+
+    A clip that cannot be annotated is a refusal in the result, with code and reason; the others are annotated all the
+    same. A clip in which nothing is found gets no annotation.
+    """
+    propose = _proposal(params)
+    rigs = {pin.item: pin for pin in context.inputs.get("rigs", ())}
+    pins = context.inputs["clips"]
+    layer_name = params.layer or params.proposal.method
+    labels: Counter[str] = Counter()
+    refused: list[dict[str, str]] = []
+    empty: list[str] = []
+    ready: list[StagedOutput] = []
+    for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
+        context.progress(done, len(pins), f"annotating {pin.name}")
+        place = f"{pin.collection}/{pin.name}".lstrip("/")
+        try:
+            motion = Motion.model_validate(tree)
+            used = RevisionRef.model_validate(motion.skeleton.model_dump())
+            edited = rigs.get(used.item)
+            rigged = read_rigged(context, Rig(used, _ref(edited) if edited else used))
+            layer = propose(documents.clip_from_document(motion, rigged.skeleton), rigged)
+            _require_name(pin, layer_name)
+        except (MotionError, ValidationError) as error:
+            code = error.code if isinstance(error, MotionError) else "bad-document"
+            context.log(f"{place}: {error}")
+            refused.append({"name": place, "item": pin.item, "code": code, "detail": str(error)})
+            continue
+        if not (layer.segments or layer.keyframes):
+            empty.append(place)
+            continue
+        labels.update(segment.label for segment in layer.segments)
+        sources = {"clips": (_input(pin),), **({"rigs": (_input(edited),)} if edited else {})}
+        ready.append(_output(pin, layer, layer_name, params, sources))
+        if len(ready) == OUTPUTS_PER_STAGE:
+            context.stage(ready)
+            ready = []
+    if ready:
+        context.stage(ready)
+    annotated = len(pins) - len(empty) - len(refused)
+    return {"annotations": annotated, "segments": dict(sorted(labels.items())), "empty": empty, "refused": refused}
+
+
+def _proposal(params: AnnotateParams) -> Propose:
+    """The function that makes a layer of a clip as the parameters say. Raises `JobRefused`."""
+    wanted = params.proposal
+    try:
+        if isinstance(wanted, StepsProposal):
+            steps = _step_options(wanted)
+            return lambda clip, rigged: propose_steps(clip, _body(rigged), steps)
+        if isinstance(wanted, WristContactProposal):
+            reaches = ReachOptions(**wanted.model_dump(exclude={"method"}))
+            return lambda clip, rigged: propose_reaches(clip, _body(rigged), reaches)
+        return _pauses(wanted)
+    except MotionError as error:
+        raise JobRefused(error.code, str(error)) from error
+
+
+def _step_options(wanted: StepsProposal) -> StepOptions:
+    contacts = ContactOptions(speed_m_s=wanted.contact_speed_m_s)
+    return StepOptions(contacts=contacts, **wanted.model_dump(exclude={"method", "contact_speed_m_s"}))
+
+
+def _pauses(wanted: VelocityMinimaProposal) -> Propose:
+    options = PauseOptions(**wanted.model_dump(exclude={"method", "joints"}))
+    return lambda clip, rigged: propose_pauses(clip, _joints(rigged, wanted.joints), options)
+
+
+def _joints(rigged: Rigged, names: Sequence[str]) -> tuple[int, ...]:
+    """Joints by their own name or, where there is no such joint, by their standard name. Raises `UnknownJoint`."""
+    found = []
+    for name in names:
+        own = name if name in rigged.skeleton else rigged.mapping.joints.get(name)
+        if own is None:
+            raise UnknownJoint("it is neither a joint of the skeleton nor a standard joint it has", where=name)
+        found.append(rigged.skeleton.index_of(own))
+    return tuple(found)
+
+
+def _body(rigged: Rigged) -> MatchingBody:
+    return MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
+
+
+def _require_name(pin: PinnedInput, layer_name: str) -> None:
+    if len(pin.name) + 1 + len(layer_name) > MAX_NAME_LENGTH:
+        raise AnnotationError(
+            f"its name and that of the layer together have more than {MAX_NAME_LENGTH} characters", code="name-too-long"
+        )
+
+
+def _output(
+    pin: PinnedInput, layer: Layer, name: str, params: AnnotateParams, sources: dict[str, tuple[ItemInput, ...]]
+) -> StagedOutput:
+    document = documents.layer_to_document(layer, _ref(pin), name, "algorithm")
+    return StagedOutput(
+        name=f"{pin.collection}/{pin.name}",
+        kind=Kind.ANNOTATION,
+        item_name=f"{pin.name} {name}",
+        collection=pin.collection,
+        tags=params.tags,
+        parts={"annotation": document.model_dump(mode="json", by_alias=True)},
+        sources=sources,
+    )
+
+
+def _ref(pin: PinnedInput) -> RevisionRef:
+    return RevisionRef(item=pin.item, revision=pin.revision)
+
+
+def _input(pin: PinnedInput) -> ItemInput:
+    return ItemInput(item=pin.item, revision=pin.revision)

@@ -1,0 +1,210 @@
+"""Clips cut along the segments of their annotations."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import ValidationError
+
+from marey_motion import documents
+from marey_motion.editing.annotations import Segment, piece_of
+from marey_motion.errors import MotionError
+from marey_schemas.annotations import MAX_NAME_LENGTH, CutParams
+from marey_schemas.documents import Annotation, ClipInfo, Motion, OutputRef, RevisionRef, Source
+from marey_schemas.items import Item
+from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
+from marey_schemas.kinds import Kind
+from marey_worker.context import Context, JobRefused, NoSuchThing
+
+BYTES_PER_STAGE = 2 << 20
+OUTPUTS_PER_STAGE = 64
+
+
+def run(context: Context, params: CutParams) -> dict[str, Any]:
+    """Make a clip of every segment that is wanted, with an annotation of its own where keyframes are in it.
+
+    Raises `JobRefused` where no annotation has such a segment, and where two pieces would get one name.
+    """
+    return _Cutting(context, params).run()
+
+
+class _Annotated(NamedTuple):
+    """An annotation, the clip it is of, and the segments to cut out with the names that the pieces get."""
+
+    pin: PinnedInput
+    annotation: Annotation
+    clip: RevisionRef
+    item: Item | PinnedInput
+    pieces: tuple[tuple[Segment, str], ...]
+
+
+class _Cutting:
+    """One job."""
+
+    def __init__(self, context: Context, params: CutParams) -> None:
+        self._context = context
+        self._params = params
+        self._clip_pins = {(pin.item, pin.revision): pin for pin in context.inputs.get("clips", ())}
+        self._ready: list[StagedOutput] = []
+        self._ready_bytes = 0
+
+    def run(self) -> dict[str, Any]:
+        """All annotations; how many pieces were made of each label, and what was refused."""
+        refused: list[dict[str, str]] = []
+        labels: Counter[str] = Counter()
+        todo = self._read(refused)
+        self._require_pieces(todo, refused)
+        for done, one in enumerate(todo):
+            self._context.progress(done, len(todo), f"cutting {one.item.name}")
+            try:
+                for output, label in self._pieces(one):
+                    labels.update([label] if label else [])
+                    self._add(output)
+            except (MotionError, ValidationError, NoSuchThing) as error:
+                refused.append(self._refusal(one.pin, error))
+        self._flush()
+        return {"clips": labels.total(), "labels": dict(sorted(labels.items())), "refused": refused}
+
+    # -- what there is to cut --
+
+    def _read(self, refused: list[dict[str, str]]) -> list[_Annotated]:
+        pins = self._context.inputs["annotations"]
+        found = []
+        for pin, tree in self._context.documents(pins, "annotation"):
+            try:
+                annotation = Annotation.model_validate(tree)
+                clip = RevisionRef.model_validate(annotation.clip.model_dump())
+                item = self._clip_pins.get((clip.item, clip.revision)) or self._context.item(Kind.CLIP, clip.item)
+            except (ValidationError, NoSuchThing) as error:
+                refused.append(self._refusal(pin, error))
+                continue
+            if self._params.layer in (None, annotation.layer):
+                found.append(_Annotated(pin, annotation, clip, item, tuple(self._named(annotation, item))))
+        return found
+
+    def _named(self, annotation: Annotation, clip: Item | PinnedInput) -> Iterator[tuple[Segment, str]]:
+        """The wanted segments with their names; what is left out of a label is counted all the same."""
+        numbers: Counter[str] = Counter()
+        for one in annotation.segments:
+            numbers[one.label] += 1
+            if not self._params.labels or one.label in self._params.labels:
+                name = self._params.piece_name(clip.name, one.label, numbers[one.label])
+                yield Segment(one.label, one.start, one.end), name
+
+    def _require_pieces(self, todo: Sequence[_Annotated], refused: Sequence[dict[str, str]]) -> None:
+        places = Counter((self._folder(one, segment), name) for one in todo for segment, name in one.pieces)
+        if not places:
+            labels = sorted({segment.label for one in todo for segment in one.annotation.segments})
+            known = f"the labels there are: {', '.join(labels)}" if labels else "they have none"
+            why = f"; {refused[0]['detail']}" if refused else ""
+            raise JobRefused("nothing-to-cut", f"no segment of {len(todo)} annotations is asked for; {known}{why}")
+        (folder, name), count = places.most_common(1)[0]
+        if count > 1:
+            raise JobRefused(
+                "same-name",
+                f"{count} pieces would be {folder}/{name}; cut one layer at a time, or, where clips of one folder have "
+                "pieces of the same name, those clips into different folders",
+            )
+        long = [name for _, name in places if len(name) > MAX_NAME_LENGTH]
+        if long:
+            raise JobRefused("name-too-long", f"{long[0]!r} has {len(long[0])} of {MAX_NAME_LENGTH} characters")
+
+    def _folder(self, one: _Annotated, segment: Segment) -> str:
+        below = (one.item.collection, segment.label.replace("/", "-") if self._params.by_label else "")
+        return "/".join(filter(None, below))
+
+    # -- pieces --
+
+    def _pieces(self, one: _Annotated) -> Iterator[tuple[StagedOutput, str | None]]:
+        motion = Motion.model_validate(self._context.document(Kind.CLIP, one.clip.item, one.clip.revision, "motion"))
+        info = self._info(one.clip)
+        layer = documents.layer_from_document(one.annotation, len(motion.poses))
+        for segment, name in one.pieces:
+            duration_s = (segment.end - segment.start) / motion.frame_rate_hz
+            longest_s = self._params.longest_s
+            if duration_s < self._params.shortest_s or (longest_s is not None and duration_s > longest_s):
+                continue
+            frames = self._with_margins(segment, motion)
+            place = f"{self._folder(one, segment)}/{name}"
+            common = {
+                "item_name": name,
+                "collection": self._folder(one, segment),
+                "tags": self._params.tags,
+                "sources": self._sources(one),
+            }
+            cut_out = {"motion": _sliced(motion, frames), "info": _piece_info(info, one, segment, frames)}
+            yield StagedOutput(name=place, kind=Kind.CLIP, parts=cut_out, **common), segment.label
+            said = piece_of(layer, segment, *frames)
+            if said.keyframes or frames != (segment.start, segment.end):
+                document = documents.layer_to_document(
+                    said, OutputRef(output=place), one.annotation.layer, one.annotation.made_by
+                )
+                parts = {"annotation": document.model_dump(mode="json", by_alias=True)}
+                yield StagedOutput(name=f"{place} (annotation)", kind=Kind.ANNOTATION, parts=parts, **common), None
+
+    def _with_margins(self, segment: Segment, motion: Motion) -> tuple[int, int]:
+        before, after = (
+            round(margin_s * motion.frame_rate_hz)
+            for margin_s in (self._params.margin_before_s, self._params.margin_after_s)
+        )
+        return max(0, segment.start - before), min(len(motion.poses), segment.end + after)
+
+    def _info(self, clip: RevisionRef) -> ClipInfo:
+        """What is known of the clip and holds for its pieces."""
+        try:
+            stored = self._context.document(Kind.CLIP, clip.item, clip.revision, "info")
+        except NoSuchThing:
+            return ClipInfo()
+        return ClipInfo.model_validate(stored).model_copy(update={"checks": ()})
+
+    def _sources(self, one: _Annotated) -> dict[str, tuple[ItemInput, ...]]:
+        sources = {"annotations": (_input(one.pin),)}
+        if clip := self._clip_pins.get((one.clip.item, one.clip.revision)):
+            sources["clips"] = (_input(clip),)
+        return sources
+
+    # -- results --
+
+    def _refusal(self, pin: PinnedInput, error: Exception) -> dict[str, str]:
+        code = {NoSuchThing: "no-clip", ValidationError: "bad-document"}.get(type(error), getattr(error, "code", ""))
+        place = f"{pin.collection}/{pin.name}".lstrip("/")
+        self._context.log(f"{place}: {error}")
+        return {"name": place, "item": pin.item, "code": code, "detail": str(error)}
+
+    def _add(self, output: StagedOutput) -> None:
+        self._ready.append(output)
+        if output.kind is Kind.CLIP:
+            self._ready_bytes += output.parts["motion"]["poses"].nbytes
+        if self._ready_bytes > BYTES_PER_STAGE or len(self._ready) >= OUTPUTS_PER_STAGE:
+            self._flush()
+
+    def _flush(self) -> None:
+        if self._ready:
+            self._context.stage(self._ready)
+        self._ready, self._ready_bytes = [], 0
+
+
+def _sliced(motion: Motion, frames: tuple[int, int]) -> dict[str, Any]:
+    """The `motion` part of the frames [start, end), bit for bit."""
+    kept = slice(*frames)
+    translations = None if motion.translations is None else np.ascontiguousarray(motion.translations[kept])
+    poses = np.ascontiguousarray(motion.poses[kept])
+    return motion.model_copy(update={"poses": poses, "translations": translations}).model_dump(by_alias=True)
+
+
+def _piece_info(info: ClipInfo, one: _Annotated, segment: Segment, frames: tuple[int, int]) -> dict[str, Any]:
+    details = {
+        "clip": one.clip.model_dump(),
+        "annotation": _input(one.pin).model_dump(),
+        "label": segment.label,
+        "frames": list(frames),
+    }
+    cut = info.model_copy(update={"source": Source(format="cut", details=details)})
+    return cut.model_dump(mode="json", by_alias=True, exclude_none=True)
+
+
+def _input(pin: PinnedInput) -> ItemInput:
+    return ItemInput(item=pin.item, revision=pin.revision)
