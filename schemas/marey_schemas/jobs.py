@@ -106,6 +106,19 @@ class CollectionInput(Request):
     collection: CollectionPath
 
 
+class JobOutputsInput(Request):
+    """Everything of the input's kind that another job of the project makes, pinned when that job has succeeded.
+
+    The job waits for the other one, as for those in `after`.
+    """
+
+    job: str = Field(min_length=1, max_length=40)
+
+
+JobInput = ItemInput | CollectionInput | JobOutputsInput
+"""What can stand for an input of a job."""
+
+
 class Resources(Request):
     """Limits of one attempt."""
 
@@ -117,9 +130,7 @@ class JobCreate(Request):
     """Submit a job."""
 
     kind: str = Field(min_length=1, max_length=64)
-    inputs: dict[str, ItemInput | CollectionInput | tuple[ItemInput | CollectionInput, ...]] = Field(
-        default_factory=dict
-    )
+    inputs: dict[str, JobInput | tuple[JobInput, ...]] = Field(default_factory=dict)
     params: dict[str, Any] = Field(default_factory=dict)
     into: CollectionPath = Field("", description="The collection the results go to.")
     priority: int = Field(0, ge=-100, le=100)
@@ -172,7 +183,10 @@ class Job(Answer):
     kind: str
     state: JobState
     params: dict[str, Any]
-    inputs: dict[str, Any]
+    inputs: dict[str, Any] = Field(
+        description="What each input is: items at their revisions, or `{job}` for what that job has yet to make."
+    )
+    after: tuple[str, ...] = Field((), description="Jobs that had, or have, to succeed first.")
     into: str
     priority: int
     seed: int

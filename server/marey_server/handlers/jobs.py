@@ -16,7 +16,7 @@ from marey_server.handlers.declarations import MIB, Access, Body, Bytes, reads, 
 from marey_server.handlers.queries import CommaSeparated, CommaSeparatedOf, CountedPageQuery, PageQuery
 from marey_server.handlers.reply import Rendered, Reply
 from marey_server.handlers.resource import Resource
-from marey_server.store import events, jobs, submission
+from marey_server.store import events, jobs, retrying, submission
 from marey_server.store.job_logs import MOST_READ_BYTES, LogPage
 from marey_server.store.jobs import JobFilters
 from marey_server.store.wakeups import wakeups
@@ -274,7 +274,7 @@ class JobRetry(Resource):
     @writes(access=Access.CONTRIBUTOR, scope="jobs", answer=Job, status=202, idempotency="key")
     async def post(self, job: str) -> Rendered:
         """Submit a failed or cancelled job again, with the inputs it had; the answer is the new job."""
-        return await self.answer_with(_accepted, jobs.retry_job, job)
+        return await self.answer_with(_accepted, retrying.retry_job, job)
 
 
 RESOURCES: tuple[type[Resource], ...] = (

@@ -9,7 +9,7 @@ from sqlalchemy import Row, Select, bindparam, func, select
 
 from marey_schemas.jobs import Job, JobState, Progress
 from marey_server.store.clock import datetime_of
-from marey_server.store.tables import job, project, user
+from marey_server.store.tables import job, job_dependency, project, user
 from marey_server.store.transaction import Transaction
 
 IN_LIST = 1000
@@ -42,7 +42,19 @@ def as_documents(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Job]:
     children = _children(tx, [row.id for row in gathering])
     at_work = [row for row in gathering if row.state == JobState.RUNNING and row.lease_expires_us is None]
     progress = _progress_of_tasks(tx, at_work, children)
-    return [_document(row, children.get(row.id, {}), progress.get(row.id)) for row in rows]
+    after = _after(tx, rows)
+    return [_document(row, after.get(row.id, ()), children.get(row.id, {}), progress.get(row.id)) for row in rows]
+
+
+def _after(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, tuple[str, ...]]:
+    """The jobs each of these comes after. Whom a job waits to share a result with, it does not need."""
+    shared = {row.id: row.cached_from for row in rows}
+    statement = select(job_dependency.c.job_id, job_dependency.c.on_job_id).where(job_dependency.c.job_id.in_(shared))
+    found: dict[str, tuple[str, ...]] = {}
+    for row in tx.execute(statement.order_by(job_dependency.c.on_job_id)):
+        if row.on_job_id != shared[row.job_id]:
+            found[row.job_id] = (*found.get(row.job_id, ()), row.on_job_id)
+    return found
 
 
 def _children(tx: Transaction, parents: Sequence[str]) -> dict[str, dict[str, int]]:
@@ -83,7 +95,7 @@ def _progress_of_tasks(
     return told
 
 
-def _document(row: Row[Any], children: dict[str, int], at_work: Progress | None) -> Job:
+def _document(row: Row[Any], after: tuple[str, ...], children: dict[str, int], at_work: Progress | None) -> Job:
     return Job(
         id=row.id,
         project=row.project_name,
@@ -91,6 +103,7 @@ def _document(row: Row[Any], children: dict[str, int], at_work: Progress | None)
         state=row.state,
         params=row.params,
         inputs=row.inputs,
+        after=after,
         into=row.into_path,
         priority=row.priority,
         seed=row.seed,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from sqlalchemy import ColumnElement, bindparam, func, or_, select
 
 from marey_schemas.job_kinds import KindDeclaration
-from marey_schemas.jobs import CollectionInput, InputSpec, ItemInput, JobCreate
+from marey_schemas.jobs import CollectionInput, InputSpec, ItemInput, JobCreate, JobInput, JobOutputsInput
 from marey_schemas.problems import FieldError
 from marey_server.errors import Invalid
 from marey_server.store.projects import ProjectRow
@@ -19,7 +19,7 @@ MOST_INPUTS = 100_000
 IN_LIST = 1000
 
 Pin = dict[str, Any]
-"""An input as the job keeps it: the fields of `PinnedInput`."""
+"""An input as the job keeps it: the fields of `PinnedInput`, or `{job}` as long as that job has yet to make it."""
 
 PinnedInputs = dict[str, list[Pin]]
 
@@ -46,11 +46,16 @@ _ITEMS_BY_ID = _ITEMS.where(item.c.id.in_(bindparam("ids", expanding=True)))
 def find_items(tx: Transaction, project: ProjectRow, requests: Iterable[JobCreate]) -> dict[str, FoundItem]:
     """Those items of the project that the requests name one by one, by id."""
     choices = (choice for request in requests for many in request.inputs.values() for choice in _as_many(many))
-    wanted = sorted({choice.item for choice in choices if isinstance(choice, ItemInput)})
+    return items_by_id(tx, project.id, (choice.item for choice in choices if isinstance(choice, ItemInput)))
+
+
+def items_by_id(tx: Transaction, project_id: str, ids: Iterable[str]) -> dict[str, FoundItem]:
+    """Those of the items that are there in the project, by id."""
+    wanted = sorted(set(ids))
     rows = [
         FoundItem(row.id, row.kind, row.name, row.head, row.path)
         for start in range(0, len(wanted), IN_LIST)
-        for row in tx.execute(_ITEMS_BY_ID, {"project_id": project.id, "ids": wanted[start : start + IN_LIST]})
+        for row in tx.execute(_ITEMS_BY_ID, {"project_id": project_id, "ids": wanted[start : start + IN_LIST]})
     ]
     return {row.id: row for row in rows}
 
@@ -63,7 +68,8 @@ def pin_inputs(
     known: dict[str, FoundItem],
     at: str = "",
 ) -> PinnedInputs:
-    """Every input with the revision it has now, or had when it was named; collections become their items.
+    """Every input with the revision it has now, or had when it was named; collections become their items. What other
+    jobs make stays to be bound.
 
     `known` holds what `find_items` found of the request's items.
     Raises `Invalid`, with a pointer below `at` for each thing that is wrong: an input the kind does not have or lacks,
@@ -116,8 +122,12 @@ def _pin_input(
 ) -> list[Pin]:
     single = not isinstance(choices, tuple)
     pins: dict[tuple[str, int], Pin] = {}
+    made: dict[str, Pin] = {}
     for index, choice in enumerate(_as_many(choices)):
         place = pointer if single else f"{pointer}/{index}"
+        if isinstance(choice, JobOutputsInput):
+            made[choice.job] = {"job": choice.job}
+            continue
         if isinstance(choice, CollectionInput):
             found = _items_below(tx, project, spec, choice.collection)
             if not found:
@@ -132,13 +142,24 @@ def _pin_input(
                 continue
             chosen = [(one, choice.revision or one.head)]
         for one, number in chosen:
-            pins.setdefault((one.id, number), _pin(one, number))
-    if not errors and not spec.many and len(pins) != 1:
-        errors.append(_error(pointer, "one-item", f"This input takes one {spec.kind.value}, not {len(pins)}."))
-    return list(pins.values())
+            pins.setdefault((one.id, number), pin(one, number))
+    total = len(pins) + len(made)
+    if not errors and not spec.many and total != 1:
+        errors.append(_error(pointer, "one-item", f"This input takes one {spec.kind.value}, not {total}."))
+    return [*pins.values(), *made.values()]
 
 
-def _pin(found: FoundItem, number: int) -> Pin:
+def late_inputs(request: JobCreate, at: str = "") -> Iterator[tuple[str, str, str]]:
+    """Those inputs that other jobs make: where the request says so, the input's name, and the job's id."""
+    for name, choices in request.inputs.items():
+        for index, choice in enumerate(_as_many(choices)):
+            if isinstance(choice, JobOutputsInput):
+                place = f"{at}/inputs/{_escaped(name)}" + (f"/{index}" if isinstance(choices, tuple) else "")
+                yield f"{place}/job", name, choice.job
+
+
+def pin(found: FoundItem, number: int) -> Pin:
+    """An item at a revision, as the job keeps it."""
     return {"item": found.id, "revision": number, "kind": found.kind, "name": found.name, "collection": found.path}
 
 
@@ -175,7 +196,7 @@ def _missing_revisions(request: JobCreate, known: dict[str, FoundItem], at: str)
     ]
 
 
-def _as_many(choices: Any) -> Sequence[ItemInput | CollectionInput]:
+def _as_many(choices: Any) -> Sequence[JobInput]:
     return choices if isinstance(choices, tuple) else (choices,)
 
 

@@ -1,4 +1,4 @@
-"""Jobs as their users see them: read, listed, cancelled, tried again."""
+"""Jobs as their users see them: read, listed, cancelled."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from sqlalchemy import ColumnElement, Row, and_, case, func, select, update
 
 from marey_schemas.access import Role
 from marey_schemas.items import Page
-from marey_schemas.job_kinds import UnknownKindError, find_kind
-from marey_schemas.jobs import Attempt, Job, JobCreate, JobOutput, JobState, Resources, TaskResult
+from marey_schemas.jobs import Attempt, Job, JobOutput, JobState, TaskResult
 from marey_server.access import roles
 from marey_server.errors import Conflict, Forbidden, NotFound
 from marey_server.store import events, listing, projects
@@ -24,7 +23,6 @@ from marey_server.store.job_logs import MOST_READ_BYTES, LogPage, read_log
 from marey_server.store.projects import ProjectRow
 from marey_server.store.queue_policy import DEFAULT_POLICY, QueuePolicy
 from marey_server.store.settling import settle
-from marey_server.store.submission import Submission, submit_checked
 from marey_server.store.tables import attempt, job, user
 from marey_server.store.transaction import Transaction
 
@@ -53,7 +51,7 @@ class JobFilters:
 
 def read_job(tx: Transaction, job_id: str) -> Job:
     """A job and how it stands. Raises `NotFound`."""
-    row, _ = _find(tx, job_id)
+    row, _ = find_job(tx, job_id)
     return as_documents(tx, [row])[0]
 
 
@@ -82,7 +80,7 @@ def list_jobs(
 
 def list_attempts(tx: Transaction, job_id: str) -> Page:
     """Every try at a job, the first one first."""
-    _find(tx, job_id)
+    find_job(tx, job_id)
     rows = tx.execute(select(attempt).where(attempt.c.job_id == job_id).order_by(attempt.c.fence))
     return Page(items=tuple(_attempt_document(row) for row in rows))
 
@@ -101,7 +99,7 @@ def _attempt_document(row: Row[Any]) -> Attempt:
 
 def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
     """What a job published; where it is the sum of its tasks, what they published, task by task."""
-    row, _ = _find(tx, job_id)
+    row, _ = find_job(tx, job_id)
     if row.size is None or row.gathers:
         return Page(items=tuple(JobOutput(**output) for output in row.outputs or ()))
     order = listing.parse_order("position", {"position": job.c.position, "id": job.c.id})
@@ -113,7 +111,7 @@ def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit:
 
 def list_results(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
     """What the tasks of a gathering job brought, in their order; empty for other jobs."""
-    _find(tx, job_id)
+    find_job(tx, job_id)
     order = listing.parse_order("position", {"position": job.c.position, "id": job.c.id})
     statement = select(job.c.id, job.c.position, job.c.state, job.c.result).where(job.c.parent_id == job_id)
     tasks, next_cursor = listing.read_page(tx, statement, order, job_id, cursor, limit)
@@ -123,13 +121,13 @@ def list_results(tx: Transaction, job_id: str, cursor: str | None = None, limit:
 
 def list_job_events(tx: Transaction, job_id: str, after: int = 0, limit: int = 100) -> Page:
     """What happened to a job, for members of its project."""
-    _, project = _find(tx, job_id, public=False)
+    _, project = find_job(tx, job_id, public=False)
     return Page(items=tuple(events.list_events(tx, project.name, after=after, limit=limit, subject=job_id)))
 
 
 def read_job_log(tx: Transaction, job_id: str, offset: int = 0, limit: int = MOST_READ_BYTES) -> LogPage:
     """A piece of what a job's attempts printed, for members of its project."""
-    row, _ = _find(tx, job_id, public=False)
+    row, _ = find_job(tx, job_id, public=False)
     return read_log(tx, row, offset, limit)
 
 
@@ -157,10 +155,13 @@ def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLIC
     A gathering job is cancelled with its tasks. Cancelling twice is cancelling once.
     Raises `Conflict` for a job that has succeeded or failed, `Forbidden` for somebody else's job.
     """
-    row, project = _find(tx, job_id, "jobs")
-    _require_own(tx, row, project, "cancel")
-    tasks = _cancel(tx, job.c.parent_id == job_id, policy) if row.size is not None else []
+    row, project = find_job(tx, job_id, "jobs")
+    require_own(tx, row, project, "cancel")
+    of_job = job.c.parent_id == job_id
+    tasks = _cancel(tx, of_job, policy) if row.size is not None else ()
     whole = _cancel(tx, job.c.id == job_id, policy)
+    if row.unbound:  # it may have got its inputs, and tasks, since it was read
+        tasks = _cancel(tx, of_job, policy)
     settle(tx, [as_ended(one) for one in (*tasks, *whole) if one.state != "running"])
     document = job_documents(tx, [job_id])[0]
     if not whole and document.state != JobState.CANCELLED:
@@ -196,66 +197,10 @@ def _cancel(tx: Transaction, which: ColumnElement[bool], policy: QueuePolicy) ->
     return rows
 
 
-# -- trying again ------------------------------------------------------------------------------------------------------
-
-
-def retry_job(tx: Transaction, job_id: str) -> Job:
-    """Submit a failed or cancelled job again, with the inputs it had; what its tasks brought is not computed twice.
-
-    Raises `Conflict` for a job that has not ended or has succeeded, and for a task.
-    """
-    row, project = _find(tx, job_id, "jobs")
-    _require_own(tx, row, project, "retry")
-    if row.state not in ("failed", "cancelled"):
-        raise Conflict(
-            f"Only a failed or cancelled job can be tried again; this one is {row.state}.", code="not-failed"
-        )
-    if row.parent_id is not None:
-        raise Conflict(f"This is a task; try {row.parent_id} again, which it belongs to.", code="is-task")
-    try:
-        kind = find_kind(row.kind)
-    except UnknownKindError as error:
-        raise Conflict(f"This server does not know the kind any more: {error}.", code="unknown-kind") from error
-    request = JobCreate(
-        kind=row.kind,
-        params=row.params,
-        into=row.into_path,
-        priority=row.priority,
-        after=(),
-        on_failure=row.on_failure,
-        concurrency_key=_concurrency_key(tx, row),
-        cache=row.cache_mode,
-        seed=row.seed,
-        max_attempts=row.max_attempts,
-        resources=Resources(time_limit_s=row.time_limit_s, memory_limit_mb=row.memory_limit_mb),
-        message=row.message,
-    )
-    pins = _pins_of(tx, row, kind.fan_out)
-    again = Submission(kind, request, row.params, pins, row.size or 1, row.labels_key, retry_of=row.id)
-    return submit_checked(tx, project, [again])[0]
-
-
-def _pins_of(tx: Transaction, row: Row[Any], fanned: str | None) -> dict[str, Any]:
-    """The inputs of a job; those of a gathering job are with its tasks."""
-    if row.size is None or fanned is None:
-        return dict(row.inputs)
-    statement = select(job.c.inputs).where(job.c.parent_id == row.id).order_by(job.c.position)
-    pins = [pin for inputs in tx.execute(statement).scalars() for pin in inputs[fanned]]
-    return {**row.inputs, fanned: pins}
-
-
-def _concurrency_key(tx: Transaction, row: Row[Any]) -> str | None:
-    """The key of a job, or of a gathering job's tasks."""
-    key: str | None = row.concurrency_key
-    if row.size is not None:
-        key = tx.execute(select(job.c.concurrency_key).where(job.c.parent_id == row.id).limit(1)).scalar()
-    return key
-
-
 # -- who may -----------------------------------------------------------------------------------------------------------
 
 
-def _find(tx: Transaction, job_id: str, scope: str = "read", *, public: bool = True) -> tuple[Row[Any], ProjectRow]:
+def find_job(tx: Transaction, job_id: str, scope: str = "read", *, public: bool = True) -> tuple[Row[Any], ProjectRow]:
     """The job and its project, if the caller may read it; a job of a hidden project is as unknown as none."""
     row = tx.execute(select_jobs().where(job.c.id == job_id)).one_or_none()
     if row is not None:
@@ -266,7 +211,7 @@ def _find(tx: Transaction, job_id: str, scope: str = "read", *, public: bool = T
     raise NotFound(f"There is no job {job_id!r} that you may see.", code="no-job")
 
 
-def _require_own(tx: Transaction, row: Row[Any], project: ProjectRow, what: str) -> None:
+def require_own(tx: Transaction, row: Row[Any], project: ProjectRow, what: str) -> None:
     """Contributors act on their own jobs, maintainers on all."""
     if roles.includes(project.role, Role.MAINTAINER):
         return

@@ -11,9 +11,9 @@ from collections.abc import Collection, Iterable, Sequence
 from itertools import islice
 from typing import Any
 
-from sqlalchemy import Row, and_, bindparam, false, select, update
+from sqlalchemy import Row, and_, bindparam, delete, false, select, tuple_, update
 
-from marey_server.store import job_cache
+from marey_server.store import binding, job_cache
 from marey_server.store.fencing import RUNNING, WAITING
 from marey_server.store.gathering import gather
 from marey_server.store.job_ends import Ended, dependency_failure, end_jobs
@@ -37,20 +37,21 @@ def settle(tx: Transaction, ended: Iterable[Ended]) -> None:
 
 def make_ready(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
     """Let waiting jobs whose dependencies are met go on: into the queue, to their tasks, or to a result that is there.
+    Those whose inputs were to be made get them first.
 
     The rows hold `READY_COLUMNS`. Returns the jobs that ended by it.
     """
-    ended: list[Ended] = []
+    ended = binding.bind(tx, [row.id for row in rows if row.unbound])
     for row in rows:
         if row.size is not None:
             ended += _open_fan_out(tx, row)
-    single = [row for row in rows if row.size is None]
+    single = [row for row in rows if row.size is None and not row.unbound]
     for page in _pages(single):
         ended += _admit(tx, page)
     return ended
 
 
-READY_COLUMNS = (job.c.id, job.c.project_id, job.c.kind, job.c.size, job.c.cache_key, job.c.cache_mode)
+READY_COLUMNS = (job.c.id, job.c.project_id, job.c.kind, job.c.size, job.c.unbound, job.c.cache_key, job.c.cache_mode)
 
 
 def _announce(tx: Transaction, ended: Sequence[Ended]) -> None:
@@ -193,6 +194,8 @@ def _stop_sharing(tx: Transaction, rows: Sequence[Row[Any]]) -> None:
     if rows:
         ids = [row.id for row in rows]
         tx.execute(update(job).where(job.c.id.in_(ids)).values(cached_from=None, dependencies_left=0))
+        pairs = [(row.id, row.cached_from) for row in rows]
+        tx.execute(delete(job_dependency).where(tuple_(job_dependency.c.job_id, job_dependency.c.on_job_id).in_(pairs)))
 
 
 def _pages(rows: Sequence[Row[Any]]) -> Iterable[Sequence[Row[Any]]]:

@@ -232,6 +232,7 @@ job = Table(
     Column("state", String(16), nullable=False),
     Column("params", Document, nullable=False),
     Column("inputs", Document, nullable=False),  # {name: [{item, revision, kind, name, collection}]}, pinned
+    Column("unbound", Boolean, nullable=False, default=False, server_default=false()),  # some inputs are still {job}
     Column("into_path", String(1024), nullable=False, default=""),
     Column("priority", Integer, nullable=False, default=0),
     Column("seed", BigInteger, nullable=False, default=0),
@@ -312,6 +313,12 @@ job = Table(
         postgresql_where=text("state = 'running' AND concurrency_key IS NOT NULL"),
     ),
     Index("ix_job_cache", "project_id", "cache_key"),
+    Index(
+        "ix_job_retry",
+        "retry_of",
+        sqlite_where=text("retry_of IS NOT NULL"),
+        postgresql_where=text("retry_of IS NOT NULL"),
+    ),
 )
 
 job_dependency = Table(

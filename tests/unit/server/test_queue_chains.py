@@ -12,7 +12,7 @@ from marey_schemas.jobs import JobCreate, Progress
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import Conflict, Forbidden, Invalid, LeaseLost, NotFound
-from marey_server.store import blobs, garbage, items, jobs, members, users
+from marey_server.store import blobs, garbage, items, jobs, members, retrying, users
 from marey_server.store.items.drafts import Draft
 from marey_server.store.reaper import share_waiting
 from marey_server.store.tables import staged_output
@@ -336,7 +336,7 @@ def test_a_failed_task_leaves_nothing_to_gather_and_trying_again_repeats_only_wh
     assert (desk.state(job), failure.code) == ("failed", "bad-thing")
     assert desk.claim_many() == []
 
-    again = desk.database.write(desk.user, jobs.retry_job, job)
+    again = desk.database.write(desk.user, retrying.retry_job, job)
     assert again.children == {"succeeded": 2, "queued": 1}
     lease = desk.claim()
     assert lease.position == bad.position
@@ -354,7 +354,7 @@ def test_when_a_task_has_failed_for_good_those_that_nobody_began_are_not_begun(d
     assert head.failure is not None
     assert (head.state, head.failure.code) == ("failed", "refused")
     assert head.children == {"succeeded": 1, "failed": 1, "cancelled": 2}
-    again = desk.database.write(desk.user, jobs.retry_job, job)
+    again = desk.database.write(desk.user, retrying.retry_job, job)
     assert again.children == {"succeeded": 1, "queued": 3}
 
 
@@ -383,7 +383,7 @@ def test_a_gathering_that_fails_for_good_fails_the_whole_and_its_tasks_serve_the
         desk.complete(lease)
     desk.fail(desk.claim(), retryable=False)
     assert desk.state(job) == "failed"
-    again = desk.database.write(desk.user, jobs.retry_job, job)
+    again = desk.database.write(desk.user, retrying.retry_job, job)
     assert (again.state, again.children) == ("queued", {"succeeded": 2})
     (gathering,) = desk.claim_many()
     assert gathering.job == again.id
@@ -637,7 +637,7 @@ def test_tasks_find_the_results_of_earlier_tasks(desk: Desk) -> None:
     desk.fail(leases[2], retryable=False)
     assert desk.state(first) == "failed"
 
-    again = desk.database.write(desk.user, jobs.retry_job, first)
+    again = desk.database.write(desk.user, retrying.retry_job, first)
     assert (again.retry_of, again.size, again.children) == (first, 3, {"succeeded": 2, "queued": 1})
     lease = desk.claim()
     desk.stage(lease, *(f"{pin.name}-squared" for pin in lease.inputs["things"]))
@@ -652,9 +652,9 @@ def test_tasks_find_the_results_of_earlier_tasks(desk: Desk) -> None:
 def test_only_what_failed_or_was_cancelled_can_be_tried_again(desk: Desk) -> None:
     job = desk.submit(params={"number": 7}, priority=3, concurrency_key="k", labels={"gpu": "x"}, max_attempts=1)
     with pytest.raises(Conflict):
-        desk.database.write(desk.user, jobs.retry_job, job)
+        desk.database.write(desk.user, retrying.retry_job, job)
     desk.cancel(job)
-    again = desk.database.write(desk.user, jobs.retry_job, job)
+    again = desk.database.write(desk.user, retrying.retry_job, job)
     assert (again.params, again.priority, again.max_attempts, again.retry_of) == ({"number": 7}, 3, 1, job)
     assert desk.claim_many() == []
     assert desk.claim(labels={"gpu": "x"}).job == again.id

@@ -14,7 +14,7 @@ from sqlalchemy import Connection, delete, func, select
 from marey_schemas.jobs import Lease
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import Conflict, LeaseLost
-from marey_server.store import submission, tables
+from marey_server.store import job_layout, tables
 from marey_server.store.reaper import share_waiting
 from marey_server.store.transaction import Transaction
 from queue_desk import Desk
@@ -320,7 +320,7 @@ def run_machine(desk: Desk, monkeypatch: pytest.MonkeyPatch, *, examples: int = 
     """Run the machine on a desk whose clock stands still and whose ids are numbers, so that runs can be repeated."""
     clock = StillClock()
     numbers = itertools.count(1)
-    monkeypatch.setattr(submission, "new_id", lambda prefix: f"{prefix}_{next(numbers):08}")
+    monkeypatch.setattr(job_layout, "new_id", lambda prefix: f"{prefix}_{next(numbers):08}")
     desk.database.clock = clock
     desk.things(4)
     run_state_machine_as_test(
