@@ -122,8 +122,8 @@ class EvaluationHandle(ItemHandle):
 
     def _with_candidates(self, candidates: Places) -> dict[str, Any]:
         inputs: dict[str, Any] = {"evaluation": self.as_input()}
-        if places := _as_places(candidates):
-            inputs["candidates"] = tuple(map(_as_input, places))
+        if places := as_places(candidates):
+            inputs["candidates"] = tuple(map(as_input, places))
         return inputs
 
     def _find_out(
@@ -147,9 +147,9 @@ def evaluate_request(
     project: ProjectHandle, clips: Places, params: EvaluateParams, normaliser: EvaluationHandle | str | None
 ) -> JobCreate:
     """The job that evaluates `clips`, with loops that are tagged so and the mapping of a skeleton that was edited."""
-    places = _as_places(clips)
+    places = as_places(clips)
     found = [item for place in places for item in items_at(project, place)]
-    inputs: dict[str, Any] = {"clips": tuple(map(_as_input, places))}
+    inputs: dict[str, Any] = {"clips": tuple(map(as_input, places))}
     if normaliser is not None:
         inputs["normaliser"] = ItemInput(item=normaliser) if isinstance(normaliser, str) else normaliser.as_input()
     if len(edited := project.edited_rigs(found)) == 1:
@@ -159,11 +159,13 @@ def evaluate_request(
     return JobCreate(kind="evaluate", inputs=inputs, params=given)
 
 
-def _as_places(places: Places) -> list[Place]:
+def as_places(places: Places) -> list[Place]:
+    """One place or several, as a list."""
     return [places] if isinstance(places, str | CollectionInput | ItemInput | ClipHandle) else list(places)
 
 
-def _as_input(place: Place) -> CollectionInput | ItemInput:
+def as_input(place: Place) -> CollectionInput | ItemInput:
+    """A place as an input of jobs; a clip at the revision that was read."""
     if isinstance(place, str):
         return CollectionInput(collection=place.strip("/"))
     return place.as_input() if isinstance(place, ClipHandle) else place

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
 from marey_client.access import Members
+from marey_client.annotations import AnnotationHandle, AnnotationPlaces, annotate_request, cut_request
 from marey_client.blobs import Blobs
 from marey_client.coverage_streams import CoverageStreams
 from marey_client.evaluations import EvaluationHandle, Places, evaluate_request, items_at
@@ -18,6 +19,7 @@ from marey_client.motions import ClipHandle, SkeletonHandle
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.access import Project, ProjectChange
+from marey_schemas.annotations import AnnotateParams, CutParams
 from marey_schemas.evaluation import EvaluateParams
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
 from marey_schemas.jobs import CollectionInput, ItemInput, Job, JobCreate, RetargetParams
@@ -70,13 +72,23 @@ class ProjectHandle:
         return Items(self.transport, self.name, Kind.SKELETON, SkeletonHandle)
 
     @cached_property
+    def annotations(self) -> Items[AnnotationHandle]:
+        """Its annotations."""
+        return Items(self.transport, self.name, Kind.ANNOTATION, AnnotationHandle)
+
+    @cached_property
     def evaluations(self) -> Items[EvaluationHandle]:
         """Its evaluations."""
         return Items(self.transport, self.name, Kind.EVALUATION, EvaluationHandle)
 
     def items(self, kind: Kind) -> Items[Any]:
         """Its items of any kind."""
-        known = {Kind.CLIP: ClipHandle, Kind.SKELETON: SkeletonHandle, Kind.EVALUATION: EvaluationHandle}
+        known: dict[Kind, type[ItemHandle]] = {
+            Kind.CLIP: ClipHandle,
+            Kind.SKELETON: SkeletonHandle,
+            Kind.ANNOTATION: AnnotationHandle,
+            Kind.EVALUATION: EvaluationHandle,
+        }
         return Items(self.transport, self.name, kind, known.get(kind, ItemHandle))
 
     @cached_property
@@ -123,6 +135,32 @@ class ProjectHandle:
             inputs["rigs"] = edited
         given = (params or RetargetParams()).model_dump(exclude_unset=True)
         return self.submit(JobCreate(kind="retarget", inputs=inputs, params=given, into=into, priority=priority))
+
+    def annotate(
+        self,
+        clips: Places,
+        *,
+        proposal: str | Mapping[str, Any] = "steps",
+        into: str = "",
+        priority: int = 0,
+        **options: Any,
+    ) -> Job:
+        """Hand in the annotation of clips, by a method or a method with its options, below the folder `into`.
+
+        Methods are `steps`, `velocity_minima` and `wrist_contact`, as in `{"method": "steps", "most_turn_deg": 45}`;
+        `options` are the others of `AnnotateParams`.
+        """
+        method = {"method": proposal} if isinstance(proposal, str) else proposal
+        request = annotate_request(self, clips, AnnotateParams.model_validate({"proposal": method, **options}))
+        return self.submit(request.model_copy(update={"into": into, "priority": priority}))
+
+    def cut(self, annotations: AnnotationPlaces, *, into: str, priority: int = 0, **options: Any) -> Job:
+        """Hand in the cutting of clips along the segments of annotations, into folders below `into`.
+
+        `options` are those of `CutParams`, for example `labels=("step_left", "step_right")` or `by_label=True`.
+        """
+        request = cut_request(self, annotations, CutParams.model_validate(options))
+        return self.submit(request.model_copy(update={"into": into, "priority": priority}))
 
     def evaluate(
         self,
