@@ -18,17 +18,19 @@ Floats = NDArray[np.float64]
 class Placement:
     """Where on the ground a clip began: what bringing it to the canonical frame took away.
 
-    A point p of the canonical frame stood at R(heading) p + (x, 0, z); heights are kept.
+    A point p of the canonical frame stood at R(heading) p + (x, y, z).
 
     Parameters
     ----------
     heading_rad : where the body faced in the first frame, 0 along +z, positive to the left
     x, z : where the root stood in the first frame, metres
+    y : what was taken off all heights, metres: nothing where they are kept, as they are by default
     """
 
     heading_rad: float
     x: float
     z: float
+    y: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

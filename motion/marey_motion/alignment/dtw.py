@@ -61,6 +61,13 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
     return Alignment(longest[:length][::-1].copy(), float(total))
 
 
+def least_total(costs: Floats, *, max_run: int | None = None) -> float:
+    """The total of `align` alone, infinite where no way keeps the limit; costs as `frame_costs` makes them."""
+    from marey_motion.alignment import dtw_kernels as kernels
+
+    return float(kernels.total(costs) if max_run is None else kernels.total_limited(costs, max_run))
+
+
 def _checked(costs: ArrayLike, max_run: int | None) -> Floats:
     matrix = np.ascontiguousarray(costs, dtype=np.float64)
     if matrix.ndim != 2 or not matrix.size:

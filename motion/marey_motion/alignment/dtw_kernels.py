@@ -56,75 +56,112 @@ def _walk_back(steps, path):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
-    """As `align`, with at most `max_run` steps 1-0, or 0-1, in a row.
-
-    Per cell there is a total for each way to have come: state 0 by a step in both, r by r steps in the first in a row,
-    max_run + r by r steps in the second.
-    """
+def total(costs):  # type: ignore[no-untyped-def]
+    """The least total alone, in memory for one row."""
     n, m = costs.shape
-    states = 1 + 2 * max_run
-    # The state before, where it is not told by the state itself: for a step in both, a first 1-0, a first 0-1.
-    before = np.zeros((n, m, 3), np.uint8)
-    above = np.full((m, states), np.inf)
-    here = np.full((m, states), np.inf)
+    totals = np.empty(m)
     for i in range(n):
+        diagonal = left = np.inf
         for j in range(m):
-            here[j, :] = np.inf
-            if i == 0 and j == 0:
-                here[0, 0] = costs[0, 0]
-                continue
-            cost = costs[i, j]
-            if i > 0 and j > 0:
-                state = _least(above[j - 1], 0, states, 0, 0)
-                here[j, 0], before[i, j, 0] = above[j - 1, state] + cost, state
-            if i > 0 and max_run > 0:
-                state = _least(above[j], 0, 1, max_run + 1, states)
-                here[j, 1], before[i, j, 1] = above[j, state] + cost, state
-                for run in range(2, max_run + 1):
-                    here[j, run] = above[j, run - 1] + cost
-            if j > 0 and max_run > 0:
-                state = _least(here[j - 1], 0, max_run + 1, 0, 0)
-                here[j, max_run + 1], before[i, j, 2] = here[j - 1, state] + cost, state
-                for run in range(2, max_run + 1):
-                    here[j, max_run + run] = here[j - 1, max_run + run - 1] + cost
-        above, here = here, above
-    state = _least(above[m - 1], 0, states, 0, 0)
-    total = above[m - 1, state]
-    return total, _walk_back_limited(before, max_run, state, path) if np.isfinite(total) else 0
+            above = totals[j] if i > 0 else np.inf
+            left = costs[0, 0] if i == 0 and j == 0 else min(diagonal, above, left) + costs[i, j]
+            totals[j] = left
+            diagonal = above
+    return totals[m - 1]
 
 
 @_compiled
-def _least(totals, start, stop, other_start, other_stop):  # type: ignore[no-untyped-def]
-    """The first of the least among totals[start:stop] and totals[other_start:other_stop]."""
-    best = start
-    for state in range(start, stop):
-        if totals[state] < totals[best]:
-            best = state
-    for state in range(other_start, other_stop):
-        if totals[state] < totals[best]:
-            best = state
-    return best
+def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
+    """As `align`, with at most `max_run` steps 1-0, or 0-1, in a row."""
+    n, m = costs.shape
+    # Least totals of the ways to each cell that do not come by a step in the first alone, and in the second alone.
+    not_first, not_second = np.empty((n, m)), np.empty((n, m))
+    runs, scratch = np.full((max_run, m), np.inf), np.empty((2, m))
+    for i in range(n):
+        before = max(0, i - 1)
+        _limited_row(costs[i], i, not_first[before], not_second[before], runs, scratch, not_first[i], not_second[i])
+    total = min(not_first[n - 1, m - 1], not_second[n - 1, m - 1])
+    return total, _walk_back_limited(costs, max_run, not_first, not_second, path) if np.isfinite(total) else 0
 
 
 @_compiled
-def _walk_back_limited(before, max_run, state, path):  # type: ignore[no-untyped-def]
-    i, j, length = before.shape[0] - 1, before.shape[1] - 1, 0
-    while True:
-        path[length, 0], path[length, 1] = i, j
-        length += 1
-        if i == 0 and j == 0:
-            return length
-        if state == 0:
-            state = before[i, j, 0]
-            i -= 1
-            j -= 1
-        elif state <= max_run:
-            state = before[i, j, 1] if state == 1 else state - 1
-            i -= 1
-        else:
-            state = before[i, j, 2] if state == max_run + 1 else state - 1
-            j -= 1
+def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
+    """The least total alone, infinite where no way keeps the limit, in memory for a few rows."""
+    n, m = costs.shape
+    not_first, not_second = np.empty((2, m)), np.empty((2, m))
+    runs, scratch = np.full((max_run, m), np.inf), np.empty((2, m))
+    for i in range(n):
+        now, before = i % 2, (i + 1) % 2
+        _limited_row(costs[i], i, not_first[before], not_second[before], runs, scratch, not_first[now], not_second[now])
+    return min(not_first[(n - 1) % 2, m - 1], not_second[(n - 1) % 2, m - 1])
+
+
+@_compiled
+def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first, not_second):  # type: ignore[no-untyped-def]
+    """One row of totals from the row before it; runs (max_run, m) are totals after 1, 2, ... steps 1-0 in a row.
+
+    A step 0-1 begins a run only where none goes on, and those totals depend on the row before alone: nothing has to
+    wait for its left neighbour, and every loop runs over whole vectors.
+    """
+    m, max_run = costs.shape[0], runs.shape[0]
+    if i == 0:
+        not_second[:] = np.inf
+        not_second[0] = costs[0]
+    else:
+        not_second[0] = np.inf
+        for j in range(1, m):
+            least = first_before[j - 1] if first_before[j - 1] < second_before[j - 1] else second_before[j - 1]
+            not_second[j] = least + costs[j]
+    not_first[:] = not_second
+    if i > 0:
+        for r in range(max_run - 1, -1, -1):
+            source = first_before if r == 0 else runs[r - 1]
+            for j in range(m):
+                reached = source[j] + costs[j]
+                runs[r, j] = reached
+                not_second[j] = reached if reached < not_second[j] else not_second[j]
+    source = not_second
+    for r in range(max_run):
+        target = scratch[r % 2]
+        target[0] = np.inf
+        for j in range(1, m):
+            reached = source[j - 1] + costs[j]
+            target[j] = reached
+            not_first[j] = reached if reached < not_first[j] else not_first[j]
+        source = target
+
+
+@_compiled
+def _walk_back_limited(costs, max_run, not_first, not_second, path):  # type: ignore[no-untyped-def]
+    """Fill `path` backwards: at each cell, the first of the least ways to it, runs as a whole."""
+    i, j, length = costs.shape[0] - 1, costs.shape[1] - 1, 0
+    barred = BOTH  # what the step that was taken last, in time, forbids: to go on as another run of its own kind
+    while i > 0 or j > 0:
+        best, kind, steps = np.inf, BOTH, 1
+        if i > 0 and j > 0:
+            best = min(not_first[i - 1, j - 1], not_second[i - 1, j - 1]) + costs[i, j]
+        if barred != FIRST:
+            for run in range(1, min(max_run, i) + 1):
+                reached = not_first[i - run, j]
+                for step in range(i - run + 1, i + 1):
+                    reached += costs[step, j]
+                if reached < best:
+                    best, kind, steps = reached, FIRST, run
+        if barred != SECOND:
+            for run in range(1, min(max_run, j) + 1):
+                reached = not_second[i, j - run]
+                for step in range(j - run + 1, j + 1):
+                    reached += costs[i, step]
+                if reached < best:
+                    best, kind, steps = reached, SECOND, run
+        for _ in range(steps):
+            path[length, 0], path[length, 1] = i, j
+            length += 1
+            i -= kind != SECOND
+            j -= kind != FIRST
+        barred = kind
+    path[length, 0], path[length, 1] = 0, 0
+    return length + 1
 
 
 @_compiled

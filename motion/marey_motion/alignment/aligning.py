@@ -1,0 +1,306 @@
+"""Examples of one action, brought to one canonical frame and one canonical time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Placement
+from marey_motion.alignment.canonical import placed, to_canonical
+from marey_motion.alignment.cost import CostOptions, CostPoints, cost_points, costs_between
+from marey_motion.alignment.dtw import align
+from marey_motion.alignment.reference import medoid, nearest_mean_length, pairwise_totals
+from marey_motion.alignment.segments import (
+    Cut,
+    SectionedAlignment,
+    Sections,
+    align_sections,
+    common_labels,
+    require_labels,
+    sections_of,
+)
+from marey_motion.alignment.warp import inverse, warped
+from marey_motion.clip import Clip
+from marey_motion.errors import MotionError
+from marey_motion.matching.body import MatchingBody
+from marey_motion.mirroring import mirror_clip
+from marey_motion.motion import Motion
+from marey_motion.resampling import resample_motion
+from marey_motion.skeleton import same_hierarchy
+
+Floats = NDArray[np.float64]
+
+MEDOID, NEAREST_MEAN_LENGTH = "medoid", "nearest_mean_length"
+LEAST_CLIPS = 2
+LEAST_FRAMES = 4
+MOST_FRAMES = 4000
+"""Of one example: the costs of two such take 128 MB."""
+SAME_OFFSET_M = 1e-3
+"""By which bones of one skeleton may differ between files."""
+MIRRORED = "~mirrored"
+
+Progress = Callable[[float, float | None, str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class SourceExample:
+    """A clip that shows the action.
+
+    Parameters
+    ----------
+    uid : what names the example for good; ties go to the lower one
+    name : for people
+    cuts : frames of the clip that all examples have under the same labels, in the order of time (`segments.cuts_of`)
+    """
+
+    uid: str
+    name: str
+    clip: Clip
+    cuts: tuple[Cut, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class AlignOptions:
+    """How examples are aligned.
+
+    Parameters
+    ----------
+    reference : "medoid", "nearest_mean_length", or the uid of the example whose time is the canonical time
+    rate_hz : of canonical frames; None for that of the reference where its uid is given, else for the commonest one
+    max_run : at most so many frames of one motion in a row are matched with a single one of the other (the slope
+        limit); None for any
+    cost : of a pair of frames; its weights are one for each joint of the skeleton
+    keep_height : leave heights above the floor as they are
+    """
+
+    reference: str = MEDOID
+    rate_hz: float | None = None
+    max_run: int | None = 3
+    cost: CostOptions = field(default_factory=CostOptions)
+    keep_height: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """An example in the canonical frame, at the set's rate."""
+
+    example: SourceExample
+    motion: Motion
+    placement: Placement
+    sections: Sections
+    points: CostPoints
+
+    @property
+    def uid(self) -> str:
+        return self.example.uid
+
+
+OnRefusal = Callable[[SourceExample, MotionError], None]
+
+
+def with_mirrored(examples: Sequence[SourceExample], body: MatchingBody) -> list[SourceExample]:
+    """The examples, and each once more with left and right exchanged, its uid and name ending in `~mirrored`."""
+    mirrored = [
+        replace(one, uid=one.uid + MIRRORED, name=one.name + MIRRORED, clip=mirror_clip(one.clip, body.partners))
+        for one in examples
+    ]
+    return [*examples, *mirrored]
+
+
+def align_clips(
+    clips: Sequence[SourceExample],
+    body: MatchingBody,
+    options: AlignOptions | None = None,
+    *,
+    threads: int = 1,
+    progress: Progress | None = None,
+    on_refusal: OnRefusal | None = None,
+) -> AlignedSet:
+    """Align examples of an action with one of them, in space and in time, section by section where cuts are given.
+
+    The same bytes come out for any number of threads and any order of the clips.
+
+    Parameters
+    ----------
+    on_refusal : told of each example that does not fit, which is then left out; without it the first one raises
+
+    Raises `MotionError` for options that do not fit the clips, and where fewer than two examples are left.
+    """
+    run = _Aligning(body, options or AlignOptions(), threads, progress or (lambda _done, _total, _note: None))
+    run.on_refusal = on_refusal
+    return run.align(sorted(clips, key=lambda one: one.uid))
+
+
+class _Aligning:
+    """One run."""
+
+    on_refusal: OnRefusal | None = None
+
+    def __init__(self, body: MatchingBody, options: AlignOptions, threads: int, progress: Progress) -> None:
+        self._body = body
+        self._options = options
+        self._threads = max(1, threads)
+        self._tell = progress
+
+    def align(self, clips: Sequence[SourceExample]) -> AlignedSet:
+        self._require_options(clips)
+        rate_hz = self._rate_of(clips)
+        self._tell(0, None, f"reading {len(clips)} clips")
+        prepared = self._kept(clips, [self._attempt(self._prepare, one, rate_hz) for one in clips])
+        common = self._common_labels(prepared)
+        prepared = self._kept(
+            [one.example for one in prepared],
+            [self._attempt(self._with_labels, one, common) for one in prepared],
+        )
+        reference = prepared[self._reference_among(prepared)]
+        with ThreadPoolExecutor(self._threads) as pool:
+            tries = list(pool.map(partial(self._attempt, self._aligned, reference), prepared))
+        clips_aligned = self._kept([one.example for one in prepared], tries)
+        return AlignedSet(
+            skeleton=self._body.skeleton,
+            frame_rate_hz=rate_hz,
+            clips=tuple(clips_aligned),
+            reference=reference.uid,
+            keyframes=reference.sections.keyframes,
+        )
+
+    # -- what fits --
+
+    def _require_options(self, clips: Sequence[SourceExample]) -> None:
+        repeated = [uid for uid, count in Counter(one.uid for one in clips).items() if count > 1]
+        if repeated:
+            raise MotionError("two examples have this uid", where=repeated[0])
+        wanted = self._options.reference
+        if wanted not in (MEDOID, NEAREST_MEAN_LENGTH) and wanted not in {one.uid for one in clips}:
+            raise MotionError("the reference is none of the clips", code="unknown-reference", where=wanted)
+        rate = self._options.rate_hz
+        if rate is not None and not (np.isfinite(rate) and rate > 0):
+            raise MotionError(f"the rate is {rate}, a positive number is needed", where="rate_hz")
+
+    def _attempt(self, work: Callable[..., Any], *arguments: Any) -> Any:
+        """What the work makes, or the `MotionError` that it raises."""
+        try:
+            return work(*arguments)
+        except MotionError as error:
+            return error
+
+    def _kept(self, examples: Sequence[SourceExample], tries: Sequence[Any]) -> list[Any]:
+        """What could be made; the others are refused."""
+        for example, made in zip(examples, tries, strict=True):
+            if isinstance(made, MotionError):
+                if self.on_refusal is None or example.uid == self._options.reference:
+                    raise type(made)(f"{example.name}: {made.message}", code=made.code, where=made.where) from made
+                self.on_refusal(example, made)
+        kept = [made for made in tries if not isinstance(made, MotionError)]
+        if len(kept) < LEAST_CLIPS:
+            raise MotionError(
+                f"{len(kept)} of {len(examples)} clips are left, but {LEAST_CLIPS} are needed to align any",
+                code="too-few-clips",
+            )
+        return kept
+
+    def _rate_of(self, clips: Sequence[SourceExample]) -> float:
+        if self._options.rate_hz is not None:
+            return self._options.rate_hz
+        rates = {one.uid: one.clip.frame_rate_hz for one in clips}
+        if self._options.reference in rates:
+            return rates[self._options.reference]
+        counts = Counter(rates.values())
+        if not counts:
+            raise MotionError("there are no clips to align", code="too-few-clips")
+        return min(counts, key=lambda rate: (-counts[rate], rate))
+
+    def _prepare(self, example: SourceExample, rate_hz: float) -> _Prepared:
+        clip, skeleton = example.clip, self._body.skeleton
+        if not same_hierarchy(clip.skeleton, skeleton, tolerance_m=SAME_OFFSET_M):
+            raise MotionError("it moves another skeleton than the others; retarget it first", code="skeleton-mismatch")
+        for cut in example.cuts:
+            if not 0 <= cut.frame < clip.frame_count:
+                shown = ", ".join(cut.labels)
+                raise MotionError(
+                    f"it has the frames 0:{clip.frame_count}", code="outside-clip", where=f"{shown}: {cut.frame}"
+                )
+        motion = resample_motion(Motion.of(clip), clip.frame_rate_hz, rate_hz)
+        frames = motion.frame_count
+        if not LEAST_FRAMES <= frames <= MOST_FRAMES:
+            raise MotionError(
+                f"it has {frames} frames at {rate_hz:g} Hz; {LEAST_FRAMES} to {MOST_FRAMES} can be aligned",
+                code="too-short" if frames < LEAST_FRAMES else "too-long",
+            )
+        sections = sections_of(example.cuts, frames, rate_ratio=rate_hz / clip.frame_rate_hz)
+        moved, placement = to_canonical(motion, self._body, keep_height=self._options.keep_height)
+        points = cost_points(moved.positions(skeleton), self._options.cost)
+        return _Prepared(example, moved, placement, sections, points)
+
+    def _common_labels(self, prepared: Sequence[_Prepared]) -> tuple[tuple[str, ...], ...]:
+        labels = {one.uid: one.sections.labels for one in prepared}
+        return labels.get(self._options.reference) or common_labels(labels)
+
+    def _with_labels(self, one: _Prepared, common: tuple[tuple[str, ...], ...]) -> _Prepared:
+        require_labels(one.sections.labels, common)
+        return one
+
+    # -- the reference --
+
+    def _reference_among(self, prepared: Sequence[_Prepared]) -> int:
+        wanted = self._options.reference
+        if wanted == NEAREST_MEAN_LENGTH:
+            return nearest_mean_length([one.motion.frame_count for one in prepared])
+        if wanted != MEDOID:
+            return [one.uid for one in prepared].index(wanted)
+        totals = pairwise_totals(
+            [one.points for one in prepared],
+            [one.sections.bounds for one in prepared],
+            self._options.cost,
+            max_run=self._options.max_run,
+            threads=self._threads,
+            progress=lambda done, total: self._tell(done, total, f"comparing {len(prepared)} clips"),
+        )
+        return medoid(totals)
+
+    # -- the alignment --
+
+    def _aligned(self, reference: _Prepared, one: _Prepared) -> AlignedClip:
+        found = self._found(reference, one)
+        motion = warped(one.motion, found.times)
+        return AlignedClip(
+            uid=one.uid,
+            name=one.example.name,
+            motion=_with_signs_of(motion, reference.motion),
+            time_function=found.times,
+            placement=one.placement,
+            cost=found.mean_cost,
+            source_frames=one.motion.frame_count,
+        )
+
+    def _found(self, reference: _Prepared, one: _Prepared) -> SectionedAlignment:
+        return align_sections(
+            costs_between(reference.points, one.points, self._options.cost),
+            reference.sections.bounds,
+            one.sections.bounds,
+            partial(align, max_run=self._options.max_run),
+        )
+
+
+def _with_signs_of(motion: Motion, reference: Motion) -> Motion:
+    """The motion with each joint's quaternions, over the whole clip, on the reference's side."""
+    rotations = motion.rotations.copy()
+    dots = np.einsum("fjc,fjc->fj", rotations[1:], rotations[:-1])
+    signs = np.cumprod(np.concatenate((np.ones((1, dots.shape[1])), np.where(dots < 0.0, -1.0, 1.0))), axis=0)
+    signs *= np.where(np.einsum("fjc,fjc,fj->j", rotations, reference.rotations, signs) < 0.0, -1.0, 1.0)
+    return motion._replace(rotations=rotations * signs[..., None])
+
+
+def restore(clip: AlignedClip) -> Motion:
+    """The source again, at the set's rate and where it stood: what `align_clips` did to it, undone.
+
+    Exact where the time function is the identity; elsewhere poses between those of canonical frames are interpolated.
+    """
+    return placed(warped(clip.motion, inverse(clip.time_function)), clip.placement)

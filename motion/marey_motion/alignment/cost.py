@@ -1,0 +1,132 @@
+"""How much the poses of two motions differ: the cost of each pair of their frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marey_motion.errors import MotionError
+
+Floats = NDArray[np.float64]
+CostMethod = Literal["turned", "plain"]
+
+LONGEST_WINDOW = 61
+
+
+@dataclass(frozen=True, eq=False)
+class CostOptions:
+    """What makes poses differ.
+
+    Parameters
+    ----------
+    method : "turned" compares after the best turn about the vertical and the best shift on the ground, so that only the
+        pose and its height count; "plain" compares positions as they are
+    window : odd number of frames that are compared at once, around each frame; 1 for poses alone. At the ends of a
+        motion its first and last frame are repeated. All frames of a window are turned and shifted together.
+    weights : (P,) not negative, of the points; equal ones when None. Their sum does not matter.
+    """
+
+    method: CostMethod = "turned"
+    window: int = 1
+    weights: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        if self.method not in ("turned", "plain"):
+            raise MotionError(f"{self.method!r} is no cost; there are turned and plain", where="cost")
+        if not (1 <= self.window <= LONGEST_WINDOW and self.window % 2 == 1):
+            raise MotionError(f"a window is an odd number of frames up to {LONGEST_WINDOW}", where="window")
+
+
+class CostPoints(NamedTuple):
+    """The points of one motion of n frames, made ready for all comparisons with others.
+
+    F is n, or with a window of W frames n + W - 1.
+
+    Parameters
+    ----------
+    rows : (F, P, 3) what each frame is compared with: weighted by the square root of each point's share
+    columns : (P, 3, F) the same
+    energies : (n,) weighted squares on the ground, about their centre, summed over each frame's window
+    centres : (n, 2) weighted centre on the ground of each frame's window; zero where frames are centred one by one
+    """
+
+    rows: Floats
+    columns: Floats
+    energies: Floats
+    centres: Floats
+
+
+def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None) -> Floats:
+    """Cost (n, m), in metres squared, of each pair of frames of points `a` (n, P, 3) and `b` (m, P, 3), Y up.
+
+    The mean over points, weighted, of their squared distances (and over the frames of the window, if there is one).
+
+    Raises `MotionError` for points that do not match or are not finite, and for weights that are none.
+
+    Notes
+    -----
+    Kovar and Gleicher 2002, equation 1, divided by the sum of weights. With horizontal positions as complex numbers z
+    about their weighted centre, the least sum over all turns and shifts is Σ w|z_a|² + Σ w|z_b|² - 2 |Σ w z_a z̄_b|;
+    the differences of heights are added as they are.
+    """
+    options = options or CostOptions()
+    if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
+        raise MotionError(f"points must be (frames, points, 3), the same points in both, not {a.shape} and {b.shape}")
+    return costs_between(cost_points(a, options), cost_points(b, options), options)
+
+
+def cost_points(points: Floats, options: CostOptions) -> CostPoints:
+    """Points (n, P, 3) of a motion, ready to be compared."""
+    if not np.isfinite(points).all():
+        raise MotionError("positions must be finite", where=f"frame {int(np.argwhere(~np.isfinite(points))[0, 0])}")
+    shares = _shares(options.weights, points.shape[1])
+    around = options.window // 2
+    padded = np.pad(points.astype(np.float64), ((around, around), (0, 0), (0, 0)), mode="edge")
+    centres = np.zeros((len(points), 2))
+    if options.method == "turned":
+        if around:
+            padded[..., ::2] -= np.einsum("fpc,p->c", padded[..., ::2], shares) / len(padded)
+            centres = _boxed(np.einsum("fpc,p->fc", padded[..., ::2], shares), options.window) / options.window
+        else:
+            padded[..., ::2] -= np.einsum("fpc,p->fc", padded[..., ::2], shares)[:, None]
+    rows = padded * np.sqrt(shares)[:, None]
+    squares = _boxed(np.einsum("fpc,fpc->f", rows[..., ::2], rows[..., ::2]), options.window)
+    energies = squares - options.window * np.einsum("nc,nc->n", centres, centres)
+    columns = np.ascontiguousarray(rows.transpose(1, 2, 0))
+    return CostPoints(np.ascontiguousarray(rows), columns, energies, centres)
+
+
+def costs_between(a: CostPoints, b: CostPoints, options: CostOptions) -> Floats:
+    """As `frame_costs`, of points that are ready."""
+    from marey_motion.alignment import cost_kernels as kernels
+
+    costs = np.empty((len(a.energies), len(b.energies)))
+    if options.method == "turned":
+        if options.window == 1:
+            kernels.turned(a.rows, b.columns, a.energies, b.energies, costs)
+        else:
+            kernels.turned_windows(a, b, options.window, costs)
+    elif options.window == 1:
+        kernels.plain(a.rows, b.columns, costs)
+    else:
+        kernels.plain_windows(a.rows, b.columns, options.window, costs)
+    return costs
+
+
+def _shares(weights: ArrayLike | None, count: int) -> Floats:
+    given = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
+    if given.shape != (count,):
+        raise MotionError(f"{given.shape} weights where {count} points have one each", where="weights")
+    if not (np.isfinite(given).all() and (given >= 0).all() and given.sum() > 0):
+        raise MotionError("weights are finite, not negative, and not all zero", where="weights")
+    return np.asarray(given / given.sum())
+
+
+def _boxed(values: Floats, window: int) -> Floats:
+    """Sums over each run of `window` values along the first axis."""
+    if window == 1:
+        return values
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(values, window, axis=0).sum(axis=-1))

@@ -1,0 +1,105 @@
+"""Compiled costs of pairs of frames, kept apart so that importing the rest of the package does not load numba.
+
+Inner loops run along the frames of the second motion, which therefore come last in its arrays.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+
+
+@_compiled
+def _products(points, others, real, imaginary, heights):  # type: ignore[no-untyped-def]
+    """Sums over points (P, 3), for each frame of others (P, 3, m): of z·z̄ on the ground, of squared rises."""
+    real[:] = 0.0
+    imaginary[:] = 0.0
+    heights[:] = 0.0
+    for p in range(points.shape[0]):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        xs, ys, zs = others[p, 0], others[p, 1], others[p, 2]
+        for j in range(real.shape[0]):
+            real[j] += x * xs[j] + z * zs[j]
+            imaginary[j] += z * xs[j] - x * zs[j]
+            rise = y - ys[j]
+            heights[j] += rise * rise
+
+
+@_compiled
+def turned(rows, columns, energies, other_energies, costs):  # type: ignore[no-untyped-def]
+    """Fill costs (n, m); rows (n, P, 3) and columns (P, 3, m) are centred in each frame."""
+    n, m = costs.shape
+    real, imaginary, heights = np.empty(m), np.empty(m), np.empty(m)
+    for i in range(n):
+        _products(rows[i], columns, real, imaginary, heights)
+        for j in range(m):
+            overlap = np.sqrt(real[j] * real[j] + imaginary[j] * imaginary[j])
+            costs[i, j] = max(0.0, energies[i] + other_energies[j] - 2.0 * overlap) + heights[j]
+
+
+@_compiled
+def turned_windows(a, b, window, costs):  # type: ignore[no-untyped-def]
+    """Fill costs (n, m) of windows: sums along diagonals of what single frames have."""
+    n, m = costs.shape
+    width = m + window - 1
+    sums = np.zeros((3, m))
+    history = np.empty((window + 1, 3, width))
+    for row in range(n + window - 1):
+        slot = row % (window + 1)
+        _products(a.rows[row], b.columns, history[slot, 0], history[slot, 1], history[slot, 2])
+        i = row - window + 1
+        if i < 0:
+            continue
+        _slide(history, row, window, sums)
+        ax, az = a.centres[i, 0], a.centres[i, 1]
+        for j in range(m):
+            bx, bz = b.centres[j, 0], b.centres[j, 1]
+            real = sums[0, j] - window * (ax * bx + az * bz)
+            imaginary = sums[1, j] - window * (az * bx - ax * bz)
+            ground = a.energies[i] + b.energies[j] - 2.0 * np.sqrt(real * real + imaginary * imaginary)
+            costs[i, j] = (max(0.0, ground) + sums[2, j]) / window
+
+
+@_compiled
+def _slide(history, row, window, sums):  # type: ignore[no-untyped-def]
+    """Fill sums (c, m) with those over the window of rows that ends at `row`, along diagonals."""
+    sums[:] = 0.0
+    for step in range(window):
+        past = history[(row - window + 1 + step) % (window + 1)]
+        for channel in range(sums.shape[0]):
+            values, total = past[channel], sums[channel]
+            for j in range(total.shape[0]):
+                total[j] += values[j + step]
+
+
+@_compiled
+def _squares(points, others, row):  # type: ignore[no-untyped-def]
+    row[:] = 0.0
+    for p in range(points.shape[0]):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        xs, ys, zs = others[p, 0], others[p, 1], others[p, 2]
+        for j in range(row.shape[0]):
+            dx, dy, dz = x - xs[j], y - ys[j], z - zs[j]
+            row[j] += dx * dx + dy * dy + dz * dz
+
+
+@_compiled
+def plain(rows, columns, costs):  # type: ignore[no-untyped-def]
+    """Fill costs (n, m) with squared distances as they are."""
+    for i in range(costs.shape[0]):
+        _squares(rows[i], columns, costs[i])
+
+
+@_compiled
+def plain_windows(rows, columns, window, costs):  # type: ignore[no-untyped-def]
+    """As `plain`, the mean over windows."""
+    n, m = costs.shape
+    sums = np.zeros((1, m))
+    history = np.empty((window + 1, 1, m + window - 1))
+    for row in range(n + window - 1):
+        _squares(rows[row], columns, history[row % (window + 1), 0])
+        if row >= window - 1:
+            _slide(history, row, window, sums)
+            costs[row - window + 1] = sums[0] / window

@@ -1,0 +1,104 @@
+"""Time functions: which moment of a motion belongs to each frame of another, and motions played by them.
+
+A time function gives a fractional frame of the source for each canonical frame. It is strictly increasing, begins at 0
+and ends at the source's last frame; between canonical frames it is linear.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marey_motion import quaternions
+from marey_motion.errors import MotionError
+from marey_motion.motion import Motion
+
+Floats = NDArray[np.float64]
+
+LEAST_SLOPE = 0.01
+# A slope is raised by a little more than needed, so that sums of slopes keep it in spite of rounding.
+_SLACK = 1e-9
+_WHOLE = 1e-9
+
+
+def time_function(path: NDArray[np.integer]) -> Floats:
+    """The time function (N,) of a way (L, 2) through the N frames of a reference and those of a source.
+
+    Each canonical frame belongs to the mean of the source frames that it is matched with. Source frames that are
+    matched with several canonical frames belong to the middle of those, and time passes evenly in between. Both ends
+    are pinned. Slopes below `LEAST_SLOPE` are raised to it by the least change, in the sense of squares, of all slopes.
+
+    Raises `MotionError` where one of the motions is too short for that.
+    """
+    if len(path) < 2 or (path[-1] <= path[0]).any():
+        raise MotionError("a time function needs at least two frames in both motions", code="too-few-frames")
+    canonical, source = _knots(path)
+    frames = np.arange(path[0, 0], path[-1, 0] + 1, dtype=np.float64)
+    return _with_least_slope(np.interp(frames, canonical, source))
+
+
+def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
+    """The middle of every run of cells that share a frame of either motion; for the first and last run, the ends."""
+    steps = np.diff(path, axis=0)
+    side = steps[:, 0] - steps[:, 1]  # 0 for a step in both, else which motion steps alone
+    before = np.concatenate(([0], side[:-1]))
+    runs = np.concatenate(([0], np.cumsum((side == 0) | ((before != 0) & (before != side)))))
+    lengths = np.bincount(runs)
+    middles = np.stack([np.bincount(runs, weights=frames) / lengths for frames in path.T], axis=1)
+    knots = np.concatenate((path[:1], middles[1:-1], path[-1:]))
+    return knots[:, 0], knots[:, 1]
+
+
+def _with_least_slope(times: Floats) -> Floats:
+    """The nearest times, by the squares of their steps, with the same ends and no step under the least slope."""
+    steps, least = np.diff(times), LEAST_SLOPE + _SLACK
+    if steps.min() >= LEAST_SLOPE:
+        return times
+    spare = times[-1] - times[0] - least * len(steps)
+    if spare < 0:
+        raise MotionError(
+            f"{len(times)} frames cannot pass in {times[-1] - times[0]:g} frames of the source",
+            code="alignment-impossible",
+        )
+    # Projection onto the simplex of steps above the least one (Held, Wolfe and Crowder 1974).
+    above = np.sort(steps - least)[::-1]
+    excess = (np.cumsum(above) - spare) / np.arange(1, len(above) + 1)
+    kept = np.count_nonzero(above > excess)
+    raised = times.copy()
+    raised[1:-1] = times[0] + np.cumsum(np.maximum(steps - least - excess[kept - 1], 0.0) + least)[:-1]
+    return raised
+
+
+def inverse(times: Floats) -> Floats:
+    """The canonical time (M,) of each source frame 0 to M - 1, of a time function (N,)."""
+    return np.interp(np.arange(round(times[-1]) + 1, dtype=np.float64), times, np.arange(len(times), dtype=np.float64))
+
+
+def warped(motion: Motion, times: ArrayLike) -> Motion:
+    """The motion at fractional frames (n,): positions linear, rotations by slerp between neighbouring frames.
+
+    Raises `MotionError` for times that the motion does not have.
+    """
+    places = np.asarray(times, dtype=np.float64)
+    last = motion.frame_count - 1
+    if places.size and not (places.min() >= -_WHOLE and places.max() <= last + _WHOLE):
+        raise MotionError(f"the motion has the frames 0 to {last}", where="times")
+    places = np.clip(places, 0.0, last)
+    whole = np.round(places)
+    places = np.where(np.abs(places - whole) <= _WHOLE, whole, places)
+    frames = np.minimum(places.astype(np.int64), max(last - 1, 0))
+    after = np.minimum(frames + 1, last)
+    share = places - frames
+    if not share.any():
+        return motion.at_frames(frames)
+    rotations = quaternions.slerp(motion.rotations[frames], motion.rotations[after], share[:, None])
+    return motion._replace(
+        root_translations=_between(motion.root_translations, frames, after, share),
+        rotations=np.asarray(rotations, dtype=np.float64),
+        translations=_between(motion.translations, frames, after, share),
+    )
+
+
+def _between(values: Floats, frames: NDArray[np.int64], after: NDArray[np.int64], share: Floats) -> Floats:
+    fraction = share.reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray((1.0 - fraction) * values[frames] + fraction * values[after])
