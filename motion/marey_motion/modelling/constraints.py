@@ -1,0 +1,214 @@
+"""What a motion shall do at a moment: where a joint is, how it is turned, where the body stands and faces, and when.
+
+A moment is the label of a keyframe of the model, `start`, `end`, or a canonical frame, which may be a fraction. Places
+and directions are in the world; the model's canonical frame lies in it by a `Placement`, at its origin unless one is
+given. Each constraint has a tolerance sigma, the error that counts as 1, and a weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import isfinite, radians
+
+from marey_motion.errors import MotionError
+from marey_motion.modelling.primitive import MotionPrimitive
+
+Moment = str | float
+Coordinates = tuple[float | None, float | None, float | None]
+Vector = tuple[float, float, float]
+Rotation = tuple[float, float, float, float]
+
+START, END = "start", "end"
+TOLERANCE_M = 0.01
+TOLERANCE_RAD = radians(5.0)
+TOLERANCE_S = 0.05
+
+
+class ConstraintError(MotionError):
+    """The constraint makes no sense, or the model has not what it names."""
+
+    default_code = "constraint-invalid"
+
+
+@dataclass(frozen=True)
+class JointPosition:
+    """A joint is at a place.
+
+    Parameters
+    ----------
+    joint : by its own name or its standard name
+    at : moment
+    target_m : (x, y, z) metres; None where the coordinate is free
+    tolerance_m, weight : positive
+    """
+
+    joint: str
+    at: Moment
+    target_m: Coordinates
+    tolerance_m: float = TOLERANCE_M
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        known = [value for value in self.target_m if value is not None]
+        _require(len(self.target_m) == 3 and bool(known), "a position needs at least one of x, y and z", "target_m")
+        _require(all(map(isfinite, known)), "coordinates are finite numbers", "target_m")
+        _require_positive(tolerance_m=self.tolerance_m, weight=self.weight)
+
+
+@dataclass(frozen=True)
+class JointOrientation:
+    """A joint is turned so; the error is the angle of the rotation that is missing, about any axis.
+
+    Parameters
+    ----------
+    rotation : (w, x, y, z) in the world, of any length but zero
+    """
+
+    joint: str
+    at: Moment
+    rotation: Rotation
+    tolerance_rad: float = TOLERANCE_RAD
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        _require_direction(self.rotation, 4, "rotation")
+        _require_positive(tolerance_rad=self.tolerance_rad, weight=self.weight)
+
+
+@dataclass(frozen=True)
+class LookDirection:
+    """An axis of a joint points in a direction, or at a point; the error is the angle between them.
+
+    Parameters
+    ----------
+    direction : (x, y, z) in the world, of any length but zero
+    point_m : (x, y, z) metres, in place of a direction
+    axis : (x, y, z) in the joint's own frame
+    """
+
+    joint: str
+    at: Moment
+    direction: Vector | None = None
+    point_m: Vector | None = None
+    axis: Vector = (0.0, 0.0, 1.0)
+    tolerance_rad: float = TOLERANCE_RAD
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        _require((self.direction is None) != (self.point_m is None), "give a direction or a point", "direction")
+        if self.direction is not None:
+            _require_direction(self.direction, 3, "direction")
+        if self.point_m is not None:
+            _require(len(self.point_m) == 3 and all(map(isfinite, self.point_m)), "a point has x, y, z", "point_m")
+        _require_direction(self.axis, 3, "axis")
+        _require_positive(tolerance_rad=self.tolerance_rad, weight=self.weight)
+
+
+@dataclass(frozen=True)
+class RootPosition:
+    """The root stands over a place on the ground.
+
+    Parameters
+    ----------
+    target_m : (x, z) metres; None where the coordinate is free
+    """
+
+    at: Moment
+    target_m: tuple[float | None, float | None]
+    tolerance_m: float = TOLERANCE_M
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        known = [value for value in self.target_m if value is not None]
+        _require(len(self.target_m) == 2 and bool(known), "a place on the ground needs x or z", "target_m")
+        _require(all(map(isfinite, known)), "coordinates are finite numbers", "target_m")
+        _require_positive(tolerance_m=self.tolerance_m, weight=self.weight)
+
+
+@dataclass(frozen=True)
+class RootHeading:
+    """The body faces a heading on the ground, by its hips and shoulders.
+
+    Parameters
+    ----------
+    heading_rad : 0 along +z, positive to the left
+    """
+
+    at: Moment
+    heading_rad: float
+    tolerance_rad: float = TOLERANCE_RAD
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        _require(isfinite(self.heading_rad), "a heading is a finite number", "heading_rad")
+        _require_positive(tolerance_rad=self.tolerance_rad, weight=self.weight)
+
+
+@dataclass(frozen=True)
+class KeyframeTime:
+    """A moment comes so long after the motion's beginning.
+
+    Parameters
+    ----------
+    seconds : since the first canonical frame, not negative
+    """
+
+    at: Moment
+    seconds: float
+    tolerance_s: float = TOLERANCE_S
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        _require(isfinite(self.seconds) and self.seconds >= 0, "a time is not negative", "seconds")
+        _require_positive(tolerance_s=self.tolerance_s, weight=self.weight)
+
+
+Constraint = JointPosition | JointOrientation | LookDirection | RootPosition | RootHeading | KeyframeTime
+
+
+def tolerance_of(constraint: Constraint) -> float:
+    """Sigma in metres, radians or seconds."""
+    match constraint:
+        case JointPosition() | RootPosition():
+            return constraint.tolerance_m
+        case KeyframeTime():
+            return constraint.tolerance_s
+        case _:
+            return constraint.tolerance_rad
+
+
+def frame_at(primitive: MotionPrimitive, at: Moment) -> float:
+    """The canonical frame of a moment. Raises `ConstraintError`, naming the keyframes that there are."""
+    last = primitive.frame_count - 1
+    if isinstance(at, str):
+        moments: Mapping[str, int] = {START: 0, END: last, **primitive.keyframes}
+        if at not in moments:
+            known = ", ".join(moments)
+            raise ConstraintError(f"{primitive.name} has no keyframe {at!r}; it has {known}", where="at")
+        return float(moments[at])
+    if not 0 <= at <= last:
+        raise ConstraintError(f"canonical frame {at:g} is not within 0 to {last}", where="at")
+    return float(at)
+
+
+def joint_index(primitive: MotionPrimitive, name: str, standard_joints: Mapping[str, int]) -> int:
+    """The joint of this name, or of this standard name. Raises `UnknownJoint`."""
+    if name not in primitive.skeleton and name in standard_joints:
+        return standard_joints[name]
+    return primitive.skeleton.index_of(name)
+
+
+def _require(holds: bool, message: str, where: str) -> None:
+    if not holds:
+        raise ConstraintError(message, where=where)
+
+
+def _require_positive(**values: float) -> None:
+    for name, value in values.items():
+        _require(isfinite(value) and value > 0, f"{value} is not positive", name)
+
+
+def _require_direction(values: tuple[float, ...], count: int, where: str) -> None:
+    sound = len(values) == count and all(map(isfinite, values)) and any(abs(value) > 1e-9 for value in values)
+    _require(sound, f"{count} finite numbers are needed, not all of them zero", where)

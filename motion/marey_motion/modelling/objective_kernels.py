@@ -1,0 +1,228 @@
+"""Compiled evaluation of constraints, kept apart so that importing the rest of the package does not load numba.
+
+`chains`, `clocks` and `rows` are the tuples of `objective`. Latent vectors are handled one by one, so what comes out
+does not depend on how many are asked for at once, nor on threads. A placement is (heading, x, z).
+
+Derivatives of rotations are angular velocities in the world: turning by a small w takes q to (1, w / 2) q.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+POSITION, ORIENTATION, DIRECTION, POINT, HEADING, TIME = range(6)
+
+# Sine of an angle below which its direction is rounding noise.
+_TINY = 1e-9
+# Angle below which series replace quotients of small numbers.
+_SMALL = 1e-4
+
+_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+
+
+@_compiled
+def _product(a, b, out):  # type: ignore[no-untyped-def]
+    """out = a · b, of quaternions; out may be neither of them."""
+    out[0] = a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3]
+    out[1] = a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2]
+    out[2] = a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1]
+    out[3] = a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0]
+
+
+@_compiled
+def _turned(q, x, y, z):  # type: ignore[no-untyped-def]
+    """A vector turned by a unit quaternion."""
+    tx = 2.0 * (q[2] * z - q[3] * y)
+    ty = 2.0 * (q[3] * x - q[1] * z)
+    tz = 2.0 * (q[1] * y - q[2] * x)
+    return (
+        x + q[0] * tx + q[2] * tz - q[3] * ty,
+        y + q[0] * ty + q[3] * tx - q[1] * tz,
+        z + q[0] * tz + q[1] * ty - q[2] * tx,
+    )
+
+
+@_compiled
+def _pose(chains, latent, channels, local, positions, rotations):  # type: ignore[no-untyped-def]
+    """Channels of the constrained frames, and where the joints on their chains are; lengths of raw quaternions last."""
+    channels[:] = chains.mean
+    for component in range(chains.directions.shape[0]):
+        score = latent[component]
+        for column in range(channels.shape[0]):
+            channels[column] += score * chains.directions[component, column]
+    for node in range(chains.parents.shape[0]):
+        first, parent = chains.columns[node], chains.parents[node]
+        w, x, y, z = channels[first], channels[first + 1], channels[first + 2], channels[first + 3]
+        length = math.sqrt(w * w + x * x + y * y + z * z)
+        local[node, 0], local[node, 1], local[node, 2] = w / length, x / length, y / length
+        local[node, 3], local[node, 4] = z / length, length
+        if parent < 0:
+            rotations[node] = local[node, :4]
+            positions[node] = channels[first - 3 : first]
+        else:
+            _product(rotations[parent], local[node], rotations[node])
+            offset = chains.offsets[node]
+            dx, dy, dz = _turned(rotations[parent], offset[0], offset[1], offset[2])
+            positions[node, 0] = positions[parent, 0] + dx
+            positions[node, 1] = positions[parent, 1] + dy
+            positions[node, 2] = positions[parent, 2] + dz
+
+
+@_compiled
+def _items(chains, placement, positions, rotations, points, turns):  # type: ignore[no-untyped-def]
+    """What is tracked, in the world: sums of joint positions, and the rotation of one joint of each."""
+    cos, sin = math.cos(placement[0]), math.sin(placement[0])
+    yaw = np.array((math.cos(0.5 * placement[0]), 0.0, math.sin(0.5 * placement[0]), 0.0))
+    for item in range(points.shape[0]):
+        points[item] = 0.0
+        for term in range(chains.term_starts[item], chains.term_starts[item + 1]):
+            for axis in range(3):
+                points[item, axis] += chains.term_signs[term] * positions[chains.term_nodes[term], axis]
+        x, z, held = points[item, 0], points[item, 2], chains.held[item]
+        points[item, 0] = cos * x + sin * z + held * placement[1]
+        points[item, 2] = cos * z - sin * x + held * placement[2]
+        _product(yaw, rotations[chains.turned[item]], turns[item])
+
+
+@_compiled
+def _times(clocks, latent, first, log_steps, times):  # type: ignore[no-untyped-def]
+    """Seconds since the beginning at each clock; the steps that they add up stay in `log_steps`."""
+    log_steps[:] = clocks.mean
+    for component in range(clocks.directions.shape[0]):
+        score = latent[first + component]
+        for step in range(log_steps.shape[0]):
+            log_steps[step] += score * clocks.directions[component, step]
+    for step in range(log_steps.shape[0]):
+        log_steps[step] = math.exp(log_steps[step])
+    for clock in range(times.shape[0]):
+        total = 0.0
+        for step in range(log_steps.shape[0]):
+            total += clocks.weights[clock, step] * log_steps[step]
+        times[clock] = total
+
+
+@_compiled
+def _angle_factors(sine, cosine):  # type: ignore[no-untyped-def]
+    """Angle over its sine, and the derivative of that by the cosine."""
+    angle = math.atan2(sine, cosine)
+    if angle < _SMALL:
+        return 1.0 + angle * angle / 6.0, -1.0 / 3.0
+    sine = max(sine, _TINY)
+    return angle / sine, -(sine - angle * cosine) / (sine * sine * sine)
+
+
+@_compiled
+def _rotation_error(turn, target, out):  # type: ignore[no-untyped-def]
+    """The rotation vector that takes the target to where the joint is turned; its length is the geodesic distance."""
+    w = turn[0] * target[0] + turn[1] * target[1] + turn[2] * target[2] + turn[3] * target[3]
+    x = -turn[0] * target[1] + turn[1] * target[0] - turn[2] * target[3] + turn[3] * target[2]
+    y = -turn[0] * target[2] + turn[1] * target[3] + turn[2] * target[0] - turn[3] * target[1]
+    z = -turn[0] * target[3] - turn[1] * target[2] + turn[2] * target[1] + turn[3] * target[0]
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    sine = math.sqrt(x * x + y * y + z * z)
+    factor = 2.0 if sine < _TINY else 2.0 * math.atan2(sine, w) / sine
+    out[0], out[1], out[2] = factor * x, factor * y, factor * z
+
+
+@_compiled
+def _aims(kind, row, rows, points, turns, pointing, wanted):  # type: ignore[no-untyped-def]
+    """Where a joint's axis points, where it should, both of length 1, and how far the point to look at is."""
+    item = rows.items[row]
+    axis, target = rows.axes[row], rows.targets[row]
+    pointing[0], pointing[1], pointing[2] = _turned(turns[item], axis[0], axis[1], axis[2])
+    wanted[:] = target[:3]
+    distance = 1.0
+    if kind == POINT:
+        wanted -= points[item]
+        distance = math.sqrt(wanted[0] * wanted[0] + wanted[1] * wanted[1] + wanted[2] * wanted[2])
+        if distance < _TINY:  # it stands where it should look at: any direction is right
+            wanted[:] = pointing
+            return 1.0
+        wanted /= distance
+    return distance
+
+
+@_compiled
+def _crossed(a, b, out):  # type: ignore[no-untyped-def]
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+    return math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+
+
+@_compiled
+def _residual(row, rows, points, turns, times, room, out):  # type: ignore[no-untyped-def]
+    """Fill `out` (3,) with a constraint's error: metres, radians or seconds."""
+    kind, item, target = rows.kinds[row], rows.items[row], rows.targets[row]
+    out[:] = 0.0
+    if kind == POSITION:
+        for axis in range(3):
+            out[axis] = rows.axes[row, axis] * (points[item, axis] - target[axis])
+    elif kind == ORIENTATION:
+        _rotation_error(turns[item], target, out)
+    elif kind == HEADING:
+        # Forward is lateral times up: its (x, z) are (-lateral z, lateral x).
+        error = math.atan2(-points[item, 2], points[item, 0]) - target[0]
+        out[0] = error - 2.0 * math.pi * round(error / (2.0 * math.pi))
+    elif kind == TIME:
+        out[0] = times[item] - target[0]
+    else:
+        _aims(kind, row, rows, points, turns, room[0], room[1])
+        sine = _crossed(room[0], room[1], out)
+        cosine = room[0, 0] * room[1, 0] + room[0, 1] * room[1, 1] + room[0, 2] * room[1, 2]
+        if sine < _TINY and cosine < 0.0:  # the opposite way: about any axis across
+            across = np.argmin(np.abs(room[0]))
+            room[1] = 0.0
+            room[1, across] = 1.0
+            out *= 0.0
+            sine = _crossed(room[0], room[1], out)
+            out *= math.pi / sine
+        else:
+            out *= _angle_factors(sine, cosine)[0]
+
+
+@_compiled
+def errors(chains, clocks, rows, placement, latents, out):  # type: ignore[no-untyped-def]
+    """Fill `out` (n, rows) with how far latent vectors (n, L) miss each constraint: metres, radians or seconds."""
+    nodes, items = chains.parents.shape[0], chains.turned.shape[0]
+    channels, local = np.empty(chains.mean.shape[0]), np.empty((nodes, 5))
+    positions, rotations = np.empty((nodes, 3)), np.empty((nodes, 4))
+    points, turns = np.empty((items, 3)), np.empty((items, 4))
+    log_steps, times = np.empty(clocks.mean.shape[0]), np.empty(clocks.weights.shape[0])
+    room, residual = np.empty((2, 3)), np.empty(3)
+    spatial = chains.directions.shape[0]
+    for n in range(latents.shape[0]):
+        if nodes:
+            _pose(chains, latents[n], channels, local, positions, rotations)
+            _items(chains, placement, positions, rotations, points, turns)
+        if times.shape[0]:
+            _times(clocks, latents[n], spatial, log_steps, times)
+        for row in range(rows.kinds.shape[0]):
+            _residual(row, rows, points, turns, times, room, residual)
+            square = residual[0] * residual[0] + residual[1] * residual[1] + residual[2] * residual[2]
+            out[n, row] = math.sqrt(square)
+
+
+@_compiled
+def costs(prices, errors, out):  # type: ignore[no-untyped-def]
+    """Fill `out` (n,) with sums of errors (n, rows) times their prices (rows,), in the order of the rows."""
+    for n in range(out.shape[0]):
+        total = 0.0
+        for row in range(prices.shape[0]):
+            total += prices[row] * errors[n, row]
+        out[n] = total
+
+
+@_compiled
+def track(chains, placement, latents, out):  # type: ignore[no-untyped-def]
+    """Fill `out` (n, items, 3) with what is tracked of the motions of latent vectors (n, L), in the world."""
+    nodes, items = chains.parents.shape[0], chains.turned.shape[0]
+    channels, local = np.empty(chains.mean.shape[0]), np.empty((nodes, 5))
+    positions, rotations, turns = np.empty((nodes, 3)), np.empty((nodes, 4)), np.empty((items, 4))
+    for n in range(latents.shape[0]):
+        _pose(chains, latents[n], channels, local, positions, rotations)
+        _items(chains, placement, positions, rotations, out[n], turns)

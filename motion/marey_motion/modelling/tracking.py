@@ -1,0 +1,146 @@
+"""What is computed of a primitive's motions to evaluate constraints: a few joints at a few moments, and no more.
+
+A spline at a fixed moment is linear in the scores, so each channel of a joint costs one product with numbers that are
+known before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MappingError
+from marey_motion.modelling.primitive import MotionPrimitive
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+LEFTS, RIGHTS = ("left_hip", "left_shoulder"), ("right_hip", "right_shoulder")
+"""Standard joints whose difference tells where a body faces."""
+
+
+class Tracked(NamedTuple):
+    """A joint at a canonical frame, or a difference of joints.
+
+    Parameters
+    ----------
+    frame : canonical
+    joints : whose positions are added; the rotation tracked is that of the first
+    minus : whose positions are subtracted, as many as are added; none for a joint alone
+    """
+
+    frame: float
+    joints: tuple[int, ...]
+    minus: tuple[int, ...] = ()
+
+
+class Chains(NamedTuple):
+    """What has to be computed for n tracked points: V joints at some moments, with X channels in all.
+
+    Parameters
+    ----------
+    mean, directions : (X,), (k, X) channels, and what one unit of each spatial score adds to them
+    columns : (V,) first channel of each joint's quaternion; a root's translation stands before it
+    parents : (V,) place of the parent among the V, -1 for roots
+    offsets : (V, 3) metres
+    term_starts, term_nodes, term_signs : (n + 1,), (t,), (t,) the joints whose positions make up each point
+    held : (n,) 1 for places, 0 for differences, which no shift changes
+    turned : (n,) the joint whose rotation goes with each point
+    """
+
+    mean: Floats
+    directions: Floats
+    columns: Indices
+    parents: Indices
+    offsets: Floats
+    term_starts: Indices
+    term_nodes: Indices
+    term_signs: Floats
+    held: Floats
+    turned: Indices
+
+
+class Clocks(NamedTuple):
+    """Seconds that have passed at n moments.
+
+    Parameters
+    ----------
+    mean, directions : (N - 1,), (k, N - 1) logarithms of steps, and what one unit of each temporal number adds to them
+    weights : (n, N - 1) seconds that one frame of each step counts for each moment
+    """
+
+    mean: Floats
+    directions: Floats
+    weights: Floats
+
+
+def facing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
+    """The body's axis from right to left. Raises `MappingError` where hips or shoulders are not known."""
+    missing = [name for name in (*LEFTS, *RIGHTS) if name not in standard_joints]
+    if missing:
+        raise MappingError(f"a heading needs {', '.join(missing)}, which the skeleton's mapping does not name")
+    lefts, rights = (tuple(standard_joints[name] for name in side) for side in (LEFTS, RIGHTS))
+    return Tracked(frame, lefts, rights)
+
+
+def track_points(primitive: MotionPrimitive, tracked: Sequence[Tracked]) -> Chains:
+    """The joints that carry tracked points, with their channels at the moments asked for."""
+    nodes = _nodes(primitive, tracked)
+    places = {node: place for place, node in enumerate(nodes)}
+    frames = sorted({frame for frame, _ in nodes})
+    mean, directions, columns = [], [], []
+    width = 0
+    for frame in frames:
+        joints = [joint for at, joint in nodes if at == frame]
+        channels = np.array([0, 1, 2, *(3 + 4 * joint + part for joint in joints for part in range(4))])
+        row = primitive.spatial.basis.matrix([frame])[0]
+        used = np.flatnonzero(row)
+        mean.append(row[used] @ primitive.spatial.mean[np.ix_(used, channels)])
+        directions.append(np.tensordot(primitive.spatial.directions[:, used][:, :, channels], row[used], axes=(1, 0)))
+        columns += [width + 3 + 4 * place for place in range(len(joints))]
+        width += len(channels)
+    parents = primitive.skeleton.parents.tolist()
+    terms = [[places[one.frame, joint] for joint in (*one.joints, *one.minus)] for one in tracked]
+    return Chains(
+        mean=_joined(mean, (0,)),
+        directions=np.ascontiguousarray(_joined(directions, (primitive.spatial.count, 0))),
+        columns=np.array(columns, dtype=np.int64),
+        parents=np.array([places.get((frame, parents[joint]), -1) for frame, joint in nodes], dtype=np.int64),
+        offsets=primitive.skeleton.offsets[[joint for _, joint in nodes]].reshape(-1, 3),
+        term_starts=np.cumsum([0, *map(len, terms)], dtype=np.int64),
+        term_nodes=np.array([place for one in terms for place in one], dtype=np.int64),
+        term_signs=np.array([sign for one in tracked for sign in (*[1.0] * len(one.joints), *[-1.0] * len(one.minus))]),
+        held=np.array([float(not one.minus) for one in tracked]),
+        turned=np.array([places[one.frame, one.joints[0]] for one in tracked], dtype=np.int64),
+    )
+
+
+def track_times(primitive: MotionPrimitive, moments: Sequence[float]) -> Clocks:
+    """The steps of canonical time, with how much of each has passed at the moments."""
+    temporal = primitive.temporal
+    steps = np.arange(primitive.frame_count - 1)
+    passed = np.clip(np.asarray(moments, dtype=np.float64)[:, None] - steps, 0.0, 1.0)
+    directions = np.tensordot(temporal.directions[..., 0], temporal.basis.at_frames, axes=(1, 1))
+    return Clocks(
+        mean=temporal.basis.at_frames @ temporal.mean[:, 0],
+        directions=np.ascontiguousarray(directions / primitive.temporal_weight),
+        weights=np.ascontiguousarray(passed / primitive.frame_rate_hz).reshape(len(moments), len(steps)),
+    )
+
+
+def _nodes(primitive: MotionPrimitive, tracked: Sequence[Tracked]) -> list[tuple[float, int]]:
+    """Every joint at every frame that must be known, in the skeleton's order within a frame."""
+    found = {
+        (one.frame, carrier)
+        for one in tracked
+        for joint in (*one.joints, *one.minus)
+        for carrier in primitive.skeleton.path_to_root(joint)
+    }
+    return sorted(found)
+
+
+def _joined(pieces: list[Floats], empty: tuple[int, ...]) -> Floats:
+    return np.concatenate(pieces, axis=-1) if pieces else np.zeros(empty)

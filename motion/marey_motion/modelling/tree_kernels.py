@@ -1,0 +1,163 @@
+"""Compiled k-means over ranges of samples, kept apart so that importing the rest of the package does not load numba.
+
+Everything runs in one thread and in a fixed order: the same samples and the same random numbers give the same tree.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+MOST_ROUNDS = 25
+"""Rounds of Lloyd's algorithm; what is left to gain after them is little."""
+
+_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+
+
+@_compiled
+def _square_distance(a, b):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for d in range(a.shape[0]):
+        step = a[d] - b[d]
+        total += step * step
+    return total
+
+
+@_compiled
+def _place_centres(features, members, randoms, nearest, centres):  # type: ignore[no-untyped-def]
+    """Choose members as centres, far ones more likely, as k-means++ (Arthur and Vassilvitskii 2007); how many."""
+    count = members.shape[0]
+    centres[0] = features[members[min(int(randoms[0] * count), count - 1)]]
+    for m in range(count):
+        nearest[m] = np.inf
+    for chosen in range(1, centres.shape[0]):
+        total = 0.0
+        for m in range(count):
+            nearest[m] = min(nearest[m], _square_distance(features[members[m]], centres[chosen - 1]))
+            total += nearest[m]
+        if not total > 0.0:
+            return chosen
+        left, pick = randoms[chosen] * total, -1
+        for m in range(count):
+            if nearest[m] > 0.0:
+                pick = m
+                left -= nearest[m]
+                if left < 0.0:
+                    break
+        centres[chosen] = features[members[pick]]
+    return centres.shape[0]
+
+
+@_compiled
+def _assign(features, members, centres, labels):  # type: ignore[no-untyped-def]
+    """Give each member to its nearest centre, the first of equals; how many changed."""
+    changed = 0
+    for m in range(members.shape[0]):
+        best, label = np.inf, 0
+        for centre in range(centres.shape[0]):
+            distance = _square_distance(features[members[m]], centres[centre])
+            if distance < best:
+                best, label = distance, centre
+        changed += labels[m] != label
+        labels[m] = label
+    return changed
+
+
+@_compiled
+def _average(features, members, labels, centres, sizes):  # type: ignore[no-untyped-def]
+    """Move each centre to the mean of what it was given; one that was given nothing stays."""
+    sums = np.zeros(centres.shape)
+    sizes[:] = 0
+    for m in range(members.shape[0]):
+        sizes[labels[m]] += 1
+        for d in range(features.shape[1]):
+            sums[labels[m], d] += features[members[m], d]
+    for centre in range(centres.shape[0]):
+        if sizes[centre]:
+            centres[centre] = sums[centre] / sizes[centre]
+
+
+@_compiled
+def _split(features, members, randoms, sizes, room):  # type: ignore[no-untyped-def]
+    """Order members by cluster, changed in place, and fill the clusters' sizes; how many clusters there are."""
+    nearest, labels, ordered = room
+    count = members.shape[0]
+    centres = np.empty((sizes.shape[0], features.shape[1]))
+    placed = _place_centres(features, members, randoms, nearest[:count], centres)
+    centres, labels = centres[:placed], labels[:count]
+    labels[:] = -1
+    sizes[:] = 0
+    for _ in range(MOST_ROUNDS):
+        changed = _assign(features, members, centres, labels)
+        _average(features, members, labels, centres, sizes)
+        if not changed:
+            break
+    filled, place = 0, 0
+    for centre in range(placed):
+        size = sizes[centre]
+        if size:
+            for m in range(count):
+                if labels[m] == centre:
+                    ordered[place] = members[m]
+                    place += 1
+            sizes[filled] = size
+            filled += 1
+    sizes[filled:] = 0
+    members[:] = ordered[:count]
+    return filled
+
+
+@_compiled
+def grow(features, randoms, branching, leaf_size, depth, order, starts, sizes, children):  # type: ignore[no-untyped-def]
+    """Split samples (n, D) again and again, level by level; how many nodes there are.
+
+    `order` (n,) is permuted so that each node's members stand together; `starts`, `sizes` and `children` (nodes,) are
+    filled per node: first member, number of members, number of child nodes. Children of a node follow one another, and
+    nodes of a level come in the order of their parents.
+    """
+    count = features.shape[0]
+    room = (np.empty(count), np.empty(count, np.int64), np.empty(count, np.int64))
+    parts = np.empty(branching, np.int64)
+    starts[0], sizes[0] = 0, count
+    nodes, level_end, level = 1, 1, 0
+    node = 0
+    while node < nodes:
+        if node == level_end:
+            level, level_end = level + 1, nodes
+        start, size = starts[node], sizes[node]
+        children[node] = 0
+        if size > leaf_size and level < depth:
+            filled = _split(features, order[start : start + size], randoms[node], parts, room)
+            if filled > 1:
+                children[node] = filled
+                for part in range(filled):
+                    starts[nodes], sizes[nodes] = start, parts[part]
+                    start += parts[part]
+                    nodes += 1
+        node += 1
+    return nodes
+
+
+@_compiled
+def locate(sizes, children, starts):  # type: ignore[no-untyped-def]
+    """Fill each node's first sample: where its parent's begin, after those of the siblings before it."""
+    starts[0] = 0
+    following = 1
+    for node in range(sizes.shape[0]):
+        start = starts[node]
+        for child in range(following, following + children[node]):
+            starts[child] = start
+            start += sizes[child]
+        following += children[node]
+
+
+@_compiled
+def average(samples, starts, sizes, means):  # type: ignore[no-untyped-def]
+    """Fill the mean of each node's samples."""
+    means[:] = 0.0
+    for node in range(sizes.shape[0]):
+        for sample in range(starts[node], starts[node] + sizes[node]):
+            for d in range(samples.shape[1]):
+                means[node, d] += samples[sample, d]
+        for d in range(samples.shape[1]):
+            means[node, d] /= sizes[node]
