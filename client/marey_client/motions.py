@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from marey_client.items import ItemHandle
-from marey_schemas.documents import ClipInfo, Motion, SkeletonHierarchy, SkeletonMapping
+from marey_client.annotations import AnnotationHandle
+from marey_client.items import ItemHandle, Items
+from marey_schemas.documents import Annotation, ClipInfo, Motion, SkeletonHierarchy, SkeletonMapping
 from marey_schemas.items import Item
+from marey_schemas.kinds import Kind
 
 
 class MotionArrays(Motion):
@@ -54,6 +56,23 @@ class ClipHandle(ItemHandle):
     def put_info(self, info: ClipInfo) -> Item:
         """Make a revision with another description; the poses are shared."""
         return self.put_part("info", info.model_dump(mode="json", by_alias=True))
+
+    def annotations(self) -> Iterator[AnnotationHandle]:
+        """What is said about any revision of the clip, oldest first."""
+        found = Items(self.transport, self.project, Kind.ANNOTATION, AnnotationHandle)
+        return found.list(sort="created_at", filters={"clip": self.id})
+
+    def annotate(self, layer: str, *, name: str | None = None, **said: Any) -> AnnotationHandle:
+        """Make a layer of annotation beside the clip, over the revision that was read.
+
+        `said` are `segments` and `keyframes` as in `Annotation`; a layer may start without any.
+        """
+        document = Annotation.model_validate({"clip": self.as_input().model_dump(), "layer": layer, **said})
+        return Items(self.transport, self.project, Kind.ANNOTATION, AnnotationHandle).create(
+            name or f"{self.name} {layer}",
+            {"annotation": document.model_dump(mode="json", by_alias=True)},
+            collection=self.item.collection,
+        )
 
 
 class SkeletonHandle(ItemHandle):

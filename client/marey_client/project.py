@@ -8,7 +8,8 @@ from functools import cached_property
 from typing import Any, Literal
 
 from marey_client.access import Members
-from marey_client.annotations import AnnotationHandle, AnnotationPlaces, annotate_request, cut_request
+from marey_client.annotation_jobs import AnnotationPlaces, annotate_request, cut_request
+from marey_client.annotations import AnnotationHandle
 from marey_client.blobs import Blobs
 from marey_client.coverage_streams import CoverageStreams
 from marey_client.evaluations import EvaluationHandle, Places, evaluate_request, items_at

@@ -2,6 +2,7 @@
 
 from marey_server.handlers import (
     access,
+    annotations,
     blobs,
     collections,
     coverage_streams,
@@ -26,6 +27,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     *collections.RESOURCES,
     *items.RESOURCES,
     *parts.RESOURCES,
+    *annotations.RESOURCES,
     *exports.RESOURCES,
     *evaluations.RESOURCES,
     *coverage_streams.RESOURCES,

@@ -29,6 +29,7 @@ class ItemsQuery(CountedPageQuery):
     name: str | None = Field(None, max_length=255, description="Exactly this name, or with a final * its beginning.")
     tag_in: CommaSeparated = Field((), alias="tag.in", description="With any of these tags.")
     skeleton: str | None = Field(None, max_length=64, description="Clips on this skeleton.")
+    clip: str | None = Field(None, max_length=64, description="Annotations of this clip.")
     frames_gte: int | None = Field(None, alias="frames.gte", ge=0, le=MAX_INTEGER, description="At least so long.")
     frames_lte: int | None = Field(None, alias="frames.lte", ge=0, le=MAX_INTEGER, description="At most so long.")
     q: str | None = Field(None, max_length=255, description="Part of the name, in any case.")
@@ -45,6 +46,7 @@ class ItemsQuery(CountedPageQuery):
             name=self.name,
             tags=self.tag_in,
             skeleton=self.skeleton,
+            clip=self.clip,
             frames_gte=self.frames_gte,
             frames_lte=self.frames_lte,
             q=self.q,

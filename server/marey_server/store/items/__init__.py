@@ -1,5 +1,6 @@
 """Items: named things with revisions. This package is the only one that writes them."""
 
+from marey_server.store.items.annotating import apply_commands
 from marey_server.store.items.changing import (
     change_item,
     create_item,
@@ -22,6 +23,7 @@ __all__ = [
     "Part",
     "Published",
     "StoredDocument",
+    "apply_commands",
     "change_item",
     "create_item",
     "delete_item",

@@ -41,6 +41,8 @@ class ItemFilters:
     tags: tuple[str, ...] = ()
     """Any of these."""
     skeleton: str | None = None
+    clip: str | None = None
+    """Annotations of this clip."""
     frames_gte: int | None = None
     frames_lte: int | None = None
     q: str | None = None
@@ -101,6 +103,8 @@ def _conditions(project_id: str, kind: Kind, filters: ItemFilters) -> list[Colum
         conditions.append(item.c.id.in_(tagged))
     if filters.skeleton is not None:
         conditions.append(item.c.skeleton_id == filters.skeleton)
+    if filters.clip is not None:
+        conditions.append(item.c.summary["clip"].as_string() == filters.clip)
     if filters.frames_gte is not None:
         conditions.append(item.c.frames >= filters.frames_gte)
     if filters.frames_lte is not None:

@@ -1,0 +1,61 @@
+"""Commands that change annotations."""
+
+from __future__ import annotations
+
+from marey_schemas.annotations import AnnotationChange, command_arguments
+from marey_schemas.documents import Annotation, RevisionRef
+from marey_schemas.items import Item
+from marey_schemas.kinds import Kind
+from marey_schemas.problems import FieldError
+from marey_server.errors import Invalid, NotFound
+from marey_server.store.items.changing import put_part
+from marey_server.store.items.reading import read_part
+from marey_server.store.revs import moved_on
+from marey_server.store.transaction import Transaction
+
+
+def apply_commands(
+    tx: Transaction, project: str, item_id: str, change: AnnotationChange, *, expected_rev: int | None
+) -> Item:
+    """Apply commands to an annotation one after another, all of them or none; the item with its new revision.
+
+    Raises `Invalid` naming the command that cannot be carried out, `PreconditionFailed` where the annotation is not at
+    `expected_rev` any more.
+    """
+    from marey_motion import documents
+    from marey_motion.editing.annotations import COMMANDS
+    from marey_motion.errors import MotionError
+
+    found = read_part(tx, project, Kind.ANNOTATION, item_id, "annotation")
+    if expected_rev not in (None, found.rev):
+        raise moved_on(found.rev)
+    annotation = Annotation.model_validate(found.tree)
+    layer = documents.layer_from_document(annotation, _frame_count(tx, project, annotation))
+    for index, command in enumerate(change.commands):
+        try:
+            layer = COMMANDS[command.command](layer, **command_arguments(command))
+        except MotionError as error:
+            wrong = FieldError(pointer=f"/commands/{index}", code=error.code, detail=str(error))
+            detail = f"Command {index} ({command.command}) cannot be carried out, so none was: {error}"
+            raise Invalid(detail, code="command-refused", errors=[wrong]) from error
+    changed = documents.layer_to_document(layer, annotation.clip, annotation.layer, annotation.made_by)
+    return put_part(
+        tx,
+        project,
+        Kind.ANNOTATION,
+        item_id,
+        "annotation",
+        changed.model_dump(mode="json", by_alias=True),
+        expected_rev=found.rev,
+        message=change.message,
+    )
+
+
+def _frame_count(tx: Transaction, project: str, annotation: Annotation) -> int:
+    """Frames of the revision of the clip that an annotation is of. Raises `Invalid` where the clip is gone."""
+    clip = RevisionRef.model_validate(annotation.clip.model_dump())
+    try:
+        motion = read_part(tx, project, Kind.CLIP, clip.item, "motion", revision=clip.revision, arrays="none").tree
+    except NotFound as error:
+        raise Invalid(f"Its clip is not there any more: {error.detail}", code="no-clip") from error
+    return int(motion["poses"]["shape"][0])
