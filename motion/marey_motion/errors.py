@@ -86,6 +86,12 @@ class EditError(MotionError):
     default_code = "edit-invalid"
 
 
+class ModelError(MotionError):
+    """No model can be made of these examples, or the numbers describe none."""
+
+    default_code = "model-invalid"
+
+
 # Files
 
 

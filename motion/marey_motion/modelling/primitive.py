@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from marey_motion.errors import MotionError
 from marey_motion.modelling.mixture import LatentMixture
 from marey_motion.modelling.splines import SplineBasis
+from marey_motion.modelling.time_model import fit_log_slopes
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 
@@ -155,8 +156,7 @@ class MotionPrimitive:
         Quaternions must have the signs of the training examples (dot products with the mean motion not negative).
         """
         scores = self.spatial.scores(self.spatial.basis.fit(poses))
-        slopes = np.log(np.diff(time_functions, axis=1))[..., None]
-        temporal = self.temporal.scores(self.temporal.basis.fit(slopes))
+        temporal = self.temporal.scores(fit_log_slopes(self.temporal.basis, time_functions))
         return np.concatenate((scores, self.temporal_weight * temporal), axis=1)
 
     def log_density(self, latents: Floats) -> Floats:

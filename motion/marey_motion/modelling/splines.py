@@ -99,6 +99,17 @@ class SplineBasis:
         return self.matrix(np.arange(self.frame_count, dtype=np.float64))
 
     @cached_property
+    def products(self) -> Floats:
+        """(n, n) integrals over canonical time of the products of basis functions, by Gauss's rule, which is exact."""
+        nodes, shares = np.polynomial.legendre.leggauss(self.degree + 1)
+        breaks = np.unique(self.knots)
+        half = 0.5 * np.diff(breaks)[:, None]
+        start, stop = self.span
+        places = np.clip((breaks[:-1, None] + half) + half * nodes, start, stop).ravel()
+        values = self.matrix(places)
+        return np.asarray(values.T @ (values * (half * shares).reshape(-1, 1)), dtype=np.float64)
+
+    @cached_property
     def _fitting(self) -> Floats:
         """(n, N) from samples to coefficients."""
         return np.asarray(np.linalg.pinv(self.at_frames), dtype=np.float64)

@@ -1,0 +1,123 @@
+"""How far joints are off when motions are reconstructed from a few components, also of examples left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.modelling.fpca import PrincipalExamples
+from marey_motion.modelling.splines import SplineBasis
+from marey_motion.skeleton import Skeleton
+
+Floats = NDArray[np.float64]
+Progress = Callable[[int, int, str], None]
+
+MOST_DIMENSIONS = 200
+"""Of the space in which examples are left out; with more examples than that, the smallest components are dropped."""
+
+CM_PER_M = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class ReconstructionErrors:
+    """Mean distance of joints from where they are in the aligned examples, centimetres.
+
+    Parameters
+    ----------
+    components : (c,) 0, 1, 2, ...
+    training_cm : (c,) of examples that the components were found in, mean over the examples
+    left_out_cm : (c,) of each example by the components and the mean of all others, mean over the examples
+    left_out_each_cm : (m, c)
+    """
+
+    components: NDArray[np.int64]
+    training_cm: Floats
+    left_out_cm: Floats
+    left_out_each_cm: Floats
+
+
+def reconstruction_errors(
+    skeleton: Skeleton,
+    principal: PrincipalExamples,
+    poses: Floats,
+    most_components: int,
+    *,
+    threads: int = 1,
+    progress: Progress | None = None,
+) -> ReconstructionErrors:
+    """The errors of m aligned examples, poses (m, N, D) with consistent signs, by number of components.
+
+    Notes
+    -----
+    Leaving example i out of a principal component analysis takes c sᵢsᵢᵀ from the diagonal covariance of the scores s,
+    with c = m / (m - 1), and moves the mean to -sᵢ / (m - 1): each is an eigenproblem of the size of the score space,
+    without going back to the coefficients.
+    """
+    basis = principal.functions.basis
+    frames = comparison_frames(basis)
+    values = basis.matrix(frames.astype(np.float64))
+    mean = values @ principal.functions.mean
+    used = min(principal.directions.shape[0], MOST_DIMENSIONS)
+    directions = values @ principal.directions[:used]
+    scores = principal.scores[:, :used]
+    compare = _Comparison(skeleton, mean, directions)
+    count = min(most_components, used) + 1
+
+    def errors_of(example: int) -> tuple[Floats, Floats]:
+        chosen = np.ascontiguousarray(poses[example, frames])
+        own = np.tril(np.ones((count, used)), -1) * scores[example]
+        return compare.distances(own, chosen), compare.distances(_left_out(scores, example, count), chosen)
+
+    found = []
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        for done, errors in enumerate(pool.map(errors_of, range(len(poses)))):
+            found.append(errors)
+            if progress is not None:
+                progress(done + 1, len(poses), "leaving examples out")
+    training, left_out = (np.array(one) * CM_PER_M for one in zip(*found, strict=True))
+    return ReconstructionErrors(np.arange(count), training.mean(axis=0), left_out.mean(axis=0), left_out)
+
+
+def comparison_frames(basis: SplineBasis) -> NDArray[np.int64]:
+    """Canonical frames that tell how well motions agree: two for each coefficient of the splines."""
+    count = min(basis.frame_count, 2 * basis.count)
+    return np.unique(np.linspace(0, basis.frame_count - 1, count).round().astype(np.int64))
+
+
+def _left_out(scores: Floats, example: int, count: int) -> Floats:
+    """Scores (count, r) of an example's reconstruction by 0, 1, ... components of the others."""
+    examples = len(scores)
+    own = scores[example]
+    if examples < 2:
+        return np.zeros((count, scores.shape[1]))
+    share = examples / (examples - 1)
+    _, vectors = np.linalg.eigh(np.diag(np.einsum("mr,mr->r", scores, scores)) - share * np.outer(own, own))
+    leading = vectors[:, ::-1][:, : count - 1]
+    along = leading * (leading.T @ own * share)
+    return np.asarray(np.concatenate((np.zeros((1, len(own))), np.cumsum(along.T, axis=0))) - own / (examples - 1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """Motions of a score space, at T frames: mean (T, D), directions (r, T, D)."""
+
+    skeleton: Skeleton
+    mean: Floats
+    directions: Floats
+
+    def distances(self, scores: Floats, poses: Floats) -> Floats:
+        """Mean distances (c,) of the joints of motions with scores (c, r) from those of poses (T, D), metres."""
+        from marey_motion import kinematics
+        from marey_motion.modelling import reconstruction_kernels
+
+        made = self.mean + np.tensordot(scores, self.directions, axes=1)
+        targets = kinematics.forward_kinematics(self.skeleton, poses)
+        out = np.empty(len(made))
+        reconstruction_kernels.mean_distances(
+            made, self.skeleton.parents, self.skeleton.offsets, np.asarray(targets, dtype=np.float64), out
+        )
+        return out

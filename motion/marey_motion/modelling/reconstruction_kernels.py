@@ -1,0 +1,115 @@
+"""Compiled comparison of poses by where their joints are, with the derivative by the poses."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_compiled = njit(cache=True, nogil=True)
+
+
+@_compiled
+def _load_rotations(pose, rotations, lengths):  # type: ignore[no-untyped-def]
+    """Unit local rotations (J, 4) and the lengths (J,) that the pose's quaternions had."""
+    for joint in range(len(rotations)):
+        column = 3 + 4 * joint
+        w, x, y, z = pose[column], pose[column + 1], pose[column + 2], pose[column + 3]
+        length = np.sqrt(w * w + x * x + y * y + z * z)
+        lengths[joint] = length
+        rotations[joint, 0] = w / length
+        rotations[joint, 1] = x / length
+        rotations[joint, 2] = y / length
+        rotations[joint, 3] = z / length
+
+
+@_compiled
+def _place_joints(pose, local, parents, offsets, world, positions):  # type: ignore[no-untyped-def]
+    """Global rotations (J, 4) and positions (J, 3)."""
+    world[0] = local[0]
+    positions[0] = pose[:3]
+    for joint in range(1, len(parents)):
+        parent = parents[joint]
+        aw, ax, ay, az = world[parent]
+        bw, bx, by, bz = local[joint]
+        world[joint, 0] = aw * bw - ax * bx - ay * by - az * bz
+        world[joint, 1] = aw * bx + ax * bw + ay * bz - az * by
+        world[joint, 2] = aw * by - ax * bz + ay * bw + az * bx
+        world[joint, 3] = aw * bz + ax * by - ay * bx + az * bw
+        ox, oy, oz = offsets[joint]
+        tx = 2.0 * (ay * oz - az * oy)
+        ty = 2.0 * (az * ox - ax * oz)
+        tz = 2.0 * (ax * oy - ay * ox)
+        positions[joint, 0] = positions[parent, 0] + ox + aw * tx + ay * tz - az * ty
+        positions[joint, 1] = positions[parent, 1] + oy + aw * ty + az * tx - ax * tz
+        positions[joint, 2] = positions[parent, 2] + oz + aw * tz + ax * ty - ay * tx
+
+
+@_compiled
+def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-untyped-def]
+    """Fill `out` (B,) with the mean distance of joints from targets (T, J, 3), of poses (B, T, D) not of unit length."""
+    joints = len(parents)
+    local, world = np.empty((joints, 4)), np.empty((joints, 4))
+    lengths, positions = np.empty(joints), np.empty((joints, 3))
+    for motion in range(poses.shape[0]):
+        total = 0.0
+        for frame in range(poses.shape[1]):
+            _load_rotations(poses[motion, frame], local, lengths)
+            _place_joints(poses[motion, frame], local, parents, offsets, world, positions)
+            for joint in range(joints):
+                x = positions[joint, 0] - targets[frame, joint, 0]
+                y = positions[joint, 1] - targets[frame, joint, 1]
+                z = positions[joint, 2] - targets[frame, joint, 2]
+                total += np.sqrt(x * x + y * y + z * z)
+        out[motion] = total / (poses.shape[1] * joints)
+
+
+@_compiled
+def squared_error_gradient(poses, parents, offsets, targets, gradient):  # type: ignore[no-untyped-def]
+    """The sum of squared distances of joints from targets (F, J, 3); fill its gradient (F, D) by the poses (F, D).
+
+    Quaternions need not be of unit length: the error, and so the gradient, is that of the rotations they stand for. What
+    pulls at the joints below one adds up to a force and a torque on it, from the leaves to the root.
+    """
+    joints = len(parents)
+    local, world = np.empty((joints, 4)), np.empty((joints, 4))
+    lengths, positions = np.empty(joints), np.empty((joints, 3))
+    forces, torques = np.empty((joints, 3)), np.empty((joints, 3))
+    total = 0.0
+    for frame in range(len(poses)):
+        _load_rotations(poses[frame], local, lengths)
+        _place_joints(poses[frame], local, parents, offsets, world, positions)
+        for joint in range(joints):
+            for axis in range(3):
+                away = positions[joint, axis] - targets[frame, joint, axis]
+                total += away * away
+                forces[joint, axis] = 2.0 * away
+                torques[joint, axis] = 0.0
+        for joint in range(joints - 1, -1, -1):
+            parent = parents[joint]
+            tx, ty, tz = torques[joint]
+            if parent >= 0:
+                fx, fy, fz = forces[joint]
+                lx = positions[joint, 0] - positions[parent, 0]
+                ly = positions[joint, 1] - positions[parent, 1]
+                lz = positions[joint, 2] - positions[parent, 2]
+                forces[parent, 0] += fx
+                forces[parent, 1] += fy
+                forces[parent, 2] += fz
+                torques[parent, 0] += tx + ly * fz - lz * fy
+                torques[parent, 1] += ty + lz * fx - lx * fz
+                torques[parent, 2] += tz + lx * fy - ly * fx
+                # The torque in the frame that the local rotation turns in: that of the parent.
+                w, x, y, z = world[parent, 0], -world[parent, 1], -world[parent, 2], -world[parent, 3]
+                ux = 2.0 * (y * tz - z * ty)
+                uy = 2.0 * (z * tx - x * tz)
+                uz = 2.0 * (x * ty - y * tx)
+                tx, ty, tz = tx + w * ux + y * uz - z * uy, ty + w * uy + z * ux - x * uz, tz + w * uz + x * uy - y * ux
+            qw, qx, qy, qz = local[joint]
+            scale = 2.0 / lengths[joint]
+            column = 3 + 4 * joint
+            gradient[frame, column] = scale * (-tx * qx - ty * qy - tz * qz)
+            gradient[frame, column + 1] = scale * (tx * qw + ty * qz - tz * qy)
+            gradient[frame, column + 2] = scale * (-tx * qz + ty * qw + tz * qx)
+            gradient[frame, column + 3] = scale * (tx * qy - ty * qx + tz * qw)
+        gradient[frame, :3] = forces[0]
+    return total

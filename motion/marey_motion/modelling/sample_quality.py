@@ -1,0 +1,69 @@
+"""What can be wrong with motions drawn from a model: feet below the floor, feet that slide, odd durations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import kinematics
+from marey_motion.kinematics import CONTACT_SPEED_M_S
+from marey_motion.skeleton import Skeleton
+
+Floats = NDArray[np.float64]
+
+CM_PER_M = 100.0
+
+
+@dataclass(frozen=True)
+class FootQuality:
+    """Feet of motions, by the joints that touch the ground.
+
+    Parameters
+    ----------
+    below_floor_share : share of frames in which at least one foot is under height 0
+    below_floor_mean_cm : how deep the lowest foot is in those frames; 0 where there are none
+    lowest_cm : mean over the motions of their lowest foot
+    slide_m_s : mean speed on the ground of feet in the frames where feet of the training examples mostly stand
+    """
+
+    below_floor_share: float
+    below_floor_mean_cm: float
+    lowest_cm: float
+    slide_m_s: float
+
+
+def foot_speeds(toes: Floats, time_functions: Floats, frame_rate_hz: float) -> Floats:
+    """(m, N - 1, k) speeds on the ground, m/s, of toes (m, N, k, 3) in steps of canonical time."""
+    moved = np.linalg.norm(np.diff(toes[..., (0, 2)], axis=1), axis=-1)
+    return np.asarray(moved / np.diff(time_functions, axis=1)[..., None] * frame_rate_hz)
+
+
+def standing_steps(toes: Floats, time_functions: Floats, frame_rate_hz: float) -> NDArray[np.bool_]:
+    """(N - 1, k) where most examples have a foot on the ground: slower than the limit of contacts, height included."""
+    moved = np.linalg.norm(np.diff(toes, axis=1), axis=-1)
+    speeds = moved / np.diff(time_functions, axis=1)[..., None] * frame_rate_hz
+    return np.asarray((speeds < CONTACT_SPEED_M_S).mean(axis=0) > 0.5)
+
+
+def foot_quality(
+    toes: Floats, time_functions: Floats, frame_rate_hz: float, standing: NDArray[np.bool_]
+) -> FootQuality:
+    """Of m motions with toes (m, N, k, 3) in metres."""
+    lowest = toes[..., 1].min(axis=2)
+    below = lowest < 0.0
+    speeds = foot_speeds(toes, time_functions, frame_rate_hz)[:, standing]
+    return FootQuality(
+        below_floor_share=float(below.mean()),
+        below_floor_mean_cm=float(-lowest[below].mean() * CM_PER_M) if below.any() else 0.0,
+        lowest_cm=float(lowest.min(axis=1).mean() * CM_PER_M),
+        slide_m_s=float(speeds.mean()) if speeds.size else 0.0,
+    )
+
+
+def toe_positions(skeleton: Skeleton, poses: Floats, joints: tuple[int, ...]) -> Floats:
+    """(m, N, k, 3) where k joints are in poses (m, N, D), metres."""
+    motions, frames, width = poses.shape
+    positions = kinematics.forward_kinematics(skeleton, np.ascontiguousarray(poses).reshape(-1, width))
+    return np.asarray(positions[:, list(joints)].reshape(motions, frames, len(joints), 3), dtype=np.float64)

@@ -1,0 +1,160 @@
+"""Weights of channels under which few components keep joints where they are (Du et al. 2016, scaled FPCA)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import kinematics
+from marey_motion.modelling.fpca import InnerProduct, Keep, find_components
+from marey_motion.modelling.reconstruction import comparison_frames
+from marey_motion.modelling.splines import SplineBasis
+from marey_motion.skeleton import Skeleton
+
+Floats = NDArray[np.float64]
+
+SMALLEST_WEIGHT = 1e-2
+LARGEST_WEIGHT = 1e3
+MOST_ITERATIONS = 60
+TOLERANCE = 1e-5
+"""Of the error, as a share of that at the start."""
+
+MOST_POSES = 6000
+"""Poses at which joints are compared; more examples are compared at fewer frames."""
+
+
+def optimised_weights(
+    skeleton: Skeleton,
+    basis: SplineBasis,
+    coefficients: Floats,
+    root_max: Floats,
+    keep: Keep,
+    inner_product: InnerProduct = "coefficients",
+) -> tuple[Floats, Keep]:
+    """Weights (D,), one for each root axis and each joint, that minimise the squared distance of joints.
+
+    The number of components is that which `keep` gives under the weights of root_max, and stays; it is returned with
+    the weights. The start is all ones, or the weights of root_max if these do better.
+
+    Parameters
+    ----------
+    coefficients : (m, n, D) of examples with consistent signs
+    root_max : (D,)
+
+    Notes
+    -----
+    Reconstructing examples from their leading components projects their matrix of coefficients from the left, on the
+    leading eigenvectors of the Gram matrix K = Σ wᵍ² Kᵍ over the channels g. So the weights enter by an (m, m) matrix
+    alone, and the derivative of its eigenprojector gives the gradient: all of it costs one pass of forward kinematics.
+    """
+    from scipy.optimize import minimize
+
+    count = find_components(basis, coefficients, root_max, keep, inner_product).functions.count
+    problem = _Problem(skeleton, basis, coefficients, count, inner_product)
+    starts = [_logarithms(weights) for weights in (np.ones(len(root_max)), root_max)]
+    start = min(starts, key=lambda logarithms: problem.value_and_gradient(logarithms)[0])
+    if not 0 < count < len(coefficients) - 1:
+        return _expanded(np.exp(start)), Keep(count=count)
+    first = problem.value_and_gradient(start)[0]
+
+    def relative(logarithms: Floats) -> tuple[float, Floats]:
+        # The tolerance of SLSQP is an absolute one.
+        value, gradient = problem.value_and_gradient(logarithms)
+        return value / first, gradient / first
+
+    found = minimize(
+        relative,
+        start,
+        jac=True,
+        method="SLSQP",
+        bounds=[(np.log(SMALLEST_WEIGHT), np.log(LARGEST_WEIGHT))] * len(start),
+        options={"maxiter": MOST_ITERATIONS, "ftol": TOLERANCE},
+    )
+    return _expanded(np.exp(found.x if found.fun < 1.0 else start)), Keep(count=count)
+
+
+def _logarithms(weights: Floats) -> Floats:
+    """(3 + J,) of weights (3 + 4·J,) that are one for each joint."""
+    return np.log(np.clip(np.concatenate((weights[:3], weights[3::4])), SMALLEST_WEIGHT, LARGEST_WEIGHT))
+
+
+def _expanded(groups: Floats) -> Floats:
+    return np.concatenate((groups[:3], np.repeat(groups[3:], 4)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The mean squared distance of joints after reconstruction, as a function of the logarithms of weights."""
+
+    skeleton: Skeleton
+    basis: SplineBasis
+    coefficients: Floats
+    count: int
+    inner_product: InnerProduct
+
+    @cached_property
+    def deviations(self) -> Floats:
+        """(m, n, D) of the examples from their mean."""
+        return np.asarray(self.coefficients - self.coefficients.mean(axis=0))
+
+    @cached_property
+    def grams(self) -> Floats:
+        """(3 + J, m, m) inner products of the examples in each group of channels."""
+        root = np.eye(self.basis.count)
+        if self.inner_product == "l2":
+            root = np.linalg.cholesky(self.basis.products)
+        shaped = root.T @ self.deviations
+        each = np.einsum("anc,bnc->cab", shaped, shaped, optimize=True)
+        joints = each[3:].reshape(-1, 4, *each.shape[1:]).sum(axis=1)
+        return np.concatenate((each[:3], joints))
+
+    @cached_property
+    def values(self) -> Floats:
+        """(T, n) of the basis functions at the frames where joints are compared."""
+        frames = comparison_frames(self.basis)
+        allowed = max(4, MOST_POSES // len(self.coefficients))
+        chosen = frames[np.unique(np.linspace(0, len(frames) - 1, min(allowed, len(frames))).round().astype(np.int64))]
+        return self.basis.matrix(chosen.astype(np.float64))
+
+    @cached_property
+    def deviating_poses(self) -> Floats:
+        """(m, T·D) deviations of the examples at those frames."""
+        return np.asarray((self.values @ self.deviations).reshape(len(self.coefficients), -1))
+
+    @cached_property
+    def mean_poses(self) -> Floats:
+        """(T·D,)"""
+        return np.asarray((self.values @ self.coefficients.mean(axis=0)).ravel())
+
+    @cached_property
+    def targets(self) -> Floats:
+        """(m·T, J, 3) where the joints of the examples are."""
+        poses = (self.mean_poses + self.deviating_poses).reshape(-1, self.coefficients.shape[2])
+        rotations = poses[:, 3:].reshape(len(poses), -1, 4)
+        rotations /= np.linalg.norm(rotations, axis=2, keepdims=True)
+        return np.asarray(kinematics.forward_kinematics(self.skeleton, poses), dtype=np.float64)
+
+    def value_and_gradient(self, logarithms: Floats) -> tuple[float, Floats]:
+        """Mean squared distance in metres squared, and its gradient (3 + J,) by the logarithms of the weights."""
+        from marey_motion.modelling import reconstruction_kernels
+
+        squares = np.exp(2.0 * logarithms)
+        eigenvalues, vectors = np.linalg.eigh(np.tensordot(squares, self.grams, axes=1))
+        kept, dropped = vectors[:, ::-1][:, : self.count], vectors[:, ::-1][:, self.count :]
+        made = self.mean_poses + kept @ (kept.T @ self.deviating_poses)
+        poses = made.reshape(-1, self.coefficients.shape[2])
+        gradient = np.empty_like(poses)
+        total = reconstruction_kernels.squared_error_gradient(
+            poses, self.skeleton.parents, self.skeleton.offsets, self.targets, gradient
+        )
+        by_projector = gradient.reshape(made.shape) @ self.deviating_poses.T
+        # The projector on the kept eigenvectors changes by how the matrix couples kept and dropped ones.
+        gaps = eigenvalues[::-1][: self.count, None] - eigenvalues[::-1][None, self.count :]
+        gaps = np.maximum(gaps, 1e-12 * max(float(eigenvalues[-1]), np.finfo(np.float64).tiny))
+        coupling = kept.T @ (by_projector + by_projector.T) @ dropped / gaps
+        by_squares = np.einsum("gab,ab->g", self.grams, kept @ coupling @ dropped.T, optimize=True)
+        share = 1.0 / (self.targets.shape[0] * self.targets.shape[1])
+        return total * share, 2.0 * squares * by_squares * share

@@ -1,0 +1,38 @@
+"""The time of a motion as a function: logarithms of slopes, so that whatever is drawn from a model runs forward."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.modelling.splines import SplineBasis
+
+Floats = NDArray[np.float64]
+
+
+def fit_log_slopes(basis: SplineBasis, time_functions: Floats) -> Floats:
+    """Coefficients (m, n, 1) of the logarithm of the slopes of time functions (m, N), over their N - 1 steps.
+
+    Least squares on the logarithms; then each is shifted as a whole, so that the motion lasts exactly as long as it
+    did. (Smoothing logarithms would shorten it: the logarithm of a mean is above the mean of logarithms.)
+    """
+    slopes = np.diff(time_functions, axis=1)
+    if not (np.isfinite(slopes).all() and (slopes > 0.0).all()):
+        worst = int(np.argwhere(~(slopes > 0.0))[0, 0])
+        raise MotionError("a time function must rise strictly", code="time-function-invalid", where=f"example {worst}")
+    coefficients = basis.fit(np.log(slopes)[..., None])
+    lasting = np.exp(basis.at_frames @ coefficients).sum(axis=1, keepdims=True)
+    # B-splines add up to 1 everywhere: what is added to all coefficients is added to the function.
+    return np.asarray(coefficients + np.log(slopes.sum(axis=1)[:, None, None] / lasting), dtype=np.float64)
+
+
+def equalising_weight(spatial_variances: Floats, temporal_variances: Floats) -> float:
+    """The factor that gives the temporal part of latent vectors the variance of the spatial part; 1 if either has none.
+
+    Parameters
+    ----------
+    spatial_variances, temporal_variances : (k,), (l,) of the scores
+    """
+    spatial, temporal = float(spatial_variances.sum()), float(temporal_variances.sum())
+    return float(np.sqrt(spatial / temporal)) if spatial > 0.0 and temporal > 0.0 else 1.0

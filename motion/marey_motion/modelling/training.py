@@ -1,0 +1,184 @@
+"""Trains a motion primitive on aligned examples, and reports how good it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.alignment.aligned import AlignedSet
+from marey_motion.errors import ModelError
+from marey_motion.modelling.fpca import Keep, PrincipalExamples, find_components
+from marey_motion.modelling.mixture_fitting import FittedMixture, MixtureOptions, fit_mixture, one_thread
+from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.primitive import MotionPrimitive
+from marey_motion.modelling.scaled_fpca import optimised_weights
+from marey_motion.modelling.scaling import jacobian_weights, root_max_weights
+from marey_motion.modelling.signs import consistent_poses
+from marey_motion.modelling.splines import SplineBasis, coefficient_count
+from marey_motion.modelling.time_model import equalising_weight, fit_log_slopes
+from marey_motion.modelling.training_report import TrainingReport, report_on
+from marey_motion.modelling.training_warnings import Warned, warnings_of
+
+Floats = NDArray[np.float64]
+Progress = Callable[[int, int | None, str], None]
+
+MOST_EXAMPLES = 5000
+LEAST_FRAMES = 5
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedPrimitive:
+    """A model and how good it is.
+
+    Parameters
+    ----------
+    weights : (3 + 4·J,) that the channels were multiplied by for the analysis; undone in the primitive
+    """
+
+    primitive: MotionPrimitive
+    report: TrainingReport
+    warnings: tuple[Warned, ...]
+    options: ModelOptions
+    weights: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class FittedExamples:
+    """Examples as what is modelled: their poses with consistent signs, and the components of space and time."""
+
+    poses: Floats
+    spatial: PrincipalExamples
+    temporal: PrincipalExamples
+    weights: Floats
+
+
+def train_primitive(
+    aligned: AlignedSet,
+    options: ModelOptions = ModelOptions(),
+    *,
+    name: str = "primitive",
+    seed: int = 0,
+    threads: int = 1,
+    progress: Progress | None = None,
+) -> TrainedPrimitive:
+    """A generative model of aligned examples: splines, principal components, a mixture (Herrmann et al. 2019, 3).
+
+    Parameters
+    ----------
+    seed : of the mixture's starts, the folds and the samples of the report
+    threads : for leaving examples out; the result does not depend on it
+    progress : called with steps done, steps in all where they are known, and what is being done
+
+    Raises
+    ------
+    ModelError    where the examples are none that a model could be made of
+    """
+    tell: Progress = progress or (lambda done, total, what: None)
+    check_examples(aligned)
+    with one_thread():
+        tell(0, None, "fitting splines")
+        fitted = fit_examples(aligned, options)
+        weight = options.temporal_weight or equalising_weight(
+            fitted.spatial.functions.variances, fitted.temporal.functions.variances
+        )
+        latents = np.concatenate((_kept_scores(fitted.spatial), weight * _kept_scores(fitted.temporal)), axis=1)
+        tell(0, None, "fitting the mixture")
+        mixture = fit_mixture(latents, _mixture_options(options), seed=seed)
+        primitive = _assemble(name, aligned, fitted, weight, mixture)
+        report = report_on(primitive, aligned, fitted.poses, fitted.spatial, fitted.temporal, latents, mixture, options,
+                           seed=seed, threads=threads, progress=tell)  # fmt: skip
+    return TrainedPrimitive(primitive, report, warnings_of(primitive, report, options), options, fitted.weights)
+
+
+def check_examples(aligned: AlignedSet) -> None:
+    """Raise `ModelError` where no model could be made of the examples, saying which one is wrong."""
+    if not 1 <= len(aligned.clips) <= MOST_EXAMPLES:
+        raise ModelError(f"{len(aligned.clips)} examples; a model is of 1 to {MOST_EXAMPLES:,}", code="example-count")
+    frames = aligned.frame_count
+    if frames < LEAST_FRAMES:
+        raise ModelError(f"{frames} canonical frames; at least {LEAST_FRAMES} are needed", code="too-few-frames")
+    shape = (frames, aligned.skeleton.joint_count, 4)
+    for clip in aligned.clips:
+        motion = clip.motion
+        if motion.rotations.shape != shape or clip.time_function.shape != (frames,):
+            raise ModelError(f"{motion.rotations.shape[0]} frames where the others have {frames}", where=clip.name)
+        if motion.translated_joints:
+            joint = aligned.skeleton.joint_names[motion.translated_joints[0]]
+            raise ModelError(
+                f"the joint {joint} moves against its parent, which a model of rotations cannot hold; "
+                "retarget the clips to a skeleton whose bones keep their length",
+                code="translated-joints",
+                where=clip.name,
+            )
+        if not (np.isfinite(motion.poses).all() and np.isfinite(clip.time_function).all()):
+            raise ModelError("numbers that are not finite", where=clip.name)
+        if not (np.diff(clip.time_function) > 0.0).all():
+            raise ModelError("the time function does not rise everywhere", where=clip.name)
+
+
+def fit_examples(aligned: AlignedSet, options: ModelOptions) -> FittedExamples:
+    """The functional components of space and time."""
+    frames = aligned.frame_count
+    reference = next(clip for clip in aligned.clips if clip.uid == aligned.reference)
+    poses = consistent_poses(aligned.poses, reference.motion.poses)
+    wanted = options.spatial_coefficients or coefficient_count(frames)
+    basis = SplineBasis.clamped(frames, min(wanted, frames))
+    coefficients = basis.fit(poses)
+    keep = Keep(share=options.spatial_share, count=options.spatial_components)
+    weights, keep = channel_weights(aligned, basis, poses, coefficients, keep, options)
+    spatial = find_components(basis, coefficients, weights, keep, options.inner_product)
+    steps = SplineBasis.clamped(frames - 1, min(options.temporal_coefficients, frames - 1))
+    temporal = find_components(
+        steps,
+        fit_log_slopes(steps, aligned.time_functions),
+        np.ones(1),
+        Keep(share=options.temporal_share, most=options.most_temporal_components),
+        options.inner_product,
+    )
+    return FittedExamples(poses, spatial, temporal, weights)
+
+
+def channel_weights(
+    aligned: AlignedSet, basis: SplineBasis, poses: Floats, coefficients: Floats, keep: Keep, options: ModelOptions
+) -> tuple[Floats, Keep]:
+    """The weights (D,) of the chosen scaling, and how many components to keep under it."""
+    if options.scaling == "none":
+        return np.ones(poses.shape[2]), keep
+    if options.scaling == "jacobian":
+        return jacobian_weights(aligned.skeleton, basis.at_frames @ coefficients.mean(axis=0)), keep
+    weights = root_max_weights(poses)
+    if options.scaling == "root_max":
+        return weights, keep
+    return optimised_weights(aligned.skeleton, basis, coefficients, weights, keep, options.inner_product)
+
+
+def _kept_scores(principal: PrincipalExamples) -> Floats:
+    return principal.scores[:, : principal.functions.count]
+
+
+def _mixture_options(options: ModelOptions) -> MixtureOptions:
+    return MixtureOptions(
+        criterion=options.criterion,
+        most_components=options.most_mixture_components,
+        components=options.mixture_components,
+        regularisation=options.regularisation,
+        starts=options.starts,
+    )
+
+
+def _assemble(
+    name: str, aligned: AlignedSet, fitted: FittedExamples, weight: float, mixture: FittedMixture
+) -> MotionPrimitive:
+    return MotionPrimitive(
+        name=name,
+        skeleton=aligned.skeleton,
+        frame_rate_hz=aligned.frame_rate_hz,
+        spatial=fitted.spatial.functions,
+        temporal=fitted.temporal.functions,
+        temporal_weight=weight,
+        mixture=mixture.mixture,
+        keyframes=dict(aligned.keyframes),
+    )

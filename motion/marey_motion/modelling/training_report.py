@@ -1,0 +1,200 @@
+"""How good a trained model is: what it explains, what it cannot, and what its samples look like."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.alignment.aligned import AlignedSet
+from marey_motion.landmarks import find_landmarks
+from marey_motion.modelling.fpca import PrincipalExamples
+from marey_motion.modelling.held_out import held_out_log_densities
+from marey_motion.modelling.mixture_fitting import Candidate, FittedMixture
+from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.primitive import MotionPrimitive
+from marey_motion.modelling.reconstruction import ReconstructionErrors, reconstruction_errors
+from marey_motion.modelling.sample_quality import FootQuality, foot_quality, standing_steps, toe_positions
+
+Floats = NDArray[np.float64]
+Progress = Callable[[int, int | None, str], None]
+
+MORE_COMPONENTS_SHOWN = 10
+OUTLIER_DEVIATIONS = 3.5
+"""Robust standard deviations below the median from which on an example's likelihood stands out."""
+
+DEVIATION_OF_MEDIAN = 1.4826
+DURATION_MARGIN = 0.2
+
+
+@dataclass(frozen=True)
+class ExampleReport:
+    """One example as the model sees it.
+
+    Parameters
+    ----------
+    log_likelihood : natural logarithm of its density
+    held_out_log_likelihood : under a mixture fitted without it; None where that was not asked for
+    left_out_error_cm : mean distance of its joints when the other examples' components reconstruct it, as many as kept
+    outlier : its likelihood stands out from the others'
+    """
+
+    uid: str
+    name: str
+    log_likelihood: float
+    held_out_log_likelihood: float | None
+    left_out_error_cm: float | None
+    duration_s: float
+    alignment_cost: float
+    outlier: bool
+
+
+@dataclass(frozen=True)
+class Durations:
+    """Of motions, in seconds; `outside_share` lie outside the range of the examples extended by a fifth."""
+
+    least_s: float
+    mean_s: float
+    most_s: float
+    outside_share: float
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingReport:
+    """How good a model is.
+
+    Parameters
+    ----------
+    spatial_energy, temporal_energy : cumulative share of the variance, of all components there are
+    mixture_method : see `FittedMixture`
+    candidates : the curve of the criterion
+    log_likelihood : mean over the examples
+    held_out_log_likelihood : mean over the examples of their density under mixtures fitted without them
+    examples : in the order of the aligned set
+    spline_error_cm : mean distance of joints of the examples' splines, with all components
+    time_error_frames : root mean square of what time functions are off, after their splines and kept components
+    """
+
+    spatial_energy: Floats
+    temporal_energy: Floats
+    mixture_method: str
+    candidates: tuple[Candidate, ...]
+    log_likelihood: float
+    held_out_log_likelihood: float | None
+    examples: tuple[ExampleReport, ...]
+    reconstruction: ReconstructionErrors | None
+    time_error_frames: float
+    training_durations: Durations
+    sample_durations: Durations | None
+    training_feet: FootQuality | None
+    sample_feet: FootQuality | None
+
+
+def report_on(
+    primitive: MotionPrimitive,
+    aligned: AlignedSet,
+    poses: Floats,
+    spatial: PrincipalExamples,
+    temporal: PrincipalExamples,
+    latents: Floats,
+    fitted: FittedMixture,
+    options: ModelOptions,
+    *,
+    seed: int,
+    threads: int,
+    progress: Progress,
+) -> TrainingReport:
+    """Measure a model against its examples.
+
+    Parameters
+    ----------
+    poses : (m, N, D) of the examples, with consistent signs
+    latents : (m, L) of the examples
+    """
+    densities = primitive.log_density(latents)
+    held_out = None
+    if options.folds >= 2 and len(latents) > options.folds and primitive.dimensions:
+        progress(0, None, "fitting mixtures to parts of the examples")
+        held_out = held_out_log_densities(latents, fitted, options, seed=seed)
+    errors = None
+    if options.leave_one_out:
+        most = primitive.spatial.count + MORE_COMPONENTS_SHOWN
+        errors = reconstruction_errors(primitive.skeleton, spatial, poses, most, threads=threads, progress=progress)
+    progress(0, None, "drawing samples")
+    durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
+    span = (float(durations.min()), float(durations.max()))
+    sampled = primitive.sample(options.report_samples, seed) if options.report_samples else None
+    feet, sample_feet = _feet(primitive, aligned, poses, sampled)
+    time_error = primitive.time_functions(latents) - aligned.time_functions
+    return TrainingReport(
+        spatial_energy=spatial.energy,
+        temporal_energy=temporal.energy,
+        mixture_method=fitted.method,
+        candidates=fitted.candidates,
+        log_likelihood=float(densities.mean()),
+        held_out_log_likelihood=None if held_out is None else float(held_out.mean()),
+        examples=_examples(primitive, aligned, densities, held_out, errors, durations),
+        reconstruction=errors,
+        time_error_frames=float(np.sqrt((time_error**2).mean())),
+        training_durations=_durations(durations, span),
+        sample_durations=None if sampled is None else _durations(primitive.durations_s(sampled), span),
+        training_feet=feet,
+        sample_feet=sample_feet,
+    )
+
+
+def _examples(
+    primitive: MotionPrimitive,
+    aligned: AlignedSet,
+    densities: Floats,
+    held_out: Floats | None,
+    errors: ReconstructionErrors | None,
+    durations: Floats,
+) -> tuple[ExampleReport, ...]:
+    judged = densities if held_out is None else held_out
+    middle = np.median(judged)
+    spread = DEVIATION_OF_MEDIAN * np.median(np.abs(judged - middle))
+    outlying = judged < middle - OUTLIER_DEVIATIONS * spread if spread > 0.0 else np.zeros(len(judged), dtype=bool)
+    kept = primitive.spatial.count
+    return tuple(
+        ExampleReport(
+            uid=clip.uid,
+            name=clip.name,
+            log_likelihood=float(densities[index]),
+            held_out_log_likelihood=None if held_out is None else float(held_out[index]),
+            left_out_error_cm=None if errors is None else float(errors.left_out_each_cm[index, _at(errors, kept)]),
+            duration_s=float(durations[index]),
+            alignment_cost=float(clip.cost),
+            outlier=bool(outlying[index]),
+        )
+        for index, clip in enumerate(aligned.clips)
+    )
+
+
+def _at(errors: ReconstructionErrors, components: int) -> int:
+    """Where the curve is at so many components, or at its end."""
+    return min(components, len(errors.components) - 1)
+
+
+def _durations(durations: Floats, span: tuple[float, float]) -> Durations:
+    least, most = span[0] * (1.0 - DURATION_MARGIN), span[1] * (1.0 + DURATION_MARGIN)
+    outside = (durations < least) | (durations > most)
+    return Durations(float(durations.min()), float(durations.mean()), float(durations.max()), float(outside.mean()))
+
+
+def _feet(
+    primitive: MotionPrimitive, aligned: AlignedSet, poses: Floats, sampled: Floats | None
+) -> tuple[FootQuality | None, FootQuality | None]:
+    """Of the examples and of samples; None where the skeleton has no feet that are known."""
+    joints = find_landmarks(primitive.skeleton).ground_joints
+    if not joints:
+        return None, None
+    toes = toe_positions(primitive.skeleton, poses, joints)
+    standing = standing_steps(toes, aligned.time_functions, primitive.frame_rate_hz)
+    training = foot_quality(toes, aligned.time_functions, primitive.frame_rate_hz, standing)
+    if sampled is None:
+        return training, None
+    drawn = toe_positions(primitive.skeleton, primitive.poses(sampled), joints)
+    return training, foot_quality(drawn, primitive.time_functions(sampled), primitive.frame_rate_hz, standing)

@@ -1,0 +1,104 @@
+"""What somebody should look at before using a model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.primitive import MotionPrimitive
+from marey_motion.modelling.training_report import ExampleReport, TrainingReport
+
+FEW_EXAMPLES_PER_DIMENSION = 2
+NAMES_SHOWN = 5
+DEEP_BELOW_FLOOR_CM = 2.0
+MANY_OUTSIDE = 0.05
+OVERFITTED_RATIO = 2.0
+LEAST_ERROR_CM = 0.5
+
+
+@dataclass(frozen=True)
+class Warned:
+    """Something about a model: a stable code and a sentence."""
+
+    code: str
+    message: str
+
+
+def warnings_of(primitive: MotionPrimitive, report: TrainingReport, options: ModelOptions) -> tuple[Warned, ...]:
+    """Everything that is noteworthy, gravest first."""
+    return (*_of_examples(primitive, report, options), *_of_mixture(report), *_of_samples(report))
+
+
+def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: ModelOptions) -> list[Warned]:
+    count, found = len(report.examples), []
+    if primitive.dimensions == 0:
+        found.append(Warned("no-variation", f"the {count} examples are one motion: the model can only repeat it"))
+    elif count < FEW_EXAMPLES_PER_DIMENSION * primitive.dimensions:
+        found.append(
+            Warned(
+                "too-few-examples",
+                f"{count} examples for {primitive.dimensions} dimensions: their likelihoods say little, and the mixture "
+                f"has one component; add examples, or keep less than {options.spatial_share:.0%} of the variance",
+            )
+        )
+    errors = report.reconstruction
+    if errors is not None and primitive.spatial.count < len(errors.components):
+        training, left_out = (curve[primitive.spatial.count] for curve in (errors.training_cm, errors.left_out_cm))
+        if left_out > max(OVERFITTED_RATIO * training, LEAST_ERROR_CM):
+            found.append(
+                Warned(
+                    "does-not-generalise",
+                    f"an example left out is reconstructed {left_out:.1f} cm off on average, those trained on "
+                    f"{training:.1f} cm: the examples do not cover how this action varies",
+                )
+            )
+    outliers = sorted((one for one in report.examples if one.outlier), key=_likelihood)
+    if outliers:
+        names = ", ".join(one.name for one in outliers[:NAMES_SHOWN])
+        more = f" and {len(outliers) - NAMES_SHOWN} more" if len(outliers) > NAMES_SHOWN else ""
+        found.append(Warned("outliers", f"unlike the other examples: {names}{more}; look at them"))
+    return found
+
+
+def _likelihood(example: ExampleReport) -> float:
+    held_out = example.held_out_log_likelihood
+    return example.log_likelihood if held_out is None else held_out
+
+
+def _of_mixture(report: TrainingReport) -> list[Warned]:
+    found = []
+    refused = [candidate.components for candidate in report.candidates if candidate.refusal]
+    if refused:
+        numbers = ", ".join(map(str, refused))
+        found.append(
+            Warned("components-refused", f"mixtures of {numbers} components leave one with too few examples: not taken")
+        )
+    slow = [candidate.components for candidate in report.candidates if not candidate.converged]
+    if slow:
+        found.append(
+            Warned("not-converged", f"the fit of {', '.join(map(str, slow))} components did not come to an end")
+        )
+    return found
+
+
+def _of_samples(report: TrainingReport) -> list[Warned]:
+    found = []
+    feet, trained = report.sample_feet, report.training_feet
+    if feet is not None and trained is not None and feet.below_floor_mean_cm > DEEP_BELOW_FLOOR_CM:
+        found.append(
+            Warned(
+                "feet-below-floor",
+                f"in {feet.below_floor_share:.0%} of their frames, samples have a foot below the floor, "
+                f"{feet.below_floor_mean_cm:.1f} cm on average (examples: {trained.below_floor_share:.0%}, "
+                f"{trained.below_floor_mean_cm:.1f} cm)",
+            )
+        )
+    durations = report.sample_durations
+    if durations is not None and durations.outside_share > MANY_OUTSIDE:
+        found.append(
+            Warned(
+                "odd-durations",
+                f"{durations.outside_share:.0%} of the samples last longer or shorter than any example by over a fifth",
+            )
+        )
+    return found
