@@ -18,19 +18,22 @@ Floats = NDArray[np.float64]
 class Placement:
     """Where on the ground a clip began: what bringing it to the canonical frame took away.
 
-    A point p of the canonical frame stood at R(heading) p + (x, y, z).
+    A point p of the canonical frame stood at R(heading) p + (x, y, z), R turning about the vertical.
 
     Parameters
     ----------
     heading_rad : where the body faced in the first frame, 0 along +z, positive to the left
-    x, z : where the root stood in the first frame, metres
+    x, z : where the joint that carries the body stood in the first frame, metres
     y : what was taken off all heights, metres: nothing where they are kept, as they are by default
+    joint : the joint that carries the body (`MatchingBody.carrier`): the root, or, below a root that is a static
+        reference on the floor, mostly the hips
     """
 
     heading_rad: float
     x: float
     z: float
     y: float = 0.0
+    joint: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +44,8 @@ class AlignedClip:
     ----------
     uid : unique among the clips; ties are broken by it
     name : for people
-    motion : N canonical frames, in the canonical frame: the first root stands at x = z = 0 and faces +z
+    motion : N canonical frames, in the canonical frame: the body begins at x = z = 0 and faces +z. Joints between a
+        static root and the one that carries the body are not translated.
     time_function : (N,) fractional frame of the source (at the set's rate) at each canonical frame; strictly
         increasing from 0 to the last frame of the source
     placement : what was taken away

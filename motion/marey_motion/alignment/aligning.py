@@ -33,7 +33,7 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.mirroring import mirror_clip
 from marey_motion.motion import Motion
 from marey_motion.resampling import resample_motion
-from marey_motion.skeleton import same_hierarchy
+from marey_motion.skeleton import Skeleton, same_hierarchy
 
 Floats = NDArray[np.float64]
 
@@ -76,7 +76,8 @@ class AlignOptions:
     rate_hz : of canonical frames; None for that of the reference where its uid is given, else for the commonest one
     max_run : at most so many frames of one motion in a row are matched with a single one of the other (the slope
         limit); None for any
-    cost : of a pair of frames; its weights are one for each joint of the skeleton
+    cost : of a pair of frames; its weights are one for each joint of the skeleton. Without weights, all joints of the
+        body count the same, and those that it does not carry (a static root, what lies on the floor) not at all.
     keep_height : leave heights above the floor as they are
     """
 
@@ -146,6 +147,9 @@ class _Aligning:
     def __init__(self, body: MatchingBody, options: AlignOptions, threads: int, progress: Progress) -> None:
         self._body = body
         self._options = options
+        self._cost = options.cost
+        if self._cost.weights is None:
+            self._cost = replace(self._cost, weights=_weights_of_body(body))
         self._threads = max(1, threads)
         self._tell = progress
 
@@ -236,7 +240,7 @@ class _Aligning:
             )
         sections = sections_of(example.cuts, frames, rate_ratio=rate_hz / clip.frame_rate_hz)
         moved, placement = to_canonical(motion, self._body, keep_height=self._options.keep_height)
-        points = cost_points(moved.positions(skeleton), self._options.cost)
+        points = cost_points(moved.positions(skeleton), self._cost)
         return _Prepared(example, moved, placement, sections, points)
 
     def _common_labels(self, prepared: Sequence[_Prepared]) -> tuple[tuple[str, ...], ...]:
@@ -258,7 +262,7 @@ class _Aligning:
         totals = pairwise_totals(
             [one.points for one in prepared],
             [one.sections.bounds for one in prepared],
-            self._options.cost,
+            self._cost,
             max_run=self._options.max_run,
             threads=self._threads,
             progress=lambda done, total: self._tell(done, total, f"comparing {len(prepared)} clips"),
@@ -282,11 +286,16 @@ class _Aligning:
 
     def _found(self, reference: _Prepared, one: _Prepared) -> SectionedAlignment:
         return align_sections(
-            costs_between(reference.points, one.points, self._options.cost),
+            costs_between(reference.points, one.points, self._cost),
             reference.sections.bounds,
             one.sections.bounds,
             partial(align, max_run=self._options.max_run),
         )
+
+
+def _weights_of_body(body: MatchingBody) -> Floats:
+    paths = (body.skeleton.path_to_root(joint) for joint in range(body.skeleton.joint_count))
+    return np.array([float(body.carrier in path) for path in paths])
 
 
 def _with_signs_of(motion: Motion, reference: Motion) -> Motion:
@@ -298,9 +307,9 @@ def _with_signs_of(motion: Motion, reference: Motion) -> Motion:
     return motion._replace(rotations=rotations * signs[..., None])
 
 
-def restore(clip: AlignedClip) -> Motion:
+def restore(clip: AlignedClip, skeleton: Skeleton) -> Motion:
     """The source again, at the set's rate and where it stood: what `align_clips` did to it, undone.
 
     Exact where the time function is the identity; elsewhere poses between those of canonical frames are interpolated.
     """
-    return placed(warped(clip.motion, inverse(clip.time_function)), clip.placement)
+    return placed(warped(clip.motion, inverse(clip.time_function)), clip.placement, skeleton)

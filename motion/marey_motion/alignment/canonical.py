@@ -10,6 +10,7 @@ from marey_motion.alignment.aligned import Placement
 from marey_motion.kinematics import forward_directions, headings
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
+from marey_motion.skeleton import Skeleton
 
 Floats = NDArray[np.float64]
 
@@ -17,36 +18,62 @@ Floats = NDArray[np.float64]
 def to_canonical(motion: Motion, body: MatchingBody, *, keep_height: bool = True) -> tuple[Motion, Placement]:
     """The motion turned and moved as a whole so that its first frame stands at x = z = 0 and faces +z.
 
-    Where it faces is what hips and shoulders say together; where they say nothing in the first frame, the first frame
-    counts in which they do.
+    What stands there is the joint that carries the body: the root, except where that is a static reference on the
+    floor. Such a reference keeps its rotations and is moved along so that the body comes where it belongs; translations
+    of joints between the two go into those of the root.
+
+    Where the body faces is what hips and shoulders say together; where they say nothing in the first frame, the first
+    frame counts in which they do.
 
     Parameters
     ----------
-    keep_height : leave heights above the floor as they are; else the root begins at y = 0, too
+    keep_height : leave heights above the floor as they are; else the body begins at y = 0, too
 
     Raises `MotionError` when hips and shoulders never tell a direction.
     """
-    directions = forward_directions(motion.positions(body.skeleton), body.lefts, body.rights)
-    x, y, z = (float(coordinate) for coordinate in motion.root_translations[0])
-    placement = Placement(float(headings(directions[:1])[0]), x, z, 0.0 if keep_height else y)
-    moved = motion._replace(root_translations=motion.root_translations - _origin(placement))
-    return _turned(moved, -placement.heading_rad), placement
+    positions = motion.positions(body.skeleton)
+    directions = forward_directions(positions, body.lefts, body.rights)
+    carrier = positions[:, body.carrier]
+    x, y, z = (float(coordinate) for coordinate in carrier[0])
+    placement = Placement(float(headings(directions[:1])[0]), x, z, 0.0 if keep_height else y, body.carrier)
+    turn = _turn(-placement.heading_rad)
+    places = quaternions.rotate_vectors(turn, carrier - _origin(placement))
+    return _carried(motion, body.skeleton, body.carrier, turn, places), placement
 
 
-def placed(motion: Motion, placement: Placement) -> Motion:
+def placed(motion: Motion, placement: Placement, skeleton: Skeleton) -> Motion:
     """A motion of the canonical frame where it was: the inverse of `to_canonical`."""
-    turned = _turned(motion, placement.heading_rad)
-    return turned._replace(root_translations=turned.root_translations + _origin(placement))
+    turn = _turn(placement.heading_rad)
+    carrier = motion.positions(skeleton)[:, placement.joint]
+    places = quaternions.rotate_vectors(turn, carrier) + _origin(placement)
+    return _carried(motion, skeleton, placement.joint, turn, places)
 
 
 def _origin(placement: Placement) -> Floats:
     return np.array((placement.x, placement.y, placement.z))
 
 
-def _turned(motion: Motion, angle_rad: float) -> Motion:
-    """The motion turned to the left about the vertical through the origin."""
-    turn = quaternions.from_axis_angle((0.0, 1.0, 0.0), angle_rad)
+def _turn(angle_rad: float) -> Floats:
+    """To the left about the vertical."""
+    return np.asarray(quaternions.from_axis_angle((0.0, 1.0, 0.0), angle_rad), dtype=np.float64)
+
+
+def _carried(motion: Motion, skeleton: Skeleton, carrier: int, turn: Floats, places: quaternions.Floats) -> Motion:
+    """The motion with the joint `carrier` at `places` (F, 3), and turned in the world by `turn`."""
+    above = skeleton.path_to_root(carrier)[:0:-1]
+    arm = np.zeros((motion.frame_count, 3))
+    parent = quaternions.identity(motion.frame_count)
+    for joint, child in zip(above, (*above[1:], carrier), strict=True):
+        parent = quaternions.multiply(parent, motion.rotations[:, joint])
+        arm += quaternions.rotate_vectors(parent, skeleton.offsets[child])
     rotations = motion.rotations.copy()
-    rotations[:, 0] = quaternions.multiply(turn, rotations[:, 0])
-    moved = quaternions.rotate_vectors(turn, motion.root_translations)
-    return motion._replace(root_translations=np.asarray(moved, dtype=np.float64), rotations=rotations)
+    local = quaternions.multiply(quaternions.conjugate(parent), quaternions.multiply(turn, parent))
+    rotations[:, carrier] = quaternions.multiply(local, rotations[:, carrier])
+    chain = {*above, carrier}
+    kept = [slot for slot, joint in enumerate(motion.translated_joints) if joint not in chain]
+    return Motion(
+        np.asarray(places - arm, dtype=np.float64),
+        rotations,
+        motion.translations[:, kept],
+        tuple(motion.translated_joints[slot] for slot in kept),
+    )
