@@ -139,7 +139,7 @@ def on_the_floor(clip: Clip) -> tuple[Clip, float]:
 def _track(clip: Clip, landmarks: Landmarks | None = None) -> _Tracks:
     skeleton = clip.skeleton
     landmarks = landmarks or find_landmarks(skeleton)
-    soles = tuple(_sole(skeleton, foot) for foot in landmarks.feet or ())
+    soles = tuple(sole_points(skeleton, foot) for foot in landmarks.feet or ())
     bodies = [joint for pair in (landmarks.hands, landmarks.feet) if pair for joint in pair]
     points = sorted({0, landmarks.hips or 0, *bodies, *(point for sole in soles for point in sole)})
     positions = np.empty((clip.frame_count, len(points), 3), np.float32)
@@ -158,8 +158,8 @@ def _track(clip: Clip, landmarks: Landmarks | None = None) -> _Tracks:
     return _Tracks(landmarks, positions, column, tuple(np.array([column[p] for p in sole]) for sole in soles))
 
 
-def _sole(skeleton: Skeleton, foot: int) -> list[int]:
-    """The foot's joints from the ankle down, and its end sites as the points that follow the joints."""
+def sole_points(skeleton: Skeleton, foot: int) -> list[int]:
+    """The foot's joints from the ankle down, and its end sites as the points that `end_sites` puts after the joints."""
     below = {foot}
     for joint in range(foot + 1, skeleton.joint_count):
         if int(skeleton.parents[joint]) in below:

@@ -34,7 +34,7 @@ class Motion(NamedTuple):
     def of(cls, clip: Clip) -> Motion:
         """A clip's own numbers."""
         moved = np.zeros((clip.frame_count, 0, 3)) if clip.translations is None else clip.translations
-        rotations = unit_and_continuous(clip.rotations.astype(np.float64))
+        rotations = _unit_and_continuous(clip.rotations.astype(np.float64))
         return cls(
             clip.root_translations.astype(np.float64), rotations, moved.astype(np.float64), clip.translated_joints
         )
@@ -70,7 +70,7 @@ class Motion(NamedTuple):
         )
 
 
-def unit_and_continuous(rotations: Floats) -> Floats:
+def _unit_and_continuous(rotations: Floats) -> Floats:
     """Rotations (F, J, 4) of nearly unit length, changed in place: sums of four as one product, which is what costs."""
     rotations /= np.sqrt(np.einsum("fjc,fjc->fj", rotations, rotations))[..., None]
     turned_over = np.einsum("fjc,fjc->fj", rotations[1:], rotations[:-1]) < 0.0

@@ -50,18 +50,23 @@ def resample_motion(motion: Motion, from_hz: float, to_hz: float, *, seam: LoopS
     if seam is not None:
         count = max(1, round(frames / from_hz * to_hz))
         places = LOOP_REACH + np.arange(count, dtype=np.float64) * (frames / count)
-        return _sampled(continue_motion(motion, seam, LOOP_REACH, LOOP_REACH), places)
+        return sample_motion(continue_motion(motion, seam, LOOP_REACH, LOOP_REACH), places)
+    count = count_samples(frames, from_hz, to_hz)
+    return sample_motion(motion, np.minimum(np.arange(count, dtype=np.float64) * (from_hz / to_hz), frames - 1.0))
+
+
+def count_samples(frames: int, from_hz: float, to_hz: float) -> int:
+    """How many frames a motion of so many frames has at another rate, none beyond its last one."""
     # Rates that divide each other must not lose their last frame to rounding.
-    count = int((frames - 1) / from_hz * to_hz + 1e-6) + 1
-    return _sampled(motion, np.minimum(np.arange(count, dtype=np.float64) * (from_hz / to_hz), frames - 1.0))
+    return int((frames - 1) / from_hz * to_hz + 1e-6) + 1
 
 
 def _are_same(rate_hz: float, other_hz: float) -> bool:
     return abs(rate_hz - other_hz) <= SAME_RATE * other_hz
 
 
-def _sampled(motion: Motion, places: Floats) -> Motion:
-    """The motion at fractional frame numbers `places` (n,)."""
+def sample_motion(motion: Motion, places: Floats) -> Motion:
+    """The motion at fractional frame numbers `places` (n,) from 0 to F - 1; frames are taken as they are."""
     nearest = np.round(places).astype(np.int64)
     if np.all(np.abs(places - nearest) <= SAME_RATE * motion.frame_count):
         return motion.at_frames(nearest)

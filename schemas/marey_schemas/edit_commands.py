@@ -216,14 +216,13 @@ class FindContacts(Request):
     """Find when the feet stand; changes nothing."""
 
     command: Literal["find_contacts"]
-    speed_limit_m_s: float = Field(
-        0.15, gt=0, le=100, allow_inf_nan=False, description="A foot that stands is slower than this."
+    speed_m_s: float = Field(
+        0.5, gt=0, le=100, allow_inf_nan=False, description="A foot that stands is slower than this."
     )
+    shortest_swing_s: float = Field(0.1, gt=0, le=10, allow_inf_nan=False, description="Shorter swings are noise.")
+    shortest_stance_s: float = Field(0.06, gt=0, le=10, allow_inf_nan=False, description="Shorter stances are noise.")
     height_limit_m: float | None = Field(
-        0.1, gt=0, le=100, allow_inf_nan=False, description="And nearer to the ground; null: at any height."
-    )
-    window_s: float = Field(
-        0.1, gt=0, le=10, allow_inf_nan=False, description="Each frame follows the majority of so much time around it."
+        0.1, gt=0, le=100, allow_inf_nan=False, description="And so near to the ground; null: at any height."
     )
 
 

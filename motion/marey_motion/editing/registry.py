@@ -10,23 +10,53 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from marey_motion.clip import Clip
+from marey_motion.editing.drift import fix_drift
+from marey_motion.editing.ground import find_contacts, find_ground, move_to_ground
+from marey_motion.editing.joining import concatenate
+from marey_motion.editing.loops import close_loop
+from marey_motion.editing.pasting import paste
+from marey_motion.editing.placement import face, flip_axes, move_to_origin, rotate, scale, translate
 from marey_motion.editing.ranges import split, trim
-from marey_motion.editing.take import MOST_NUMBERS, EditedBody, Finding, Take
+from marey_motion.editing.smoothing import smooth
+from marey_motion.editing.symmetry import mirror
+from marey_motion.editing.take import MOST_NUMBERS, EditedBody, Finding, Take, motion_of, settled
+from marey_motion.editing.timing import resample, retime
+from marey_motion.editing.turning_joints import rotate_joint
 from marey_motion.errors import EditError, MotionError
-from marey_motion.motion import Motion, unit_and_continuous
 
 Command = Callable[..., Take | tuple[Take, ...]]
 NamedCommand = tuple[str, Mapping[str, Any]]
 
 COMMANDS: Mapping[str, Command] = {
-    "trim": trim,
-    "split": split,
+    command.__name__: command
+    for command in (
+        trim,
+        split,
+        concatenate,
+        resample,
+        retime,
+        close_loop,
+        translate,
+        rotate,
+        face,
+        move_to_origin,
+        scale,
+        flip_axes,
+        fix_drift,
+        move_to_ground,
+        find_ground,
+        find_contacts,
+        mirror,
+        smooth,
+        rotate_joint,
+        paste,
+    )
 }
 """By name. A new one gets its line here and its schema in `marey_schemas.editing`."""
 
@@ -71,11 +101,9 @@ def edit_clip(
     ------
     MotionError    where a command cannot be applied; `where` tells which and what of it
     """
-    takes: tuple[Take, ...] = (
-        Take(
-            Motion.of(clip), clip.frame_rate_hz, body or EditedBody(clip.skeleton), sources or {}, (), (), most_numbers
-        ),
-    )
+    body = body or EditedBody(clip.skeleton)
+    first = Take(motion_of(clip), clip.frame_rate_hz, body, sources or {}, most_numbers=most_numbers)
+    takes: tuple[Take, ...] = (first,)
     for number, (name, parameters) in enumerate(commands):
         try:
             takes = tuple(one for take in takes for one in apply_command(take, name, parameters))
@@ -115,4 +143,4 @@ def _checked(take: Take) -> Take:
         finite = np.isfinite(numbers).all(axis=tuple(range(1, numbers.ndim)))
         if not finite.all():
             raise EditError(f"frame {int(np.argmin(finite))} gets a number that is not finite", code="edit-not-finite")
-    return replace(take, motion=motion._replace(rotations=unit_and_continuous(motion.rotations.copy())))
+    return take.moved(settled(motion))

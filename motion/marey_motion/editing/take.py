@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from marey_motion.clip import Clip
 from marey_motion.errors import EditError
+from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
 from marey_motion.rigs import JointMapping, map_joints, symmetric_joints
 from marey_motion.skeleton import Skeleton
@@ -21,6 +22,10 @@ Floats = NDArray[np.float64]
 
 MOST_NUMBERS = 200_000_000
 """Numbers of the motion that a command may make: 1.6 GB, or two and a half hours of 60 joints at 90 Hz."""
+
+
+UNIT_IN_SINGLE = 3e-7
+"""What rounding to single precision leaves between the square of a length and one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +57,9 @@ class EditedBody:
         return self.skeleton.index_of(self.mapping.joints.get("pelvis", self.skeleton.joint_names[0]))
 
     @cached_property
-    def sides(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Left and right hips and shoulders, whose difference tells where the body faces. Raises `MappingError`."""
-        lefts = self.mapping.indices(self.skeleton, ("left_hip", "left_shoulder"))
-        return lefts, self.mapping.indices(self.skeleton, ("right_hip", "right_shoulder"))
+    def matching(self) -> MatchingBody:
+        """Hips, shoulders, feet and toes. Raises `MappingError` naming the standard joints that are missing."""
+        return MatchingBody.from_mapping(self.skeleton, self.mapping)
 
 
 @dataclass(frozen=True)
@@ -149,3 +153,33 @@ class Take:
                 f"the result would have {frames:,} frames; of this skeleton {most:,} are possible",
                 code="edit-too-large",
             )
+
+
+def motion_of(clip: Clip) -> Motion:
+    """A clip's own numbers in double precision; frames that no command touches keep their bytes."""
+    nothing = np.zeros((clip.frame_count, 0, 3))
+    return settled(
+        Motion(
+            clip.root_translations.astype(np.float64),
+            clip.rotations.astype(np.float64),
+            nothing if clip.translations is None else clip.translations.astype(np.float64),
+            clip.translated_joints,
+        )
+    )
+
+
+def settled(motion: Motion) -> Motion:
+    """The motion with rotations of unit length and of continuous sign.
+
+    What is of unit length in single precision stays as it is.
+    """
+    rotations = motion.rotations
+    squares = np.einsum("fjc,fjc->fj", rotations, rotations)
+    off = np.abs(squares - 1.0) > UNIT_IN_SINGLE
+    turned_over = np.einsum("fjc,fjc->fj", rotations[1:], rotations[:-1]) < 0.0
+    if not (off.any() or turned_over.any()):
+        return motion
+    rotations = rotations.copy()
+    rotations[off] /= np.sqrt(squares[off])[:, None]
+    rotations[1:][np.cumsum(turned_over, axis=0) % 2 == 1] *= -1.0
+    return motion._replace(rotations=rotations)

@@ -1,0 +1,125 @@
+"""Where the ground is, and when the feet stand on it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.checks import sole_points
+from marey_motion.editing.contacts import ContactOptions, Stance, find_stances
+from marey_motion.editing.placement import translate
+from marey_motion.editing.take import Finding, Take
+from marey_motion.kinematics import forward_kinematics
+
+Floats = NDArray[np.float64]
+
+FEET = ("left_foot", "right_foot")
+LOWEST_SHARE = 0.05
+"""Of the frames: where no foot ever stands, the lowest ones tell where the ground is."""
+
+
+class Ground(NamedTuple):
+    """An estimate of the ground.
+
+    Parameters
+    ----------
+    height_m : metres
+    standing_frames : how many frames tell it; with 0, it is where the lowest point of the feet comes down to
+    """
+
+    height_m: float
+    standing_frames: int
+
+
+def move_to_ground(take: Take, *, height_m: float | None = None) -> Take:
+    """Shift everything up or down so that the ground, at `height_m` or where it is estimated, is at height zero.
+
+    Raises `MappingError` where the feet are not known.
+    """
+    ground = estimate_ground(take) if height_m is None else Ground(height_m, 0)
+    moved = translate(take, shift_m=(0.0, -ground.height_m, 0.0))
+    return moved if height_m is not None else moved.with_finding(Finding("move_to_ground", ground._asdict()))
+
+
+def find_ground(take: Take) -> Take:
+    """Note the height of the ground. Raises `MappingError` where the feet are not known."""
+    return take.with_finding(Finding("find_ground", estimate_ground(take)._asdict()))
+
+
+def find_contacts(
+    take: Take,
+    *,
+    speed_m_s: float = 0.5,
+    shortest_swing_s: float = 0.1,
+    shortest_stance_s: float = 0.06,
+    height_limit_m: float | None = 0.1,
+) -> Take:
+    """Note for which frames each foot stands, as the segments of an annotation.
+
+    Parameters
+    ----------
+    speed_m_s, shortest_swing_s, shortest_stance_s : see `contacts.ContactOptions`
+    height_limit_m : a foot that is slow but so far above the ground does not stand; None to ask for its speed only
+
+    Raises
+    ------
+    MappingError    where the feet are not known
+    """
+    stances = _stances(take, ContactOptions(speed_m_s, shortest_swing_s, shortest_stance_s))
+    if height_limit_m is not None:
+        heights = sole_heights(take)
+        limit = _ground_of(heights, stances).height_m + height_limit_m
+        stances = tuple(
+            [one for one in foot if np.median(heights[one.start : one.end, side]) <= limit]
+            for side, foot in enumerate(stances)
+        )
+    segments = [
+        {"label": label, "start": one.start, "end": one.end}
+        for label, foot in zip(FEET, stances, strict=True)
+        for one in foot
+    ]
+    segments.sort(key=lambda one: (one["start"], one["label"]))
+    values = {"frame_count": take.frame_count, "frame_rate_hz": take.frame_rate_hz, "segments": segments}
+    return take.with_finding(Finding("find_contacts", values))
+
+
+def estimate_ground(take: Take) -> Ground:
+    """The median height of the lower foot's sole over the frames in which that foot stands.
+
+    So neither a foot below the floor for some frames nor a kick that is held moves it. Raises `MappingError`.
+    """
+    return _ground_of(sole_heights(take), _stances(take, ContactOptions()))
+
+
+def sole_heights(take: Take) -> Floats:
+    """(F, 2) height of the lowest point of the left and the right foot, metres. Raises `MappingError`."""
+    motion, skeleton = take.motion, take.skeleton
+    positions = forward_kinematics(
+        skeleton,
+        motion.poses,
+        translations=motion.translations,
+        translated_joints=motion.translated_joints,
+        end_sites=True,
+    )
+    soles = (sole_points(skeleton, foot) for foot in take.body.matching.feet)
+    return np.stack([positions[:, sole, 1].min(axis=1) for sole in soles], axis=1)
+
+
+def _stances(take: Take, options: ContactOptions) -> tuple[list[Stance], ...]:
+    clip = take.motion.as_clip(take.skeleton, take.frame_rate_hz)
+    return find_stances(clip, take.body.matching, options)
+
+
+def _ground_of(heights: Floats, stances: tuple[list[Stance], ...]) -> Ground:
+    standing = np.zeros(heights.shape, dtype=np.bool_)
+    for side, foot in enumerate(stances):
+        for one in foot:
+            standing[one.start : one.end, side] = True
+    lower = np.argmin(heights, axis=1)
+    lowest = heights.min(axis=1)
+    told = lowest[np.take_along_axis(standing, lower[:, None], axis=1)[:, 0]]
+    if told.size == 0:
+        return Ground(float(np.quantile(lowest, LOWEST_SHARE)), 0)
+    return Ground(float(np.median(told)), int(told.size))

@@ -1,0 +1,126 @@
+"""One motion after another."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.editing.borders import blended, smooth_step
+from marey_motion.editing.offsets import add_offset, dying_away, offset_to, step_of
+from marey_motion.editing.placement import body_track, moved_over
+from marey_motion.editing.take import Take, motion_of
+from marey_motion.editing.translations import with_equal_joints
+from marey_motion.errors import EditError
+from marey_motion.looping import LoopSeam, loop_seam, rotated
+from marey_motion.motion import Motion
+from marey_motion.resampling import count_samples, resample_motion
+from marey_motion.skeleton import same_hierarchy
+
+Floats = NDArray[np.float64]
+
+SAME_SKELETON_M = 1e-5
+VELOCITY_S = 0.3
+"""A difference of velocities is used up after this, so that long blends do not swing out."""
+
+
+def concatenate(
+    take: Take,
+    *,
+    source: str,
+    place: Literal["seam", "keep"] = "seam",
+    blend: Literal["inertialise", "slerp"] = "inertialise",
+    blend_s: float = 0.3,
+) -> Take:
+    """Append a clip of the same skeleton, at this motion's frame rate.
+
+    Parameters
+    ----------
+    source : the clip
+    place : seam, turned about the vertical and shifted on the ground so that the body goes on where it was and facing
+        where it faced; keep, as it is
+    blend : inertialise, all frames of both, and the difference at the seam dies away in the second; slerp, so many
+        frames of both overlap and are faded over
+    blend_s : how long that takes; 0 for a hard cut
+
+    Raises
+    ------
+    EditError    for an unknown source, another skeleton, and a result that is too long
+    MotionError    where the body faces no direction at the seam
+    """
+    added = _same_rate(take, source)
+    first, second = with_equal_joints(take.motion, added.motion, take.skeleton)
+    before, after = take.moved(first), added.moved(second)
+    count = take.count_frames(blend_s)
+    overlap = min(count, before.frame_count, after.frame_count) if blend == "slerp" else 0
+    if place == "seam":
+        after = after.moved(moved_over(second, _seam(before, after, overlap)))
+    if overlap:
+        return take.moved(_faded_over(first, after.motion, overlap))
+    joined = after.motion if count == 0 else _inertialised(before, after, count)
+    return take.moved(_in_a_row(first, joined))
+
+
+def _same_rate(take: Take, source: str) -> Take:
+    """The source clip as a take at the rate of this one. Raises `EditError`."""
+    clip = take.source(source)
+    if not same_hierarchy(clip.skeleton, take.skeleton, tolerance_m=SAME_SKELETON_M):
+        raise EditError(
+            f"the clip {source} moves another skeleton; retarget it first", code="other-skeleton", where="source"
+        )
+    count = count_samples(clip.frame_count, clip.frame_rate_hz, take.frame_rate_hz)
+    take.require_room(take.frame_count + count)
+    return take.moved(resample_motion(motion_of(clip), clip.frame_rate_hz, take.frame_rate_hz))
+
+
+def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
+    """The move on the ground that lets one go on where the other ends; in the middle of an overlap they meet."""
+    if overlap:
+        there, here = before.frame_count - overlap + overlap // 2, overlap // 2
+        (target,), (wanted,) = body_track(before, there, there + 1)
+        (start,), (heading,) = body_track(after, here, here + 1)
+        turn = float(wanted - heading)
+        return LoopSeam(turn, target[[0, 2]] - rotated(start[[0, 2]], turn))
+    ends, end_headings = body_track(before, max(0, before.frame_count - 2), before.frame_count)
+    starts, start_headings = body_track(after, 0, min(2, after.frame_count))
+    # One frame alone stands still: it is its own neighbour.
+    rows = np.stack((starts[0], starts[-1], ends[0], ends[-1]))[:, [0, 2]]
+    return loop_seam(rows, np.array([start_headings[0], start_headings[-1], end_headings[0], end_headings[-1]]))
+
+
+def _inertialised(before: Take, after: Take, count: int) -> Motion:
+    """The second motion, starting with the pose and velocity that the first one ends with."""
+    first, second = before.motion, after.motion
+    last = before.frame_count - 1
+    arrival = step_of(first, max(0, last - 1))
+    going_on = add_offset(first.at_frames(np.array([last])), np.array([0]), arrival)
+    difference = offset_to(second, 0, going_on, 0)
+    velocity = arrival.minus(step_of(second, 0))
+    ages = np.arange(min(count, after.frame_count), dtype=np.float64)
+    velocity_life = min(float(count), max(1.0, VELOCITY_S * before.frame_rate_hz))
+    left = dying_away(difference, velocity, ages, float(count), velocity_life)
+    return add_offset(second, np.arange(len(ages)), left)
+
+
+def _in_a_row(first: Motion, second: Motion) -> Motion:
+    return first._replace(
+        root_translations=np.concatenate((first.root_translations, second.root_translations)),
+        rotations=np.concatenate((first.rotations, second.rotations)),
+        translations=np.concatenate((first.translations, second.translations)),
+    )
+
+
+def _faded_over(first: Motion, second: Motion, overlap: int) -> Motion:
+    """Both, the last frames of the one faded over into the first ones of the other."""
+    share = smooth_step(np.arange(1, overlap + 1) / (overlap + 1))
+    end, start = slice(first.frame_count - overlap, None), slice(None, overlap)
+    middle = first._replace(
+        root_translations=first.root_translations[end]
+        + share[:, None] * (second.root_translations[start] - first.root_translations[end]),
+        rotations=blended(first.rotations[end], second.rotations[start], share),
+        translations=first.translations[end]
+        + share[:, None, None] * (second.translations[start] - first.translations[end]),
+    )
+    kept = first.at_frames(np.arange(first.frame_count - overlap))
+    return _in_a_row(_in_a_row(kept, middle), second.at_frames(np.arange(overlap, second.frame_count)))

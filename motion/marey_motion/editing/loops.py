@@ -1,0 +1,73 @@
+"""Clips made into loops."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.editing.offsets import add_offset, dying_away, offset_to, step_of
+from marey_motion.editing.placement import body_track, carried, moved_over
+from marey_motion.editing.take import Take
+from marey_motion.errors import EditError
+from marey_motion.looping import LoopSeam, about_vertical, loop_seam, rotated
+from marey_motion.motion import Motion
+
+Floats = NDArray[np.float64]
+
+FEWEST_FRAMES = 4
+VELOCITY_S = 0.3
+"""A difference of velocities is used up after this, so that poses far from the seam stay."""
+
+
+def close_loop(take: Take, *, in_place: bool = False, blend_s: float | None = None) -> Take:
+    """Make the last frame lead into the first one, elsewhere on the ground where the clip travels.
+
+    What is missing between the pose and velocity that the end runs towards and those of the start is shared: half dies
+    away from the start onwards, half from the end backwards.
+
+    Parameters
+    ----------
+    in_place : take travel and turn of the round out first, the same share per frame
+    blend_s : how far from the seam poses may change; None for up to the middle
+
+    Raises
+    ------
+    EditError    for fewer than four frames
+    MotionError    where the body never faces any direction
+    """
+    frames = take.frame_count
+    if frames < FEWEST_FRAMES:
+        raise EditError(f"a loop needs at least {FEWEST_FRAMES} frames, there are {frames}", code="frames-missing")
+    places, headings = body_track(take, 0, frames)
+    seam = loop_seam(places[:, [0, 2]], headings)
+    motion = take.motion
+    if in_place:
+        motion = _in_place(motion, places, seam)
+        seam = LoopSeam(0.0, np.zeros(2))
+    life = 0.5 * frames if blend_s is None else min(0.5 * frames, max(1.0, blend_s * take.frame_rate_hz))
+    return take.moved(_closed(motion, seam, life, min(life, max(1.0, VELOCITY_S * take.frame_rate_hz))))
+
+
+def _in_place(motion: Motion, places: Floats, seam: LoopSeam) -> Motion:
+    """Without the travel and turn of a round, given pelvis positions (F, 3): each frame turns back about its own."""
+    shares = np.arange(motion.frame_count) / motion.frame_count
+    start = places[0, [0, 2]]
+    travel = rotated(start, seam.turn_rad) + seam.shift_m - start
+    shifts = shares[:, None] * -np.array([travel[0], 0.0, travel[1]])
+    return carried(motion, about_vertical(-shares * seam.turn_rad), places, shifts)
+
+
+def _closed(motion: Motion, seam: LoopSeam, life: float, velocity_life: float) -> Motion:
+    """The difference at the seam, half of it at either end."""
+    frames = motion.frame_count
+    following = moved_over(motion.at_frames(np.array([0, 1])), seam)
+    arrival = step_of(motion, frames - 2)
+    going_on = add_offset(motion.at_frames(np.array([frames - 1])), np.array([0]), arrival)
+    difference = offset_to(following, 0, going_on, 0).times(0.5)
+    velocity = arrival.minus(step_of(following, 0)).times(0.5)
+    touched = np.arange(min(frames, int(np.ceil(life))))
+    ages = touched.astype(np.float64)
+    at_end = dying_away(difference.times(-1.0), velocity, ages + 1.0, life, velocity_life)
+    motion = add_offset(motion, frames - 1 - touched, at_end)
+    at_start = dying_away(difference, velocity, ages, life, velocity_life)
+    return add_offset(motion, touched, at_start.turned(-seam.turn_rad))

@@ -1,0 +1,93 @@
+"""Differences between poses that die away over time: blending by inertialisation.
+
+An offset x with velocity v decays to nothing over T frames as the quintics that begin with position x, velocity v and
+no acceleration, and end without any of them (after Bollo 2018, "Inertialization", there with the acceleration of the
+source). With s = t/T they are x·(1-s)³·(1+3s+6s²) and v·t·(1-s)³·(1+3s).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import quaternions
+from marey_motion.looping import about_vertical
+from marey_motion.motion import Motion
+
+Floats = NDArray[np.float64]
+
+
+class PoseOffset(NamedTuple):
+    """What takes a pose to another one of the same joints, or how fast that changes, per frame.
+
+    Parameters
+    ----------
+    root : (..., 3) metres
+    turns : (..., J, 3) rotation vectors in the parents' axes, radians
+    translations : (..., k, 3) metres
+    """
+
+    root: Floats
+    turns: Floats
+    translations: Floats
+
+    def times(self, factor: float) -> PoseOffset:
+        """All of it so many times."""
+        return PoseOffset(self.root * factor, self.turns * factor, self.translations * factor)
+
+    def minus(self, other: PoseOffset) -> PoseOffset:
+        """The difference of both."""
+        return PoseOffset(self.root - other.root, self.turns - other.turns, self.translations - other.translations)
+
+    def turned(self, angle_rad: float) -> PoseOffset:
+        """As it is in a world that is turned about the vertical: only the root's part is given in the world's axes."""
+        turn = about_vertical(np.asarray(angle_rad))
+        turns = self.turns.copy()
+        turns[..., 0, :] = quaternions.rotate_vectors(turn, turns[..., 0, :])
+        root = np.asarray(quaternions.rotate_vectors(turn, self.root), dtype=np.float64)
+        return self._replace(root=root, turns=turns)
+
+
+def offset_to(motion: Motion, frame: int, other: Motion, other_frame: int) -> PoseOffset:
+    """What takes a frame of a motion to a frame of another one of the same joints."""
+    back = quaternions.conjugate(motion.rotations[frame])
+    turns = quaternions.as_rotation_vector(quaternions.multiply(other.rotations[other_frame], back))
+    return PoseOffset(
+        other.root_translations[other_frame] - motion.root_translations[frame],
+        np.asarray(turns, dtype=np.float64),
+        other.translations[other_frame] - motion.translations[frame],
+    )
+
+
+def step_of(motion: Motion, frame: int) -> PoseOffset:
+    """What takes a frame to the next one; nothing where there is no next."""
+    return offset_to(motion, frame, motion, min(frame + 1, motion.frame_count - 1))
+
+
+def add_offset(motion: Motion, frames: NDArray[np.int64], offset: PoseOffset) -> Motion:
+    """The motion with offsets (n, ...) added to its frames (n,)."""
+    root, rotations, translations = (
+        motion.root_translations.copy(), motion.rotations.copy(), motion.translations.copy()
+    )  # fmt: skip
+    root[frames] += offset.root
+    rotations[frames] = quaternions.multiply(quaternions.from_rotation_vector(offset.turns), rotations[frames])
+    translations[frames] += offset.translations
+    return motion._replace(root_translations=root, rotations=rotations, translations=translations)
+
+
+def dying_away(offset: PoseOffset, velocity: PoseOffset, ages: Floats, life: float, velocity_life: float) -> PoseOffset:
+    """What is left of an offset, and of its velocity per frame, at `ages` (n,) in frames.
+
+    `life` and `velocity_life` are the frames after which nothing is left of either.
+    """
+    s = np.clip(ages / life, 0.0, 1.0)
+    places = (1.0 - s) ** 3 * (1.0 + 3.0 * s + 6.0 * s * s)
+    u = np.clip(ages / velocity_life, 0.0, 1.0)
+    speeds = ages * (1.0 - u) ** 3 * (1.0 + 3.0 * u)
+
+    def left(x: Floats, v: Floats) -> Floats:
+        return np.multiply.outer(places, x) + np.multiply.outer(speeds, v)
+
+    return PoseOffset(*(left(x, v) for x, v in zip(offset, velocity, strict=True)))

@@ -1,0 +1,97 @@
+"""Joints whose motion is taken from another clip."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import quaternions
+from marey_motion.clip import Clip
+from marey_motion.editing.borders import blended, range_weights
+from marey_motion.editing.take import Take, motion_of
+from marey_motion.editing.translations import translated
+from marey_motion.errors import EditError
+from marey_motion.motion import Motion
+from marey_motion.resampling import sample_motion
+from marey_motion.skeleton import Skeleton
+
+Floats = NDArray[np.float64]
+
+SAME_AXES_RAD = 0.02
+"""Rest rotations up to so far apart count as the same axes: subjects of one rig are measured one by one."""
+
+
+def paste(
+    take: Take,
+    *,
+    source: str,
+    joints: Sequence[str],
+    source_frames: tuple[int, int | None] | None = None,
+    frames: tuple[int, int | None] | None = None,
+    border_s: float = 0.2,
+) -> Take:
+    """Put a stretch of another clip in place of these joints' own motion (Herrmann et al. 2019, section 4.1.4).
+
+    The stretch is resampled with cubic splines to the frames it shall fill; equal lengths are copied exactly. Within
+    the borders rotations go over along the shorter arc, translations along straight lines.
+
+    Raises
+    ------
+    UnknownJoint
+    EditError    for an unknown source, frames that are not there, and joints whose axes differ in the two skeletons
+    """
+    clip = take.source(source)
+    targets = sorted({take.joint(name) for name in joints})
+    origins = _same_joints(take.skeleton, clip.skeleton, targets)
+    span, shares = range_weights(take, frames, border_s)
+    copied = _stretched(take, clip, source_frames, len(shares))
+    own = _with_more_translations(take, targets, origins, copied)
+    rotations, translations = own.rotations.copy(), own.translations.copy()
+    rotations[span, targets] = blended(rotations[span, targets], copied.rotations[:, origins], shares)
+    for target, origin in zip(targets, origins, strict=True):
+        if target in own.translated_joints:
+            column = own.translated_joints.index(target)
+            there = _translations_of(copied, origin, take.skeleton.offsets[target])
+            translations[span, column] += shares[:, None] * (there - translations[span, column])
+    return take.moved(own._replace(rotations=rotations, translations=translations))
+
+
+def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> list[int]:
+    """Indices in `source` of the target's `joints`, by name. Raises `UnknownJoint`, `EditError`."""
+    origins = [source.index_of(target.joint_names[joint]) for joint in joints]
+    apart = quaternions.angle_between(target.rest_rotations[list(joints)], source.rest_rotations[origins])
+    odd = np.flatnonzero(apart > SAME_AXES_RAD)
+    if odd.size:
+        raise EditError(
+            "the joint stands otherwise in the rest pose of the source's skeleton; retarget the source first",
+            code="other-axes",
+            where=f"joint {target.joint_names[joints[int(odd[0])]]}",
+        )
+    return origins
+
+
+def _stretched(take: Take, clip: Clip, frames: tuple[int, int | None] | None, count: int) -> Motion:
+    """A range of frames of a clip, stretched to `count` of them. Raises `EditError` where they are not there."""
+    try:
+        start, stop = take.moved(motion_of(clip)).frames(frames)
+    except EditError as error:
+        error.where = "source_frames"
+        raise
+    places = np.linspace(start, stop - 1, count) if count > 1 else np.array([float(start)])
+    return sample_motion(motion_of(clip), places)
+
+
+def _with_more_translations(take: Take, targets: Sequence[int], origins: Sequence[int], copied: Motion) -> Motion:
+    """The take's motion, with translations of all joints that have any here or are pasted from one that has."""
+    added = (target for target, origin in zip(targets, origins, strict=True) if origin in copied.translated_joints)
+    joints = tuple(sorted({*take.motion.translated_joints, *added}))
+    return translated(take.motion, take.skeleton, joints)
+
+
+def _translations_of(motion: Motion, joint: int, offset: Floats) -> Floats:
+    """Translations (n, 3) of a joint, or its offset (3,) where it has none."""
+    if joint not in motion.translated_joints:
+        return offset
+    return motion.translations[:, motion.translated_joints.index(joint)]

@@ -1,0 +1,123 @@
+"""Where the body is and where it faces: the whole motion moved as one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import kinematics, quaternions
+from marey_motion.editing.take import Take
+from marey_motion.errors import EditError
+from marey_motion.looping import LoopSeam, about_vertical
+from marey_motion.motion import Motion
+
+Floats = NDArray[np.float64]
+
+GROUND = np.array([1.0, 0.0, 1.0])
+
+
+def translate(take: Take, *, shift_m: Sequence[float]) -> Take:
+    """Shift everything by (x, y, z) metres."""
+    motion = take.motion
+    return take.moved(motion._replace(root_translations=motion.root_translations + np.asarray(shift_m)))
+
+
+def rotate(
+    take: Take,
+    *,
+    angle_rad: float,
+    axis: Sequence[float] = (0.0, 1.0, 0.0),
+    pivot: Literal["origin", "body"] = "origin",
+) -> Take:
+    """Turn everything about an axis of the world through the origin, or through the ground under the first frame."""
+    turn = np.asarray(quaternions.from_axis_angle(axis, angle_rad), dtype=np.float64)
+    place = np.zeros(3) if pivot == "origin" else body_at(take, 0)[0] * GROUND
+    return take.moved(carried(take.motion, turn, place))
+
+
+def face(take: Take, *, heading_rad: float = 0.0, frame: int = 0) -> Take:
+    """Turn everything about the vertical through the body at `frame`, so that it faces `heading_rad` there.
+
+    Raises `MotionError` where the body faces no direction in that frame, as when it lies on its side.
+    """
+    place, heading = body_at(take, frame)
+    return take.moved(carried(take.motion, about_vertical(np.asarray(heading_rad - heading)), place))
+
+
+def move_to_origin(take: Take, *, frame: int = 0) -> Take:
+    """Shift everything on the ground, so that the pelvis is above the origin at `frame`. Heights stay."""
+    return translate(take, shift_m=-pelvis_track(take, frame, frame + 1)[0] * GROUND)
+
+
+def scale(take: Take, *, factor: float, translations: bool = False) -> Take:
+    """Scale the path of the body about the origin, heights too, and with `translations` what other joints move.
+
+    The skeleton is another item and stays as it is, so that the strides of a scaled path fit another body's legs.
+    """
+    motion = take.motion
+    scaled = motion.translations.copy()
+    carriers = take.skeleton.path_to_root(take.body.pelvis)
+    chosen = [translations or joint in carriers for joint in motion.translated_joints]
+    scaled[:, chosen] *= factor
+    return take.moved(motion._replace(root_translations=motion.root_translations * factor, translations=scaled))
+
+
+def flip_axes(take: Take, *, up: str = "+z", forward: str = "-y") -> Take:
+    """Turn the world so that its axis `up`, one of +x to -z, becomes +y, and `forward` becomes +z.
+
+    Only rotations: a world of the other hand is a mirror image, which `mirror` makes. Raises `EditError` where both
+    lie on one axis.
+    """
+    y, z = _direction(up), _direction(forward)
+    if np.any(np.abs(y + z) != np.abs(y) + np.abs(z)) or up[1] == forward[1]:
+        raise EditError(f"up {up} and forward {forward} lie on one axis", where="forward")
+    turn = quaternions.from_matrix(np.stack((np.cross(y, z), y, z)))
+    return take.moved(carried(take.motion, np.asarray(turn, dtype=np.float64), np.zeros(3)))
+
+
+def carried(motion: Motion, turns: Floats, pivots: Floats, shifts: Floats | None = None) -> Motion:
+    """Turned by rotations (4,) or (F, 4) about points (3,) or (F, 3), then shifted by (F, 3) or (3,)."""
+    arms = motion.root_translations - pivots
+    places = pivots + quaternions.rotate_vectors(turns, arms)
+    rotations = motion.rotations.copy()
+    rotations[:, 0] = quaternions.multiply(turns, rotations[:, 0])
+    return motion._replace(root_translations=places if shifts is None else places + shifts, rotations=rotations)
+
+
+def moved_over(motion: Motion, seam: LoopSeam) -> Motion:
+    """Turned about the origin and shifted on the ground."""
+    shift = np.array([seam.shift_m[0], 0.0, seam.shift_m[1]])
+    return carried(motion, about_vertical(np.asarray(seam.turn_rad)), np.zeros(3), shift)
+
+
+def pelvis_track(take: Take, start: int, stop: int) -> Floats:
+    """Positions (n, 3) of the pelvis in the frames [start, stop). Raises `EditError` where they are not there."""
+    return _positions(take, start, stop)[:, take.body.pelvis]
+
+
+def body_at(take: Take, frame: int) -> tuple[Floats, float]:
+    """Where the pelvis is (3,) and where the body faces at a frame. Raises `MotionError`."""
+    places, headings = body_track(take, frame, frame + 1)
+    return places[0], float(headings[0])
+
+
+def body_track(take: Take, start: int, stop: int) -> tuple[Floats, Floats]:
+    """Positions (n, 3) of the pelvis and continuous headings (n,) in the frames [start, stop). Raises `MotionError`."""
+    positions = _positions(take, start, stop)
+    directions = kinematics.forward_directions(positions, take.body.matching.lefts, take.body.matching.rights)
+    return positions[:, take.body.pelvis], kinematics.headings(directions)
+
+
+def _positions(take: Take, start: int, stop: int) -> Floats:
+    first, last = take.frames((start, stop))
+    return take.motion.at_frames(np.arange(first, last)).positions(take.skeleton)
+
+
+def _direction(axis: str) -> Floats:
+    """The unit vector of an axis such as -y."""
+    if len(axis) != 2 or axis[0] not in "+-" or axis[1] not in "xyz":
+        raise EditError(f"{axis!r} is no axis; write such as +z or -y", code="command-invalid")
+    return np.asarray((-1.0 if axis[0] == "-" else 1.0) * np.eye(3)["xyz".index(axis[1])], dtype=np.float64)

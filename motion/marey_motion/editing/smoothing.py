@@ -1,0 +1,123 @@
+"""Noise taken out of rotations and translations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import quaternions
+from marey_motion.editing.borders import blended, range_weights
+from marey_motion.editing.take import Take
+from marey_motion.errors import EditError
+
+Floats = NDArray[np.float64]
+
+LEAST_LENGTH = 0.1
+"""Of a mean of unit quaternions: with less, what is averaged goes all the way round and has no mean."""
+
+
+def smooth(
+    take: Take,
+    *,
+    method: Literal["savitzky_golay", "gaussian"] = "savitzky_golay",
+    window_s: float = 0.25,
+    order: int = 3,
+    joints: Sequence[str] | None = None,
+    root_translation: bool = True,
+    frames: tuple[int, int | None] | None = None,
+    border_s: float = 0.2,
+) -> Take:
+    """Weighted means over time of the joints' rotations and translations, and of the root's path.
+
+    No frame is lost: beyond its ends a motion goes on as its own reflection through its end poses, which leaves the
+    first and the last frame, and straight paths, exactly as they are. Rotations are averaged as quaternions of
+    continuous sign and brought back to unit length.
+
+    Parameters
+    ----------
+    window_s : full width of the mean; for a gaussian, six standard deviations
+    order : degree of the polynomials of savitzky_golay
+    joints : which; None for all
+    root_translation : smooth the path of the root, and of the joints between root and pelvis where those move
+
+    Raises
+    ------
+    UnknownJoint
+    EditError    where the frames are not there, where the window is too short for the polynomials, and where a joint
+        spins so fast that its rotations have no mean
+    """
+    motion = take.motion
+    span, shares = range_weights(take, frames, border_s)
+    chosen = list(range(take.skeleton.joint_count)) if joints is None else sorted({take.joint(one) for one in joints})
+    weights = _weights(take, method, window_s, order)
+    root, rotations, translations = motion.root_translations.copy(), motion.rotations.copy(), motion.translations.copy()
+    if root_translation:
+        root[span] += shares[:, None] * (_smooth_positions(root, weights) - root)[span]
+    smoothed = _smooth_rotations(take, rotations[:, chosen], weights, chosen)[span]
+    rotations[span, chosen] = blended(rotations[span, chosen], smoothed, shares)
+    carriers = take.skeleton.path_to_root(take.body.pelvis) if motion.translated_joints else ()
+    moved = [root_translation if joint in carriers else joint in chosen for joint in motion.translated_joints]
+    steps = _smooth_positions(translations[:, moved], weights) - translations[:, moved]
+    translations[span, moved] += shares[:, None, None] * steps[span]
+    return take.moved(motion._replace(root_translations=root, rotations=rotations, translations=translations))
+
+
+def _weights(take: Take, method: str, window_s: float, order: int) -> Floats:
+    """Symmetric weights (2 n + 1,) that sum to 1; a motion that is shorter than the window gets a shorter one."""
+    asked = max(1, int(0.5 * window_s * take.frame_rate_hz + 1e-9))
+    reach = min(asked, take.frame_count - 1)
+    if method == "gaussian":
+        bell = np.exp(-0.5 * (3.0 * np.arange(-reach, reach + 1) / asked) ** 2)
+        return np.asarray(bell / bell.sum(), dtype=np.float64)
+    from scipy.signal import savgol_coeffs
+
+    if order > 2 * asked:
+        raise EditError(
+            f"a window of {2 * asked + 1} frames is too short for polynomials of degree {order}; at "
+            f"{take.frame_rate_hz:g} Hz it takes {2 * ((order + 1) // 2) / take.frame_rate_hz:.3g} s",
+            code="window-too-short",
+            where="window_s",
+        )
+    return np.asarray(savgol_coeffs(2 * reach + 1, min(order, 2 * reach)), dtype=np.float64)
+
+
+def _smooth_positions(values: Floats, weights: Floats) -> Floats:
+    """Weighted means over time of positions (F, ...)."""
+    reach = len(weights) // 2
+    before = 2.0 * values[0] - values[reach:0:-1]
+    after = 2.0 * values[-1] - values[-2 : -reach - 2 : -1]
+    return _averaged(np.concatenate((before, values, after)), weights)
+
+
+def _smooth_rotations(take: Take, rotations: Floats, weights: Floats, joints: Sequence[int]) -> Floats:
+    """Weighted means over time of rotations (F, J, 4), of unit length."""
+    reach = len(weights) // 2
+    before = _reflected(rotations[0], rotations[reach:0:-1])
+    after = _reflected(rotations[-1], rotations[-2 : -reach - 2 : -1])
+    means = _averaged(np.concatenate((before, rotations, after)), weights)
+    lengths = np.linalg.norm(means, axis=-1)
+    if lengths.size and lengths.min() < LEAST_LENGTH:
+        frame, joint = np.unravel_index(int(np.argmin(lengths)), lengths.shape)
+        raise EditError(
+            f"around frame {frame} the joint turns all the way round within the window; take a shorter one",
+            code="window-too-long",
+            where=f"joint {take.skeleton.joint_names[joints[int(joint)]]}",
+        )
+    return np.asarray(means / lengths[..., None], dtype=np.float64)
+
+
+def _reflected(end: Floats, rotations: Floats) -> Floats:
+    """Rotations (n, J, 4) reflected through those of an end frame (J, 4): as far from it, the other way."""
+    back = quaternions.multiply(end, quaternions.multiply(quaternions.conjugate(rotations), end))
+    return np.asarray(back, dtype=np.float64)
+
+
+def _averaged(padded: Floats, weights: Floats) -> Floats:
+    """Weighted means (F, ...) of values (n + F + n, ...), by weights (2 n + 1,)."""
+    from scipy.ndimage import correlate1d
+
+    reach = len(weights) // 2
+    return np.asarray(correlate1d(padded, weights, axis=0)[reach : len(padded) - reach], dtype=np.float64)
