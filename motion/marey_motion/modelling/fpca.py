@@ -80,7 +80,7 @@ def find_components(
             f"coefficients {coefficients.shape} do not fit {basis.count} splines, weights {weights.shape}"
         )
     mean = coefficients.mean(axis=0)
-    root = _root_of_products(basis, inner_product)
+    root = root_of_products(basis, inner_product)
     scaled = (root.T @ (coefficients - mean)) * weights
     flat = scaled.reshape(examples, -1)
     size = np.linalg.norm((root.T @ coefficients) * weights)
@@ -122,7 +122,7 @@ def _kept_count(energy: Floats, keep: Keep) -> int:
     return min(enough, len(energy), len(energy) if keep.most is None else keep.most)
 
 
-def _root_of_products(basis: SplineBasis, inner_product: InnerProduct) -> Floats:
+def root_of_products(basis: SplineBasis, inner_product: InnerProduct) -> Floats:
     """(n, n) lower triangular L with L Lᵀ the inner products of the basis functions."""
     if inner_product == "coefficients":
         return np.eye(basis.count)

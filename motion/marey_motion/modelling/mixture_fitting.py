@@ -82,7 +82,7 @@ class FittedMixture:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Linear algebra and clustering on one thread: how sums are rounded depends on how many threads share them."""
-    from threadpoolctl import threadpool_limits
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     for module in ("scipy.linalg", "sklearn.mixture"):
         import_module(module)  # libraries that are loaded later would not be held to it

@@ -81,3 +81,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "folds": (0, 100),
     "report_samples": (0, 10_000),
 }
+
+DEFAULT_OPTIONS = ModelOptions()
+"""What models are trained with unless something else is asked for."""

@@ -46,7 +46,7 @@ def _place_joints(pose, local, parents, offsets, world, positions):  # type: ign
 
 @_compiled
 def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (B,) with the mean distance of joints from targets (T, J, 3), of poses (B, T, D) not of unit length."""
+    """Fill `out` (B,) with the mean distance of joints from targets (T, J, 3), of poses (B, T, D) of any length."""
     joints = len(parents)
     local, world = np.empty((joints, 4)), np.empty((joints, 4))
     lengths, positions = np.empty(joints), np.empty((joints, 3))
@@ -67,8 +67,8 @@ def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-un
 def squared_error_gradient(poses, parents, offsets, targets, gradient):  # type: ignore[no-untyped-def]
     """The sum of squared distances of joints from targets (F, J, 3); fill its gradient (F, D) by the poses (F, D).
 
-    Quaternions need not be of unit length: the error, and so the gradient, is that of the rotations they stand for. What
-    pulls at the joints below one adds up to a force and a torque on it, from the leaves to the root.
+    Quaternions need not be of unit length: the error, and so the gradient, is that of the rotations they stand for.
+    What pulls at the joints below one adds up to a force and a torque on it, from the leaves to the root.
     """
     joints = len(parents)
     local, world = np.empty((joints, 4)), np.empty((joints, 4))

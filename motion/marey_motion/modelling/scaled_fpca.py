@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import kinematics
-from marey_motion.modelling.fpca import InnerProduct, Keep, find_components
+from marey_motion.modelling.fpca import InnerProduct, Keep, find_components, root_of_products
 from marey_motion.modelling.reconstruction import comparison_frames
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.skeleton import Skeleton
@@ -103,9 +103,7 @@ class _Problem:
     @cached_property
     def grams(self) -> Floats:
         """(3 + J, m, m) inner products of the examples in each group of channels."""
-        root = np.eye(self.basis.count)
-        if self.inner_product == "l2":
-            root = np.linalg.cholesky(self.basis.products)
+        root = root_of_products(self.basis, self.inner_product)
         shaped = root.T @ self.deviations
         each = np.einsum("anc,bnc->cab", shaped, shaped, optimize=True)
         joints = each[3:].reshape(-1, 4, *each.shape[1:]).sum(axis=1)
@@ -134,7 +132,7 @@ class _Problem:
         """(m·T, J, 3) where the joints of the examples are."""
         poses = (self.mean_poses + self.deviating_poses).reshape(-1, self.coefficients.shape[2])
         rotations = poses[:, 3:].reshape(len(poses), -1, 4)
-        rotations /= np.linalg.norm(rotations, axis=2, keepdims=True)
+        rotations /= np.sqrt(np.einsum("fjc,fjc->fj", rotations, rotations))[..., None]
         return np.asarray(kinematics.forward_kinematics(self.skeleton, poses), dtype=np.float64)
 
     def value_and_gradient(self, logarithms: Floats) -> tuple[float, Floats]:

@@ -12,7 +12,7 @@ from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.errors import ModelError
 from marey_motion.modelling.fpca import Keep, PrincipalExamples, find_components
 from marey_motion.modelling.mixture_fitting import FittedMixture, MixtureOptions, fit_mixture, one_thread
-from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.options import DEFAULT_OPTIONS, ModelOptions
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.scaled_fpca import optimised_weights
 from marey_motion.modelling.scaling import jacobian_weights, root_max_weights
@@ -55,14 +55,18 @@ class FittedExamples:
     weights: Floats
 
 
+def _silent(_done: int, _total: int | None, _doing: str) -> None:
+    """Tell nobody."""
+
+
 def train_primitive(
     aligned: AlignedSet,
-    options: ModelOptions = ModelOptions(),
+    options: ModelOptions = DEFAULT_OPTIONS,
     *,
     name: str = "primitive",
     seed: int = 0,
     threads: int = 1,
-    progress: Progress | None = None,
+    progress: Progress = _silent,
 ) -> TrainedPrimitive:
     """A generative model of aligned examples: splines, principal components, a mixture (Herrmann et al. 2019, 3).
 
@@ -76,20 +80,19 @@ def train_primitive(
     ------
     ModelError    where the examples are none that a model could be made of
     """
-    tell: Progress = progress or (lambda done, total, what: None)
     check_examples(aligned)
     with one_thread():
-        tell(0, None, "fitting splines")
+        progress(0, None, "fitting splines")
         fitted = fit_examples(aligned, options)
         weight = options.temporal_weight or equalising_weight(
             fitted.spatial.functions.variances, fitted.temporal.functions.variances
         )
         latents = np.concatenate((_kept_scores(fitted.spatial), weight * _kept_scores(fitted.temporal)), axis=1)
-        tell(0, None, "fitting the mixture")
+        progress(0, None, "fitting the mixture")
         mixture = fit_mixture(latents, _mixture_options(options), seed=seed)
         primitive = _assemble(name, aligned, fitted, weight, mixture)
         report = report_on(primitive, aligned, fitted.poses, fitted.spatial, fitted.temporal, latents, mixture, options,
-                           seed=seed, threads=threads, progress=tell)  # fmt: skip
+                           seed=seed, threads=threads, progress=progress)  # fmt: skip
     return TrainedPrimitive(primitive, report, warnings_of(primitive, report, options), options, fitted.weights)
 
 

@@ -37,8 +37,9 @@ def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: Mo
         found.append(
             Warned(
                 "too-few-examples",
-                f"{count} examples for {primitive.dimensions} dimensions: their likelihoods say little, and the mixture "
-                f"has one component; add examples, or keep less than {options.spatial_share:.0%} of the variance",
+                f"{count} examples for {primitive.dimensions} dimensions: their likelihoods say little, and the "
+                "mixture has one component; add examples, or keep less than "
+                f"{options.spatial_share:.0%} of the variance",
             )
         )
     errors = report.reconstruction
