@@ -1,0 +1,324 @@
+"""Inverse kinematics: rotations of joints that bring points, orientations and looks to where they are wanted.
+
+Three solvers, each for one frame or many, which are solved one by one: the same frame has the same result alone and
+among others. None returns a pose that misses its targets by more than the one it was given (weighted squares of
+metres, where `ANGLE_LENGTH_M` is a radian); where that pose is outside of limits, than that pose within them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.editing.inverse_kinematics_problem import Found, Problem, pose_problem
+from marey_motion.editing.inverse_kinematics_targets import (
+    Freedom,
+    OrientationTarget,
+    PositionTarget,
+    SolverOptions,
+    Target,
+)
+from marey_motion.errors import EditError
+from marey_motion.motion import Motion
+from marey_motion.rigs import JointAxes, JointMapping
+from marey_motion.skeleton import Skeleton
+
+Floats = NDArray[np.float64]
+Solver = Literal["auto", "ccd", "two_bone", "least_squares"]
+Ending = Literal["carried", "held"]
+
+_ANYWHERE = Freedom()
+_OPTIONS = SolverOptions()
+_STILL = np.array([[1.0, 0.0, 0.0, 0.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedPoses:
+    """What a solver found for F frames and C targets.
+
+    Parameters
+    ----------
+    motion : the frames, with the joints turned
+    residual_before, residual_after : (F, C) what each target is missed by: metres, or radians
+    iterations : (F,) sweeps or steps
+    reached : (F,) whether all targets are met within the tolerances
+    """
+
+    motion: Motion
+    residual_before: Floats
+    residual_after: Floats
+    iterations: NDArray[np.int64]
+    reached: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Limb:
+    """A chain of two bones; joints between its own are carried along as they are.
+
+    Parameters
+    ----------
+    start, middle, end : indices of shoulder, elbow, wrist, or hip, knee, ankle
+    hinge : unit direction in the middle joint's frame about which the limb stretches. It is read where the limb is
+        nearly straight and does not tell itself; None leaves that to chance.
+    """
+
+    start: int
+    middle: int
+    end: int
+    hinge: tuple[float, float, float] | None = None
+
+    @property
+    def joints(self) -> tuple[int, int, int]:
+        """Indices from the end up."""
+        return self.end, self.middle, self.start
+
+
+class _LimbKernel(NamedTuple):
+    """A limb in the numbering of the kernels."""
+
+    start: int
+    middle: int
+    end: int
+    offset: Floats
+    hinge: Floats
+    damping_zone: float
+    ending: int
+
+
+def limb_ending_at(
+    skeleton: Skeleton, mapping: JointMapping, joint: int, axes: Mapping[str, JointAxes] | None = None
+) -> Limb | None:
+    """The arm or leg whose wrist or ankle the joint is, None for other joints.
+
+    Parameters
+    ----------
+    axes : the joints' axes by name (`rigs.guess_axes`); without them straight limbs do not know where to bend
+    """
+    for side in ("left", "right"):
+        for root, middle, end in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")):
+            names = [mapping.joints.get(f"{side}_{part}") for part in (root, middle, end)]
+            if None in names or skeleton.joint_names[joint] != names[2]:
+                continue
+            top, mid = (skeleton.index_of(str(name)) for name in names[:2])
+            swing = None if axes is None else axes[str(names[1])].swing
+            # Knees bend about their swing axis, elbows stretch about it.
+            hinge = swing if swing is None or middle == "elbow" else (-swing[0], -swing[1], -swing[2])
+            return Limb(top, mid, joint, hinge)
+    return None
+
+
+def solve(
+    skeleton: Skeleton,
+    motion: Motion,
+    targets: Sequence[Target],
+    *,
+    freedom: Freedom = _ANYWHERE,
+    limb: Limb | None = None,
+    solver: Solver = "auto",
+    options: SolverOptions = _OPTIONS,
+) -> SolvedPoses:
+    """Bring targets to where they are wanted, by the solver that fits or by the one named.
+
+    Parameters
+    ----------
+    motion : F frames, which stay as they are
+    freedom : what may turn
+    limb : a limb that may turn instead. "auto" takes the two-bone solver where there is one, all targets are the
+        position (in all axes) and the orientation of its end, and no limits are asked for; else least squares.
+
+    Raises
+    ------
+    EditError    naming the target that cannot be asked for, or why the solver does not fit
+    """
+    asked = _limb_targets(targets, limb)
+    if solver == "two_bone" or (solver == "auto" and asked is not None and not freedom.limits):
+        if asked is None or limb is None:
+            raise EditError(
+                "two bones reach one position in all axes, and one orientation, of the end of a limb",
+                code="solver-unfit",
+                where="solver",
+            )
+        position, orientation = asked
+        return solve_two_bone(skeleton, motion, limb, position, orientation=orientation, options=options)
+    if limb is not None and freedom.joints is None:
+        freedom = Freedom(limb.joints, freedom.root_moves, freedom.limits, freedom.stiffness)
+    chosen = solve_ccd if solver == "ccd" else solve_least_squares
+    return chosen(skeleton, motion, targets, freedom=freedom, options=options)
+
+
+def solve_ccd(
+    skeleton: Skeleton,
+    motion: Motion,
+    targets: Sequence[Target],
+    *,
+    freedom: Freedom = _ANYWHERE,
+    options: SolverOptions = _OPTIONS,
+) -> SolvedPoses:
+    """Cyclic coordinate descent: joint after joint, from the targets to the root, takes the rotation that is best.
+
+    For one target that is the shortest rotation that aims at it (Wright 2015); for several, the rotation that solves
+    Wahba's problem for all of them at once (Davenport's q-method); for a hinge, the best angle within its limits.
+    The best pose of all sweeps is returned.
+
+    Raises `EditError` naming the target that cannot be asked for.
+    """
+    from marey_motion.editing import ccd_kernels
+
+    if freedom.root_moves:
+        raise EditError("cyclic coordinate descent cannot shift the root", code="solver-unfit", where="root_moves")
+    problem = pose_problem(skeleton, motion, targets, freedom)
+    found = problem.found
+    ends = (options.most_iterations, options.tolerance_m, options.tolerance_rad)
+    ccd_kernels.descend(problem.body, problem.targets, ends, problem.roots, problem.rotations, problem.placing, found)
+    return _solved(motion, problem, found)
+
+
+def solve_least_squares(
+    skeleton: Skeleton,
+    motion: Motion,
+    targets: Sequence[Target],
+    *,
+    freedom: Freedom = _ANYWHERE,
+    options: SolverOptions = _OPTIONS,
+) -> SolvedPoses:
+    """Damped least squares over all targets at once, with the analytic Jacobian of rotation-vector displacements.
+
+    Minimises the weighted squares of the errors plus those of the displacements, `regularisation_m` per radian, so
+    that what targets leave open stays as it was. Joints at a limit slide along it.
+
+    Raises `EditError` naming the target that cannot be asked for.
+    """
+    from marey_motion.editing import least_squares_kernels
+
+    problem = pose_problem(skeleton, motion, targets, freedom)
+    found, room = problem.found, problem.stepping(options.regularisation_m)
+    ends = (options.most_iterations, options.tolerance_m, options.tolerance_rad)
+    least_squares_kernels.solve_frames(
+        problem.body, problem.targets, ends, problem.roots, problem.rotations, room, found
+    )
+    return _solved(motion, problem, found)
+
+
+def solve_two_bone(
+    skeleton: Skeleton,
+    motion: Motion,
+    limb: Limb,
+    position: PositionTarget,
+    *,
+    orientation: OrientationTarget | None = None,
+    ending: Ending = "carried",
+    damping_zone_rad: float = 0.0,
+    options: SolverOptions = _OPTIONS,
+) -> SolvedPoses:
+    """The limb's tip brought to `position` in closed form: exact where it can be reached, else stretched towards it.
+
+    The middle joint opens or closes in the plane of the limb; then the limb is aimed (Lee and Shin 1999, 5.3).
+
+    Parameters
+    ----------
+    orientation : how the end is to be turned; without it, "carried" leaves its local rotation and "held" its
+        orientation in the world
+    damping_zone_rad : the middle joint's change is damped in so many radians before straight, so that it does not snap
+        (Kovar, Schreiner and Gleicher 2002); a target there is missed by a little
+
+    Raises `EditError` where the joints are no limb or the targets are not of its end.
+    """
+    from marey_motion.editing import two_bone_kernels
+
+    targets: tuple[Target, ...] = (position,) if orientation is None else (position, orientation)
+    if _limb_targets(targets, limb) is None:
+        raise EditError("the targets must be of the limb's end, the position in all axes", where="targets")
+    path = skeleton.path_to_root(limb.end)
+    if not {limb.middle, limb.start} <= set(path) or not limb.start < limb.middle < limb.end:
+        raise EditError("start, middle and end must hang from one another", code="chain-invalid", where="limb")
+    problem = pose_problem(skeleton, motion, targets, Freedom(limb.joints))
+    found = problem.found
+    _measure(problem, options, found.before, found)
+    before = problem.rotations.copy()
+    kernel_limb = _LimbKernel(
+        *(int(np.searchsorted(problem.joints, joint)) for joint in (limb.start, limb.middle, limb.end)),
+        problem.targets.offsets[0],
+        np.array(limb.hinge or (0.0, 0.0, 0.0)),
+        float(damping_zone_rad),
+        two_bone_kernels.GIVEN if orientation else {"carried": 0, "held": 1}[ending],
+    )
+    two_bone_kernels.reach_frames(
+        kernel_limb,
+        problem.body,
+        np.ascontiguousarray(problem.targets.values[:, 0, :3]),
+        _STILL if orientation is None else np.ascontiguousarray(problem.targets.values[:, 1]),
+        problem.roots,
+        problem.rotations,
+        problem.placing,
+    )
+    _measure(problem, options, found.after, found)
+    _keep_better(problem, before, found)
+    return _solved(motion, problem, found)
+
+
+def _keep_better(problem: Problem, before: Floats, found: Found) -> None:
+    """Frames that the closed form made worse, such as for an orientation that pulls a tool out of reach, stay."""
+    squares = problem.targets.scales**2
+    worse = (found.after**2) @ squares > (found.before**2) @ squares + 1e-18
+    problem.rotations[worse] = before[worse]
+    found.after[worse] = found.before[worse]
+    found.iterations[~worse] = 1
+
+
+def _measure(problem: Problem, options: SolverOptions, residuals: Floats, found: Found) -> None:
+    from marey_motion.editing import pose_kernels
+
+    pose_kernels.measure_frames(
+        problem.body,
+        problem.targets,
+        (options.tolerance_m, options.tolerance_rad),
+        problem.roots,
+        problem.rotations,
+        problem.placing,
+        residuals,
+        found.reached,
+    )
+
+
+def measure_residuals(skeleton: Skeleton, motion: Motion, targets: Sequence[Target]) -> Floats:
+    """What each of C targets is missed by in each of F frames (F, C): metres, or radians."""
+    problem = pose_problem(skeleton, motion, targets, _ANYWHERE)
+    found = problem.found
+    _measure(problem, _OPTIONS, found.before, found)
+    return found.before
+
+
+def constraint_jacobian(
+    skeleton: Skeleton, motion: Motion, targets: Sequence[Target], freedom: Freedom = _ANYWHERE
+) -> tuple[Floats, Floats, tuple[int, ...]]:
+    """Scaled errors (3·C,) of the first frame, their derivatives (3·C, 3·V + 3) and the V joints these are by.
+
+    Columns are displacements of local rotations, q·exp(d), joint by joint in the order returned, then the root's
+    translation, which is left out (zeros) where the root does not move.
+    """
+    from marey_motion.editing import least_squares_kernels
+
+    problem = pose_problem(skeleton, motion, targets, freedom)
+    room = problem.stepping(0.0)
+    least_squares_kernels.residuals_and_jacobian(problem.body, problem.targets, problem.roots, problem.rotations, room)
+    return room.scaled_errors, room.jacobian, tuple(problem.joints[problem.body.movable].tolist())
+
+
+def _limb_targets(
+    targets: Sequence[Target], limb: Limb | None
+) -> tuple[PositionTarget, OrientationTarget | None] | None:
+    """The position and the orientation asked of a limb's end, None where something else is asked."""
+    positions = [target for target in targets if isinstance(target, PositionTarget)]
+    orientations = [target for target in targets if isinstance(target, OrientationTarget)]
+    fits = len(positions) == 1 and len(orientations) <= 1 and len(positions) + len(orientations) == len(targets)
+    if limb is None or not fits or len(set(positions[0].axes)) < 3 or {t.joint for t in targets} != {limb.end}:
+        return None
+    return positions[0], orientations[0] if orientations else None
+
+
+def _solved(motion: Motion, problem: Problem, found: Found) -> SolvedPoses:
+    return SolvedPoses(problem.put_back(motion), found.before, found.after, found.iterations, found.reached)

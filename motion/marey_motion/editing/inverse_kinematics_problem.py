@@ -1,0 +1,258 @@
+"""Targets and freedom packed into the arrays that the kernels of inverse kinematics work on.
+
+Of a skeleton only the joints between the root and the targets matter; these K joints are numbered anew, parents first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.editing.inverse_kinematics_targets import (
+    ANGLE_LENGTH_M,
+    Freedom,
+    LookAtTarget,
+    OrientationTarget,
+    PositionTarget,
+    Target,
+)
+from marey_motion.errors import EditError
+from marey_motion.motion import Motion
+from marey_motion.skeleton import Skeleton
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+_KINDS: dict[type, int] = {PositionTarget: 0, OrientationTarget: 1, LookAtTarget: 2}
+
+
+class Body(NamedTuple):
+    """K joints: parents (K,), offsets (F or 1, K, 3) metres, and what each may do; `carries` (K, C) its targets."""
+
+    parents: Ints
+    offsets: Floats
+    movable: Flags
+    stiffness: Floats
+    limited: Flags
+    limits: Floats
+    carries: Flags
+    root_moves: bool
+
+
+class Targets(NamedTuple):
+    """C targets: kinds and joints (C,), values (F or 1, C, 4), the rest (C, 3); `scales` (C,) of their errors."""
+
+    kinds: Ints
+    joints: Ints
+    values: Floats
+    axes: Floats
+    directions: Floats
+    offsets: Floats
+    scales: Floats
+
+
+class Found(NamedTuple):
+    """What a solver tells: residuals (F, C), iterations and whether all targets are reached (F,)."""
+
+    before: Floats
+    after: Floats
+    iterations: Ints
+    reached: Flags
+
+
+class Placing(NamedTuple):
+    """Room for one pose of K joints and C targets; the last three for the best turn of one joint."""
+
+    spins: Floats
+    places: Floats
+    tips: Floats
+    turns: Floats
+    errors: Floats
+    matrix: Floats
+    form: Floats
+    vectors: Floats
+
+
+class Stepping(NamedTuple):
+    """Room for one pose and for a step of least squares of n unknowns and m errors."""
+
+    spins: Floats
+    places: Floats
+    tips: Floats
+    turns: Floats
+    errors: Floats
+    first: Floats
+    first_root: Floats
+    trial: Floats
+    trial_root: Floats
+    holding: Floats
+    displacement: Floats
+    gradient: Floats
+    step: Floats
+    softness: Floats
+    jacobian: Floats
+    softened: Floats
+    scaled_errors: Floats
+    right: Floats
+    matrix: Floats
+    blocked: Ints
+    outward: Floats
+
+
+class Problem(NamedTuple):
+    """Everything that stays the same while a solver runs, and the poses it changes.
+
+    Parameters
+    ----------
+    joints : (K,) indices in the skeleton
+    roots, rotations : (F, 3) metres and (F, K, 4) local, copies of the motion's
+    """
+
+    joints: Ints
+    body: Body
+    targets: Targets
+    roots: Floats
+    rotations: Floats
+
+    @property
+    def found(self) -> Found:
+        """Empty room for what the solver tells."""
+        frames, count = len(self.roots), len(self.targets.kinds)
+        return Found(
+            np.zeros((frames, count)), np.zeros((frames, count)), np.zeros(frames, np.int64), np.zeros(frames, np.bool_)
+        )
+
+    @property
+    def placing(self) -> Placing:
+        """Room for cyclic coordinate descent."""
+        return Placing(*self._pose_room(), np.zeros((3, 3)), np.zeros((4, 4)), np.zeros((4, 4)))
+
+    def stepping(self, regularisation_m: float) -> Stepping:
+        """Room for least squares."""
+        movable = int(self.body.movable.sum())
+        joints, unknowns, errors = len(self.joints), 3 * movable + 3, 3 * len(self.targets.kinds)
+        holding = np.full(unknowns, regularisation_m**2)
+        holding[:-3] /= np.repeat((1.0 - self.body.stiffness[self.body.movable]) ** 2, 3)
+        return Stepping(
+            *self._pose_room(),
+            *(np.zeros(shape) for shape in ((joints, 4), 3, (joints, 4), 3)),
+            holding,
+            *(np.zeros(unknowns) for _ in range(4)),
+            *(np.zeros((errors, unknowns)) for _ in range(2)),
+            *(np.zeros(errors) for _ in range(2)),
+            np.zeros((errors, errors)),
+            np.zeros(movable, np.int64),
+            np.zeros((movable, 3)),
+        )
+
+    def _pose_room(self) -> tuple[Floats, ...]:
+        joints, count = len(self.joints), len(self.targets.kinds)
+        shapes = ((joints, 4), (joints, 3), (count, 3), (count, 4), (count, 3))
+        return tuple(np.zeros(shape) for shape in shapes)
+
+    def put_back(self, motion: Motion) -> Motion:
+        """The motion with the poses of this problem."""
+        rotations = motion.rotations.copy()
+        rotations[:, self.joints] = self.rotations
+        return motion._replace(root_translations=self.roots, rotations=rotations)
+
+
+def pose_problem(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], freedom: Freedom) -> Problem:
+    """Pack targets for the frames of a motion.
+
+    Raises
+    ------
+    EditError    naming the target and what is wrong with it
+    """
+    for number, target in enumerate(targets):
+        if not 0 <= target.joint < skeleton.joint_count:
+            raise EditError(f"joint {target.joint} of {skeleton.joint_count}", where=f"targets[{number}]")
+    if not targets:
+        raise EditError("at least one target is needed", where="targets")
+    paths = [skeleton.path_to_root(target.joint) for target in targets]
+    joints = np.array(sorted(set().union(*paths)), dtype=np.int64)
+    carries = np.array([[joint in path for path in paths] for joint in joints.tolist()], dtype=np.bool_)
+    body = _body(skeleton, motion, joints, carries, freedom)
+    packed = _targets(joints, targets, motion.frame_count)
+    rotations = np.ascontiguousarray(motion.rotations[:, joints], dtype=np.float64)
+    return Problem(joints, body, packed, motion.root_translations.astype(np.float64), rotations)
+
+
+def _body(skeleton: Skeleton, motion: Motion, joints: Ints, carries: Flags, freedom: Freedom) -> Body:
+    count = len(joints)
+    may_turn = joints.tolist() if freedom.joints is None else freedom.joints
+    movable = np.isin(joints, may_turn)
+    if not movable.any() and not freedom.root_moves:
+        raise EditError("none of the joints that may move carries a target", code="chain-invalid", where="joints")
+    limits, limited, stiffness = np.zeros((count, 14)), np.zeros(count, np.bool_), np.zeros(count)
+    for k, joint in enumerate(joints.tolist()):
+        stiffness[k] = freedom.stiffness.get(joint, 0.0)
+        if joint in freedom.limits:
+            limited[k], limits[k] = True, freedom.limits[joint].row
+    parents = np.searchsorted(joints, skeleton.parents[joints]).astype(np.int64)
+    parents[0] = -1
+    offsets = skeleton.offsets[joints][None]
+    moving = np.isin(motion.translated_joints, joints)
+    if moving.any():
+        offsets = np.repeat(offsets, motion.frame_count, axis=0)
+        places = np.searchsorted(joints, np.array(motion.translated_joints)[moving])
+        offsets[:, places] = motion.translations[:, moving]
+    offsets = np.ascontiguousarray(offsets, dtype=np.float64)
+    return Body(parents, offsets, movable, stiffness, limited, limits, carries, freedom.root_moves)
+
+
+def _targets(joints: Ints, targets: Sequence[Target], frames: int) -> Targets:
+    count = len(targets)
+    values = [_checked_values(target, number, frames) for number, target in enumerate(targets)]
+    rows = max(len(value) for value in values)
+    packed = Targets(
+        np.array([_KINDS[type(target)] for target in targets], dtype=np.int64),
+        np.searchsorted(joints, [target.joint for target in targets]).astype(np.int64),
+        np.zeros((rows, count, 4)),
+        *(np.zeros((count, 3)) for _ in range(3)),
+        np.zeros(count),
+    )
+    for number, (target, value) in enumerate(zip(targets, values, strict=True)):
+        packed.values[:, number, : value.shape[1]] = value
+        packed.scales[number] = _scale(target, number)
+        if isinstance(target, PositionTarget):
+            packed.axes[number] = [axis in target.axes for axis in "xyz"]
+        if not isinstance(target, OrientationTarget):
+            packed.offsets[number] = _vector(target.offset, f"targets[{number}].offset")
+        if isinstance(target, LookAtTarget):
+            axis = _vector(target.axis, f"targets[{number}].axis")
+            length = float(np.linalg.norm(axis))
+            if length < 1e-9:
+                raise EditError("a direction of length zero looks nowhere", where=f"targets[{number}].axis")
+            packed.directions[number] = axis / length
+    return packed
+
+
+def _checked_values(target: Target, number: int, frames: int) -> Floats:
+    try:
+        values = target.values
+    except ValueError as error:
+        raise EditError(str(error), where=f"targets[{number}]") from None
+    if len(values) not in (1, frames):
+        raise EditError(f"{len(values)} values for {frames} frames", where=f"targets[{number}]")
+    if isinstance(target, PositionTarget) and (not target.axes or set(target.axes) - set("xyz")):
+        raise EditError(f"{target.axes!r} are no axes; write such as 'xz'", where=f"targets[{number}].axes")
+    return values
+
+
+def _scale(target: Target, number: int) -> float:
+    if not (np.isfinite(target.weight) and target.weight > 0.0):
+        raise EditError(f"{target.weight} must be a positive number", where=f"targets[{number}].weight")
+    unit = 1.0 if isinstance(target, PositionTarget) else ANGLE_LENGTH_M
+    return float(np.sqrt(target.weight)) * unit
+
+
+def _vector(values: Any, where: str) -> Floats:
+    vector = np.asarray(values, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise EditError("three finite numbers are needed", where=where)
+    return vector

@@ -1,0 +1,228 @@
+"""What inverse kinematics is asked for: targets of joints, limits of joints, and the joints that may turn.
+
+Right-handed, Y up, metres, radians; quaternions (w, x, y, z). Targets are in the world, tips and limits in a joint's
+own frame.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marey_motion import quaternions
+from marey_motion.errors import EditError
+from marey_motion.rigs import JointAxes
+from marey_motion.skeleton import Skeleton
+
+Floats = NDArray[np.float64]
+
+ANGLE_LENGTH_M = 0.01 / math.radians(5.0)
+"""Metres that a radian counts for beside positions: five degrees are as bad as a centimetre."""
+
+Axes = Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]
+
+
+@dataclass(frozen=True, eq=False)
+class PositionTarget:
+    """A point of a joint should be somewhere.
+
+    Parameters
+    ----------
+    joint : index of the joint
+    position : (3,), or (F, 3) for each frame    metres, world
+    axes : coordinates that count, the others are free
+    offset : (3,) metres in the joint's frame, from the joint to the point: the tip of a tool
+    weight : of the squared distance
+    """
+
+    joint: int
+    position: ArrayLike
+    axes: Axes = "xyz"
+    offset: ArrayLike = (0.0, 0.0, 0.0)
+    weight: float = 1.0
+
+    @property
+    def values(self) -> Floats:
+        """(F or 1, 3) metres."""
+        return _rows(self.position, 3, "position")
+
+
+@dataclass(frozen=True, eq=False)
+class OrientationTarget:
+    """A joint should be turned in a certain way.
+
+    Parameters
+    ----------
+    joint : index of the joint
+    rotation : (4,), or (F, 4) for each frame    unit, world
+    weight : of the squared angle, where `ANGLE_LENGTH_M` is one radian
+    """
+
+    joint: int
+    rotation: ArrayLike
+    weight: float = 1.0
+
+    @property
+    def values(self) -> Floats:
+        """(F or 1, 4) of unit length."""
+        return np.asarray(quaternions.normalise(_rows(self.rotation, 4, "rotation")), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class LookAtTarget:
+    """An axis of a joint should point at something.
+
+    Parameters
+    ----------
+    joint : index of the joint
+    point : (3,), or (F, 3) for each frame    metres, world
+    axis : (3,) direction in the joint's frame that looks
+    offset : (3,) metres in the joint's frame, from the joint to the eye
+    weight : of the squared angle, where `ANGLE_LENGTH_M` is one radian
+    """
+
+    joint: int
+    point: ArrayLike
+    axis: ArrayLike
+    offset: ArrayLike = (0.0, 0.0, 0.0)
+    weight: float = 1.0
+
+    @property
+    def values(self) -> Floats:
+        """(F or 1, 3) metres."""
+        return _rows(self.point, 3, "point")
+
+
+Target = PositionTarget | OrientationTarget | LookAtTarget
+
+
+@dataclass(frozen=True, eq=False)
+class JointLimit:
+    """How far a joint turns from a reference: a twist about an axis, then a swing of the axis.
+
+    Parameters
+    ----------
+    axis, side : (3,) unit directions in the joint's frame at a right angle to each other: what it twists about, and the
+        first axis it swings about; the second is axis × side
+    twist_rad : least and greatest twist
+    swing_rad : half axes of the ellipse that the swing's rotation vector stays in, about `side` and about axis × side
+    reference : (4,) local rotation that counts as none
+    """
+
+    axis: ArrayLike
+    side: ArrayLike
+    twist_rad: tuple[float, float]
+    swing_rad: tuple[float, float]
+    reference: ArrayLike = (1.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        low, high = self.twist_rad
+        if not -math.pi <= low <= high <= math.pi:
+            raise EditError(f"a twist from {low:g} to {high:g}; -π ≤ least ≤ greatest ≤ π is needed", where="twist_rad")
+        if not all(0.0 <= half <= math.pi for half in self.swing_rad):
+            raise EditError(f"half axes {self.swing_rad}; each must be in 0 to π", where="swing_rad")
+        axis, side = _vector(self.axis, "axis"), _vector(self.side, "side")
+        if not np.allclose((axis @ axis, side @ side, axis @ side), (1.0, 1.0, 0.0), atol=1e-6):
+            raise EditError("axis and side must be of length 1 and at a right angle", where="axis")
+
+    @classmethod
+    def hinge(
+        cls, axes: JointAxes, least_rad: float, greatest_rad: float, reference: ArrayLike = (1.0, 0.0, 0.0, 0.0)
+    ) -> JointLimit:
+        """A joint that turns about its swing axis alone, as knees and elbows do."""
+        return cls(axes.swing, axes.twist, (least_rad, greatest_rad), (0.0, 0.0), reference)
+
+    @classmethod
+    def cone(
+        cls,
+        axes: JointAxes,
+        swing_rad: float | tuple[float, float],
+        twist_rad: tuple[float, float] = (-math.pi, math.pi),
+        reference: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+    ) -> JointLimit:
+        """A joint whose bone stays within a cone, round or elliptical, as shoulders and hips do."""
+        halves = swing_rad if isinstance(swing_rad, tuple) else (swing_rad, swing_rad)
+        return cls(axes.twist, axes.swing, twist_rad, halves, reference)
+
+    @property
+    def row(self) -> Floats:
+        """(14,) as the kernels read it."""
+        reference = quaternions.normalise(_rows(self.reference, 4, "reference")[0])
+        return np.concatenate(
+            (reference, _vector(self.axis, ""), _vector(self.side, ""), self.twist_rad, self.swing_rad)
+        )
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """When to stop.
+
+    Parameters
+    ----------
+    tolerance_m, tolerance_rad : targets missed by no more are reached
+    most_iterations : sweeps of cyclic coordinate descent, steps of least squares
+    regularisation_m : least squares: metres that a displacement of one radian, or of one metre of the root, counts for
+    """
+
+    tolerance_m: float = 1e-4
+    tolerance_rad: float = 1e-3
+    most_iterations: int = 100
+    regularisation_m: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value >= 0):
+                raise EditError(f"{value} must be a number of at least 0", code="option-invalid", where=name)
+
+
+@dataclass(frozen=True, eq=False)
+class Freedom:
+    """What a solver may turn.
+
+    Parameters
+    ----------
+    joints : indices of the joints that may turn; None for all that carry a target
+    root_moves : whether the root may be shifted (least squares only)
+    limits : by joint index; a joint outside its limits is brought into them first
+    stiffness : by joint index, 0 (turns freely, as joints that are not named) to below 1
+    """
+
+    joints: tuple[int, ...] | None = None
+    root_moves: bool = False
+    limits: dict[int, JointLimit] = field(default_factory=dict)
+    stiffness: dict[int, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for joint, stiffness in self.stiffness.items():
+            if not 0.0 <= stiffness < 1.0:
+                raise EditError(f"{stiffness} must be in 0 to below 1", where=f"stiffness of joint {joint}")
+
+
+def chain_of(skeleton: Skeleton, effector: int, top: int) -> tuple[int, ...]:
+    """Indices of the joints from `effector` up to `top`, both included. Raises `EditError` where it hangs elsewhere."""
+    path = skeleton.path_to_root(effector)
+    if top not in path:
+        names = skeleton.joint_names
+        raise EditError(f"{names[effector]} does not hang from {names[top]}", code="chain-invalid", where=names[top])
+    return path[: path.index(top) + 1]
+
+
+def _rows(values: ArrayLike, size: int, where: str) -> Floats:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim not in (1, 2) or array.shape[-1] != size or not array.size:
+        raise EditError(f"shape {array.shape} where ({size},) or (frames, {size}) is needed", where=where)
+    if not np.isfinite(array).all():
+        raise EditError("all numbers must be finite", where=where)
+    return np.atleast_2d(array)
+
+
+def _vector(values: ArrayLike, where: str) -> Floats:
+    rows = _rows(values, 3, where)
+    if rows.shape != (1, 3):
+        raise EditError(f"shape {np.shape(values)} where (3,) is needed", where=where)
+    vector: Floats = rows[0]
+    return vector

@@ -1,0 +1,353 @@
+"""Damped least squares: all targets at once, each joint displaced as little as they allow.
+
+The unknowns are displacements of the local rotations, as rotation vectors in each joint's own frame, and of the root.
+There are many more of them than targets, so that the damped normal equations are solved in the space of the targets
+(the Woodbury identity): with a diagonal D, (JᵀJ + D)⁻¹ = D⁻¹ - D⁻¹Jᵀ(1 + J·D⁻¹·Jᵀ)⁻¹J·D⁻¹.
+"""
+
+from __future__ import annotations
+
+import math
+
+from marey_motion.editing.pose_kernels import (
+    ORIENTATION,
+    POSITION,
+    measure,
+    store_residuals,
+    within_limits,
+)
+from marey_motion.editing.rotation_kernels import (
+    TINY,
+    compiled,
+    cross,
+    direction,
+    dot,
+    exponential,
+    inverse,
+    length,
+    logarithm,
+    minus,
+    plus,
+    product,
+    put_rotation,
+    put_vector,
+    rotated,
+    rotation_at,
+    scaled,
+    unit,
+    vector_at,
+)
+
+LONGEST_STEP_RAD = 1.0
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e8
+# An accepted step that improves the objective by less than this share is the last one.
+CONVERGED_SHARE = 1e-13
+# Passes in which joints at a limit are found, for each step.
+LIMIT_PASSES = 4
+
+
+@compiled
+def _turned_error(kind, error, gaze, wished, turn, drift):  # type: ignore[no-untyped-def]
+    """Change of an angular error when what is turned turns by `turn`, and the wished direction by `drift`."""
+    if kind == ORIENTATION:
+        # The inverse left Jacobian of the rotation group at `error`.
+        angle = length(error)
+        half = 0.5 * angle
+        share = (1.0 - half / math.tan(half)) / (angle * angle) if angle > 1e-4 else 1.0 / 12.0
+        twice = cross(error, cross(error, turn))
+        return plus(minus(turn, scaled(cross(error, turn), 0.5)), scaled(twice, share))
+    return plus(cross(drift, error), _look_change(gaze, wished, minus(turn, drift)))
+
+
+@compiled
+def _look_change(gaze, wished, turn):  # type: ignore[no-untyped-def]
+    """Change of `look_error` when the gaze turns by a vector."""
+    across = cross(wished, gaze)
+    sine, cosine = length(across), dot(wished, gaze)
+    if sine < 1e-9:
+        return minus(turn, scaled(gaze, dot(gaze, turn)))
+    axis = scaled(across, 1.0 / sine)
+    moved = minus(scaled(turn, cosine), scaled(gaze, dot(wished, turn)))
+    moved = minus(moved, scaled(axis, dot(axis, moved)))
+    return plus(scaled(axis, dot(axis, turn)), scaled(moved, math.atan2(sine, cosine) / sine))
+
+
+@compiled
+def _fill_column(targets, frame, c, error, tip, turn, move, spin, jacobian, column):  # type: ignore[no-untyped-def]
+    """Derivatives of target `c` by an unknown that moves its tip by `move` and turns its joint by `spin`."""
+    if targets.kinds[c] == POSITION:
+        axes = targets.axes
+        change = (move[0] * axes[c, 0], move[1] * axes[c, 1], move[2] * axes[c, 2])
+    elif targets.kinds[c] == ORIENTATION:
+        change = _turned_error(ORIENTATION, error, error, error, spin, spin)
+    else:
+        way = minus(vector_at(targets.values[frame], c), tip)
+        far = length(way)
+        wished = direction(way)
+        drift = scaled(cross(move, wished), 1.0 / max(far, TINY))  # the eye moves, the point does not
+        gaze = rotated(turn, vector_at(targets.directions, c))
+        change = _turned_error(targets.kinds[c], error, gaze, wished, spin, drift)
+    for i in range(3):
+        jacobian[3 * c + i, column] = targets.scales[c] * change[i]
+
+
+@compiled
+def fill_jacobian(body, targets, frame, work, jacobian):  # type: ignore[no-untyped-def]
+    """Fill derivatives (3·C, 3·V + 3) of the scaled errors by displacements of the V movable joints and of the root."""
+    jacobian[:] = 0.0
+    columns = 0
+    for k in range(body.parents.shape[0]):
+        if not body.movable[k]:
+            continue
+        place, spin = vector_at(work.places, k), rotation_at(work.spins, k)
+        for axis in range(3):
+            own = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0)
+            turn = rotated(spin, own)
+            for c in range(targets.kinds.shape[0]):
+                if body.carries[k, c]:
+                    tip = vector_at(work.tips, c)
+                    move = cross(turn, minus(tip, place))
+                    error, spun = vector_at(work.errors, c), rotation_at(work.turns, c)
+                    _fill_column(targets, frame, c, error, tip, spun, move, turn, jacobian, columns)
+            columns += 1
+    if body.root_moves:
+        for axis in range(3):
+            move = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0)
+            for c in range(targets.kinds.shape[0]):
+                error, spun = vector_at(work.errors, c), rotation_at(work.turns, c)
+                tip, still = vector_at(work.tips, c), (0.0, 0.0, 0.0)
+                _fill_column(targets, frame, c, error, tip, spun, move, still, jacobian, columns + axis)
+
+
+@compiled
+def _displace(body, local, root, first_local, first_root, work):  # type: ignore[no-untyped-def]
+    """Fill displacements (3·V + 3,) since the start, and return the sum of their weighted squares."""
+    columns, cost = 0, 0.0
+    for k in range(local.shape[0]):
+        if body.movable[k]:
+            moved = logarithm(product(inverse(rotation_at(first_local, k)), rotation_at(local, k)))
+            for axis in range(3):
+                work.displacement[columns] = moved[axis]
+                cost += work.holding[columns] * moved[axis] ** 2
+                columns += 1
+    for axis in range(3):
+        work.displacement[columns] = root[axis] - first_root[axis]
+        cost += work.holding[columns] * work.displacement[columns] ** 2
+        columns += 1
+    return cost
+
+
+@compiled
+def _fill_softness(body, damping, work):  # type: ignore[no-untyped-def]
+    """Fill D⁻¹: a diagonal, with the directions taken out in which a joint would leave its limits."""
+    columns = 0
+    for k in range(body.parents.shape[0]):
+        if body.movable[k]:
+            flexible = (1.0 - body.stiffness[k]) ** 2
+            for _ in range(3):
+                work.softness[columns] = 1.0 / (work.holding[columns] + damping / flexible)
+                columns += 1
+    for _ in range(3):
+        work.softness[columns] = 1.0 / (work.holding[columns] + damping) if body.root_moves else 0.0
+        columns += 1
+
+
+@compiled
+def _soften(work, vector, out):  # type: ignore[no-untyped-def]
+    """out = D⁻¹·vector."""
+    for v in range(work.blocked.shape[0]):
+        kind = work.blocked[v]
+        along = 0.0
+        if kind == 1:
+            for i in range(3):
+                along += work.outward[v, i] * vector[3 * v + i]
+        for i in range(3):
+            rest = 0.0 if kind == 2 else vector[3 * v + i] - along * work.outward[v, i]
+            out[3 * v + i] = work.softness[3 * v + i] * rest
+    first = 3 * work.blocked.shape[0]
+    for i in range(first, first + 3):
+        out[i] = work.softness[i] * vector[i]
+
+
+@compiled
+def _solve_positive(matrix, right):  # type: ignore[no-untyped-def]
+    """Solve matrix·x = right in place by Cholesky's factors; the matrix (m, m) is destroyed."""
+    m = right.shape[0]
+    for i in range(m):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = math.sqrt(total) if i == j else total / matrix[j, j]
+    for i in range(m):
+        for k in range(i):
+            right[i] -= matrix[i, k] * right[k]
+        right[i] /= matrix[i, i]
+    for i in range(m - 1, -1, -1):
+        for k in range(i + 1, m):
+            right[i] -= matrix[k, i] * right[k]
+        right[i] /= matrix[i, i]
+
+
+@compiled
+def _fill_step(work):  # type: ignore[no-untyped-def]
+    """Fill the step -(JᵀJ + D)⁻¹·gradient."""
+    rows, columns = work.jacobian.shape
+    _soften(work, work.gradient, work.step)
+    for i in range(rows):
+        _soften(work, work.jacobian[i], work.softened[i])
+    for i in range(rows):
+        total = 0.0
+        for n in range(columns):
+            total += work.jacobian[i, n] * work.step[n]
+        work.right[i] = total
+        for j in range(i + 1):
+            total = 1.0 if i == j else 0.0
+            for n in range(columns):
+                total += work.jacobian[i, n] * work.softened[j, n]
+            work.matrix[i, j] = total
+    _solve_positive(work.matrix, work.right)
+    for n in range(columns):
+        total = work.step[n]
+        for i in range(rows):
+            total -= work.softened[i, n] * work.right[i]
+        work.step[n] = -total
+
+
+@compiled
+def _take_step(body, local, root, work):  # type: ignore[no-untyped-def]
+    """Fill the trial pose; return whether a joint ran into a limit that was not yet known to block it."""
+    longest = 0.0
+    for n in range(3 * work.blocked.shape[0]):
+        longest = max(longest, abs(work.step[n]))
+    share = min(1.0, LONGEST_STEP_RAD / longest) if longest > 0.0 else 1.0
+    v, newly_blocked = 0, False
+    for k in range(local.shape[0]):
+        if not body.movable[k]:
+            put_rotation(work.trial, k, rotation_at(local, k))
+            continue
+        step = (share * work.step[3 * v], share * work.step[3 * v + 1], share * work.step[3 * v + 2])
+        new = unit(product(rotation_at(local, k), exponential(step)))
+        if body.limited[k]:
+            kept = within_limits(body.limits[k], new)
+            over = logarithm(product(inverse(kept), new))
+            size = length(over)
+            if size > 1e-9 and work.blocked[v] < 2:
+                put_vector(work.outward, v, scaled(over, 1.0 / size))
+                work.blocked[v] += 1
+                newly_blocked = True
+            new = kept
+        put_rotation(work.trial, k, new)
+        v += 1
+    first = 3 * work.blocked.shape[0]
+    for i in range(3):
+        work.trial_root[i] = root[i] + share * work.step[first + i]
+    return newly_blocked
+
+
+@compiled
+def _fill_gradient(work):  # type: ignore[no-untyped-def]
+    for n in range(work.gradient.shape[0]):
+        total = work.holding[n] * work.displacement[n]
+        for c in range(work.errors.shape[0]):
+            for i in range(3):
+                total += work.jacobian[3 * c + i, n] * work.scaled_errors[3 * c + i]
+        work.gradient[n] = total
+
+
+@compiled
+def _prepare(body, targets, frame, work):  # type: ignore[no-untyped-def]
+    """Fill Jacobian and gradient of the pose just measured; the mean size of the Jacobian's rows."""
+    fill_jacobian(body, targets, frame, work, work.jacobian)
+    for c in range(targets.kinds.shape[0]):
+        for i in range(3):
+            work.scaled_errors[3 * c + i] = targets.scales[c] * work.errors[c, i]
+    _fill_gradient(work)
+    size = 0.0
+    for i in range(work.jacobian.shape[0]):
+        for n in range(work.jacobian.shape[1]):
+            size += work.jacobian[i, n] ** 2
+    return size / work.jacobian.shape[0]
+
+
+@compiled
+def _try_step(body, damping, local, root, work):  # type: ignore[no-untyped-def]
+    """Fill the trial pose that a damped step leads to, joints at their limits sliding along them."""
+    _fill_softness(body, damping, work)
+    work.blocked[:] = 0
+    for _ in range(LIMIT_PASSES):
+        _fill_step(work)
+        if not _take_step(body, local, root, work):
+            break
+
+
+@compiled
+def _solve_frame(body, targets, frame, offsets, ends, local, root, work, before, after):  # type: ignore[no-untyped-def]
+    """Solve one frame in place; the number of steps tried and whether all targets are reached."""
+    most_steps, tolerance_m, tolerance_rad = ends
+    work.first[:] = local
+    work.first_root[:] = root
+    cost, reached = measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad)
+    store_residuals(work.errors, before)
+    clamped = False
+    for k in range(local.shape[0]):
+        if body.limited[k] and body.movable[k]:
+            put_rotation(local, k, within_limits(body.limits[k], rotation_at(local, k)))
+            clamped = True
+    if clamped:
+        work.first[:] = local
+        cost, reached = measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad)
+    store_residuals(work.errors, after)
+    work.displacement[:] = 0.0
+    steps = 0
+    if reached:
+        return steps, reached
+    damping = FIRST_DAMPING * max(_prepare(body, targets, frame, work), TINY)
+    while steps < most_steps:
+        _try_step(body, damping, local, root, work)
+        steps += 1
+        trial, arrived = measure(
+            body, targets, frame, offsets, work.trial_root, work.trial, work, tolerance_m, tolerance_rad
+        )
+        trial += _displace(body, work.trial, work.trial_root, work.first, work.first_root, work)
+        if not trial < cost:
+            damping *= 8.0
+            # The displacements of the pose that is kept; its Jacobian and gradient still stand.
+            _displace(body, local, root, work.first, work.first_root, work)
+            if damping > MOST_DAMPING:
+                break
+            continue
+        local[:] = work.trial
+        root[:] = work.trial_root
+        store_residuals(work.errors, after)
+        gained = cost - trial
+        cost, reached = trial, arrived
+        if reached or gained < CONVERGED_SHARE * cost:
+            break
+        damping = max(0.1 * damping, LEAST_DAMPING)
+        _prepare(body, targets, frame, work)
+    return steps, reached
+
+
+@compiled
+def solve_frames(body, targets, ends, roots, rotations, work, found):  # type: ignore[no-untyped-def]
+    """Solve every frame on its own: `roots` (F, 3) and `rotations` (F, K, 4) are changed in place, `found` is filled.
+
+    ends: most steps, tolerance in metres, tolerance in radians.
+    """
+    for f in range(rotations.shape[0]):
+        frame = min(f, targets.values.shape[0] - 1)
+        offsets = body.offsets[min(f, body.offsets.shape[0] - 1)]
+        steps, reached = _solve_frame(
+            body, targets, frame, offsets, ends, rotations[f], roots[f], work, found.before[f], found.after[f]
+        )
+        found.iterations[f] = steps
+        found.reached[f] = reached
+
+
+@compiled
+def residuals_and_jacobian(body, targets, roots, rotations, work):  # type: ignore[no-untyped-def]
+    """Fill `work.scaled_errors` and `work.jacobian` of the first frame."""
+    measure(body, targets, 0, body.offsets[0], roots[0], rotations[0], work, 0.0, 0.0)
+    work.displacement[:] = 0.0
+    _prepare(body, targets, 0, work)

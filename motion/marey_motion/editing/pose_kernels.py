@@ -1,0 +1,158 @@
+"""One pose of the joints that matter to inverse kinematics: where they are, how far targets are missed, limits."""
+
+from __future__ import annotations
+
+import math
+
+from marey_motion.editing.rotation_kernels import (
+    TINY,
+    about,
+    compiled,
+    cross,
+    direction,
+    dot,
+    exponential,
+    inverse,
+    length,
+    logarithm,
+    minus,
+    perpendicular,
+    plus,
+    product,
+    put_rotation,
+    put_vector,
+    rotated,
+    rotation_at,
+    scaled,
+    twist_angle,
+    unit,
+    vector_at,
+)
+
+# Kinds of targets.
+POSITION, ORIENTATION, LOOK_AT = 0, 1, 2
+
+# Columns of a joint's limits.
+REFERENCE, TWIST_AXIS, SIDE_AXIS, TWIST_RANGE, SWING_RANGE, LIMIT_COLUMNS = 0, 4, 7, 10, 12, 14
+
+
+@compiled
+def place_joints(parents, offsets, root, local, spins, places):  # type: ignore[no-untyped-def]
+    """Fill world rotations `spins` (K, 4) and positions `places` (K, 3) from local rotations (K, 4) and root (3,)."""
+    put_rotation(spins, 0, rotation_at(local, 0))
+    put_vector(places, 0, (root[0], root[1], root[2]))
+    for k in range(1, parents.shape[0]):
+        parent = parents[k]
+        spin = rotation_at(spins, parent)
+        put_rotation(spins, k, product(spin, rotation_at(local, k)))
+        put_vector(places, k, plus(vector_at(places, parent), rotated(spin, vector_at(offsets, k))))
+
+
+@compiled
+def place_tips(targets, spins, places, tips, turns):  # type: ignore[no-untyped-def]
+    """Fill the points (C, 3) and world rotations (C, 4) that the targets are about."""
+    for c in range(targets.kinds.shape[0]):
+        k = targets.joints[c]
+        spin = rotation_at(spins, k)
+        put_rotation(turns, c, spin)
+        put_vector(tips, c, plus(vector_at(places, k), rotated(spin, vector_at(targets.offsets, c))))
+
+
+@compiled
+def look_error(gaze, wished):  # type: ignore[no-untyped-def]
+    """Rotation vector (radians) from the wished unit direction to the gaze."""
+    across = cross(wished, gaze)
+    sine, cosine = length(across), dot(wished, gaze)
+    if sine > TINY:
+        return scaled(across, math.atan2(sine, cosine) / sine)
+    return (0.0, 0.0, 0.0) if cosine > 0.0 else scaled(perpendicular(wished), math.pi)
+
+
+@compiled
+def target_error(targets, c, frame, tip, turn):  # type: ignore[no-untyped-def]
+    """What target `c` is missed by: metres along its axes, or a rotation vector in radians, both in the world."""
+    values = targets.values[frame]
+    if targets.kinds[c] == POSITION:
+        off = minus(tip, vector_at(values, c))
+        axes = targets.axes
+        return off[0] * axes[c, 0], off[1] * axes[c, 1], off[2] * axes[c, 2]
+    if targets.kinds[c] == ORIENTATION:
+        return logarithm(product(turn, inverse(rotation_at(values, c))))
+    gaze = rotated(turn, vector_at(targets.directions, c))
+    return look_error(gaze, direction(minus(vector_at(values, c), tip)))
+
+
+@compiled
+def weigh_errors(targets, frame, tips, turns, errors, tolerance_m, tolerance_rad):  # type: ignore[no-untyped-def]
+    """Fill `errors` (C, 3); return the weighted sum of their squares and whether all are within the tolerances."""
+    cost, reached = 0.0, True
+    for c in range(targets.kinds.shape[0]):
+        error = target_error(targets, c, frame, vector_at(tips, c), rotation_at(turns, c))
+        put_vector(errors, c, error)
+        square = dot(error, error)
+        cost += targets.scales[c] ** 2 * square
+        tolerance = tolerance_m if targets.kinds[c] == POSITION else tolerance_rad
+        reached = reached and square <= tolerance * tolerance
+    return cost, reached
+
+
+@compiled
+def measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad):  # type: ignore[no-untyped-def]
+    """Place everything and fill the errors; the cost of the targets and whether all are reached."""
+    place_joints(body.parents, offsets, root, local, work.spins, work.places)
+    place_tips(targets, work.spins, work.places, work.tips, work.turns)
+    return weigh_errors(targets, frame, work.tips, work.turns, work.errors, tolerance_m, tolerance_rad)
+
+
+@compiled
+def store_residuals(errors, out):  # type: ignore[no-untyped-def]
+    for c in range(errors.shape[0]):
+        out[c] = length(vector_at(errors, c))
+
+
+@compiled
+def nearest_in_range(angle, low, high):  # type: ignore[no-untyped-def]
+    """The angle (radians, on the circle) in [low, high] that is nearest to `angle`."""
+    if low <= angle <= high:
+        return angle
+    above = (angle - high) % (2.0 * math.pi)
+    below = (low - angle) % (2.0 * math.pi)
+    return high if above < below else low
+
+
+@compiled
+def within_limits(row, q):  # type: ignore[no-untyped-def]
+    """The local rotation `q` brought into the limits of a row of `Body.limits`."""
+    reference = (row[0], row[1], row[2], row[3])
+    axis, side = (row[4], row[5], row[6]), (row[7], row[8], row[9])
+    turn = product(inverse(reference), q)
+    twist = twist_angle(turn, axis)
+    swing = logarithm(product(turn, about(axis, -twist)))
+    forward = cross(axis, side)
+    across, along = dot(swing, side), dot(swing, forward)
+    across, along = _within_ellipse(across, along, row[SWING_RANGE], row[SWING_RANGE + 1])
+    kept = nearest_in_range(twist, row[TWIST_RANGE], row[TWIST_RANGE + 1])
+    swing = plus(scaled(side, across), scaled(forward, along))
+    return unit(product(reference, product(exponential(swing), about(axis, kept))))
+
+
+@compiled
+def _within_ellipse(x, y, width, height):  # type: ignore[no-untyped-def]
+    """The point (x, y) drawn towards the middle of an ellipse with these half axes until it is in it."""
+    if width <= 0.0:
+        x = 0.0
+    if height <= 0.0:
+        y = 0.0
+    size = math.sqrt((x / width if width > 0.0 else 0.0) ** 2 + (y / height if height > 0.0 else 0.0) ** 2)
+    return (x / size, y / size) if size > 1.0 else (x, y)
+
+
+@compiled
+def measure_frames(body, targets, tolerances, roots, rotations, work, residuals, reached):  # type: ignore[no-untyped-def]
+    """Fill residuals (F, C) and whether all targets are reached (F,)."""
+    tolerance_m, tolerance_rad = tolerances
+    for f in range(rotations.shape[0]):
+        frame = min(f, targets.values.shape[0] - 1)
+        offsets = body.offsets[min(f, body.offsets.shape[0] - 1)]
+        _, reached[f] = measure(body, targets, frame, offsets, roots[f], rotations[f], work, tolerance_m, tolerance_rad)
+        store_residuals(work.errors, residuals[f])

@@ -1,0 +1,160 @@
+"""Vectors and rotations (w, x, y, z) as tuples, for kernels that turn one joint at a time."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+
+# Below this length a direction is rounding noise.
+TINY = 1e-12
+
+
+@compiled
+def vector_at(array, row):  # type: ignore[no-untyped-def]
+    return array[row, 0], array[row, 1], array[row, 2]
+
+
+@compiled
+def rotation_at(array, row):  # type: ignore[no-untyped-def]
+    return array[row, 0], array[row, 1], array[row, 2], array[row, 3]
+
+
+@compiled
+def put_vector(array, row, v):  # type: ignore[no-untyped-def]
+    array[row, 0], array[row, 1], array[row, 2] = v
+
+
+@compiled
+def put_rotation(array, row, q):  # type: ignore[no-untyped-def]
+    array[row, 0], array[row, 1], array[row, 2], array[row, 3] = q
+
+
+@compiled
+def plus(a, b):  # type: ignore[no-untyped-def]
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@compiled
+def minus(a, b):  # type: ignore[no-untyped-def]
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@compiled
+def scaled(a, factor):  # type: ignore[no-untyped-def]
+    return a[0] * factor, a[1] * factor, a[2] * factor
+
+
+@compiled
+def dot(a, b):  # type: ignore[no-untyped-def]
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled
+def cross(a, b):  # type: ignore[no-untyped-def]
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@compiled
+def length(a):  # type: ignore[no-untyped-def]
+    return math.sqrt(dot(a, a))
+
+
+@compiled
+def direction(a):  # type: ignore[no-untyped-def]
+    """The unit vector along `a`; zero where it has no length."""
+    size = length(a)
+    return scaled(a, 1.0 / size) if size > TINY else (0.0, 0.0, 0.0)
+
+
+@compiled
+def perpendicular(a):  # type: ignore[no-untyped-def]
+    """A unit vector at a right angle to `a`, from the coordinate axis that `a` is farthest from."""
+    x, y, z = abs(a[0]), abs(a[1]), abs(a[2])
+    axis = (1.0, 0.0, 0.0)
+    if y <= x and y <= z:
+        axis = (0.0, 1.0, 0.0)
+    elif z < x:
+        axis = (0.0, 0.0, 1.0)
+    return direction(cross(a, axis))
+
+
+@compiled
+def product(a, b):  # type: ignore[no-untyped-def]
+    """The rotation that does `b`, then `a`."""
+    return (
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    )
+
+
+@compiled
+def inverse(a):  # type: ignore[no-untyped-def]
+    return a[0], -a[1], -a[2], -a[3]
+
+
+@compiled
+def unit(q):  # type: ignore[no-untyped-def]
+    size = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    return q[0] * size, q[1] * size, q[2] * size, q[3] * size
+
+
+@compiled
+def rotated(q, v):  # type: ignore[no-untyped-def]
+    axis = (q[1], q[2], q[3])
+    twice = scaled(cross(axis, v), 2.0)
+    return plus(plus(v, scaled(twice, q[0])), cross(axis, twice))
+
+
+@compiled
+def exponential(v):  # type: ignore[no-untyped-def]
+    """The rotation about `v` by its length in radians."""
+    half = 0.5 * length(v)
+    share = 0.5 * math.sin(half) / half if half > 1e-8 else 0.5
+    return math.cos(half), v[0] * share, v[1] * share, v[2] * share
+
+
+@compiled
+def logarithm(q):  # type: ignore[no-untyped-def]
+    """Axis times angle of a rotation, of at most half a turn."""
+    sign = -1.0 if q[0] < 0.0 else 1.0
+    v = (sign * q[1], sign * q[2], sign * q[3])
+    sine = length(v)
+    share = 2.0 * math.atan2(sine, sign * q[0]) / sine if sine > TINY else 2.0
+    return scaled(v, share)
+
+
+@compiled
+def between(a, b):  # type: ignore[no-untyped-def]
+    """The shortest rotation from unit vector `a` to unit vector `b`; none where one of them is zero."""
+    if dot(a, a) < 0.5 or dot(b, b) < 0.5:
+        return 1.0, 0.0, 0.0, 0.0
+    middle = plus(a, b)
+    w = 0.5 * dot(middle, middle)
+    if w > 1e-9:
+        x, y, z = cross(a, b)
+        return unit((w, x, y, z))
+    # Opposite: half a turn about any perpendicular, then what is left.
+    i, j, k = perpendicular(a)
+    x, y, z = cross(b, a)
+    return product(unit((1.0 - dot(a, b), x, y, z)), (0.0, i, j, k))
+
+
+@compiled
+def twist_angle(q, axis):  # type: ignore[no-untyped-def]
+    """Radians that `q` turns about the unit vector `axis`, in -π to π, when split into swing · twist."""
+    angle = 2.0 * math.atan2(dot((q[1], q[2], q[3]), axis), q[0])
+    if angle > math.pi:
+        angle -= 2.0 * math.pi
+    return angle + 2.0 * math.pi if angle < -math.pi else angle
+
+
+@compiled
+def about(axis, angle):  # type: ignore[no-untyped-def]
+    """The rotation about a unit vector by an angle in radians."""
+    sine = math.sin(0.5 * angle)
+    return math.cos(0.5 * angle), axis[0] * sine, axis[1] * sine, axis[2] * sine

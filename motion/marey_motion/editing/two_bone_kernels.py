@@ -1,0 +1,123 @@
+"""Limbs of two bones: the angle between the bones follows from the distance, the rest is aiming."""
+
+from __future__ import annotations
+
+import math
+
+from marey_motion.editing.pose_kernels import place_joints
+from marey_motion.editing.rotation_kernels import (
+    between,
+    compiled,
+    cross,
+    direction,
+    dot,
+    inverse,
+    length,
+    minus,
+    plus,
+    product,
+    put_rotation,
+    rotated,
+    rotation_at,
+    scaled,
+    unit,
+    vector_at,
+)
+
+# Sine of the bend below which the axis a limb bends about is drawn towards its hinge.
+NEARLY_STRAIGHT = 0.05
+# What becomes of the rotation of the limb's end.
+CARRIED, HELD, GIVEN = 0, 1, 2
+
+
+@compiled
+def bend_at(distance, first, second):  # type: ignore[no-untyped-def]
+    """Inner angle (radians, π when straight) between bones of these lengths whose ends are `distance` apart."""
+    near = max(distance * distance - (first - second) ** 2, 0.0)
+    far = max((first + second) ** 2 - distance * distance, 0.0)
+    return 2.0 * math.atan2(math.sqrt(near), math.sqrt(far))
+
+
+@compiled
+def damped_bend(angle, wished, zone):  # type: ignore[no-untyped-def]
+    """The wished inner angle, less of it the nearer a stretching limb comes to straight (Kovar et al. 2002, 5.2).
+
+    In the last `zone` radians before straight, the change from `angle` is weighed by a cubic that falls from 1 to 0.
+    """
+    if wished <= angle or zone <= 0.0:
+        return wished
+    return angle + _weighed(wished, zone) - _weighed(angle, zone)
+
+
+@compiled
+def _weighed(angle, zone):  # type: ignore[no-untyped-def]
+    into = min(1.0, max(0.0, (angle - (math.pi - zone)) / zone))
+    return min(angle, math.pi - zone) + zone * (into - into**3 + 0.5 * into**4)
+
+
+@compiled
+def _bent(upper, fore, wished, hinge):  # type: ignore[no-untyped-def]
+    """The fore bone's vector, from the middle, at the inner angle `wished` to the way back to the limb's root."""
+    back, way = direction(upper), direction(fore)
+    axis = cross(back, way)
+    sine = length(axis)
+    if sine < NEARLY_STRAIGHT:
+        axis = plus(axis, scaled(hinge, NEARLY_STRAIGHT - sine))
+    axis = direction(minus(axis, scaled(back, dot(axis, back))))
+    across = cross(axis, back)
+    size = length(fore)
+    return plus(scaled(back, size * math.cos(wished)), scaled(across, size * math.sin(wished)))
+
+
+@compiled
+def _reach(limb, body, offsets, root, local, target, rotation, work):  # type: ignore[no-untyped-def]
+    """Turn the limb's joints of one pose, `local` (K, 4), so that its tip comes to `target`."""
+    place_joints(body.parents, offsets, root, local, work.spins, work.places)
+    spin = rotation_at(work.spins, limb.end)
+    if limb.ending == GIVEN:
+        spin = rotation
+    tip = vector_at(work.places, limb.end)
+    lever = rotated(spin, (limb.offset[0], limb.offset[1], limb.offset[2]))
+    if limb.ending == CARRIED:
+        tip = plus(tip, lever)
+    else:
+        target = minus(target, lever)
+    start, middle = vector_at(work.places, limb.start), vector_at(work.places, limb.middle)
+    upper, fore = minus(start, middle), minus(tip, middle)
+    first, second = length(upper), length(fore)
+    way = minus(target, start)
+    distance = min(max(length(way), abs(first - second)), first + second)
+    now = bend_at(length(minus(tip, start)), first, second)
+    wished = damped_bend(now, bend_at(distance, first, second), limb.damping_zone)
+    hinge = rotated(rotation_at(work.spins, limb.middle), (limb.hinge[0], limb.hinge[1], limb.hinge[2]))
+    bent = _bent(upper, fore, wished, hinge)
+    opening = between(direction(fore), direction(bent))
+    aim = between(direction(minus(plus(middle, bent), start)), direction(way))
+    _turn(body, work, local, limb.start, aim)
+    _turn(body, work, local, limb.middle, opening)
+    if limb.ending != CARRIED:
+        above = rotation_at(work.spins, body.parents[limb.end])
+        put_rotation(local, limb.end, unit(product(inverse(product(product(aim, opening), above)), spin)))
+
+
+@compiled
+def _turn(body, work, local, k, turn):  # type: ignore[no-untyped-def]
+    """Turn joint k by a rotation given in the world as it was before its parents turned."""
+    parent = body.parents[k]
+    spin = product(turn, rotation_at(work.spins, k))
+    if parent >= 0:
+        spin = product(inverse(rotation_at(work.spins, parent)), spin)
+    put_rotation(local, k, unit(spin))
+
+
+@compiled
+def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):  # type: ignore[no-untyped-def]
+    """Solve every frame on its own: `rotations` (F, K, 4) are changed in place.
+
+    targets (F or 1, 3) metres in the world; target_rotations (F or 1, 4), read when the limb's ending is GIVEN.
+    """
+    for f in range(rotations.shape[0]):
+        target = vector_at(targets, min(f, targets.shape[0] - 1))
+        rotation = rotation_at(target_rotations, min(f, target_rotations.shape[0] - 1))
+        offsets = body.offsets[min(f, body.offsets.shape[0] - 1)]
+        _reach(limb, body, offsets, roots[f], rotations[f], target, rotation, work)
