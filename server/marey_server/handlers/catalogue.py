@@ -16,6 +16,7 @@ from marey_server.handlers import (
     jobs,
     leases,
     parts,
+    pipelines,
     projects,
     uploads,
 )
@@ -33,6 +34,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     *coverage_streams.RESOURCES,
     *imports.RESOURCES,
     *jobs.RESOURCES,
+    *pipelines.RESOURCES,
     *leases.RESOURCES,
     *blobs.RESOURCES,
     *uploads.RESOURCES,

@@ -116,6 +116,8 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
         for entry in entries:
             for one in _resolved(tx, row.project_id, name, spec, entry, made):
                 chosen.setdefault((one["item"], one["revision"]), one)
+        if not chosen and not spec.required:
+            continue
         if not spec.many and len(chosen) != 1:
             sources = ", ".join(entry["job"] for entry in entries if "job" in entry)
             detail = f"The input {name!r} takes one {spec.kind}; {sources} made {len(chosen)}."
@@ -130,14 +132,16 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
 def _resolved(
     tx: Transaction, project_id: str, name: str, spec: InputSpec, entry: dict[str, Any], made: dict[str, list[Pin]]
 ) -> list[Pin]:
-    """What one entry of an input stands for: itself, or what the job it names made."""
+    """What one entry of an input stands for: itself, or what the job it names made, which may be nothing only where the
+    input is not required.
+    """
     if "job" not in entry:
         return [entry]
     source: str = entry["job"]
     if source not in made:
         made[source] = _outputs(tx, project_id, source)
     found = [one for one in made[source] if one["kind"] == spec.kind]
-    if not found:
+    if not found and spec.required:
         detail = f"{source} made no {spec.kind} that is there, which this job needs as its input {name!r}."
         raise UnbindableError("no-input", detail)
     return found

@@ -155,7 +155,7 @@ def late_inputs(request: JobCreate, at: str = "") -> Iterator[tuple[str, str, st
         for index, choice in enumerate(_as_many(choices)):
             if isinstance(choice, JobOutputsInput):
                 place = f"{at}/inputs/{_escaped(name)}" + (f"/{index}" if isinstance(choices, tuple) else "")
-                yield f"{place}/job", name, choice.job
+                yield place, name, choice.job
 
 
 def pin(found: FoundItem, number: int) -> Pin:

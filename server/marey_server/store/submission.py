@@ -65,7 +65,7 @@ def submit_at(
     checked = []
     for at, one in requests.items():
         submission = _check(tx, project, one, known, at)
-        _check_makers(submission, upstream, at)
+        _check_makers(submission, upstream, made, at)
         checked.append(replace(submission, id=ids[at]) if at in ids else submission)
     return submit_checked(tx, project, checked, {one: found.state for one, found in upstream.items()})
 
@@ -158,7 +158,7 @@ def _lock_upstream(
         for at, request in requests.items()
         for place, one in (
             *((f"{at}/after/{index}", one) for index, one in enumerate(request.after)),
-            *((place, one) for place, _, one in late_inputs(request, at)),
+            *((f"{place}/job", one) for place, _, one in late_inputs(request, at)),
         )
         if one not in to_be
     }
@@ -184,8 +184,8 @@ def lock_jobs(tx: Transaction, project: ProjectRow, ids: Iterable[str]) -> dict[
     return found
 
 
-def _check_makers(submission: Submission, upstream: Mapping[str, Upstream], at: str) -> None:
-    """Jobs that are to make an input must be of a kind that makes such things."""
+def _check_makers(submission: Submission, upstream: Mapping[str, Upstream], to_be: Collection[str], at: str) -> None:
+    """Jobs that are to make an input must be of a kind that makes such things; those to be are told of as steps."""
     for place, name, maker in late_inputs(submission.request, at):
         wanted = submission.kind.inputs[name].kind
         try:
@@ -194,7 +194,7 @@ def _check_makers(submission: Submission, upstream: Mapping[str, Upstream], at: 
             continue  # of a kind that this server knew once: what it made counts
         if wanted not in makes:
             detail = f"{upstream[maker].kind} makes {', '.join(sorted(set(makes))) or 'nothing'}, and no {wanted}."
-            raise _invalid(place, "wrong-kind", detail)
+            raise _invalid(f"{place}/{'step' if maker in to_be else 'job'}", "wrong-kind", detail)
 
 
 # -- rows -------------------------------------------------------------------------------------------------------------

@@ -247,6 +247,15 @@ def test_an_input_that_takes_one_thing_refuses_more(desk: Desk) -> None:
     assert f"{maker} made 2" in detail
 
 
+def test_an_input_that_a_job_can_do_without_is_left_out_where_nothing_was_made(desk: Desk) -> None:
+    maker = desk.submit("sum")
+    desk.things(1)
+    job = desk.submit("square", inputs={"things": {"collection": "raw"}, "ruler": {"job": maker}})
+    make(desk, maker)
+    assert desk.job(job).inputs.keys() == {"things"}
+    assert square(desk) == [["thing0"]]
+
+
 def test_more_inputs_than_can_be_fail_the_job(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(binding, "MOST_INPUTS", 2)
     maker = desk.submit("sum")

@@ -1,5 +1,7 @@
 """Results of imports and jobs become items: together, once, and with references between them."""
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -134,6 +136,41 @@ def test_what_was_made_from_something_that_changed_is_stale_through_any_number_o
     lab.write(items.put_part, "lab", Kind.CLIP, clip.item, "info", {"subject": "x"}, expected_rev=None)
     assert staleness().stale
     assert [(edge.item, edge.revision) for edge in staleness().because] == [(clip.item, 1)]
+
+
+def item_that_was_added_to(lab):
+    """A clip, what was made of it, and a clip made of that which got a further part because of itself."""
+    clip, _ = publish(lab, clip_draft(), rig_draft())
+    (step,) = publish(lab, Draft("s", Kind.STUDY, "step", {"study": {"n": 1}}, sources={"clips": [(clip.item, 1)]}))
+    made, _ = publish(lab, replace(clip_draft("made", seed=1), sources={"step": [(step.item, 1)]}), rig_draft())
+    part = {"info": {"subject": "x"}}
+    (added,) = publish(lab, Draft("a", Kind.CLIP, "made", part, "raw", sources={"clip": [(made.item, 1)]}))
+    assert (added.item, added.revision) == (made.item, 2)
+    return clip, made
+
+
+def test_what_was_added_to_an_item_because_of_itself_is_not_stale(lab):
+    _, made = item_that_was_added_to(lab)
+    staleness = lab.read(items.read_staleness, "lab", Kind.CLIP, made.item)
+    assert (staleness.revision, staleness.stale, staleness.because) == (2, False, ())
+
+
+def test_a_changed_input_is_told_through_what_was_added_to_an_item_later(lab):
+    clip, made = item_that_was_added_to(lab)
+    lab.write(items.put_part, "lab", Kind.CLIP, clip.item, "info", {"subject": "x"}, expected_rev=None)
+    staleness = lab.read(items.read_staleness, "lab", Kind.CLIP, made.item)
+    assert staleness.stale
+    assert [(edge.item, edge.revision, edge.role) for edge in staleness.because] == [(clip.item, 1, "clips")]
+
+
+def test_who_still_uses_an_earlier_revision_of_such_an_item_is_stale(lab):
+    _, made = item_that_was_added_to(lab)
+    users = [
+        Draft(f"u{n}", Kind.STUDY, f"user{n}", {"study": {"n": n}}, sources={"clip": [(made.item, n)]}) for n in (1, 2)
+    ]
+    old, new = publish(lab, *users)
+    assert lab.read(items.read_staleness, "lab", Kind.STUDY, old.item).stale
+    assert not lab.read(items.read_staleness, "lab", Kind.STUDY, new.item).stale
 
 
 def test_many_publishers_of_one_skeleton_make_one(lab):

@@ -98,30 +98,25 @@ def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[Li
 
 
 def read_staleness(tx: Transaction, project_name: str, kind: Kind, item_id: str) -> Staleness:
-    """Whether anything the newest revision was made from, directly or through others, has a newer revision."""
+    """Whether anything the newest revision was made from, directly or through others, has a newer revision.
+
+    What an item was made from of itself, such as the model that its tree was made for, is no older state of an input:
+    it is looked through.
+    """
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
     ancestry = (
-        select(lineage.c.input_item_id.label("item_id"), lineage.c.input_number.label("number"))
-        .where(lineage.c.item_id == item_id, lineage.c.number == found.head)
+        select(revision.c.item_id, revision.c.number)
+        .where(revision.c.item_id == item_id, revision.c.number == found.head)
         .cte("ancestry", recursive=True)
     )
-    further = select(lineage.c.input_item_id, lineage.c.input_number).join(
-        ancestry, and_(lineage.c.item_id == ancestry.c.item_id, lineage.c.number == ancestry.c.number)
+    made_from = and_(lineage.c.item_id == ancestry.c.item_id, lineage.c.number == ancestry.c.number)
+    ancestry = ancestry.union(select(lineage.c.input_item_id, lineage.c.input_number).join(ancestry, made_from))
+    outdated = and_(
+        tuple_(lineage.c.item_id, lineage.c.number).in_(select(ancestry.c.item_id, ancestry.c.number)),
+        lineage.c.input_item_id != lineage.c.item_id,
+        item.c.head > lineage.c.input_number,
     )
-    ancestry = ancestry.union(further)
-    outdated = select(ancestry.c.item_id, ancestry.c.number).join(item, item.c.id == ancestry.c.item_id)
-    old = {(row.item_id, row.number) for row in tx.execute(outdated.where(item.c.head > ancestry.c.number))}
-    edges = _edges(
-        tx, lineage.c.input_item_id, lineage.c.input_number,
-        and_(
-            tuple_(lineage.c.input_item_id, lineage.c.input_number).in_(old),
-            tuple_(lineage.c.item_id, lineage.c.number).in_(
-                select(ancestry.c.item_id, ancestry.c.number).union(
-                    select(revision.c.item_id, revision.c.number).where(
-                        revision.c.item_id == item_id, revision.c.number == found.head
-                    )
-                )
-            ),
-        ),
-    ) if old else ()  # fmt: skip
-    return Staleness(item=item_id, revision=found.head, stale=bool(old), because=edges)
+    newer = select(lineage.c.item_id).join(item, item.c.id == lineage.c.input_item_id).where(outdated)
+    stale = tx.execute(newer.limit(1)).first() is not None
+    because = _edges(tx, lineage.c.input_item_id, lineage.c.input_number, outdated) if stale else ()
+    return Staleness(item=item_id, revision=found.head, stale=stale, because=because)

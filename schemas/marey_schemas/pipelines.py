@@ -1,0 +1,134 @@
+"""Pipelines: jobs handed in together, in which some work on what others make."""
+
+from collections.abc import Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, StringConstraints
+
+from marey_schemas.base import Answer, Request
+from marey_schemas.jobs import Job, JobCreate, JobInput, JobOutputsInput, Resources
+from marey_schemas.names import CollectionPath, Message
+
+MOST_STEPS = 32
+
+StepName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+
+
+class StepOutputsInput(Request):
+    """Everything of the input's kind that another step makes. The step waits for that one."""
+
+    step: StepName
+
+
+StepInput = JobInput | StepOutputsInput
+
+
+class PipelineStep(Request):
+    """One job of a pipeline. What is left out of the second group is as the pipeline says."""
+
+    kind: str = Field(min_length=1, max_length=64)
+    inputs: dict[str, StepInput | tuple[StepInput, ...]] = Field(default_factory=dict)
+    params: dict[str, Any] = Field(default_factory=dict)
+    after: tuple[StepName, ...] = Field(
+        (), max_length=MOST_STEPS, description="Steps that must succeed first, besides those that make its inputs."
+    )
+
+    into: CollectionPath | None = None
+    priority: int | None = Field(None, ge=-100, le=100)
+    cache: Literal["use", "refresh", "off"] | None = None
+    seed: int | None = Field(None, ge=0, lt=2**63)
+    max_attempts: int | None = Field(None, ge=1, le=20)
+    labels: dict[str, str] | None = None
+    resources: Resources | None = None
+    message: Message | None = None
+
+
+class PipelineCreate(Request):
+    """Submit jobs that depend on each other, all or none."""
+
+    steps: dict[StepName, PipelineStep] = Field(min_length=1, max_length=MOST_STEPS)
+    into: CollectionPath = Field("", description="The collection the results go to.")
+    priority: int = Field(0, ge=-100, le=100)
+    cache: Literal["use", "refresh", "off"] = "use"
+    seed: int = Field(0, ge=0, lt=2**63)
+    max_attempts: int = Field(3, ge=1, le=20)
+    labels: dict[str, str] = Field(default_factory=dict, description="A worker must carry all of them.")
+    resources: Resources = Resources()
+    message: Message = ""
+
+
+class Pipeline(Answer):
+    """The jobs of a pipeline by the names of its steps, each after those it needs."""
+
+    jobs: dict[str, Job]
+
+
+class PipelineError(ValueError):
+    """The steps make no sense together. `pointer` is the place in the pipeline, `code` a stable slug."""
+
+    def __init__(self, pointer: str, code: str, detail: str) -> None:
+        super().__init__(detail)
+        self.pointer = pointer
+        self.code = code
+
+    @classmethod
+    def unknown_step(cls, pointer: str, name: str, pipeline: PipelineCreate) -> Self:
+        """A step that is named and not there."""
+        return cls(pointer, "unknown-step", f"There is no step {name!r}; there are {', '.join(pipeline.steps)}.")
+
+
+def order_steps(pipeline: PipelineCreate) -> tuple[str, ...]:
+    """The names of the steps, each after those it needs, else as they were given.
+
+    Raises `PipelineError` for a step that is not there, and for steps that wait for each other.
+    """
+    places = {name: dict(_needed(name, step)) for name, step in pipeline.steps.items()}
+    for needed in places.values():
+        for pointer, other in needed.items():
+            if other not in pipeline.steps:
+                raise PipelineError.unknown_step(pointer, other, pipeline)
+    sorter = TopologicalSorter({name: sorted(set(needed.values())) for name, needed in places.items()})
+    try:
+        sorter.prepare()
+    except CycleError as error:
+        circle: list[str] = error.args[1]
+        pointer = next(place for place, other in places[circle[1]].items() if other == circle[0])
+        detail = f"These steps wait for each other: {' -> '.join(circle)}."
+        raise PipelineError(pointer, "cycle", detail) from error
+    order: list[str] = []
+    given = list(pipeline.steps)
+    while sorter.is_active():
+        ready = sorted(sorter.get_ready(), key=given.index)
+        order += ready
+        sorter.done(*ready)
+    return tuple(order)
+
+
+def job_of_step(pipeline: PipelineCreate, name: str, ids: Mapping[str, str]) -> JobCreate:
+    """The job that a step stands for; `ids` are those of the jobs of the steps it needs."""
+    step = pipeline.steps[name]
+
+    def resolved(choice: StepInput) -> JobInput:
+        return JobOutputsInput(job=ids[choice.step]) if isinstance(choice, StepOutputsInput) else choice
+
+    shared = pipeline.model_dump(exclude={"steps"})
+    own = step.model_dump(exclude={"kind", "inputs", "params", "after"}, exclude_none=True)
+    inputs = {
+        role: tuple(map(resolved, choices)) if isinstance(choices, tuple) else resolved(choices)
+        for role, choices in step.inputs.items()
+    }
+    after = tuple(ids[other] for other in step.after)
+    return JobCreate(kind=step.kind, inputs=inputs, params=step.params, after=after, **(shared | own))
+
+
+def _needed(name: str, step: PipelineStep) -> Iterator[tuple[str, str]]:
+    """Where a step names another one, and which."""
+    for index, other in enumerate(step.after):
+        yield f"/steps/{name}/after/{index}", other
+    for role, choices in step.inputs.items():
+        place = f"/steps/{name}/inputs/{role.replace('~', '~0').replace('/', '~1')}"
+        many = isinstance(choices, tuple)
+        for index, choice in enumerate(choices if isinstance(choices, tuple) else (choices,)):
+            if isinstance(choice, StepOutputsInput):
+                yield (f"{place}/{index}/step" if many else f"{place}/step"), choice.step
