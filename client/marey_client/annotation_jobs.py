@@ -26,7 +26,7 @@ def annotate_request(project: ProjectHandle, clips: Places, params: AnnotatePara
     inputs: dict[str, Any] = {"clips": tuple(map(as_input, places))}
     if edited := project.edited_rigs(item for place in places for item in items_at(project, place)):
         inputs["rigs"] = edited
-    return JobCreate(kind="annotate", inputs=inputs, params=params.model_dump(mode="json", exclude_defaults=True))
+    return JobCreate(kind="annotate", inputs=inputs, params=params.model_dump(mode="json", exclude_unset=True))
 
 
 def cut_request(project: ProjectHandle, annotations: AnnotationPlaces, params: CutParams) -> JobCreate:
@@ -44,7 +44,7 @@ def cut_request(project: ProjectHandle, annotations: AnnotationPlaces, params: C
         "annotations": tuple(ItemInput(item=one.id, revision=one.revision) for one in found.values()),
         "clips": tuple(ItemInput(item=clip, revision=revision) for clip, revision in sorted(clips)),
     }
-    return JobCreate(kind="cut", inputs=inputs, params=params.model_dump(mode="json", exclude_defaults=True))
+    return JobCreate(kind="cut", inputs=inputs, params=params.model_dump(mode="json", exclude_unset=True))
 
 
 def _annotations_at(project: ProjectHandle, place: AnnotationPlace) -> Iterator[Item]:

@@ -37,7 +37,7 @@ class StepsProposal(Request):
     shortest_s: Seconds = Field(0.2, description="Shorter steps get no label.")
     longest_s: Seconds = Field(1.5, description="Longer steps get no label.")
     shortest_m: float = Field(0.2, ge=0, le=10, allow_inf_nan=False, description="Way of the hips in a step.")
-    most_turn_deg: Degrees = Field(30.0, description="Steps that turn the body more get no label.")
+    most_turn_deg: Degrees = Field(45.0, description="Steps that turn the body more get no label.")
     most_aside_deg: Degrees = Field(45.0, description="Steps that lead further off where the body faces get no label.")
     standing_s: Seconds = Field(0.6, description="Both feet on the ground for so long: labelled `standing`.")
 

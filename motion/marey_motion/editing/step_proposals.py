@@ -40,7 +40,7 @@ class StepOptions:
     shortest_s: float = 0.2
     longest_s: float = 1.5
     shortest_m: float = 0.2
-    most_turn_deg: float = 30.0
+    most_turn_deg: float = 45.0
     most_aside_deg: float = 45.0
     standing_s: float = 0.6
 
