@@ -1,0 +1,124 @@
+"""From takes to single steps, as users walk it: propose, correct, cut; a real server and a real worker."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation_takes import write_walks
+from marey_client import Marey
+from marey_client.errors import JobUnsuccessful, PreconditionFailed, RequestFailed
+from marey_client.imports import find_files
+from marey_client.jobs import Jobs
+from marey_client.project import ProjectHandle
+from marey_schemas.access import ProjectCreate
+from marey_schemas.imports import ImportOptions
+from marey_schemas.jobs import Job
+from server_process import ServerProcess
+
+pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.fixture
+def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
+    process = ServerProcess(tmp_path, database_url)
+    process.start(workers=1)
+    yield process
+    process.stop()
+
+
+@pytest.fixture
+def marey(server: ServerProcess) -> Iterator[Marey]:
+    with server.client() as client:
+        yield client
+
+
+@pytest.fixture
+def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
+    """A project with nine walks."""
+    project = marey.create_project(ProjectCreate(name="lab"))
+    files = find_files([write_walks(tmp_path / "takes")]).files
+    project.imports.upload(files, ImportOptions(collection="walks"))
+    return project
+
+
+def done(project: ProjectHandle, job: Job) -> Job:
+    return Jobs(project.transport).wait(job.id)
+
+
+def test_walks_become_steps_of_each_foot_with_their_keyframes(lab: ProjectHandle) -> None:
+    told = done(lab, lab.annotate("walks")).result
+    assert told is not None
+    assert told["annotations"] == 9
+    assert told["segments"]["step_left"] >= 9 <= told["segments"]["step_right"]
+    found = list(lab.annotations.list(collection="walks"))
+    assert {one.document().made_by for one in found} == {"algorithm"}
+
+    made = done(lab, lab.cut("walks", into="steps", labels=("step_left", "step_right"), by_label=True)).result
+    assert made is not None
+    steps = list(lab.clips.list(collection="steps/walks/step_left"))
+    assert len(steps) == made["labels"]["step_left"] == told["segments"]["step_left"]
+    assert list(lab.clips.list(collection="steps/walks/step_right"))
+
+    step = next(one for one in steps if one.name == "walk 1.5 0 step_left 01")
+    (source,) = lab.clips.list(path="walks/walk 1.5 0")
+    frames = step.info().source.details["frames"]
+    np.testing.assert_array_equal(step.motion().poses, source.motion(frames=slice(*frames)).poses)
+    (said,) = step.annotations()
+    assert [keyframe.label for keyframe in said.document().keyframes] == ["passing"]
+    assert {edge.kind.value for edge in step.lineage().inputs} == {"annotation", "clip"}
+
+
+def test_pieces_are_of_the_clip_as_it_was_annotated(lab: ProjectHandle) -> None:
+    (clip,) = lab.clips.list(path="walks/walk 1 0")
+    said = clip.annotate("parts", segments=[{"label": "middle", "start": 60, "end": 120}])
+    before = clip.motion().poses
+    motion = clip.part("motion")
+    clip.put_part("motion", {**motion, "poses": np.ascontiguousarray(motion["poses"][::-1])})
+    done(lab, lab.cut(said, into="pieces", margin_before_s=0.25))
+    (piece,) = lab.clips.list(collection="pieces")
+    np.testing.assert_array_equal(piece.motion().poses, before[45:120])
+    (of_piece,) = piece.annotations()
+    assert of_piece.document().segments[0].model_dump() == {"label": "middle", "start": 15, "end": 75}
+    assert [edge.name for edge in piece.staleness().because] == ["walk 1 0"]
+
+
+def test_commands_are_carried_out_together_or_not_at_all(lab: ProjectHandle) -> None:
+    (clip,) = lab.clips.list(path="walks/walk 1 0")
+    said = clip.annotate("parts")
+    said.apply(
+        [
+            {"command": "create_segment", "label": "a", "start": 0, "end": 100},
+            {"command": "split_segment", "at": 40, "label": "b"},
+            {"command": "add_keyframe", "label": "middle", "frame": 50},
+        ],
+        message="First cut",
+    )
+    assert said.item.revision == 2
+    assert [(one.label, one.start, one.end) for one in said.document().segments] == [("a", 0, 40), ("b", 40, 100)]
+    with pytest.raises(RequestFailed) as refused:
+        said.apply([{"command": "clear"}, {"command": "remove_segment", "at": 5}])
+    assert refused.value.status == 422
+    assert refused.value.problem.errors[0].pointer == "/commands/1"
+    assert refused.value.problem.errors[0].code == "no-segment"
+    assert len(said.document().segments) == 2
+
+    other = lab.annotations.get(said.id)
+    other.apply([{"command": "relabel_segment", "at": 0, "label": "c"}])
+    with pytest.raises(PreconditionFailed):
+        said.apply([{"command": "clear"}])
+    assert [one.id for one in clip.annotations()] == [said.id]
+
+
+def test_two_pieces_of_one_name_are_refused_before_any_is_made(lab: ProjectHandle) -> None:
+    (clip,) = lab.clips.list(path="walks/walk 1 0")
+    for layer in ("mine", "yours"):
+        clip.annotate(layer, segments=[{"label": "a", "start": 0, "end": 60}])
+    with pytest.raises(JobUnsuccessful, match=r"same-name.*2 pieces would be walks/walk 1 0 a 01"):
+        done(lab, lab.cut("walks", into="pieces"))
+    assert not list(lab.clips.list(collection="pieces"))
+    done(lab, lab.cut("walks", into="pieces", layer="mine"))
+    assert len(list(lab.clips.list(collection="pieces"))) == 1
