@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal, Self, get_args
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from marey_schemas.base import Request
 from marey_schemas.edit_commands import (
@@ -29,6 +29,7 @@ from marey_schemas.edit_commands import (
     Translate,
     Trim,
 )
+from marey_schemas.names import Tag
 
 MOST_COMMANDS = 256
 
@@ -73,3 +74,22 @@ class EditDocument(Request):
     def sources(self) -> tuple[str, ...]:
         """Ids of the clips that the commands name."""
         return tuple(dict.fromkeys(str(one.source) for one in self.commands if isinstance(one, Concatenate | Paste)))
+
+
+class EditParams(Request):
+    """Parameters of `edit`."""
+
+    commands: tuple[EditCommand, ...] = Field(
+        (), max_length=MOST_COMMANDS, description="What to do, in order, where the input `edit` does not say it."
+    )
+    in_place: bool = Field(
+        False, description="Make each result the next revision of its clip; otherwise it is a clip of its own."
+    )
+    suffix: str = Field("", max_length=64, pattern=r"^[^/\x00-\x1f\x7f]*$", description="Appended to the names.")
+    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the results.")
+
+    @model_validator(mode="after")
+    def _check_place(self) -> Self:
+        if self.in_place and self.suffix:
+            raise ValueError("suffix: results that take the place of their clips keep their names")
+        return self

@@ -12,8 +12,10 @@ from importlib.metadata import entry_points
 from types import MappingProxyType
 from typing import Any, Literal
 
+from marey_schemas.alignment import AlignParams
 from marey_schemas.annotations import AnnotateParams, CutParams
 from marey_schemas.base import Request
+from marey_schemas.editing import EditParams
 from marey_schemas.evaluation import EvaluateParams, count_evaluation_tasks
 from marey_schemas.improvement import CompareParams, OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
 from marey_schemas.jobs import ExportParams, ImportParams, InputSpec, JobKind, RetargetParams
@@ -200,6 +202,32 @@ SWEEP = KindDeclaration(
     outputs={"document": "file"},
 )
 
+EDIT = KindDeclaration(
+    name="edit",
+    description="Applies the commands of an edit to clips: trims, joins, smooths, places and repairs them.",
+    params=EditParams,
+    implementation="marey_worker.kinds.edit:run",
+    version=1,
+    inputs={
+        "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to edit."),
+        "edit": InputSpec(
+            kind=Kind.EDIT, required=False, description="The commands; or give them as the parameter of that name."
+        ),
+        "sources": InputSpec(
+            kind=Kind.CLIP, many=True, required=False, description="Other clips that the commands name by their ids."
+        ),
+        "rigs": InputSpec(
+            kind=Kind.SKELETON,
+            many=True,
+            required=False,
+            description="Skeletons of the clips whose mapping was edited since, at the revision to go by.",
+        ),
+    },
+    outputs={"clips": Kind.CLIP},
+    fan_out="clips",
+    batch_size=16,
+)
+
 ANNOTATE = KindDeclaration(
     name="annotate",
     description="Proposes segments and keyframes of clips: steps, pauses, or reaches of a hand.",
@@ -240,7 +268,30 @@ CUT = KindDeclaration(
     outputs={"clips": Kind.CLIP, "annotations": Kind.ANNOTATION},
 )
 
-BUILT_IN = (IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, SUGGEST, OPTIMISE, SWEEP, ANNOTATE, CUT)
+ALIGN = KindDeclaration(
+    name="align",
+    description="Brings examples of one action into step with each other, in space and in time.",
+    params=AlignParams,
+    implementation="marey_worker.kinds.align:run",
+    version=1,
+    inputs={
+        "clips": InputSpec(kind=Kind.CLIP, many=True, description="The examples, all of one skeleton."),
+        "annotations": InputSpec(
+            kind=Kind.ANNOTATION,
+            many=True,
+            required=False,
+            description="Annotations of these clips: what they cut apart is aligned part by part.",
+        ),
+        "rig": InputSpec(
+            kind=Kind.SKELETON,
+            required=False,
+            description="The clips' skeleton at the revision whose mapping to go by, where that was edited since.",
+        ),
+    },
+    outputs={"processed": Kind.PROCESSED},
+)
+
+BUILT_IN = (IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN)
 
 
 class UnknownKindError(LookupError):

@@ -153,7 +153,7 @@ class Attempt:
         return Run(
             lease.job, lease.kind, lease.params, lease.inputs, lease.seed,
             lease.resources.memory_limit_mb * MIB, self._log_path, self._scratch, self._threads,
-            lease.position, lease.size,
+            lease.position, lease.size, lease.into,
         )  # fmt: skip
 
     # -- while the child computes --

@@ -56,6 +56,7 @@ class Context:
 
     def __init__(self, run: Run, pipe: Connection) -> None:
         self.inputs: Mapping[str, tuple[PinnedInput, ...]] = run.inputs
+        self.into = run.into
         self.seed = run.seed
         self.task = Task(0, 1) if run.position is None else Task(run.position, run.size or 1)
         self.threads = run.threads

@@ -28,6 +28,7 @@ class Run:
     threads: int
     position: int | None = None
     size: int | None = None
+    into: str = ""
 
 
 @dataclass(frozen=True)

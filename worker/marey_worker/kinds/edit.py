@@ -1,0 +1,230 @@
+"""Clips changed by the commands of an edit."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from pydantic import ValidationError
+
+from marey_motion import documents
+from marey_motion.clip import Clip
+from marey_motion.editing.registry import EditedClip, NamedCommand, edit_clip
+from marey_motion.editing.take import EditedBody
+from marey_motion.errors import EditError, MotionError
+from marey_motion.skeleton import Skeleton
+from marey_schemas.documents import ClipInfo, Motion, RevisionRef, SkeletonHierarchy, Source
+from marey_schemas.editing import EditDocument, EditParams
+from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
+from marey_schemas.kinds import Kind
+from marey_worker.context import Context, JobRefused, NoSuchThing
+from marey_worker.kinds.matching_clips import place_of
+from marey_worker.kinds.rigged import Rig, read_rigged
+from marey_worker.kinds.staged_results import StagedResults
+
+MAX_NAME_LENGTH = 255
+
+
+def run(context: Context, params: EditParams) -> dict[str, Any]:
+    """Apply the commands to every clip of the job.
+
+    A clip that cannot be edited is a refusal in the result, with code and reason; the others are made all the same.
+    Raises `JobRefused` where it is open which commands are meant, what sources they name, or where results should go.
+    """
+    return _Editing(context, params).run()
+
+
+class _Editing:
+    """One job."""
+
+    def __init__(self, context: Context, params: EditParams) -> None:
+        self._context = context
+        self._params = params
+        self._results = StagedResults(context)
+        self._rigs = {pin.item: pin for pin in context.inputs.get("rigs", ())}
+        self._bodies: dict[RevisionRef, EditedBody] = {}
+        self._frames = 0
+        self._refused: list[dict[str, Any]] = []
+        self._findings: list[dict[str, Any]] = []
+        _require_clear_place(context, params)
+        self._edit_pin, self._edit = _wanted_edit(context, params)
+        self._commands: tuple[NamedCommand, ...] = documents.commands_of_edit(self._edit)
+        self._source_pins = _wanted_sources(context, self._edit)
+
+    def run(self) -> dict[str, Any]:
+        """All clips; what became of them."""
+        pins = self._context.inputs["clips"]
+        started = time.monotonic()
+        sources = self._read_sources()
+        for done, (pin, motion) in enumerate(self._context.documents(pins, "motion")):
+            self._context.progress(done, len(pins), f"editing {pin.name}")
+            try:
+                outputs = list(self._edited(pin, Motion.model_validate(motion), sources))
+            except (MotionError, ValidationError) as error:
+                self._refuse(pin, error)
+                continue
+            for output in outputs:
+                self._results.add(output)
+        self._results.flush()
+        return {
+            "clips": self._results.count,
+            "frames": self._frames,
+            "seconds": round(time.monotonic() - started, 4),
+            "findings": self._findings,
+            "refused": self._refused,
+        }
+
+    def _read_sources(self) -> dict[str, Clip]:
+        pins = tuple(self._source_pins.values())
+        sources = {}
+        for pin, tree in self._context.documents(pins, "motion"):
+            motion = Motion.model_validate(tree)
+            try:
+                sources[pin.item] = documents.clip_from_document(motion, self._body(motion).skeleton)
+            except MotionError as error:
+                raise JobRefused(error.code, f"the source {place_of(pin)}: {error}") from error
+        return sources
+
+    def _edited(self, pin: PinnedInput, motion: Motion, sources: Mapping[str, Clip]) -> Iterator[StagedOutput]:
+        """The results of one clip. Raises `MotionError`."""
+        if self._params.in_place:
+            self._require_newest(pin)
+        body = self._body(motion)
+        clip = documents.clip_from_document(motion, body.skeleton)
+        made = edit_clip(clip, self._commands, body=body, sources=sources)
+        if self._params.in_place and len(made) > 1:
+            raise EditError("it was split, and several clips cannot take the place of one", code="several-clips")
+        info = self._info(pin)
+        for one in made:
+            name = f"{pin.name}{self._params.suffix}" + "".join(f"-{number}" for number in one.pieces)
+            self._require_free(pin, name)
+            self._note(pin, name, one)
+            yield self._output(pin, name, one.clip, motion, info)
+
+    def _output(self, pin: PinnedInput, name: str, clip: Clip, motion: Motion, info: ClipInfo) -> StagedOutput:
+        rig = self._rigs.get(_skeleton_of(motion).item)
+        pins = {"clips": [pin], "edit": [self._edit_pin], "sources": self._source_pins.values(), "rigs": [rig]}
+        sources = {role: tuple(_input(one) for one in many if one is not None) for role, many in pins.items()}
+        return StagedOutput(
+            name=f"{pin.collection}/{name}",
+            kind=Kind.CLIP,
+            item_name=name,
+            collection=pin.collection,
+            tags=self._params.tags,
+            parts={
+                "motion": documents.clip_to_document(clip, motion.skeleton).model_dump(by_alias=True),
+                "info": info.model_dump(mode="json", by_alias=True, exclude_none=True),
+            },
+            sources={role: many for role, many in sources.items() if many},
+        )
+
+    def _body(self, motion: Motion) -> EditedBody:
+        """The skeleton of a motion; its mapping is looked for when a command asks. Raises `MotionError`."""
+        used = _skeleton_of(motion)
+        if used not in self._bodies:
+            tree = self._context.document(Kind.SKELETON, used.item, used.revision, "hierarchy")
+            skeleton = documents.skeleton_from_document(SkeletonHierarchy.model_validate(tree))
+            edited = self._rigs.get(used.item)
+            mapping = used if edited is None else RevisionRef(item=edited.item, revision=edited.revision)
+            rig = Rig(used, mapping)
+
+            def find_mapping(_skeleton: Skeleton) -> Any:
+                return read_rigged(self._context, rig).mapping
+
+            self._bodies[used] = EditedBody(skeleton, find_mapping)
+        return self._bodies[used]
+
+    def _info(self, pin: PinnedInput) -> ClipInfo:
+        """What was known of the clip and still holds, and what was done to it."""
+        edit = None if self._edit_pin is None else _input(self._edit_pin).model_dump()
+        done = {"clip": _input(pin).model_dump(), "edit": edit, "commands": [name for name, _ in self._commands]}
+        try:
+            stored = self._context.document(Kind.CLIP, pin.item, pin.revision, "info")
+        except NoSuchThing:
+            return ClipInfo(source=Source(format="edited", details=done))
+        known = ClipInfo.model_validate(stored)
+        source = Source(format="edited", details=done)
+        if self._params.in_place and known.source is not None:
+            # It is still the clip of that file; only its motion is another.
+            source = known.source.model_copy(update={"details": {**known.source.details, "edited": done}})
+        return known.model_copy(update={"source": source, "checks": ()})
+
+    # -- where results go --
+
+    def _require_newest(self, pin: PinnedInput) -> None:
+        """Refuse to take the place of what somebody else made meanwhile. Raises `EditError`."""
+        now = self._context.item(Kind.CLIP, pin.item)
+        if now.revision != pin.revision:
+            raise EditError(
+                f"the edit is of revision {pin.revision} and would take the place of revision {now.revision}; "
+                "edit that one",
+                code="clip-changed",
+            )
+        if (now.collection, now.name) != (pin.collection, pin.name):
+            raise EditError("it was moved or renamed while the job waited; try again", code="clip-changed")
+
+    def _require_free(self, pin: PinnedInput, name: str) -> None:
+        if len(name) > MAX_NAME_LENGTH:
+            raise EditError(f"{name!r} has {len(name)} of {MAX_NAME_LENGTH} characters", code="name-too-long")
+        if f"{pin.collection}/{name}" in self._results.names:
+            raise EditError(f"another result of the job is called {name!r}; give a suffix", code="same-name")
+
+    # -- what is told --
+
+    def _note(self, pin: PinnedInput, name: str, made: EditedClip) -> None:
+        self._frames += made.clip.frame_count
+        place = f"{pin.collection}/{name}".lstrip("/")
+        self._findings += [
+            {"name": place, "item": pin.item, "command": one.command, **one.values} for one in made.findings
+        ]
+
+    def _refuse(self, pin: PinnedInput, error: MotionError | ValidationError) -> None:
+        code = error.code if isinstance(error, MotionError) else "bad-document"
+        self._context.log(f"{place_of(pin)}: {error}")
+        self._refused.append({"name": place_of(pin), "item": pin.item, "code": code, "detail": str(error)})
+
+
+def _require_clear_place(context: Context, params: EditParams) -> None:
+    """Refuse what would change the clips themselves unasked, or not change them though asked. Raises `JobRefused`."""
+    if params.in_place and context.into:
+        raise JobRefused(
+            "ambiguous-place", f"the results cannot both take the place of the clips and go to {context.into}"
+        )
+    if not (params.in_place or context.into or params.suffix):
+        raise JobRefused(
+            "ambiguous-place", "the results would take the place of the clips; give a folder or a suffix, or in_place"
+        )
+
+
+def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | None, EditDocument]:
+    """The commands, and the edit item they are from. Raises `JobRefused`."""
+    (pin,) = context.inputs.get("edit", ()) or (None,)
+    if (pin is None) == (not params.commands):
+        raise JobRefused("which-commands", "give either an edit or commands, and not both")
+    if pin is None:
+        return None, EditDocument(commands=params.commands)
+    try:
+        return pin, EditDocument.model_validate(context.document(Kind.EDIT, pin.item, pin.revision, "edit"))
+    except ValidationError as error:
+        raise JobRefused("bad-document", f"the edit {place_of(pin)} cannot be applied: {error}") from error
+
+
+def _wanted_sources(context: Context, edit: EditDocument) -> dict[str, PinnedInput]:
+    """The clips that commands name, by id. Raises `JobRefused` where one is missing or given twice."""
+    given = [pin for pin in context.inputs.get("sources", ()) if pin.item in edit.sources]
+    found = {pin.item: pin for pin in given}
+    if len(found) < len(given):
+        raise JobRefused("which-source", "a source is given at two revisions")
+    missing = [item for item in edit.sources if item not in found]
+    if missing:
+        raise JobRefused("source-missing", f"the commands name {', '.join(missing)}, which is not among the sources")
+    return found
+
+
+def _skeleton_of(motion: Motion) -> RevisionRef:
+    return RevisionRef.model_validate(motion.skeleton.model_dump())
+
+
+def _input(pin: PinnedInput) -> ItemInput:
+    return ItemInput(item=pin.item, revision=pin.revision)

@@ -1,0 +1,40 @@
+"""Clips handed over as they get ready, so that the server takes them in while the next ones are computed."""
+
+from __future__ import annotations
+
+from marey_schemas.jobs import StagedOutput
+from marey_schemas.kinds import Kind
+from marey_worker.context import Context
+
+BYTES_PER_STAGE = 2 << 20
+OUTPUTS_PER_STAGE = 64
+
+
+class StagedResults:
+    """The results of one job, in the order made; `names` are those of all so far."""
+
+    def __init__(self, context: Context) -> None:
+        self.names: set[str] = set()
+        self._context = context
+        self._ready: list[StagedOutput] = []
+        self._ready_bytes = 0
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.names)
+
+    def add(self, output: StagedOutput) -> None:
+        """One more; handed over with its neighbours."""
+        self.names.add(output.name)
+        self._ready.append(output)
+        if output.kind is Kind.CLIP:
+            self._ready_bytes += output.parts["motion"]["poses"].nbytes
+        if self._ready_bytes > BYTES_PER_STAGE or len(self._ready) >= OUTPUTS_PER_STAGE:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hand over what is ready."""
+        if self._ready:
+            self._context.stage(self._ready)
+        self._ready, self._ready_bytes = [], 0
