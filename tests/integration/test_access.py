@@ -49,6 +49,7 @@ BODIES = {
     "Document": {"schema": "marey/clip-info@1", "comment": CANARY},
     "JobCreate": {"kind": "no-such-kind"},
     "JobBatch": {"jobs": [{"kind": "no-such-kind"}]},
+    "PipelineCreate": {"steps": {"only": {"kind": "no-such-kind"}}},
     "ClaimRequest": {"worker": "w", "kinds": ["no-such-kind"]},
     "BatchCompleteRequest": {"completions": [{"job": "job_x", "fence": 1, "write_id": "12345678"}]},
     "Heartbeat": {},
