@@ -63,7 +63,7 @@ def _carried(motion: Motion, skeleton: Skeleton, carrier: int, turn: Floats, pla
     above = skeleton.path_to_root(carrier)[:0:-1]
     arm = np.zeros((motion.frame_count, 3))
     parent = quaternions.identity(motion.frame_count)
-    for joint, child in zip(above, (*above[1:], carrier), strict=True):
+    for joint, child in zip(above, (*above, carrier)[1:], strict=True):
         parent = quaternions.multiply(parent, motion.rotations[:, joint])
         arm += quaternions.rotate_vectors(parent, skeleton.offsets[child])
     rotations = motion.rotations.copy()
