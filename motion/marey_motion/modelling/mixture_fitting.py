@@ -5,19 +5,21 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.errors import MotionError
+from marey_motion.errors import ModelError
 from marey_motion.modelling.mixture import LatentMixture
 
 Floats = NDArray[np.float64]
+Refusal = Literal["", "small-component", "held-out"]
 
 LEAST_EXAMPLES_PER_COMPONENT = 5
+LEAST_FOLDS = 2
 SEEDS = 2**32
 
 
@@ -32,6 +34,7 @@ class MixtureOptions:
     components : exactly so many, in place of a choice
     regularisation : added to the variances, as a share of the mean variance
     starts : of expectation maximisation, the best of which counts
+    folds : parts that are held out in turn, under 2 for none
     iterations : at most, of each start
     """
 
@@ -40,6 +43,7 @@ class MixtureOptions:
     components: int | None = None
     regularisation: float = 1e-4
     starts: int = 5
+    folds: int = 5
     iterations: int = 500
 
 
@@ -51,7 +55,8 @@ class Candidate:
     ----------
     log_likelihood : of all examples, natural logarithm
     smallest_weight : of a component
-    refusal : why it was not taken whatever its criterion, or nothing
+    refusal : why it was not taken whatever its criterion: it leaves a component with too few examples, or makes those
+        not seen less likely than one component does
     """
 
     components: int
@@ -60,7 +65,7 @@ class Candidate:
     log_likelihood: float
     smallest_weight: float
     converged: bool
-    refusal: Literal["", "small-component"]
+    refusal: Refusal = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +77,13 @@ class FittedMixture:
     method : `em`: expectation maximisation; `shrunk`: one component of shrunk covariance, for few examples; `point`:
         examples that do not vary
     candidates : by number of components; empty unless the method is `em`
+    held_out : (n,) ln p of each example under mixtures of as many components fitted without its fold, or None
     """
 
     mixture: LatentMixture
     method: Literal["em", "shrunk", "point"]
     candidates: tuple[Candidate, ...]
+    held_out: Floats | None
 
 
 @contextmanager
@@ -90,45 +97,111 @@ def one_thread() -> Iterator[None]:
         yield
 
 
-def fit_mixture(latents: Floats, options: MixtureOptions = MixtureOptions(), *, seed: int = 0) -> FittedMixture:
+def fit_mixture(latents: Floats, options: MixtureOptions | None = None, *, seed: int = 0) -> FittedMixture:
     """The mixture of n latent vectors (n, d), the same for the same seed.
 
     With no more than d + 1 examples a full covariance is singular; one component then has a covariance shrunk towards a
     sphere (Ledoit and Wolf 2004). Otherwise numbers of components are compared by their criterion. A number is out of
-    the question if a component is left with fewer examples than it has dimensions (or than 5).
+    the question if a component is left with fewer examples than it has dimensions (or than 5), or if it makes held-out
+    examples less likely than one component does.
     """
     examples, dimensions = latents.shape
+    wanted = options or MixtureOptions()
     if not np.isfinite(latents).all():
-        raise MotionError("latent vectors must be finite numbers", where="latents")
+        raise ModelError("latent vectors must be finite numbers", where="latents")
     if dimensions == 0:
-        return FittedMixture(_single(latents.mean(axis=0), np.zeros((0, 0))), "point", ())
+        return FittedMixture(_single(latents.mean(axis=0), np.zeros((0, 0))), "point", (), None)
     # In units of the mean deviation, everything below is independent of the scale of the data.
     unit = float(np.sqrt(latents.var(axis=0).mean()))
     if not unit > 0.0:
-        raise MotionError("latent vectors that do not vary have no dimensions", where="latents")
-    if examples <= dimensions + 1:
-        return FittedMixture(_shrunk(latents, unit, options.regularisation), "shrunk", ())
-    counts = [options.components] if options.components else range(1, _most_components(latents.shape, options) + 1)
-    fits = [_fit(latents / unit, count, options, seed) for count in counts]
-    accepted = [fit for fit in fits if not fit[0].refusal] or fits[:1]
-    _, chosen = min(accepted, key=lambda fit: getattr(fit[0], options.criterion))
-    scaled = LatentMixture(chosen.weights, chosen.means * unit, chosen.covariances * unit**2)
-    shift = examples * dimensions * float(np.log(unit))
-    return FittedMixture(scaled, "em", tuple(_rescaled(candidate, shift) for candidate, _ in fits))
+        raise ModelError("latent vectors that do not vary have no dimensions", where="latents")
+    mixture, candidates, held_out = _Fitting(latents / unit, wanted, seed).choose()
+    shift = dimensions * float(np.log(unit))
+    return FittedMixture(
+        mixture=LatentMixture(mixture.weights, mixture.means * unit, mixture.covariances * unit**2),
+        method="em" if candidates else "shrunk",
+        candidates=tuple(_rescaled(candidate, shift * examples) for candidate in candidates),
+        held_out=None if held_out is None else held_out - shift,
+    )
 
 
-def _most_components(shape: tuple[int, ...], options: MixtureOptions) -> int:
-    examples, dimensions = shape
-    return max(1, min(options.most_components, examples // (2 * dimensions)))
+@dataclass(frozen=True, eq=False)
+class _Fitting:
+    """Latent vectors of unit mean variance."""
+
+    latents: Floats
+    options: MixtureOptions
+    seed: int
+
+    def choose(self) -> tuple[LatentMixture, list[Candidate], Floats | None]:
+        """The mixture, what was tried, and the held-out likelihood of the examples."""
+        examples, dimensions = self.latents.shape
+        if examples <= dimensions + 1:
+            return _fitted(self.latents, 1, self.options, self.seed)[0], [], self._held_out(1)
+        counts = range(1, max(1, min(self.options.most_components, examples // (2 * dimensions))) + 1)
+        if self.options.components is not None:
+            counts = range(self.options.components, self.options.components + 1)
+        fits = {count: _fitted(self.latents, count, self.options, self.seed) for count in counts}
+        candidates = {count: self._judged(count, *fit) for count, fit in fits.items()}
+        chosen, held_out = self._best(candidates)
+        return fits[chosen][0], list(candidates.values()), held_out
+
+    def _judged(self, count: int, mixture: LatentMixture, converged: bool) -> Candidate:
+        examples, dimensions = self.latents.shape
+        likelihood = float(mixture.log_density(self.latents).sum())
+        numbers = count * (1 + dimensions + dimensions * (dimensions + 1) // 2) - 1
+        smallest = float(mixture.weights.min())
+        least = max(dimensions + 1, LEAST_EXAMPLES_PER_COMPONENT) / examples
+        return Candidate(
+            components=count,
+            bic=numbers * float(np.log(examples)) - 2.0 * likelihood,
+            aic=2.0 * numbers - 2.0 * likelihood,
+            log_likelihood=likelihood,
+            smallest_weight=smallest,
+            converged=converged,
+            refusal="small-component" if count > 1 and smallest < least else "",
+        )
+
+    def _best(self, candidates: dict[int, Candidate]) -> tuple[int, Floats | None]:
+        """The number of components with the best criterion that nothing speaks against; refusals are noted."""
+        single = self._held_out(1)
+        falling = sorted(candidates.values(), key=lambda one: getattr(one, self.options.criterion))
+        for candidate in falling:
+            count = candidate.components
+            if count == 1 or self.options.components is not None:
+                return count, single if count == 1 else self._held_out(count)
+            if candidate.refusal:
+                continue
+            held_out = self._held_out(count)
+            if single is None or held_out is None or held_out.mean() > single.mean():
+                return count, held_out
+            candidates[count] = replace(candidate, refusal="held-out")
+        raise ModelError("one component is always possible")
+
+    def _held_out(self, count: int) -> Floats | None:
+        """ln p of each example under a mixture of `count` components fitted without its fold."""
+        examples = len(self.latents)
+        if self.options.folds < LEAST_FOLDS or examples <= self.options.folds:
+            return None
+        folds = np.random.Generator(np.random.Philox(self.seed)).permutation(examples) % self.options.folds
+        densities = np.empty(examples)
+        for fold in range(self.options.folds):
+            held = folds == fold
+            mixture, _ = _fitted(self.latents[~held], count, self.options, self.seed)
+            densities[held] = mixture.log_density(self.latents[held])
+        return densities
 
 
-def _fit(latents: Floats, components: int, options: MixtureOptions, seed: int) -> tuple[Candidate, LatentMixture]:
-    """A mixture of latent vectors of unit mean variance."""
+def _fitted(latents: Floats, count: int, options: MixtureOptions, seed: int) -> tuple[LatentMixture, bool]:
+    """A mixture of so many components, and whether its fit came to a stand."""
+    examples, dimensions = latents.shape
+    if count == 1:
+        return _normal(latents, options.regularisation, shrink=examples <= dimensions + 1), True
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.mixture import GaussianMixture
 
     model = GaussianMixture(
-        components,
+        count,
         covariance_type="full",
         reg_covar=options.regularisation,
         n_init=options.starts,
@@ -136,22 +209,28 @@ def _fit(latents: Floats, components: int, options: MixtureOptions, seed: int) -
         tol=1e-5,
         random_state=seed % SEEDS,
     )
+    if count > examples:
+        raise ModelError(f"{count} components for {examples} examples", code="too-many-components")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # told by `converged`
+        warnings.simplefilter("ignore", ConvergenceWarning)  # told by the second result
         model.fit(latents)
-    examples, dimensions = latents.shape
-    least = max(dimensions + 1, LEAST_EXAMPLES_PER_COMPONENT) / examples
-    smallest = float(model.weights_.min())
-    candidate = Candidate(
-        components=components,
-        bic=float(model.bic(latents)),
-        aic=float(model.aic(latents)),
-        log_likelihood=float(model.score(latents)) * examples,
-        smallest_weight=smallest,
-        converged=bool(model.converged_),
-        refusal="small-component" if components > 1 and smallest < least else "",
-    )
-    return candidate, _ordered(model.weights_, model.means_, model.covariances_)
+    return _ordered(model.weights_, model.means_, model.covariances_), bool(model.converged_)
+
+
+def _normal(latents: Floats, regularisation: float, *, shrink: bool) -> LatentMixture:
+    """One component: maximum likelihood, or shrunk towards a sphere."""
+    if shrink:
+        from sklearn.covariance import ledoit_wolf
+
+        covariance, _ = ledoit_wolf(latents)
+    else:
+        away = latents - latents.mean(axis=0)
+        covariance = away.T @ away / len(latents)
+    return _single(latents.mean(axis=0), covariance + regularisation * np.eye(latents.shape[1]))
+
+
+def _single(mean: Floats, covariance: Floats) -> LatentMixture:
+    return LatentMixture(np.ones(1), mean[None], covariance[None])
 
 
 def _ordered(weights: Floats, means: Floats, covariances: Floats) -> LatentMixture:
@@ -163,24 +242,9 @@ def _ordered(weights: Floats, means: Floats, covariances: Floats) -> LatentMixtu
 
 def _rescaled(candidate: Candidate, shift: float) -> Candidate:
     """In the units of the data; `shift` is the logarithm of the volume that all examples gain."""
-    return Candidate(
-        components=candidate.components,
+    return replace(
+        candidate,
         bic=candidate.bic + 2.0 * shift,
         aic=candidate.aic + 2.0 * shift,
         log_likelihood=candidate.log_likelihood - shift,
-        smallest_weight=candidate.smallest_weight,
-        converged=candidate.converged,
-        refusal=candidate.refusal,
     )
-
-
-def _shrunk(latents: Floats, unit: float, regularisation: float) -> LatentMixture:
-    from sklearn.covariance import ledoit_wolf
-
-    covariance, _ = ledoit_wolf(latents / unit)
-    covariance = covariance + regularisation * np.eye(len(covariance))
-    return _single(latents.mean(axis=0), covariance * unit**2)
-
-
-def _single(mean: Floats, covariance: Floats) -> LatentMixture:
-    return LatentMixture(np.ones(1), mean[None], covariance[None])

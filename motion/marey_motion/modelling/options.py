@@ -21,7 +21,7 @@ class ModelOptions:
     ----------
     scaling : of channels before the analysis. jacobian: all in metres by the lever arms of the joints; root_max: root
         axes to a maximum of 1; sfpca: optimised for the positions of joints (Du et al. 2016); none
-    inner_product : of functions; see `fpca.find_components`
+    inner_product : of spatial functions; see `fpca.find_components`. That of time functions is always l2.
     spatial_share : of the variance that the spatial components hold
     spatial_components : exactly so many, in place of the share
     spatial_coefficients : of each channel's spline; by the number of frames if None

@@ -139,7 +139,8 @@ def fit_examples(aligned: AlignedSet, options: ModelOptions) -> FittedExamples:
         fit_log_slopes(steps, aligned.time_functions),
         np.ones(1),
         Keep(share=options.temporal_share, most=options.most_temporal_components),
-        options.inner_product,
+        # Coefficients at the ends carry little of the time but vary most; as functions, few components tell durations.
+        "l2",
     )
     return FittedExamples(poses, spatial, temporal, weights)
 
@@ -169,6 +170,7 @@ def _mixture_options(options: ModelOptions) -> MixtureOptions:
         components=options.mixture_components,
         regularisation=options.regularisation,
         starts=options.starts,
+        folds=options.folds,
     )
 
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.landmarks import find_landmarks
 from marey_motion.modelling.fpca import PrincipalExamples
-from marey_motion.modelling.held_out import held_out_log_densities
 from marey_motion.modelling.mixture_fitting import Candidate, FittedMixture
 from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.primitive import MotionPrimitive
@@ -114,10 +113,7 @@ def report_on(
     latents : (m, L) of the examples
     """
     densities = primitive.log_density(latents)
-    held_out = None
-    if options.folds >= 2 and len(latents) > options.folds and primitive.dimensions:
-        progress(0, None, "fitting mixtures to parts of the examples")
-        held_out = held_out_log_densities(latents, fitted, options, seed=seed)
+    held_out = fitted.held_out
     errors = None
     if options.leave_one_out:
         most = primitive.spatial.count + MORE_COMPONENTS_SHOWN

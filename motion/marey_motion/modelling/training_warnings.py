@@ -71,9 +71,8 @@ def _of_mixture(report: TrainingReport) -> list[Warned]:
     refused = [candidate.components for candidate in report.candidates if candidate.refusal]
     if refused:
         numbers = ", ".join(map(str, refused))
-        found.append(
-            Warned("components-refused", f"mixtures of {numbers} components leave one with too few examples: not taken")
-        )
+        message = f"mixtures of {numbers} components leave one with too few examples, or fit these examples alone"
+        found.append(Warned("components-refused", message))
     slow = [candidate.components for candidate in report.candidates if not candidate.converged]
     if slow:
         found.append(
