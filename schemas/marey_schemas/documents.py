@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
+from marey_schemas.alignment import AlignmentInfo
 from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Request
 from marey_schemas.editing import EditDocument
@@ -231,7 +232,7 @@ SCHEMAS: dict[str, type[Request]] = {
     "marey/evaluation-records@1": EvaluationRecords,
     "marey/evaluation-report@1": EvaluationReport,
     "marey/edit@1": EditDocument,
-    "marey/alignment@1": OpenDocument,
+    "marey/alignment@1": AlignmentInfo,
     "marey/motion-primitive@1": OpenDocument,
     "marey/sample-tree@1": OpenDocument,
     "marey/model-report@1": OpenDocument,

@@ -149,7 +149,7 @@ class _Aligning:
         self._options = options
         self._cost = options.cost
         if self._cost.weights is None:
-            self._cost = replace(self._cost, weights=_weights_of_body(body))
+            self._cost = replace(self._cost, weights=body_weights(body))
         self._threads = max(1, threads)
         self._tell = progress
 
@@ -293,7 +293,8 @@ class _Aligning:
         )
 
 
-def _weights_of_body(body: MatchingBody) -> Floats:
+def body_weights(body: MatchingBody) -> Floats:
+    """Weights (J,) of the cost: 1 for joints that the body consists of, 0 for those that its carrier does not carry."""
     paths = (body.skeleton.path_to_root(joint) for joint in range(body.skeleton.joint_count))
     return np.array([float(body.carrier in path) for path in paths])
 

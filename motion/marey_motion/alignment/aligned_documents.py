@@ -1,0 +1,153 @@
+"""Aligned examples to and from trees of plain values and arrays that travel and are kept, one example in each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Placement
+from marey_motion.alignment.aligning import MIRRORED
+from marey_motion.clip import Clip
+from marey_motion.errors import MotionError
+from marey_motion.motion import Motion
+
+ALIGNMENT_SCHEMA = "marey/alignment@1"
+
+Tree = dict[str, Any]
+
+SHARED = ("set", "reference", "keyframes")
+"""What all examples of a set have in common."""
+
+
+class StoredExample(NamedTuple):
+    """The two documents of one example.
+
+    Parameters
+    ----------
+    uid : what names it where its tree does not tell which clip it is of
+    clip : its canonical frames
+    info : the tree that `example_to_tree` made
+    """
+
+    uid: str
+    clip: Clip
+    info: Mapping[str, Any]
+
+
+def uid_of(item: str, revision: int, *, mirrored: bool = False) -> str:
+    """What an aligned set calls a stored clip."""
+    return f"{item}@{revision}{MIRRORED if mirrored else ''}"
+
+
+def example_to_tree(
+    aligned: AlignedSet, example: AlignedClip, *, digest: str | None = None, options: Tree | None = None
+) -> Tree:
+    """Part `info` of one example of a set whose uids are those of `uid_of`.
+
+    Parameters
+    ----------
+    digest : of the whole set
+    options : how it was aligned
+    """
+    placement = example.placement
+    return {
+        "schema": ALIGNMENT_SCHEMA,
+        "name": example.name,
+        "clip": _reference_of(example.uid),
+        "reference": _reference_of(aligned.reference),
+        "set": digest,
+        "frame_rate_hz": aligned.frame_rate_hz,
+        "source_frames": example.source_frames,
+        "time_function": np.ascontiguousarray(example.time_function, dtype=np.float64),
+        "placement": {
+            "heading_rad": placement.heading_rad,
+            "x": placement.x,
+            "y": placement.y,
+            "z": placement.z,
+            "joint": aligned.skeleton.joint_names[placement.joint],
+        },
+        "keyframes": dict(aligned.keyframes),
+        "cost": example.cost,
+        "options": options,
+    }
+
+
+def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
+    """The set that stored examples make up, ordered by uid. It may lack some that were aligned with them.
+
+    Raises `MotionError` where there are none, and naming the first example that was aligned with others than those
+    before it, that moves another skeleton, or stands twice.
+    """
+    if not examples:
+        raise MotionError("there are no aligned clips", code="too-few-clips")
+    clips = sorted((_example(one) for one in examples), key=lambda clip: clip.uid)
+    first = examples[0]
+    for one in examples[1:]:
+        _require_same_set(first, one)
+    for before, after in pairwise(clips):
+        if before.uid == after.uid:
+            raise MotionError("it stands twice among the aligned clips", code="sets-differ", where=after.name)
+    reference = first.info.get("reference")
+    return AlignedSet(
+        skeleton=first.clip.skeleton,
+        frame_rate_hz=float(first.info["frame_rate_hz"]),
+        clips=tuple(clips),
+        reference=_uid(reference) if reference else "",
+        keyframes=dict(first.info.get("keyframes") or {}),
+    )
+
+
+def _example(stored: StoredExample) -> AlignedClip:
+    clip, info = stored.clip, stored.info
+    name = str(info.get("name") or stored.uid)
+    times = np.asarray(info["time_function"], dtype=np.float64)
+    if len(times) != clip.frame_count or info["frame_rate_hz"] != clip.frame_rate_hz:
+        raise MotionError(
+            f"{clip.frame_count} frames at {clip.frame_rate_hz:g} Hz, but a time function of {len(times)} at "
+            f"{info['frame_rate_hz']:g} Hz",
+            code="alignment-invalid",
+            where=name,
+        )
+    placement = dict(info.get("placement") or {})
+    joint = placement.pop("joint", None)
+    return AlignedClip(
+        uid=_uid(info["clip"]) if info.get("clip") else stored.uid,
+        name=name,
+        motion=Motion.of(clip),
+        time_function=times,
+        placement=Placement(
+            heading_rad=placement.get("heading_rad", 0.0),
+            x=placement.get("x", 0.0),
+            z=placement.get("z", 0.0),
+            y=placement.get("y", 0.0),
+            joint=0 if joint is None else clip.skeleton.index_of(joint),
+        ),
+        cost=float(info.get("cost", 0.0)),
+        source_frames=int(info["source_frames"]),
+    )
+
+
+def _require_same_set(first: StoredExample, one: StoredExample) -> None:
+    name = str(one.info.get("name") or one.uid)
+    if one.clip.skeleton.joint_names != first.clip.skeleton.joint_names:
+        raise MotionError("it moves another skeleton than the other clips", code="skeleton-mismatch", where=name)
+    same_frames = (one.clip.frame_count, one.clip.frame_rate_hz) == (first.clip.frame_count, first.clip.frame_rate_hz)
+    if not same_frames or any(one.info.get(key) != first.info.get(key) for key in SHARED):
+        raise MotionError(
+            "it was not aligned together with the other clips; align all of them in one go",
+            code="sets-differ",
+            where=name,
+        )
+
+
+def _reference_of(uid: str) -> Tree:
+    name = uid.removesuffix(MIRRORED)
+    item, _, revision = name.rpartition("@")
+    return {"item": item, "revision": int(revision), "mirrored": name != uid}
+
+
+def _uid(reference: Mapping[str, Any]) -> str:
+    return uid_of(reference["item"], reference["revision"], mirrored=bool(reference.get("mirrored")))

@@ -1,0 +1,331 @@
+"""Examples of one action, aligned with each other."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import ValidationError
+
+from marey_motion import documents
+from marey_motion.alignment import aligned_documents
+from marey_motion.alignment.aligned import AlignedClip, AlignedSet
+from marey_motion.alignment.aligning import (
+    MEDOID,
+    MIRRORED,
+    NEAREST_MEAN_LENGTH,
+    AlignOptions,
+    SourceExample,
+    align_clips,
+    body_weights,
+    with_mirrored,
+)
+from marey_motion.alignment.cost import CostOptions
+from marey_motion.alignment.segments import Cut, cuts_of
+from marey_motion.errors import MotionError
+from marey_motion.matching.body import MatchingBody
+from marey_schemas.alignment import MOST_EXAMPLES, AlignParams
+from marey_schemas.canonical import document_digest
+from marey_schemas.documents import Annotation, Motion, RevisionRef
+from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
+from marey_schemas.kinds import Kind
+from marey_worker.context import Context, JobRefused
+from marey_worker.kinds.matching_clips import place_of, refusing_motion_errors
+from marey_worker.kinds.rigged import Rig, read_rigged
+
+OUTPUTS_PER_STAGE = 64
+
+
+class _Clip(NamedTuple):
+    """A clip that may become an example."""
+
+    pin: PinnedInput
+    motion: Motion
+    content: str
+    skeleton: RevisionRef
+
+
+class _Annotated(NamedTuple):
+    """An annotation of a revision of a clip."""
+
+    pin: PinnedInput
+    annotation: Annotation
+    clip: RevisionRef
+
+
+def run(context: Context, params: AlignParams) -> dict[str, Any]:
+    """Align the clips of the job; those that do not fit are refusals in the result, with code and reason.
+
+    Raises `JobRefused` where fewer than two are left.
+    """
+    return _Job(context, params).run()
+
+
+class _Job:
+    """One job."""
+
+    def __init__(self, context: Context, params: AlignParams) -> None:
+        self._context = context
+        self._params = params
+        self._pins = {_uid(pin): pin for pin in context.inputs["clips"]}
+        self._refused: list[dict[str, str]] = []
+        self._annotations: dict[str, PinnedInput] = {}
+
+    def run(self) -> dict[str, Any]:
+        clips = self._of_one_skeleton(list(self._read()))
+        rig = self._rig(clips)
+        with refusing_motion_errors():
+            rigged = read_rigged(self._context, rig)
+            body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
+            examples = list(self._examples(clips, body))
+            self._require_examples(examples, clips)
+            aligned = align_clips(
+                with_mirrored(examples, body) if self._params.mirroring == "add" else examples,
+                body,
+                self._options(body),
+                threads=self._context.threads,
+                progress=self._context.progress,
+                on_refusal=lambda example, error: self._refuse(self._pin_of(example.uid), error, name=example.name),
+            )
+        digest = self._digest(clips, examples, rig)
+        self._stage(aligned, rig.skeleton, digest)
+        return self._result(aligned, digest)
+
+    # -- what is aligned --
+
+    def _read(self) -> Iterator[_Clip]:
+        pins = self._context.inputs["clips"]
+        for done, (pin, tree) in enumerate(self._context.documents(pins, "motion")):
+            self._context.progress(done, len(pins), f"reading {pin.name}")
+            try:
+                motion = Motion.model_validate(tree)
+            except ValidationError as error:
+                self._refuse(pin, error)
+                continue
+            yield _Clip(pin, motion, document_digest(tree), RevisionRef.model_validate(motion.skeleton.model_dump()))
+
+    def _of_one_skeleton(self, clips: Sequence[_Clip]) -> list[_Clip]:
+        """The clips of the skeleton that most of them move; the others are refused."""
+        counts = Counter(clip.skeleton.item for clip in clips)
+        most = min(counts, key=lambda item: (-counts[item], item), default=None)
+        for clip in clips:
+            if clip.skeleton.item != most:
+                error = MotionError(
+                    f"it moves another skeleton than {counts[str(most)]} of {len(clips)} clips; move it to theirs "
+                    "with marey retarget",
+                    code="skeleton-mismatch",
+                )
+                self._refuse(clip.pin, error)
+        return [clip for clip in clips if clip.skeleton.item == most]
+
+    def _rig(self, clips: Sequence[_Clip]) -> Rig:
+        """The skeleton at its newest revision in use, with the mapping to go by."""
+        if not clips:
+            raise JobRefused("too-few-clips", f"none of {len(self._pins)} clips can be read{self._first_reason()}")
+        skeleton = max((clip.skeleton for clip in clips), key=lambda ref: ref.revision)
+        for edited in self._context.inputs.get("rig", ()):
+            if edited.item != skeleton.item:
+                raise JobRefused("wrong-rig", f"the input rig is {edited.item}; the clips move {skeleton.item}")
+            return Rig(skeleton, RevisionRef(item=edited.item, revision=edited.revision))
+        return Rig.as_stored(skeleton)
+
+    def _examples(self, clips: Sequence[_Clip], body: MatchingBody) -> Iterator[SourceExample]:
+        annotations = self._read_annotations()
+        for one in clips:
+            try:
+                clip = documents.clip_from_document(one.motion, body.skeleton)
+                cuts = self._cuts(one, annotations) if annotations is not None else ()
+            except MotionError as error:
+                self._refuse(one.pin, error)
+                continue
+            yield SourceExample(_uid(one.pin), place_of(one.pin), clip, cuts)
+
+    def _require_examples(self, examples: Sequence[SourceExample], clips: Sequence[_Clip]) -> None:
+        count = len(examples) * (2 if self._params.mirroring == "add" else 1)
+        if count < 2:
+            raise JobRefused(
+                "too-few-clips", f"{len(examples)} of {len(clips)} clips are left to align{self._first_reason()}"
+            )
+        if count > MOST_EXAMPLES and self._params.reference == MEDOID:
+            raise JobRefused(
+                "too-many-clips",
+                f"{count} clips are too many to compare all with each other, over {MOST_EXAMPLES}; name a reference, "
+                f"or take {NEAREST_MEAN_LENGTH}",
+            )
+
+    # -- annotations --
+
+    def _read_annotations(self) -> dict[str, list[_Annotated]] | None:
+        """Annotations by clip, of the layer that is asked for; None where the job has none."""
+        pins = self._context.inputs.get("annotations", ())
+        if not pins:
+            if self._params.layer is not None or self._params.labels:
+                raise JobRefused("no-annotations", "a layer or labels are named, but no annotations are given")
+            return None
+        found: dict[str, list[_Annotated]] = {}
+        for pin, tree in self._context.documents(pins, "annotation"):
+            annotation = Annotation.model_validate(tree)
+            clip = RevisionRef.model_validate(annotation.clip.model_dump())
+            if self._params.layer in (None, annotation.layer):
+                found.setdefault(clip.item, []).append(_Annotated(pin, annotation, clip))
+        return found
+
+    def _cuts(self, clip: _Clip, annotations: Mapping[str, Sequence[_Annotated]]) -> tuple[Cut, ...]:
+        """Where an annotation cuts a clip; one of the clip's own revision goes before those of others."""
+        known = annotations.get(clip.pin.item, ())
+        known = [one for one in known if one.clip.revision == clip.pin.revision] or known
+        if len(known) != 1:
+            layers = ", ".join(sorted({one.annotation.layer for one in known}))
+            raise MotionError(
+                f"it has {len(known)} annotations to go by (layers: {layers}); name one layer"
+                if known
+                else "none of the annotations is of this clip" + self._of_layer(),
+                code="several-annotations" if known else "no-annotation",
+            )
+        (one,) = known
+        self._annotations[_uid(clip.pin)] = one.pin
+        layer = documents.layer_from_document(self._wanted(one.annotation), len(clip.motion.poses))
+        return cuts_of(layer)
+
+    def _wanted(self, annotation: Annotation) -> Annotation:
+        if not self._params.labels:
+            return annotation
+        wanted = set(self._params.labels)
+        return annotation.model_copy(
+            update={
+                "segments": tuple(one for one in annotation.segments if one.label in wanted),
+                "keyframes": tuple(one for one in annotation.keyframes if one.label in wanted),
+            }
+        )
+
+    def _of_layer(self) -> str:
+        return f", in the layer {self._params.layer!r}" if self._params.layer else ""
+
+    # -- options --
+
+    def _options(self, body: MatchingBody) -> AlignOptions:
+        params = self._params
+        reference = params.reference
+        if reference not in (MEDOID, NEAREST_MEAN_LENGTH):
+            named = [pin for pin in self._pins.values() if pin.item == reference]
+            if not named:
+                raise JobRefused("unknown-reference", f"the reference {reference} is none of the clips")
+            reference = _uid(max(named, key=lambda pin: pin.revision))
+        weights = body_weights(body)
+        for name, weight in params.weights.items():
+            weights[_joint(name, body)] = weight
+        return AlignOptions(
+            reference=reference,
+            rate_hz=params.rate_hz,
+            max_run=params.slope_limit,
+            cost=CostOptions(params.cost, params.window, weights),
+            keep_height=params.keep_height,
+        )
+
+    def _digest(self, clips: Sequence[_Clip], examples: Sequence[SourceExample], rig: Rig) -> str:
+        """Of all that the alignment is made from."""
+        contents = {aligned_documents.uid_of(one.pin.item, one.pin.revision): one.content for one in clips}
+        return document_digest(
+            {
+                "examples": [
+                    {
+                        "uid": one.uid,
+                        "motion": contents[one.uid],
+                        "cuts": [[list(cut.labels), cut.frame] for cut in one.cuts],
+                    }
+                    for one in examples
+                ],
+                "rig": [rig.skeleton.model_dump(), rig.mapping.model_dump()],
+                "options": self._params.model_dump(mode="json"),
+            }
+        )
+
+    # -- results --
+
+    def _pin_of(self, uid: str) -> PinnedInput:
+        return self._pins[uid.removesuffix(MIRRORED)]
+
+    def _stage(self, aligned: AlignedSet, skeleton: RevisionRef, digest: str) -> None:
+        options = self._params.model_dump(mode="json")
+        for start in range(0, len(aligned.clips), OUTPUTS_PER_STAGE):
+            self._context.progress(start, len(aligned.clips), "writing results")
+            some = aligned.clips[start : start + OUTPUTS_PER_STAGE]
+            self._context.stage([self._output(aligned, one, skeleton, digest, options) for one in some])
+
+    def _output(
+        self, aligned: AlignedSet, one: AlignedClip, skeleton: RevisionRef, digest: str, options: dict[str, Any]
+    ) -> StagedOutput:
+        pin = self._pin_of(one.uid)
+        reference = self._pin_of(aligned.reference)
+        mirrored = " mirrored" if one.uid.endswith(MIRRORED) else ""
+        motion = documents.clip_to_document(one.motion.as_clip(aligned.skeleton, aligned.frame_rate_hz), skeleton)
+        sources = {"clips": tuple(map(_input, dict.fromkeys((pin, reference))))}
+        if _uid(pin) in self._annotations:
+            sources["annotations"] = (_input(self._annotations[_uid(pin)]),)
+        if rig := self._context.inputs.get("rig"):
+            sources["rig"] = tuple(map(_input, rig))
+        return StagedOutput(
+            name=f"{place_of(pin)}{mirrored}",
+            kind=Kind.PROCESSED,
+            item_name=f"{pin.name}{self._params.suffix}{mirrored}",
+            collection=pin.collection,
+            tags=self._params.tags,
+            parts={
+                "motion": motion.model_dump(by_alias=True),
+                "info": aligned_documents.example_to_tree(aligned, one, digest=digest, options=options),
+            },
+            sources=sources,
+        )
+
+    def _result(self, aligned: AlignedSet, digest: str) -> dict[str, Any]:
+        reference = next(one for one in aligned.clips if one.uid == aligned.reference)
+        return {
+            "clips": len(aligned.clips),
+            "frames": aligned.frame_count,
+            "frame_rate_hz": aligned.frame_rate_hz,
+            "reference": reference.name,
+            "keyframes": dict(aligned.keyframes),
+            "mean_cost": float(np.mean([one.cost for one in aligned.clips])),
+            "set": digest,
+            "aligned": [_row(one) for one in aligned.clips],
+            "refused": self._refused,
+        }
+
+    def _refuse(self, pin: PinnedInput, error: MotionError | ValidationError, *, name: str | None = None) -> None:
+        code = error.code if isinstance(error, MotionError) else "bad-document"
+        shown = name or place_of(pin)
+        self._context.log(f"{shown}: {error}")
+        self._refused.append({"name": shown, "item": pin.item, "code": code, "detail": str(error)})
+
+    def _first_reason(self) -> str:
+        return f"; {self._refused[0]['name']}: {self._refused[0]['detail']}" if self._refused else ""
+
+
+def _row(one: AlignedClip) -> dict[str, Any]:
+    """What a table of the examples shows."""
+    slopes = np.diff(one.time_function)
+    return {
+        "name": one.name,
+        "item": one.uid.rpartition("@")[0],
+        "frames": one.source_frames,
+        "cost": one.cost,
+        "least_slope": float(slopes.min()),
+        "greatest_slope": float(slopes.max()),
+    }
+
+
+def _joint(name: str, body: MatchingBody) -> int:
+    """The joint of a name of its own, or of a standard one. Raises `MotionError`."""
+    if name not in body.skeleton and name in body.standard_joints:
+        return body.standard_joints[name]
+    return body.skeleton.index_of(name)
+
+
+def _uid(pin: PinnedInput) -> str:
+    return aligned_documents.uid_of(pin.item, pin.revision)
+
+
+def _input(pin: PinnedInput) -> ItemInput:
+    return ItemInput(item=pin.item, revision=pin.revision)
