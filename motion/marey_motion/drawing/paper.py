@@ -7,6 +7,7 @@ have no other way, one figure at a time; threads may draw at once.
 from __future__ import annotations
 
 import io
+import re
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -43,6 +44,8 @@ LONGEST_NAME = 30
 
 _SVG_SETTINGS = {"svg.hashsalt": "marey", "svg.fonttype": "none", "svg.image_inline": True, "svg.id": None}
 _svg_writer = threading.Lock()
+_LINES = re.compile(r"<path[^>]* d=\"[^\"]*\"")
+_FINER = re.compile(r"(?<=\.\d\d)\d+")
 
 
 class Place(NamedTuple):
@@ -195,7 +198,8 @@ def to_svg(figure: Figure, title: str) -> str:
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     with _svg_settings():
         figure.savefig(buffer, format="svg", dpi=DPI, metadata={"Title": plain(title), **nothing})
-    return buffer.getvalue()
+    # A hundredth of a point is finer than anything that shows it; lines are most of a drawing.
+    return _LINES.sub(lambda line: _FINER.sub("", line[0]), buffer.getvalue())
 
 
 @contextmanager

@@ -103,6 +103,20 @@ def body_of(skeleton: Skeleton) -> Body:
     )
 
 
+def runs_of(bones: Indices) -> list[Indices]:
+    """Bones (n, 2) joined to as few runs of points as there are, each from an outer end inwards."""
+    inner = {int(outer): int(inner) for outer, inner in bones}
+    ends = sorted(set(inner) - set(inner.values()))
+    runs, drawn = [], set()
+    for point in ends:
+        run = [point]
+        while run[-1] in inner and run[-1] not in drawn:
+            drawn.add(run[-1])
+            run.append(inner[run[-1]])
+        runs.append(np.array(run, dtype=np.intp))
+    return runs
+
+
 def stances_at(clip: Clip, body: Body, frames: Indices) -> Stances:
     """The body in these frames (K,); only they are computed, however long the clip is."""
     points = kinematics.forward_kinematics(

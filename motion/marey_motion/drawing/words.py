@@ -12,7 +12,7 @@ def amount(count: int, thing: str) -> str:
     """A number of things: one clip, 2 clips, 3 trajectories."""
     if count == 1:
         return f"1 {thing}"
-    plural = f"{thing[:-1]}ies" if thing.endswith("y") else f"{thing}s"
+    plural = f"{thing[:-1]}ies" if thing.endswith("y") and thing[-2] not in "aeou" else f"{thing}s"
     return f"{count:,} {plural}"
 
 
