@@ -107,7 +107,7 @@ class LookDirection:
 
 @dataclass(frozen=True)
 class RootPosition:
-    """The root stands over a place on the ground.
+    """The pelvis is over a place on the ground.
 
     Parameters
     ----------

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from marey_motion.alignment.aligned import Placement
 from marey_motion.errors import MotionError
 from marey_motion.modelling import objective_kernels as kernels
+from marey_motion.modelling import slope_kernels
 from marey_motion.modelling.constraints import (
     Constraint,
     ConstraintError,
@@ -27,7 +28,7 @@ from marey_motion.modelling.constraints import (
     tolerance_of,
 )
 from marey_motion.modelling.primitive import MotionPrimitive
-from marey_motion.modelling.tracking import Chains, Clocks, Tracked, facing, track_points, track_times
+from marey_motion.modelling.tracking import Chains, Clocks, Tracked, facing, standing, track_points, track_times
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -53,6 +54,21 @@ class Rows(NamedTuple):
     axes: Floats
 
 
+class Linearised(NamedTuple):
+    """Constraints about one latent vector, W numbers in all where it is one of several steps.
+
+    Parameters
+    ----------
+    points, point_slopes : (n, 3), (n, 3, W) what is tracked, in the world, and its derivatives
+    residuals, slopes : (3 m,), (3 m, W) errors of the constraints, in tolerances and by the roots of their weights
+    """
+
+    points: Floats
+    point_slopes: Floats
+    residuals: Floats
+    slopes: Floats
+
+
 @dataclass(frozen=True, eq=False)
 class Objective:
     """Constraints on the motions of a primitive, ready to be evaluated.
@@ -73,8 +89,7 @@ class Objective:
     def errors(self, latents: Floats) -> Floats:
         """How far each constraint is missed, (n, m), by latent vectors (n, L): metres, radians or seconds."""
         out = np.empty((len(latents), len(self.constraints)))
-        placement = np.array((self.placement.heading_rad, self.placement.x, self.placement.z))
-        kernels.errors(self.chains, self.clocks, self.rows, placement, np.ascontiguousarray(latents), out)
+        kernels.errors(self.chains, self.clocks, self.rows, as_row(self.placement), np.ascontiguousarray(latents), out)
         return out
 
     def costs(self, latents: Floats) -> Floats:
@@ -82,6 +97,32 @@ class Objective:
         out = np.empty(len(latents))
         kernels.costs(self.prices, self.errors(latents), out)
         return out
+
+    def linearise(self, stacked: Floats, first: int, placement: Floats, moved: Floats) -> Linearised:
+        """Errors and derivatives by all numbers of a stack of steps.
+
+        Parameters
+        ----------
+        stacked : (W,) latent vectors one after the other, this step's from `first` on
+        placement : (3,) heading, x and z of the canonical frame, in place of that of this objective
+        moved : (3, W) its derivatives
+        """
+        width, items, clocks = len(stacked), len(self.chains.turned), len(self.clocks.weights)
+        points, turns = np.empty((items, 3)), np.empty((items, 4))
+        point_slopes, turn_slopes = np.empty((items, 3, width)), np.empty((items, 3, width))
+        slope_kernels.track(self.chains, placement, moved, stacked, first, points, turns, point_slopes, turn_slopes)
+        times, time_slopes = np.empty(clocks), np.empty((clocks, width))
+        slope_kernels.keep_time(self.clocks, stacked, first + self.primitive.spatial.count, times, time_slopes)
+        residuals, slopes = np.empty((len(self.constraints), 3)), np.empty((len(self.constraints), 3, width))
+        slope_kernels.linearise(
+            self.rows, points, turns, times, point_slopes, turn_slopes, time_slopes, residuals, slopes
+        )
+        scaled, steep = residuals * self._scales[:, None], slopes * self._scales[:, None, None]
+        return Linearised(points, point_slopes, scaled.ravel(), steep.reshape(-1, width))
+
+    @cached_property
+    def _scales(self) -> Floats:
+        return np.array([np.sqrt(one.weight) / tolerance_of(one) for one in self.constraints])
 
     @cached_property
     def prices(self) -> Floats:
@@ -95,6 +136,7 @@ def build_objective(
     standard_joints: Mapping[str, int],
     *,
     placement: Placement = AT_ORIGIN,
+    also: Sequence[Tracked] = (),
 ) -> Objective:
     """Prepare constraints for evaluation.
 
@@ -102,6 +144,7 @@ def build_objective(
     ----------
     standard_joints : joint index by standard name, as far as they are known
     placement : where the canonical frame lies in the world that targets are in
+    also : what else is to be tracked, besides what constraints look at; it comes first
 
     Raises
     ------
@@ -109,7 +152,7 @@ def build_objective(
     """
     if len(constraints) > MOST_CONSTRAINTS:
         raise ConstraintError(f"{len(constraints)} constraints are more than {MOST_CONSTRAINTS}", where="constraints")
-    tracked: dict[Tracked, int] = {}
+    tracked = {one: place for place, one in enumerate(also)}
     moments: dict[float, int] = {}
     rows = []
     for number, constraint in enumerate(constraints):
@@ -126,6 +169,11 @@ def build_objective(
         clocks=track_times(primitive, list(moments)),
         rows=_as_rows(rows),
     )
+
+
+def as_row(placement: Placement) -> Floats:
+    """(3,) heading, x, z."""
+    return np.array((placement.heading_rad, placement.x, placement.z))
 
 
 class _Row(NamedTuple):
@@ -155,7 +203,7 @@ def _row(
             return _Row(kernels.HEADING, place(facing(frame, standard_joints)), (constraint.heading_rad,))
         case RootPosition():
             x, z = constraint.target_m
-            return _position_row(place(Tracked(frame, (0,))), (x, None, z))
+            return _position_row(place(standing(frame, standard_joints)), (x, None, z))
         case _:
             joint = place(Tracked(frame, (joint_index(primitive, constraint.joint, standard_joints),)))
     match constraint:

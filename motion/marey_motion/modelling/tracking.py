@@ -77,6 +77,11 @@ class Clocks(NamedTuple):
     weights: Floats
 
 
+def standing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
+    """Where the body stands: its pelvis, for a root above that may be a static reference; else the root."""
+    return Tracked(frame, (standard_joints.get("pelvis", 0),))
+
+
 def facing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
     """The body's axis from right to left. Raises `MappingError` where hips or shoulders are not known."""
     missing = [name for name in (*LEFTS, *RIGHTS) if name not in standard_joints]

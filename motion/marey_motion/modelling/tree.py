@@ -6,7 +6,7 @@ tree is valid whatever draws random numbers later, and each node's samples are a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -62,6 +62,9 @@ class TreeOptions:
             value = getattr(self, name)
             if not least <= value <= most:
                 raise MotionError(f"{value} is not within {least} to {most}", code="tree-options", where=name)
+
+
+DEFAULT_TREE = TreeOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,23 +127,19 @@ class SampleTree:
 def build_tree(
     primitive: MotionPrimitive,
     seed: int,
-    options: TreeOptions = TreeOptions(),
+    options: TreeOptions = DEFAULT_TREE,
     *,
     end_effectors: Sequence[int] = (),
-    progress: Callable[[int, int, str], None] = lambda done, total, doing: None,
 ) -> SampleTree:
     """Draw samples of a primitive and group them; the same for the same seed.
 
     Parameters
     ----------
     end_effectors : joint indices, for features of that kind
-    progress : is told how many of how many steps are done, and what comes next
     """
-    progress(0, 2, "drawing samples")
     count = options.samples if primitive.dimensions else 1
     samples = primitive.sample(count, seed).astype(np.float32)
     features = _features(primitive, samples.astype(np.float64), options, end_effectors)
-    progress(1, 2, "grouping samples")
     randoms = np.random.Generator(np.random.Philox([seed, count])).random((2 * count, options.branching))
     order = np.arange(count)
     starts, sizes, children = (np.zeros(2 * count, dtype=np.int64) for _ in range(3))

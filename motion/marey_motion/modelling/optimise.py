@@ -1,0 +1,180 @@
+"""Refining latent vectors by Levenberg and Marquardt (Herrmann et al. 2019, Equation 2, in the form of a posterior).
+
+Minimised is ½ Σ w (e / σ)² - λ Σ ln p(s): errors in their tolerances, and how likely the motions are. For the steps,
+the mixture stands for its most likely component at the current vector, whose whitened distance is a residual like any
+other (max-mixture, Olson and Agarwal 2013); the constant that belongs to it moves no step and is left out. What is
+accepted is judged by the whole mixture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.modelling.mixture import LatentMixture
+from marey_motion.modelling.objective import Objective, as_row
+
+Floats = NDArray[np.float64]
+
+MOST_ITERATIONS = 50
+FIRST_DAMPING = 1e-3
+MOST_DAMPING = 1e12
+LEAST_GAIN = 1e-12
+
+
+@dataclass(frozen=True)
+class RefineOptions:
+    """How latent vectors are refined.
+
+    Parameters
+    ----------
+    likelihood_weight : λ, not negative; 0 asks for the constraints alone
+    iterations : at most
+    """
+
+    likelihood_weight: float = 1.0
+    iterations: int = MOST_ITERATIONS
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.likelihood_weight) and self.likelihood_weight >= 0):
+            raise MotionError("the weight of the likelihood is not negative", where="likelihood_weight")
+        if self.iterations < 0:
+            raise MotionError("the number of iterations is not negative", where="iterations")
+
+
+DEFAULT_REFINING = RefineOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """Where refining ended.
+
+    Parameters
+    ----------
+    latents : (W,)
+    cost : what was minimised, there
+    start_cost : and where it began
+    iterations, evaluations : steps that were tried; motions that were evaluated, slopes included
+    """
+
+    latents: Floats
+    cost: float
+    start_cost: float
+    iterations: int
+    evaluations: int
+
+
+class Problem(Protocol):
+    """Sums of squares with a prior."""
+
+    @property
+    def priors(self) -> Sequence[LatentMixture]:
+        """Of the latent vectors, one after the other."""
+
+    def linearise(self, stacked: Floats) -> tuple[Floats, Floats]:
+        """Residuals (r,) and their derivatives (r, W)."""
+
+
+@dataclass(frozen=True, eq=False)
+class OneStep:
+    """The constraints on one motion."""
+
+    objective: Objective
+
+    @property
+    def priors(self) -> Sequence[LatentMixture]:
+        """That of the primitive."""
+        return (self.objective.primitive.mixture,)
+
+    def linearise(self, stacked: Floats) -> tuple[Floats, Floats]:
+        """Errors in tolerances and their derivatives."""
+        still = np.zeros((3, len(stacked)))
+        found = self.objective.linearise(stacked, 0, as_row(self.objective.placement), still)
+        return found.residuals, found.slopes
+
+
+def refine(problem: Problem, start: Floats, options: RefineOptions = DEFAULT_REFINING) -> Refined:
+    """Improve latent vectors; the result is never worse than the start, by what is minimised.
+
+    Parameters
+    ----------
+    start : (W,) latent vectors one after the other
+    """
+    prior = _Prior(problem.priors, options.likelihood_weight)
+    here = np.array(start, dtype=np.float64)
+    residuals, slopes = problem.linearise(here)
+    cost = start_cost = _cost(residuals, prior, here)
+    damping, evaluations, iterations = FIRST_DAMPING, 1, 0
+    while iterations < options.iterations and damping < MOST_DAMPING:
+        iterations += 1
+        curvature, gradient = prior.quadratic(here)
+        curvature += slopes.T @ slopes
+        gradient += slopes.T @ residuals
+        step = np.asarray(np.linalg.solve(curvature + damping * np.diag(prior.scales), -gradient))
+        there = here + step
+        tried = problem.linearise(there)
+        evaluations += 1
+        new_cost = _cost(tried[0], prior, there)
+        if new_cost < cost:
+            gained = cost - new_cost
+            here, (residuals, slopes), cost = there, tried, new_cost
+            damping = max(damping / 5.0, 1e-12)
+            if gained <= LEAST_GAIN * max(cost, 1.0):
+                break
+        else:
+            if _is_still(step, here):
+                break
+            damping *= 4.0
+    return Refined(here, cost, start_cost, iterations, evaluations)
+
+
+class _Quadratic(NamedTuple):
+    curvature: Floats
+    gradient: Floats
+
+
+class _Prior:
+    """-λ ln p of stacked latent vectors."""
+
+    def __init__(self, mixtures: Sequence[LatentMixture], weight: float) -> None:
+        self._mixtures = mixtures
+        self._weight = weight
+        ends = np.cumsum([mixture.dimensions for mixture in mixtures])
+        self._parts = [slice(end - one.dimensions, end) for end, one in zip(ends.tolist(), mixtures, strict=True)]
+        self.scales = np.concatenate([_precisions(mixture) for mixture in mixtures])
+
+    def cost(self, stacked: Floats) -> float:
+        """By the whole mixtures."""
+        pairs = zip(self._mixtures, self._parts, strict=True)
+        return -self._weight * sum(float(mixture.log_density(stacked[None, part])[0]) for mixture, part in pairs)
+
+    def quadratic(self, stacked: Floats) -> _Quadratic:
+        """JᵀJ and Jᵀr of the residuals of the most likely components."""
+        curvature, gradient = np.zeros((len(stacked), len(stacked))), np.zeros(len(stacked))
+        for mixture, part in zip(self._mixtures, self._parts, strict=True):
+            likeliest = int(np.argmax(mixture.component_log_densities(stacked[None, part])[0]))
+            whitening = mixture.whitening[likeliest]
+            precision = self._weight * whitening.T @ whitening
+            curvature[part, part] = precision
+            gradient[part] = precision @ (stacked[part] - mixture.means[likeliest])
+        return _Quadratic(curvature, gradient)
+
+
+def _precisions(mixture: LatentMixture) -> Floats:
+    """(L,) one over the variance of each number: what steps are damped by, so that units do not matter."""
+    centre = mixture.weights @ mixture.means
+    spread = np.diagonal(mixture.covariances, axis1=1, axis2=2) + (mixture.means - centre) ** 2
+    return np.asarray(1.0 / (mixture.weights @ spread))
+
+
+def _cost(residuals: Floats, prior: _Prior, stacked: Floats) -> float:
+    return 0.5 * float(residuals @ residuals) + prior.cost(stacked)
+
+
+def _is_still(step: Floats, here: Floats) -> bool:
+    return bool(np.abs(step).max(initial=0.0) <= 1e-12 * (1.0 + np.abs(here).max(initial=0.0)))

@@ -1,0 +1,83 @@
+"""Finding motions for several steps: each by its tree, where the one before it ended, then all of them together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.alignment.aligned import Placement
+from marey_motion.modelling.constraints import START, JointPosition
+from marey_motion.modelling.objective import AT_ORIGIN, build_objective
+from marey_motion.modelling.optimise import DEFAULT_REFINING, Refined, RefineOptions, refine
+from marey_motion.modelling.search import CANDIDATES, Found, search_tree
+from marey_motion.modelling.steps import DEFAULT_TRANSITIONS, CarriedOn, Measured, SeveralSteps, Step, TransitionOptions
+from marey_motion.modelling.tree import SampleTree
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Sequel:
+    """Motions that were found for several steps.
+
+    Parameters
+    ----------
+    latents : one vector (L,) a step
+    measured : where they take place, and what they miss
+    searched : what the search of each tree came upon
+    refined : how refining them ended, None where it was not asked for
+    """
+
+    latents: tuple[Floats, ...]
+    measured: Measured
+    searched: tuple[Found, ...]
+    refined: Refined | None
+
+
+def search_steps(
+    steps: Sequence[Step],
+    trees: Sequence[SampleTree],
+    *,
+    start: Placement = AT_ORIGIN,
+    candidates: int = CANDIDATES,
+    refining: RefineOptions | None = DEFAULT_REFINING,
+    transitions: TransitionOptions = DEFAULT_TRANSITIONS,
+) -> Sequel:
+    """Find a motion for each step.
+
+    Parameters
+    ----------
+    trees : over samples of each step's primitive
+    start : of the first step's canonical frame
+    refining : None to keep the samples that were found
+
+    Raises
+    ------
+    ConstraintError    naming step and constraint
+    """
+    problem = SeveralSteps.of(steps, start, transitions)
+    searched: list[Found] = []
+    for step, tree in zip(steps, trees, strict=True):
+        begun = problem.carried_on([one.latents[0] for one in searched])
+        searched.append(_search_step(step, tree, begun, candidates, transitions))
+    stacked = np.concatenate([one.latents[0] for one in searched])
+    refined = None if refining is None else refine(problem, stacked, refining)
+    if refined is not None:
+        stacked = refined.latents
+    return Sequel(problem.parts(stacked), problem.measure(stacked), tuple(searched), refined)
+
+
+def _search_step(
+    step: Step, tree: SampleTree, begun: CarriedOn, candidates: int, transitions: TransitionOptions
+) -> Found:
+    """The best sample for a step that goes on where another ended."""
+    going_on = tuple(
+        JointPosition(name, START, (x, y, z), transitions.tolerance_m, transitions.weight)
+        for name, (x, y, z) in ((name, point.tolist()) for name, point in begun.joints.items())
+    )
+    constraints = (*step.constraints, *going_on)
+    objective = build_objective(step.primitive, constraints, step.standard_joints, placement=begun.placement)
+    return search_tree(objective, tree, candidates=candidates)
