@@ -71,9 +71,12 @@ class LatentMixture:
         highest = each.max(axis=1)
         return np.asarray(highest + np.log(np.exp(each - highest[:, None]).sum(axis=1)))
 
-    def sample(self, count: int, seed: int) -> Floats:
-        """Latent vectors (count, L), the same for the same seed; the first are those of a smaller count."""
-        generator = np.random.Generator(np.random.Philox(seed))
+    def sample(self, count: int, seed: int, attempt: int = 0) -> Floats:
+        """Latent vectors (count, L), the same for the same seed; the first are those of a smaller count.
+
+        Each attempt gives others.
+        """
+        generator = np.random.Generator(np.random.Philox(seed).jumped(attempt))
         # One stream of rows: what a row holds must not depend on how many follow.
         draws = generator.standard_normal((count, self.dimensions + 1))
         chosen = np.searchsorted(np.cumsum(self.weights)[:-1], _as_share(draws[:, 0]), side="right")

@@ -17,6 +17,9 @@ from marey_motion.skeleton import Skeleton
 
 Floats = NDArray[np.float64]
 
+MOST_ATTEMPTS = 100
+"""To draw a motion that lasts neither too short nor too long."""
+
 
 @dataclass(frozen=True, eq=False)
 class FunctionalComponents:
@@ -79,6 +82,7 @@ class MotionPrimitive:
     temporal_weight : positive
     mixture : of latent vectors
     keyframes : canonical frame by label
+    duration_range_s : within which samples last, or None; normal distributions of logarithms have long tails
     """
 
     name: str
@@ -89,6 +93,7 @@ class MotionPrimitive:
     temporal_weight: float
     mixture: LatentMixture
     keyframes: Mapping[str, int] = field(default_factory=dict)
+    duration_range_s: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.spatial.mean.shape[1] != 3 + 4 * self.skeleton.joint_count:
@@ -113,8 +118,22 @@ class MotionPrimitive:
     # -- from latent vectors -------------------------------------------------------------------------------------------
 
     def sample(self, count: int, seed: int) -> Floats:
-        """Latent vectors (count, L) drawn from the mixture."""
-        return self.mixture.sample(count, seed)
+        """Latent vectors (count, L) drawn from the mixture, the same for the same seed.
+
+        Those whose motions would last too short or too long are drawn again; that depends on nothing but the place in
+        the row, so that the first are those of a smaller count.
+        """
+        latents = self.mixture.sample(count, seed)
+        if self.duration_range_s is None:
+            return latents
+        least, most = self.duration_range_s
+        for attempt in range(1, MOST_ATTEMPTS):
+            durations = self.durations_s(latents)
+            odd = (durations < least) | (durations > most)
+            if not odd.any():
+                break
+            latents[odd] = self.mixture.sample(count, seed, attempt)[odd]
+        return latents
 
     def poses(self, latents: Floats, times: ArrayLike | None = None) -> Floats:
         """Poses (m, T, 3 + 4·J) of latent vectors (m, L) at canonical times (T,), with unit quaternions.
@@ -142,7 +161,8 @@ class MotionPrimitive:
     def motions(self, latents: Floats) -> list[Motion]:
         """Motions in real time at `frame_rate_hz`; each lasts a whole number of frames, at most half a frame off."""
         made = []
-        for latent, passed in zip(latents, self.time_functions(latents), strict=True):
+        for latent in latents:
+            passed = self.time_functions(latent[None])[0]
             steps = max(1, round(float(passed[-1])))
             times = np.interp(np.linspace(0.0, passed[-1], steps + 1), passed, np.arange(self.frame_count))
             made.append(_as_motion(self.poses(latent[None], times)[0]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -30,19 +31,19 @@ def optimised_weights(
     skeleton: Skeleton,
     basis: SplineBasis,
     coefficients: Floats,
-    root_max: Floats,
+    starts: Sequence[Floats],
     keep: Keep,
     inner_product: InnerProduct = "coefficients",
 ) -> tuple[Floats, Keep]:
     """Weights (D,), one for each root axis and each joint, that minimise the squared distance of joints.
 
-    The number of components is that which `keep` gives under the weights of root_max, and stays; it is returned with
-    the weights. The start is all ones, or the weights of root_max if these do better.
+    The number of components is that which `keep` gives under the first of the weights to start from, and stays; it is
+    returned with the weights.
 
     Parameters
     ----------
     coefficients : (m, n, D) of examples with consistent signs
-    root_max : (D,)
+    starts : weights (D,); the best of them is improved
 
     Notes
     -----
@@ -52,10 +53,9 @@ def optimised_weights(
     """
     from scipy.optimize import minimize
 
-    count = find_components(basis, coefficients, root_max, keep, inner_product).functions.count
+    count = find_components(basis, coefficients, starts[0], keep, inner_product).functions.count
     problem = _Problem(skeleton, basis, coefficients, count, inner_product)
-    starts = [_logarithms(weights) for weights in (np.ones(len(root_max)), root_max)]
-    start = min(starts, key=lambda logarithms: problem.value_and_gradient(logarithms)[0])
+    start = min(map(_logarithms, starts), key=lambda logarithms: problem.value_and_gradient(logarithms)[0])
     if not 0 < count < len(coefficients) - 1:
         return _expanded(np.exp(start)), Keep(count=count)
     first = problem.value_and_gradient(start)[0]

@@ -13,8 +13,8 @@ Floats = NDArray[np.float64]
 LEAST_ROOT_EXTENT_M = 1e-3
 """A root axis that stays within a millimetre is not blown up to the size of the others."""
 
-LEAST_LEVER_M = 0.01
-"""The lever of joints that carry nothing: how a hand is turned still counts a little."""
+LEAST_WEIGHT_M = 0.01
+"""Of joints that carry nothing: how a hand is turned still counts a little."""
 
 
 def root_max_weights(poses: Floats) -> Floats:
@@ -29,31 +29,29 @@ def root_max_weights(poses: Floats) -> Floats:
 
 
 def jacobian_weights(skeleton: Skeleton, poses: Floats) -> Floats:
-    """(D,) weights under which every channel is in metres.
+    """(D,) weights under which a step of any channel counts by how far it moves the body, metres.
 
-    A unit step of a joint's quaternion turns what it carries by 2 radians. Its weight is therefore twice the root mean
-    square distance from the joint to the joints and end sites below it.
+    A unit step of a joint's quaternion turns what hangs below it by 2 radians. The joint's weight is the root mean
+    square, over all joints of the body, of how far that moves them: twice their lever arms, and nothing for those that
+    do not hang below it. (The mean over the joints below alone would give a finger the say of a spine.)
 
     Parameters
     ----------
     poses : (F, D) typical ones, as those of the mean motion
     """
-    points = kinematics.forward_kinematics(skeleton, poses, end_sites=True)
-    joints = skeleton.joint_count
-    away = np.linalg.norm(points[:, None, :, :] - points[:, :joints, None, :], axis=3)
-    below = _descent(skeleton)
-    counts = np.maximum(below.sum(axis=1), 1)
-    levers = np.sqrt(np.einsum("fjp,jp->j", away**2, below) / (counts * len(points)))
+    joints = kinematics.forward_kinematics(skeleton, poses)
+    away = joints[:, None, :, :] - joints[:, :, None, :]
+    squares = np.einsum("fjpc,fjpc,jp->j", away, away, _descent(skeleton)) / (len(joints) * skeleton.joint_count)
     weights = np.ones(poses.shape[1])
-    weights[3:] = np.repeat(2.0 * np.maximum(levers, LEAST_LEVER_M), 4)
+    weights[3:] = np.repeat(np.maximum(2.0 * np.sqrt(squares), LEAST_WEIGHT_M), 4)
     return weights
 
 
 def _descent(skeleton: Skeleton) -> Floats:
-    """(J, J + E) 1 where a joint or an end site hangs below a joint, else 0."""
-    joints = skeleton.joint_count
-    below = np.zeros((joints, joints + len(skeleton.end_sites)))
-    for point in range(1, joints + len(skeleton.end_sites)):
-        carrier = int(skeleton.parents[point]) if point < joints else skeleton.end_sites[point - joints].joint
-        below[list(skeleton.path_to_root(carrier)), point] = 1.0
+    """(J, J) 1 where a joint hangs below a joint, else 0."""
+    below = np.zeros((skeleton.joint_count, skeleton.joint_count))
+    for joint, parent in enumerate(skeleton.parents.tolist()):
+        if parent >= 0:
+            below[:, joint] = below[:, parent]
+            below[parent, joint] = 1.0
     return below

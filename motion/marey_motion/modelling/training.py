@@ -27,6 +27,7 @@ Progress = Callable[[int, int | None, str], None]
 
 MOST_EXAMPLES = 5000
 LEAST_FRAMES = 5
+DURATION_MARGIN = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,12 +152,13 @@ def channel_weights(
     """The weights (D,) of the chosen scaling, and how many components to keep under it."""
     if options.scaling == "none":
         return np.ones(poses.shape[2]), keep
-    if options.scaling == "jacobian":
-        return jacobian_weights(aligned.skeleton, basis.at_frames @ coefficients.mean(axis=0)), keep
-    weights = root_max_weights(poses)
     if options.scaling == "root_max":
-        return weights, keep
-    return optimised_weights(aligned.skeleton, basis, coefficients, weights, keep, options.inner_product)
+        return root_max_weights(poses), keep
+    jacobian = jacobian_weights(aligned.skeleton, basis.at_frames @ coefficients.mean(axis=0))
+    if options.scaling == "jacobian":
+        return jacobian, keep
+    starts = (jacobian, root_max_weights(poses), np.ones(poses.shape[2]))
+    return optimised_weights(aligned.skeleton, basis, coefficients, starts, keep, options.inner_product)
 
 
 def _kept_scores(principal: PrincipalExamples) -> Floats:
@@ -186,4 +188,11 @@ def _assemble(
         temporal_weight=weight,
         mixture=mixture.mixture,
         keyframes=dict(aligned.keyframes),
+        duration_range_s=_sampled_range(aligned),
     )
+
+
+def _sampled_range(aligned: AlignedSet) -> tuple[float, float]:
+    """How long samples may last: as the examples, extended by a fifth."""
+    durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
+    return float(durations.min()) * (1.0 - DURATION_MARGIN), float(durations.max()) * (1.0 + DURATION_MARGIN)

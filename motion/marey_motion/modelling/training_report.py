@@ -21,11 +21,10 @@ Floats = NDArray[np.float64]
 Progress = Callable[[int, int | None, str], None]
 
 MORE_COMPONENTS_SHOWN = 10
-OUTLIER_DEVIATIONS = 3.5
+OUTLIER_DEVIATIONS = 5.0
 """Robust standard deviations below the median from which on an example's likelihood stands out."""
 
 DEVIATION_OF_MEDIAN = 1.4826
-DURATION_MARGIN = 0.2
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class ExampleReport:
 
 @dataclass(frozen=True)
 class Durations:
-    """Of motions, in seconds; `outside_share` lie outside the range of the examples extended by a fifth."""
+    """Of motions, in seconds; `outside_share` lie outside the range of the examples."""
 
     least_s: float
     mean_s: float
@@ -72,7 +71,6 @@ class TrainingReport:
     log_likelihood : mean over the examples
     held_out_log_likelihood : mean over the examples of their density under mixtures fitted without them
     examples : in the order of the aligned set
-    spline_error_cm : mean distance of joints of the examples' splines, with all components
     time_error_frames : root mean square of what time functions are off, after their splines and kept components
     """
 
@@ -175,8 +173,7 @@ def _at(errors: ReconstructionErrors, components: int) -> int:
 
 
 def _durations(durations: Floats, span: tuple[float, float]) -> Durations:
-    least, most = span[0] * (1.0 - DURATION_MARGIN), span[1] * (1.0 + DURATION_MARGIN)
-    outside = (durations < least) | (durations > most)
+    outside = (durations < span[0]) | (durations > span[1])
     return Durations(float(durations.min()), float(durations.mean()), float(durations.max()), float(outside.mean()))
 
 

@@ -11,7 +11,7 @@ from marey_motion.modelling.training_report import ExampleReport, TrainingReport
 FEW_EXAMPLES_PER_DIMENSION = 2
 NAMES_SHOWN = 5
 DEEP_BELOW_FLOOR_CM = 2.0
-MANY_OUTSIDE = 0.05
+MANY_OUTSIDE = 0.1
 OVERFITTED_RATIO = 2.0
 LEAST_ERROR_CM = 0.5
 
@@ -98,7 +98,7 @@ def _of_samples(report: TrainingReport) -> list[Warned]:
         found.append(
             Warned(
                 "odd-durations",
-                f"{durations.outside_share:.0%} of the samples last longer or shorter than any example by over a fifth",
+                f"{durations.outside_share:.0%} of the samples last longer or shorter than any example",
             )
         )
     return found
