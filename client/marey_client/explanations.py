@@ -25,7 +25,7 @@ def explain(job: Job, attempts: list[Attempt], running: list[Job], now: datetime
         told = ", ".join(f"{count} {state}" for state, count in sorted(job.children.items()))
         return [f"{job.state}: it gathers {job.size} tasks, of which {told or 'none has begun'}."]
     reasons = {
-        JobState.WAITING: ["waiting: jobs it depends on have not all succeeded."],
+        JobState.WAITING: [_why_waiting(job)],
         JobState.QUEUED: _why_queued(job, running, now),
         JobState.RUNNING: _why_running(job, attempts),
         JobState.SUCCEEDED: ["succeeded" + (f": its result is that of {job.cached_from}." if job.cached_from else ".")],
@@ -33,6 +33,14 @@ def explain(job: Job, attempts: list[Attempt], running: list[Job], now: datetime
         JobState.CANCELLED: ["cancelled."],
     }[job.state]
     return reasons + [_told(attempt) for attempt in attempts if attempt.outcome not in (None, "succeeded")]
+
+
+def _why_waiting(job: Job) -> str:
+    if job.cached_from:
+        return f"waiting: {job.cached_from} computes the same, and its result will serve."
+    makers = {entry["job"] for entries in job.inputs.values() for entry in entries if "job" in entry}
+    told = [f"{one}, which makes its inputs" if one in makers else one for one in job.after]
+    return f"waiting: it depends on {' and '.join(told) or 'others'}, of which not all have succeeded."
 
 
 def _why_queued(job: Job, running: list[Job], now: datetime) -> list[str]:

@@ -205,6 +205,8 @@ def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
             yield name, f"{marey.project(item.project).skeletons.get(value).path} ({value})"
         elif name != "warnings":
             yield name, value
+    for edge in item.staleness().because:
+        yield "stale", f"{edge.kind} {edge.name} has newer revisions than {edge.revision}"
     for name, one in item.item.parts.items():
         yield f"part {name}", f"{one.size_bytes} bytes, {one.schema_}, {one.document}"
     if isinstance(item, ClipHandle) and "info" in item.item.parts:

@@ -14,7 +14,7 @@ from marey_client.cli.output import Advance, print_json, print_pairs, print_tabl
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
-    from marey_schemas.jobs import CollectionInput, InputSpec, ItemInput, Job, JobKind
+    from marey_schemas.jobs import CollectionInput, InputSpec, ItemInput, Job, JobInput, JobKind
 
 job = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Jobs.")
 
@@ -136,7 +136,8 @@ def submit_job(
     project: str,
     kind: Annotated[str, typer.Argument(help="What to do; marey job kinds shows what there is.")],
     inputs: Annotated[
-        list[str] | None, typer.Option("--input", help="name=folder or name=folder/item; may be repeated.")
+        list[str] | None,
+        typer.Option("--input", help="name=folder, folder/item, or id of the job that makes it; may be repeated."),
     ] = None,
     params: Annotated[
         list[str] | None, typer.Option("--param", help="name=value, the value as JSON or plain text; may be repeated.")
@@ -178,10 +179,12 @@ def _kind_of_job(marey: Marey, name: str) -> JobKind:
     return kinds[name]
 
 
-def _input_at(marey: Marey, address: Address, spec: InputSpec) -> ItemInput | CollectionInput:
-    """An item, or where the input takes many, a folder."""
-    from marey_schemas.jobs import CollectionInput, ItemInput
+def _input_at(marey: Marey, address: Address, spec: InputSpec) -> JobInput:
+    """An item, or where the input takes many, a folder; or what a job makes."""
+    from marey_schemas.jobs import CollectionInput, ItemInput, JobOutputsInput
 
+    if address.has_id and address.name.startswith("job_"):
+        return JobOutputsInput(job=address.name)
     if not spec.many:
         return ItemInput(item=require_item(marey, address, [spec.kind]).id)
     item = find_item(marey, address, [spec.kind])

@@ -1,0 +1,120 @@
+"""`pipeline`: jobs that work on what others of them make, handed in and followed together."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.output import print_json, print_table, tell
+
+if TYPE_CHECKING:
+    from marey_client.pipelines import PipelineRun
+    from marey_schemas.jobs import Job
+
+INTERRUPTED = 130
+COLUMNS = ("step", "kind", "state", "done", "job", "")
+
+Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until every job has ended.")]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    app.command()(pipeline)
+
+
+def pipeline(
+    context: typer.Context,
+    file: Annotated[Path, typer.Argument(help="The pipeline, in JSON; - reads standard input.")],
+    project: Annotated[str, typer.Option(help="The project it runs in.")],
+    wait: Wait = True,
+    as_json: AsJson = False,
+) -> None:
+    """Hand in a graph of jobs, and follow them. What was computed before is not computed again."""
+    from marey_schemas.pipelines import PipelineCreate
+
+    text = sys.stdin.read() if str(file) == "-" else file.read_text(encoding="utf-8")
+    wanted = PipelineCreate.model_validate_json(text)
+    with connect(context) as marey:
+        run = marey.project(project).pipeline(wanted)
+        follow_run(run, project, wait=wait, as_json=as_json)
+
+
+def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> None:
+    """Wait for the jobs of a pipeline, if that is wanted, and print how they stand. Raises `JobUnsuccessful`."""
+    if not wait:
+        return print_steps(run, as_json)
+    try:
+        with _live_table() as show:
+            run.wait(on_progress=show)
+    except KeyboardInterrupt:
+        first = next((job.id for job in run.steps.values() if not job.state.terminal), "JOB")
+        tell(f"the jobs go on without you; marey job ls {project} shows them, marey job cancel {first} stops them")
+        raise typer.Exit(INTERRUPTED) from None
+    finally:
+        print_steps(run, as_json)
+    return None
+
+
+def print_steps(run: PipelineRun, as_json: bool) -> None:
+    """Print how the jobs stand."""
+    if as_json:
+        print_json({"jobs": dict(run.steps)})
+    else:
+        print_table(COLUMNS, map(_row, run.steps.items()))
+
+
+@contextmanager
+def _live_table() -> Iterator[Callable[[Mapping[str, Job]], None]]:
+    """A table on the error stream that is drawn anew while the block runs; nothing where that is no terminal."""
+    if not sys.stderr.isatty():
+        yield lambda _steps: None
+        return
+    from rich import box
+    from rich.console import Console
+    from rich.live import Live
+    from rich.table import Table
+    from rich.text import Text
+
+    def drawn(steps: Mapping[str, Job]) -> Table:
+        table = Table(*COLUMNS, box=box.SIMPLE_HEAD, pad_edge=False)
+        for row in map(_row, steps.items()):
+            table.add_row(*map(Text, row))
+        return table
+
+    with Live(console=Console(stderr=True), transient=True, auto_refresh=False) as live:
+        yield lambda steps: live.update(drawn(steps), refresh=True)
+
+
+def _row(step: tuple[str, Job]) -> tuple[str, ...]:
+    name, job = step
+    return name, job.kind, _state(job), _done(job), job.id, _remark(job)
+
+
+def _state(job: Job) -> str:
+    return f"{job.state}, as before" if job.cached_from and job.state.terminal else str(job.state)
+
+
+def _done(job: Job) -> str:
+    """Tasks that have ended, of those there are, or how far the job itself is."""
+    if job.state.terminal and job.size is None:
+        return ""
+    if job.size is not None:
+        return f"{job.children.get('succeeded', 0)}/{job.size} tasks"
+    if job.progress is None or not job.progress.total:
+        return ""
+    return f"{100 * min(1.0, job.progress.done / job.progress.total):.0f} %"
+
+
+def _remark(job: Job) -> str:
+    if job.failure is not None:
+        return job.failure.detail
+    if job.progress is not None and not job.state.terminal:
+        return job.progress.note
+    result: Mapping[str, Any] = job.result or {}
+    return ", ".join(f"{value} {name}" for name, value in result.items() if isinstance(value, int))

@@ -1,0 +1,106 @@
+"""Pipelines: jobs that work on what others of them make, handed in together and followed together."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
+
+from marey_client.errors import JobUnsuccessful, WaitedTooLong
+from marey_client.jobs import Jobs
+from marey_client.transport import Transport
+from marey_schemas.jobs import FailureReason, Job, JobOutput, JobState
+from marey_schemas.pipelines import Pipeline, PipelineCreate
+
+OnProgress = Callable[[Mapping[str, Job]], None]
+
+LOOK_EVERY_S = 1.0
+LONGEST_WAIT_S = 20.0
+SHORTEST_PAUSE_S = 0.2
+"""Between two looks, however soon the server answers."""
+
+
+class PipelineRun:
+    """The jobs of a pipeline by the names of its steps, as they stood when last looked at."""
+
+    def __init__(self, transport: Transport, jobs: Mapping[str, Job]) -> None:
+        self._jobs = Jobs(transport)
+        self._steps = dict(jobs)
+
+    def __repr__(self) -> str:
+        return f"<pipeline {', '.join(f'{name} {job.state}' for name, job in self._steps.items())}>"
+
+    @property
+    def steps(self) -> Mapping[str, Job]:
+        """Every job, each after those it needs."""
+        return MappingProxyType(self._steps)
+
+    @property
+    def ended(self) -> bool:
+        """Whether every job has ended."""
+        return all(job.state.terminal for job in self._steps.values())
+
+    def refresh(self) -> Mapping[str, Job]:
+        """How the jobs stand now."""
+        return self._look(wait_s=0.0)
+
+    def wait(self, *, timeout_s: float | None = None, on_progress: OnProgress | None = None) -> Mapping[str, Job]:
+        """Wait until every job has ended; `on_progress` sees all of them about once a second.
+
+        Raises `JobUnsuccessful` for the first step that brought nothing by its own fault, `WaitedTooLong` after
+        `timeout_s`; the jobs go on in both cases.
+        """
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            if on_progress is not None:
+                on_progress(self.steps)
+            if self.ended:
+                return self._successful()
+            left_s = LONGEST_WAIT_S if deadline is None else deadline - time.monotonic()
+            if left_s <= 0:
+                unfinished = ", ".join(name for name, job in self._steps.items() if not job.state.terminal)
+                raise WaitedTooLong(f"after {timeout_s:g} s these steps have not ended: {unfinished}; they go on")
+            asked = time.monotonic()
+            self._look(wait_s=min(left_s, LOOK_EVERY_S if on_progress else LONGEST_WAIT_S))
+            if not self.ended:
+                time.sleep(max(0.0, min(left_s, asked + SHORTEST_PAUSE_S - time.monotonic())))
+
+    def outputs(self, step: str) -> Iterator[JobOutput]:
+        """The revisions a step made."""
+        return self._jobs.outputs(self._steps[step].id)
+
+    def cancel(self) -> Mapping[str, Job]:
+        """Ask every job that has not ended to stop."""
+        for job in self.refresh().values():
+            if not job.state.terminal:
+                self._jobs.cancel(job.id)
+        return self.refresh()
+
+    def _look(self, wait_s: float) -> Mapping[str, Job]:
+        """Ask for every job that had not ended; up to `wait_s` later if the first of them does not end before."""
+        for name, known in self._steps.items():
+            if not known.state.terminal:
+                self._steps[name] = self._jobs.get(known.id, wait_s=wait_s)
+                wait_s = 0.0
+        return self.steps
+
+    def _successful(self) -> Mapping[str, Job]:
+        missed = {name: job for name, job in self._steps.items() if job.state is not JobState.SUCCEEDED}
+        if not missed:
+            return self.steps
+        guilty = {name: job for name, job in missed.items() if not _only_followed(job)}
+        name, job = next(iter((guilty or missed).items()))
+        if job.failure is None:
+            raise JobUnsuccessful(f"step {name} ({job.id}) was cancelled", job)
+        raise JobUnsuccessful(f"step {name} ({job.id}) failed ({job.failure.code}): {job.failure.detail}", job)
+
+
+def _only_followed(job: Job) -> bool:
+    """Whether a job failed only because one it needed had."""
+    return job.failure is not None and job.failure.reason is FailureReason.DEPENDENCY_FAILED
+
+
+def submit_pipeline(transport: Transport, project: str, pipeline: PipelineCreate) -> PipelineRun:
+    """Hand in a pipeline: all of its jobs, or none."""
+    answer = transport.post(Pipeline, f"/projects/{project}/pipelines", pipeline)
+    return PipelineRun(transport, answer.jobs)
