@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 from marey_client.access import Members
+from marey_client.alignments import ProcessedHandle, align_request
 from marey_client.annotation_jobs import AnnotationPlaces, annotate_request, cut_request
 from marey_client.annotations import AnnotationHandle
 from marey_client.blobs import Blobs
@@ -18,13 +19,16 @@ from marey_client.items import ItemHandle, Items
 from marey_client.jobs import Jobs
 from marey_client.motions import ClipHandle, SkeletonHandle
 from marey_client.paging import pages
+from marey_client.pipelines import PipelineRun, submit_pipeline
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.access import Project, ProjectChange
+from marey_schemas.alignment import AlignParams
 from marey_schemas.annotations import AnnotateParams, CutParams
 from marey_schemas.evaluation import EvaluateParams
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
 from marey_schemas.jobs import CollectionInput, ItemInput, Job, JobCreate, RetargetParams
 from marey_schemas.kinds import Kind
+from marey_schemas.pipelines import PipelineCreate
 
 
 class ProjectHandle:
@@ -78,6 +82,11 @@ class ProjectHandle:
         return Items(self.transport, self.name, Kind.ANNOTATION, AnnotationHandle)
 
     @cached_property
+    def processed(self) -> Items[ProcessedHandle]:
+        """Its aligned clips."""
+        return Items(self.transport, self.name, Kind.PROCESSED, ProcessedHandle)
+
+    @cached_property
     def evaluations(self) -> Items[EvaluationHandle]:
         """Its evaluations."""
         return Items(self.transport, self.name, Kind.EVALUATION, EvaluationHandle)
@@ -88,6 +97,7 @@ class ProjectHandle:
             Kind.CLIP: ClipHandle,
             Kind.SKELETON: SkeletonHandle,
             Kind.ANNOTATION: AnnotationHandle,
+            Kind.PROCESSED: ProcessedHandle,
             Kind.EVALUATION: EvaluationHandle,
         }
         return Items(self.transport, self.name, kind, known.get(kind, ItemHandle))
@@ -117,6 +127,10 @@ class ProjectHandle:
     def submit(self, job: JobCreate) -> Job:
         """Hand in a job."""
         return Jobs(self.transport).submit(self.name, job)
+
+    def pipeline(self, pipeline: PipelineCreate) -> PipelineRun:
+        """Hand in jobs that work on what others of them make: all, or none."""
+        return submit_pipeline(self.transport, self.name, pipeline)
 
     def retarget(
         self,
@@ -162,6 +176,24 @@ class ProjectHandle:
         """
         request = cut_request(self, annotations, CutParams.model_validate(options))
         return self.submit(request.model_copy(update={"into": into, "priority": priority}))
+
+    def align(
+        self,
+        clips: Places,
+        *,
+        into: str,
+        annotations: AnnotationPlaces | None = None,
+        priority: int = 0,
+        cache: Literal["use", "refresh", "off"] = "use",
+        **options: Any,
+    ) -> Job:
+        """Hand in the alignment of clips of one skeleton, all of which show the same action.
+
+        `options` are those of `AlignParams`, for example `rate_hz=30` or `layer="steps"`. Where a layer or labels are
+        named and no annotations are given, the annotations of the clips are gone by.
+        """
+        request = align_request(self, clips, annotations, AlignParams.model_validate(options))
+        return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
 
     def evaluate(
         self,

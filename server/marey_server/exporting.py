@@ -13,12 +13,15 @@ from marey_server.errors import Invalid, NotFound
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
 
+WITH_MOTION = (Kind.CLIP, Kind.PROCESSED)
+"""The kinds whose part `motion` can be written as a file of motion."""
+
 ExportFormat = Literal["original", "bvh", "npz", "predecessor", "json"]
 
 
 @dataclass(frozen=True, slots=True)
 class ExportSource:
-    """An item's documents at one revision; for clips also the hierarchy of their skeleton."""
+    """An item's documents at one revision; for those with motion also the hierarchy of their skeleton."""
 
     item: Item
     revision: int
@@ -50,7 +53,7 @@ def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revisio
     held = items.read_revision(tx, project, kind, item_id, number).parts
     parts = {part: items.read_part(tx, project, kind, item_id, part, revision=number).tree for part in sorted(held)}
     hierarchy = None
-    if kind is Kind.CLIP:
+    if kind in WITH_MOTION:
         ref = parts["motion"]["skeleton"]
         hierarchy = items.read_part(tx, project, Kind.SKELETON, ref["item"], "hierarchy", revision=ref["revision"]).tree
     return ExportSource(found, number, parts, hierarchy)
@@ -71,7 +74,7 @@ def write_file(source: ExportSource, file_format: ExportFormat, unit: str) -> Ex
     """The file of an item. Raises `Invalid` where the format cannot hold it."""
     if file_format == "json":
         return ExportedFile(f"{source.item.name}.json", codecs.JSON, codecs.encode_tree(_as_tree(source), codecs.JSON))
-    if source.item.kind is not Kind.CLIP or source.hierarchy is None:
+    if source.item.kind not in WITH_MOTION or source.hierarchy is None:
         raise Invalid(f"A {source.item.kind} is exported as json.", code="no-such-export")
     from marey_motion.documents import clip_from_document, skeleton_from_document
     from marey_motion.errors import MotionError

@@ -7,7 +7,18 @@ from typing import Annotated
 
 import typer
 
-from marey_client.cli import accounts, evaluations, files, improvements, jobs, pipelines, processes, projects, skeletons
+from marey_client.cli import (
+    accounts,
+    alignments,
+    evaluations,
+    files,
+    improvements,
+    jobs,
+    pipelines,
+    processes,
+    projects,
+    skeletons,
+)
 from marey_client.cli.invocation import Invocation
 
 app = typer.Typer(
@@ -44,5 +55,16 @@ def marey(
     context.obj = Invocation(server, token_file, verbose)
 
 
-for register in (processes, accounts, projects, files, skeletons, evaluations, improvements, jobs, pipelines):
+for register in (
+    processes,
+    accounts,
+    projects,
+    files,
+    skeletons,
+    alignments,
+    evaluations,
+    improvements,
+    jobs,
+    pipelines,
+):
     register.add_to(app)

@@ -46,7 +46,7 @@ class Export(BlobSender):
         headers=("Range", "If-Range"),
     )
     async def get(self, project: str, kind: str, item: str, query: ExportQuery) -> Rendered | Reply | None:
-        """An item as a file: clips as bvh, npz, predecessor, json or the original; other kinds as json."""
+        """An item as a file: clips and aligned clips as bvh, npz, predecessor, json or the original; others as json."""
         place = (project, kind_of(kind), item, query.revision)
         if query.format == "original":
             original = await self.look_up(exporting.find_original, *place)

@@ -72,7 +72,7 @@ class ReferenceCheck:
 
     def require(self, kind: Kind, bodies: Mapping[str, Tree]) -> None:
         """Raise `Invalid` where something the new parts of an item refer to is not there or does not fit."""
-        if kind is Kind.CLIP and "motion" in bodies:
+        if kind in (Kind.CLIP, Kind.PROCESSED) and "motion" in bodies:
             self._require_joints(bodies["motion"])
         elif kind is Kind.ANNOTATION:
             self._require_frames(bodies["annotation"])

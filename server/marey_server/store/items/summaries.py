@@ -30,9 +30,16 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
         return Summary({"verdict": bodies["evaluation"]["verdict"], **bodies["evaluation"]["headline"]})
     if kind is Kind.ANNOTATION:
         return Summary(_said(bodies["annotation"]))
-    if kind is not Kind.CLIP:
-        return Summary({})
-    motion, info = bodies["motion"], bodies.get("info", {})
+    if kind is Kind.CLIP:
+        checks = bodies.get("info", {}).get("checks", ())
+        return _moved(bodies["motion"], {"warnings": sorted({check["code"] for check in checks})})
+    if kind is Kind.PROCESSED:
+        return _moved(bodies["motion"], _aligned(bodies["info"]))
+    return Summary({})
+
+
+def _moved(motion: Mapping[str, Any], known: Mapping[str, Any]) -> Summary:
+    """Of a motion, and what else is known of it."""
     frames = motion["poses"]["shape"][0]
     shown = {
         "frames": frames,
@@ -40,9 +47,23 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
         "duration_s": frames / motion["frame_rate_hz"],
         "joints": len(motion["joints"]),
         "skeleton": motion["skeleton"]["item"],
-        "warnings": sorted({check["code"] for check in info.get("checks", ())}),
+        **known,
     }
     return Summary(shown, frames, motion["skeleton"]["item"])
+
+
+def _aligned(info: Mapping[str, Any]) -> dict[str, Any]:
+    clip, reference = (info.get(name) or {} for name in ("clip", "reference"))
+    return {
+        "clip": clip.get("item"),
+        "clip_revision": clip.get("revision"),
+        "mirrored": bool(clip.get("mirrored")),
+        "reference": reference.get("item"),
+        "set": info.get("set"),
+        "source_frames": info["source_frames"],
+        "cost": info.get("cost", 0.0),
+        "keyframes": len(info.get("keyframes", {})),
+    }
 
 
 def _said(annotation: Mapping[str, Any]) -> dict[str, Any]:
