@@ -1,7 +1,7 @@
 """Rigs: standard joints, known rigs, and how a skeleton's joints and axes are recognised."""
 
 from marey_motion.rigs.axes import JointAxes, guess_axes, rest_pose_doubts
-from marey_motion.rigs.mapping import JointMapping, map_joints, symmetric_joints
+from marey_motion.rigs.mapping import JointMapping, map_joints, require_trust, symmetric_joints
 from marey_motion.rigs.standard import ESSENTIAL_JOINTS, STANDARD_JOINTS, mirrored
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "guess_axes",
     "map_joints",
     "mirrored",
+    "require_trust",
     "rest_pose_doubts",
     "symmetric_joints",
 ]

@@ -21,6 +21,8 @@ Method = Literal["names", "geometry", "manual"]
 TRUSTED_SHARE = 0.75
 # What a mapping of something that seems to have four legs is worth.
 ANIMAL_CONFIDENCE = 0.2
+# Below this a person must have looked before anything is made of a mapping.
+LEAST_CONFIDENCE = 0.3
 _ANIMAL_WORDS = ("tail", "paw", "hoof", "hock", "fetlock", "snout", "muzzle")
 
 
@@ -81,6 +83,19 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
         notes.append(f"{signs}; hind and front legs were taken for legs and arms, check before use")
     named = {standard: skeleton.joint_names[joints[standard]] for standard in STANDARD_JOINTS if standard in joints}
     return JointMapping(rig, named, round(confidence, 3), method, tuple(notes))
+
+
+def require_trust(mapping: JointMapping) -> JointMapping:
+    """The mapping itself; `MappingError` for one that hardly recognised anything.
+
+    A dog has legs and a head, too: what is guessed so badly is not used before a person has looked.
+    """
+    if mapping.confidence < LEAST_CONFIDENCE:
+        found = f"its joints were recognised with a confidence of {mapping.confidence:.2f} only"
+        reasons = f" ({'; '.join(mapping.notes)})" if mapping.notes else ""
+        advice = "correct them with `marey skeleton map`, or confirm them with its --confirm"
+        raise MappingError(f"{found}{reasons}; {advice}", code="mapping-uncertain")
+    return mapping
 
 
 def symmetric_joints(skeleton: Skeleton, mapping: JointMapping) -> NDArray[np.int32]:

@@ -107,6 +107,7 @@ def reads(
     *,
     access: Access,
     query: type[Request] | None = None,
+    body: Content | Body | None = None,
     answer: Content | None = None,
     paged: bool = False,
     etag: bool = False,
@@ -122,10 +123,11 @@ def reads(
 
     `answer` is what one answer holds, or with `paged` one element of a page; `answer_types` are the media types where
     they are not those of models and documents. `stream`: it also comes as server-sent events. `public=False`: guests of
-    a public project may not. `also` are further statuses, `headers` further request headers.
+    a public project may not. `also` are further statuses, `headers` further request headers. With a `body`, it is a
+    question too long for an address.
     """
     return _declare(
-        access=access, scope=scope, query=query, answer=answer, paged=paged, etag=etag, status=status,
+        access=access, scope=scope, query=query, body=body, answer=answer, paged=paged, etag=etag, status=status,
         answer_types=answer_types, also=also, public=public, headers=headers, stream=stream,
     )  # fmt: skip
 
@@ -150,8 +152,8 @@ def writes(
     either or none. `idempotency="key"`: honours Idempotency-Key; `nature`: doing it twice does it once anyway.
     """
     return _declare(
-        access=access, scope=scope, query=query, body=body if body is None or isinstance(body, Body) else Body(body),
-        answer=answer, status=status or (200 if answer else 204), precondition=precondition, idempotency=idempotency,
+        access=access, scope=scope, query=query, body=body, answer=answer,
+        status=status or (200 if answer else 204), precondition=precondition, idempotency=idempotency,
         etag=etag, also=also, headers=headers,
     )  # fmt: skip
 
@@ -165,7 +167,7 @@ def _declare(
     status: int,
     etag: bool,
     also: tuple[tuple[int, type[Answer] | None], ...],
-    body: Body | None = None,
+    body: Content | Body | None = None,
     paged: bool = False,
     precondition: Literal["none", "required", "create", "optional"] = "none",
     idempotency: Literal["key", "nature"] = "nature",
@@ -180,8 +182,9 @@ def _declare(
             await self.perform(method)
 
         summary, _, description = (inspect.getdoc(method) or "").partition("\n")
+        taken = body if body is None or isinstance(body, Body) else Body(body)
         perform.operation = Operation(  # type: ignore[attr-defined]
-            method.__name__.upper(), summary.rstrip("."), description.strip(), access, scope, query, body, answer,
+            method.__name__.upper(), summary.rstrip("."), description.strip(), access, scope, query, taken, answer,
             status, paged, etag, precondition, idempotency, answer_types, also, public, headers, stream,
         )  # fmt: skip
         return perform

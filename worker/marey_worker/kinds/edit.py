@@ -104,7 +104,12 @@ class _Editing:
 
     def _output(self, pin: PinnedInput, name: str, clip: Clip, motion: Motion, info: ClipInfo) -> StagedOutput:
         rig = self._rigs.get(_skeleton_of(motion).item)
-        pins = {"clips": [pin], "edit": [self._edit_pin], "sources": self._source_pins.values(), "rigs": [rig]}
+        pins: dict[str, list[PinnedInput | None]] = {
+            "clips": [pin],
+            "edit": [self._edit_pin],
+            "sources": [*self._source_pins.values()],
+            "rigs": [rig],
+        }
         sources = {role: tuple(_input(one) for one in many if one is not None) for role, many in pins.items()}
         return StagedOutput(
             name=f"{pin.collection}/{name}",

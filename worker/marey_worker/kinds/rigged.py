@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from marey_motion import documents
-from marey_motion.errors import MappingError
 from marey_motion.retargeting import RetargetPlan, plan_retarget
-from marey_motion.rigs import JointAxes, JointMapping, guess_axes, map_joints
+from marey_motion.rigs import JointAxes, JointMapping, guess_axes, map_joints, require_trust
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents import RevisionRef, SkeletonHierarchy, SkeletonMapping
 from marey_schemas.kinds import Kind
@@ -16,7 +15,6 @@ from marey_worker.context import Context, NoSuchThing
 from marey_worker.kept import Kept
 
 MOST_KEPT = 512
-LEAST_CONFIDENCE = 0.3
 
 
 class Rigged(NamedTuple):
@@ -66,18 +64,7 @@ def _read(context: Context, rig: Rig) -> Rigged:
     try:
         stored = context.document(Kind.SKELETON, rig.mapping.item, rig.mapping.revision, "mapping")
     except NoSuchThing:
-        mapping = map_joints(skeleton)
-        _require_trust(mapping)
+        mapping = require_trust(map_joints(skeleton))
         return Rigged(skeleton, mapping, guess_axes(skeleton, mapping))
     mapping, axes = documents.mapping_from_document(SkeletonMapping.model_validate(stored), skeleton)
-    _require_trust(mapping)
-    return Rigged(skeleton, mapping, axes)
-
-
-def _require_trust(mapping: JointMapping) -> None:
-    """A dog has legs and a head, too: what was hardly recognised is not used before a person has looked."""
-    if mapping.confidence < LEAST_CONFIDENCE:
-        found = f"its joints were recognised with a confidence of {mapping.confidence:.2f} only"
-        reasons = f" ({'; '.join(mapping.notes)})" if mapping.notes else ""
-        advice = "correct them with `marey skeleton map`, or confirm them with its --confirm"
-        raise MappingError(f"{found}{reasons}; {advice}", code="mapping-uncertain")
+    return Rigged(skeleton, require_trust(mapping), axes)

@@ -1,0 +1,31 @@
+"""Edits: what commands would make of a clip."""
+
+from __future__ import annotations
+
+from marey_schemas.edit_previews import EditPreviewRequest
+from marey_server import previewing
+from marey_server.handlers.declarations import Access, Document, reads
+from marey_server.handlers.items import kind_of
+from marey_server.handlers.reply import Rendered, Reply, render
+from marey_server.handlers.resource import Resource
+
+
+class EditPreviewResource(Resource):
+    """What an edit would make of a clip."""
+
+    path = "/projects/{project}/{kind}/{item}/edit-preview"
+    tag = "Items"
+
+    @reads(access=Access.READER, body=EditPreviewRequest, answer=Document)
+    async def post(self, project: str, kind: str, item: str, body: EditPreviewRequest) -> Rendered:
+        """Some frames of what commands would make of a clip (kind `clips`); nothing is stored.
+
+        The whole edit is computed, so that these frames are those that a job would make. What would take longer than
+        some seconds is refused with 413.
+        """
+        source = await self.look_up(previewing.read_preview, project, kind_of(kind), item, body)
+        form, answers = self.answer_form, self.services.answers
+        return await self.compute(lambda: render(Reply(previewing.make_preview(source, body)), form, answers))
+
+
+RESOURCES: tuple[type[Resource], ...] = (EditPreviewResource,)
