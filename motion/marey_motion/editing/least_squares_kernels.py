@@ -43,7 +43,8 @@ FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e8
 # An accepted step that improves the objective by less than this share is the last one.
 CONVERGED_SHARE = 1e-13
 # Passes in which joints at a limit are found, for each step.
-LIMIT_PASSES = 4
+LIMIT_PASSES = 6
+LIMIT_REACHED_RAD = 1e-9
 
 
 @compiled
@@ -156,14 +157,16 @@ def _fill_softness(body, damping, work):  # type: ignore[no-untyped-def]
 def _soften(work, vector, out):  # type: ignore[no-untyped-def]
     """out = D⁻¹·vector."""
     for v in range(work.blocked.shape[0]):
-        kind = work.blocked[v]
-        along = 0.0
-        if kind == 1:
-            for i in range(3):
-                along += work.outward[v, i] * vector[3 * v + i]
+        known, along = work.blocked[v], 0.0
         for i in range(3):
-            rest = 0.0 if kind == 2 else vector[3 * v + i] - along * work.outward[v, i]
-            out[3 * v + i] = work.softness[3 * v + i] * rest
+            along += work.outward[v, i] * vector[3 * v + i]
+        for i in range(3):
+            kept = vector[3 * v + i] if known < 2 else 0.0
+            if known == 1:
+                kept -= along * work.outward[v, i]
+            elif known == 2:
+                kept = along * work.outward[v, i]
+            out[3 * v + i] = work.softness[3 * v + i] * kept
     first = 3 * work.blocked.shape[0]
     for i in range(first, first + 3):
         out[i] = work.softness[i] * vector[i]
@@ -215,6 +218,21 @@ def _fill_step(work):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _block(work, v, over):  # type: ignore[no-untyped-def]
+    """Take a direction out of the steps of movable joint v; whether there was something left to take out.
+
+    `work.outward` is the one direction that is blocked, or where two are, the one that is not.
+    """
+    known = work.blocked[v]
+    if known == 1:
+        over = direction(cross(vector_at(work.outward, v), over))
+    if known < 3:
+        put_vector(work.outward, v, over)
+        work.blocked[v] = known + 1
+    return known < 3
+
+
+@compiled
 def _take_step(body, local, root, work):  # type: ignore[no-untyped-def]
     """Fill the trial pose; return whether a joint ran into a limit that was not yet known to block it."""
     longest = 0.0
@@ -231,11 +249,10 @@ def _take_step(body, local, root, work):  # type: ignore[no-untyped-def]
         if body.limited[k]:
             kept = within_limits(body.limits[k], new)
             over = logarithm(product(inverse(kept), new))
-            size = length(over)
-            if size > 1e-9 and work.blocked[v] < 2:
-                put_vector(work.outward, v, scaled(over, 1.0 / size))
-                work.blocked[v] += 1
-                newly_blocked = True
+            gone = logarithm(product(inverse(rotation_at(local, k)), kept))
+            # A joint that is still on its way to the limit goes up to it; one that is there is blocked.
+            if length(over) > LIMIT_REACHED_RAD and dot(gone, direction(over)) < LIMIT_REACHED_RAD:
+                newly_blocked = _block(work, v, direction(over)) or newly_blocked
             new = kept
         put_rotation(work.trial, k, new)
         v += 1

@@ -1,0 +1,175 @@
+"""Changes of a few frames spread over their surroundings: displacement maps that are cubic B-splines.
+
+A displacement is a rotation vector for each local rotation, q·exp(d), and a shift of the root (Lee and Shin 1999). Its
+control points lie on the frames: of all curves that meet the given frames, it is the one that bends least. Near a
+smooth end of the window the control points are zero, so that value, slope and curvature end there at exactly zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import quaternions
+from marey_motion.errors import EditError
+from marey_motion.motion import Motion
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.integer]
+
+# Values of a cubic B-spline at its control points' frames.
+WEIGHTS = np.array([1.0, 4.0, 1.0]) / 6.0
+BENDING, PULLING = (1.0, -2.0, 1.0), (1.0, -1.0)
+# Tension falls with the square of the window's length: it smooths out swings that take about this share of it.
+SWING_SHARE = 1.0 / 6.0
+# Weight of meeting the given frames beside bending; what is then still missed is fitted again, until nothing is.
+MEETING = 1e4
+MOST_REFINEMENTS = 40
+MISSED_SHARE = 1e-13
+
+
+class Window(NamedTuple):
+    """Frames [start, stop) that may change, and whether the change ends smoothly at each of their ends.
+
+    An end that is not smooth, such as one that is an end of the clip, may change as much as its neighbours.
+    """
+
+    start: int
+    stop: int
+    smooth_start: bool = True
+    smooth_stop: bool = True
+
+
+def windows_around(frames: Ints, blend_frames: int, frame_count: int) -> tuple[Window, ...]:
+    """Windows that blend the given frames in and out over so many frames; those that would overlap become one.
+
+    Parameters
+    ----------
+    frames : (n,) increasing
+    blend_frames : 0 changes nothing but the given frames
+    """
+    groups: list[list[int]] = []
+    for frame in frames.tolist():
+        if groups and frame - groups[-1][1] <= max(2 * blend_frames, 1):
+            groups[-1][1] = frame
+        else:
+            groups.append([frame, frame])
+    windows = []
+    for first, last in groups:
+        start, stop = max(0, first - blend_frames), min(frame_count, last + 1 + blend_frames)
+        windows.append(Window(start, stop, start > 0 and blend_frames > 0, stop < frame_count and blend_frames > 0))
+    return tuple(windows)
+
+
+def displace(motion: Motion, frames: Ints, changed: Motion, windows: Sequence[Window]) -> Motion:
+    """The motion with some frames changed and the change spread over windows; outside of them not a bit changes.
+
+    Parameters
+    ----------
+    motion : F frames
+    frames : (n,) increasing indices of the frames that are given, each inside of a window
+    changed : those n frames, as they should become
+    windows : apart from each other
+
+    Raises `EditError` where a frame is not inside of a window, or a window holds none.
+    """
+    _check_windows(frames, windows)
+    rotations, roots = motion.rotations.copy(), motion.root_translations.copy()
+    turned = np.flatnonzero((changed.rotations != motion.rotations[frames]).any(axis=(0, 2)))
+    moved = bool((changed.root_translations != motion.root_translations[frames]).any())
+    turns = _rotation_vectors(motion.rotations[frames][:, turned], changed.rotations[:, turned])
+    shifts = changed.root_translations - motion.root_translations[frames]
+    for window in windows:
+        given = (frames >= window.start) & (frames < window.stop)
+        span = slice(window.start, window.stop)
+        together = np.concatenate((turns[given].reshape(int(given.sum()), -1), shifts[given]), axis=1)
+        spread = spread_displacements(frames[given], _continued(together, len(turned)), window)
+        exact = quaternions.from_rotation_vector(spread[:, :-3].reshape(len(spread), -1, 3))
+        rotations[span, turned] = quaternions.multiply(rotations[span, turned], exact)
+        if moved:
+            roots[span] += spread[:, -3:]
+    return motion._replace(root_translations=roots, rotations=rotations)
+
+
+def _check_windows(frames: Ints, windows: Sequence[Window]) -> None:
+    """Each window must hold frames, and each frame must be in one, where it is smooth not at its very ends."""
+    inside = np.zeros(len(frames), dtype=np.bool_)
+    for window in windows:
+        start, stop = window.start + window.smooth_start, window.stop - window.smooth_stop
+        held = (frames >= start) & (frames < stop)
+        if not held.any():
+            raise EditError(f"the window {window.start}:{window.stop} holds no given frame", where="windows")
+        inside |= held
+    if not inside.all():
+        raise EditError(f"frame {int(frames[~inside][0])} is not inside of a window", where="windows")
+
+
+def spread_displacements(frames: Ints, values: Floats, window: Window) -> Floats:
+    """The displacement curve (stop - start, c) of a window through `values` (n, c) at `frames` (n,).
+
+    The curve of least bending that meets them; a little tension keeps it from swinging beyond them.
+    """
+    from scipy.linalg import cho_solve_banded, cholesky_banded
+
+    first = window.start + 1 if window.smooth_start else window.start - 1
+    last = window.stop - 2 if window.smooth_stop else window.stop
+    count = max(last - first + 1, 1)
+    columns = np.asarray(frames)[:, None] + np.arange(-1, 2) - first
+    weights = np.where((columns >= 0) & (columns < count), WEIGHTS, 0.0)
+    columns = np.clip(columns, 0, count - 1)
+    bands = _energy(count, window)
+    most_missed = MISSED_SHARE * np.abs(values).max(initial=0.0)
+    for i in range(3):
+        for j in range(i + 1):
+            np.add.at(bands[i - j], columns[:, j], MEETING * weights[:, i] * weights[:, j])
+    factor = cholesky_banded(bands[:count], lower=True, check_finite=False)
+    points, rest = np.zeros((count, values.shape[1])), values
+    for _ in range(MOST_REFINEMENTS):
+        right = np.zeros_like(points)
+        for i in range(3):
+            np.add.at(right, columns[:, i], MEETING * weights[:, i, None] * rest)
+        points += cho_solve_banded((factor, True), right, check_finite=False)
+        rest = values - np.einsum("ni,nic->nc", weights, points[columns])
+        if np.abs(rest).max(initial=0.0) <= most_missed:
+            break
+    padded = np.concatenate((np.zeros((3, values.shape[1])), points, np.zeros((3, values.shape[1]))))
+    start = window.start - first + 3
+    size = window.stop - window.start
+    spread: Floats = sum(WEIGHTS[i] * padded[start + i - 1 : start + i - 1 + size] for i in range(3))
+    return spread
+
+
+def _energy(count: int, window: Window) -> Floats:
+    """Lower diagonals (4, count) of the form that measures bending and tension of control points (count,).
+
+    Beyond a smooth end all control points are zero, beyond another there are none.
+    """
+    bands = np.zeros((4, count))
+    tension = (SWING_SHARE * (window.stop - window.start)) ** -2
+    for stencil, factor in ((BENDING, 1.0), (PULLING, tension)):
+        reach = len(stencil) - 1
+        rows = np.arange(0 if not window.smooth_start else -reach, count - (0 if window.smooth_stop else reach))
+        for i, a in enumerate(stencil):
+            for j in range(i + 1):
+                here = (rows + j >= 0) & (rows + i < count)
+                np.add.at(bands[i - j], rows[here] + j, factor * a * stencil[j])
+    return bands
+
+
+def _rotation_vectors(before: Floats, after: Floats) -> Floats:
+    turns = quaternions.multiply(quaternions.conjugate(before), after)
+    return np.asarray(quaternions.as_rotation_vector(turns), dtype=np.float64)
+
+
+def _continued(values: Floats, joints: int) -> Floats:
+    """Values (n, 3·joints + 3) whose rotation vectors go on beyond half a turn where their neighbours' do."""
+    vectors = values[:, : 3 * joints].reshape(len(values), joints, 3)
+    for n in range(1, len(values)):
+        angle = np.linalg.norm(vectors[n], axis=-1, keepdims=True)
+        other = vectors[n] * (1.0 - 2.0 * np.pi / np.maximum(angle, 1e-12))
+        gap, other_gap = (np.linalg.norm(one - vectors[n - 1], axis=-1, keepdims=True) for one in (vectors[n], other))
+        vectors[n] = np.where((other_gap < gap) & (angle > 1e-6), other, vectors[n])
+    return np.concatenate((vectors.reshape(len(values), -1), values[:, 3 * joints :]), axis=1)

@@ -1,0 +1,513 @@
+"""Inverse kinematics against closed forms, finite differences and an independent optimiser."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from marey_motion import kinematics, quaternions
+from marey_motion.clip import Clip
+from marey_motion.editing.inverse_kinematics import (
+    Limb,
+    SolvedPoses,
+    constraint_jacobian,
+    limb_ending_at,
+    measure_residuals,
+    solve,
+    solve_ccd,
+    solve_least_squares,
+    solve_two_bone,
+)
+from marey_motion.editing.inverse_kinematics_targets import (
+    ANGLE_LENGTH_M,
+    Freedom,
+    JointLimit,
+    LookAtTarget,
+    OrientationTarget,
+    PositionTarget,
+    SolverOptions,
+    Target,
+    chain_of,
+)
+from marey_motion.errors import EditError, MotionError
+from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
+from marey_motion.motion import Motion
+from marey_motion.rigs import JointAxes, guess_axes, map_joints
+from marey_motion.skeleton import Skeleton
+
+EXACT = SolverOptions(tolerance_m=0.0, tolerance_rad=0.0, most_iterations=400)
+ITERATIVE = (solve_ccd, solve_least_squares)
+
+
+@pytest.fixture(params=["studio", "game", "tumbled"])
+def skeleton(request: pytest.FixtureRequest, body: Skeleton) -> Skeleton:
+    """Three bodies; the joints of the last one have local axes that point anywhere."""
+    if request.param == "studio":
+        return studio_skeleton()
+    return game_skeleton() if request.param == "game" else _with_odd_axes(body)
+
+
+def _with_odd_axes(body: Skeleton) -> Skeleton:
+    """The same rest pose, described in local frames turned at random."""
+    frames = quaternions.normalise(np.random.default_rng(3).normal(size=(body.joint_count, 4)))
+    above = np.concatenate((quaternions.identity(1), frames[body.parents[1:]]))
+    return replace(
+        body,
+        offsets=quaternions.rotate_vectors(quaternions.conjugate(above), body.offsets),
+        rest_rotations=quaternions.multiply(quaternions.conjugate(above), frames),
+        end_sites=(),
+    )
+
+
+def _moved(skeleton: Skeleton, frames: int = 12, seed: int = 1, size_rad: float = 0.3) -> Motion:
+    """The rest pose with every joint turned a little."""
+    random = np.random.default_rng(seed)
+    turns = quaternions.from_rotation_vector(random.normal(0.0, size_rad, (frames, skeleton.joint_count, 3)))
+    rotations = np.asarray(quaternions.multiply(skeleton.rest_rotations, turns), dtype=np.float64)
+    roots = skeleton.offsets[0] + random.normal(0.0, 0.1, (frames, 3))
+    return Motion(roots, rotations, np.zeros((frames, 0, 3)), ())
+
+
+def _joint(skeleton: Skeleton, standard: str) -> int:
+    return map_joints(skeleton).indices(skeleton, (standard,))[0]
+
+
+def _cost(targets: Sequence[Target], residuals: np.ndarray) -> np.ndarray:
+    scales = [t.weight * (1.0 if isinstance(t, PositionTarget) else ANGLE_LENGTH_M**2) for t in targets]
+    return (residuals**2) @ np.array(scales)
+
+
+def _spins(skeleton: Skeleton, motion: Motion, joint: int) -> np.ndarray:
+    return kinematics.as_global_rotations(skeleton, motion.rotations)[:, joint]
+
+
+def _targets_everywhere(skeleton: Skeleton, motion: Motion) -> list[Target]:
+    """One of each kind, near where the joints are, with tool tips and partial axes."""
+    random = np.random.default_rng(5)
+    places = motion.positions(skeleton)
+    wrist, ankle, head = (_joint(skeleton, name) for name in ("left_wrist", "right_ankle", "head"))
+    turn = quaternions.from_rotation_vector(random.normal(0.0, 0.4, (motion.frame_count, 3)))
+    return [
+        PositionTarget(wrist, places[:, wrist] + random.normal(0, 0.1, (motion.frame_count, 3)), offset=(0.1, 0.02, 0)),
+        PositionTarget(ankle, places[:, ankle] + 0.05, axes="xz", weight=2.0),
+        OrientationTarget(wrist, quaternions.multiply(turn, _spins(skeleton, motion, wrist)), weight=0.5),
+        LookAtTarget(head, (0.4, 1.2, 2.0), axis=(0.1, 0.2, 1.0), offset=(0.0, 0.05, 0.08)),
+    ]
+
+
+def test_derivatives_of_all_kinds_of_targets_are_those_of_finite_differences(skeleton: Skeleton) -> None:
+    motion = _moved(skeleton, frames=1)
+    targets = _targets_everywhere(skeleton, motion)
+    freedom = Freedom(root_moves=True)
+    _, jacobian, joints = constraint_jacobian(skeleton, motion, targets, freedom)
+    step = 1e-6
+
+    def errors(column: int, size: float) -> np.ndarray:
+        rotations, roots = motion.rotations.copy(), motion.root_translations.copy()
+        joint, axis = divmod(column, 3)
+        if joint < len(joints):
+            turn = quaternions.from_rotation_vector(size * np.eye(3)[axis])
+            rotations[0, joints[joint]] = quaternions.multiply(rotations[0, joints[joint]], turn)
+        else:
+            roots[0, axis] += size
+        moved = motion._replace(rotations=rotations, root_translations=roots)
+        return constraint_jacobian(skeleton, moved, targets, freedom)[0]
+
+    differences = [(errors(c, step) - errors(c, -step)) / (2 * step) for c in range(jacobian.shape[1])]
+    np.testing.assert_allclose(jacobian, np.transpose(differences), atol=1e-6)
+    assert np.abs(jacobian).max() > 0.1
+
+
+@pytest.mark.parametrize("angle", [1e-7, 0.3, 3.0, np.pi - 1e-4])
+def test_derivatives_hold_for_small_and_for_nearly_half_turns(body: Skeleton, angle: float) -> None:
+    motion = _moved(body, frames=1)
+    head = body.index_of("Head")
+    turned = quaternions.multiply(quaternions.from_axis_angle((0.6, 0.8, 0.0), angle), _spins(body, motion, head)[0])
+    targets = [OrientationTarget(head, turned)]
+    errors, jacobian, joints = constraint_jacobian(body, motion, targets)
+    assert np.linalg.norm(errors) == pytest.approx(angle * ANGLE_LENGTH_M, rel=1e-6)
+    step = 1e-6
+    for column in range(3 * len(joints)):
+        sides = []
+        for sign in (1.0, -1.0):
+            rotations = motion.rotations.copy()
+            turn = quaternions.from_rotation_vector(sign * step * np.eye(3)[column % 3])
+            rotations[0, joints[column // 3]] = quaternions.multiply(rotations[0, joints[column // 3]], turn)
+            sides.append(constraint_jacobian(body, motion._replace(rotations=rotations), targets)[0])
+        np.testing.assert_allclose(jacobian[:, column], (sides[0] - sides[1]) / (2 * step), atol=2e-6)
+
+
+def test_least_squares_finds_what_an_independent_optimiser_finds(skeleton: Skeleton) -> None:
+    motion = _moved(skeleton, frames=1)
+    wrist = _joint(skeleton, "left_wrist")
+    place = motion.positions(skeleton)[0, wrist]
+    targets: list[Target] = [
+        PositionTarget(wrist, place + np.array([0.1, 0.15, 0.05])),
+        LookAtTarget(_joint(skeleton, "head"), (1.0, 1.0, 1.5), axis=(0.0, 0.0, 1.0)),
+    ]
+    joints = chain_of(skeleton, wrist, _joint(skeleton, "left_shoulder"))
+    joints += chain_of(skeleton, _joint(skeleton, "head"), _joint(skeleton, "neck"))
+    freedom, options = Freedom(joints), SolverOptions(0.0, 0.0, 400, regularisation_m=0.05)
+
+    def errors(displacement: np.ndarray) -> np.ndarray:
+        rotations = motion.rotations.copy()
+        order = np.array(sorted(joints))
+        turns = quaternions.from_rotation_vector(displacement.reshape(-1, 3))
+        rotations[0, order] = quaternions.multiply(rotations[0, order], turns)
+        missed = constraint_jacobian(skeleton, motion._replace(rotations=rotations), targets, freedom)[0]
+        return np.concatenate((missed, 0.05 * displacement))
+
+    theirs = least_squares(errors, np.zeros(3 * len(joints)), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    ours = solve_least_squares(skeleton, motion, targets, freedom=freedom, options=options)
+    moved = quaternions.multiply(quaternions.conjugate(motion.rotations), ours.motion.rotations)
+    own = quaternions.as_rotation_vector(moved)[0, sorted(joints)].ravel()
+    assert np.sum(errors(own) ** 2) == pytest.approx(2 * theirs.cost, rel=1e-6)
+    np.testing.assert_allclose(own, theirs.x, atol=1e-4)
+
+
+@pytest.mark.parametrize("solver", ITERATIVE)
+def test_a_wrist_comes_as_near_to_a_target_as_an_independent_optimiser_brings_it(
+    body: Skeleton, solver: Callable[..., SolvedPoses]
+) -> None:
+    motion = _moved(body, frames=1)
+    wrist = body.index_of("LeftHand")
+    joints = chain_of(body, wrist, body.index_of("LeftArm"))
+    shoulder = motion.positions(body)[0, body.index_of("LeftArm")]
+    for target in (shoulder + np.array([0.2, 0.3, 0.1]), shoulder + np.array([0.5, 0.6, 0.1])):
+        targets = [PositionTarget(wrist, target)]
+
+        def errors(displacement: np.ndarray, targets: list[PositionTarget] = targets) -> np.ndarray:
+            rotations = motion.rotations.copy()
+            order = sorted(joints)
+            turns = quaternions.from_rotation_vector(displacement.reshape(-1, 3))
+            rotations[0, order] = quaternions.multiply(rotations[0, order], turns)
+            return constraint_jacobian(body, motion._replace(rotations=rotations), targets)[0]
+
+        theirs = np.sqrt(2 * least_squares(errors, np.zeros(3 * len(joints))).cost)
+        options = SolverOptions(most_iterations=500)
+        ours = solver(body, motion, targets, freedom=Freedom(joints), options=options)
+        assert ours.residual_after[0, 0] <= theirs + 2e-3
+        assert ours.reached[0] == (theirs < 1e-4)
+
+
+@pytest.mark.parametrize("solver", ITERATIVE)
+def test_no_solver_leaves_targets_worse_than_they_were(skeleton: Skeleton, solver: Callable[..., SolvedPoses]) -> None:
+    motion = _moved(skeleton, frames=25, seed=9, size_rad=0.6)
+    targets = _targets_everywhere(skeleton, motion)
+    solved = solver(skeleton, motion, targets)
+    before, after = _cost(targets, solved.residual_before), _cost(targets, solved.residual_after)
+    assert np.all(after <= before)
+    assert np.median(after / before) < 0.02
+    np.testing.assert_allclose(solved.residual_before, measure_residuals(skeleton, motion, targets), atol=1e-12)
+    np.testing.assert_allclose(solved.residual_after, measure_residuals(skeleton, solved.motion, targets), atol=1e-12)
+
+
+@pytest.mark.parametrize("solver", ITERATIVE)
+def test_a_target_far_away_stretches_the_body_towards_it(body: Skeleton, solver: Callable[..., SolvedPoses]) -> None:
+    motion = _moved(body, frames=3)
+    wrist, shoulder = body.index_of("LeftHand"), body.index_of("LeftArm")
+    target = np.array([50.0, 20.0, 10.0])
+    solved = solver(body, motion, [PositionTarget(wrist, target)], freedom=Freedom(chain_of(body, wrist, shoulder)))
+    places = solved.motion.positions(body)
+    ways = (places[:, wrist] - places[:, shoulder], target - places[:, shoulder])
+    directions = [way / np.linalg.norm(way, axis=1, keepdims=True) for way in ways]
+    assert np.all(np.sum(directions[0] * directions[1], axis=1) > 0.9995)
+    assert np.all(np.linalg.norm(ways[0], axis=1) > 0.995 * 0.54)
+    assert not solved.reached.any()
+
+
+@pytest.mark.parametrize("solver", ITERATIVE)
+def test_an_orientation_about_every_axis_counts(skeleton: Skeleton, solver: Callable[..., SolvedPoses]) -> None:
+    motion = _moved(skeleton, frames=1)
+    head = _joint(skeleton, "head")
+    for axis in np.eye(3):
+        for angle in (0.5 * np.pi, np.pi):
+            about_own_axis = quaternions.from_axis_angle(axis, angle)
+            wanted = quaternions.multiply(_spins(skeleton, motion, head)[0], about_own_axis)
+            targets = [OrientationTarget(head, wanted)]
+            assert measure_residuals(skeleton, motion, targets)[0, 0] == pytest.approx(angle)
+            solved = solver(skeleton, motion, targets)
+            assert solved.reached[0]
+            assert quaternions.angle_between(_spins(skeleton, solved.motion, head)[0], wanted) < 1e-3
+
+
+@pytest.mark.parametrize("solver", ITERATIVE)
+@pytest.mark.parametrize("point", [(2.0, 1.0, 1.0), (0.3, 1.9, -3.0)])
+def test_a_head_looks_at_a_point(
+    skeleton: Skeleton, solver: Callable[..., SolvedPoses], point: tuple[float, float, float]
+) -> None:
+    motion = _moved(skeleton, frames=4)
+    head, eye = _joint(skeleton, "head"), np.array([0.0, 0.06, 0.09])
+    solved = solver(skeleton, motion, [LookAtTarget(head, point, axis=(1.0, 0.0, 2.0), offset=eye)])
+    spins = _spins(skeleton, solved.motion, head)
+    eyes = solved.motion.positions(skeleton)[:, head] + quaternions.rotate_vectors(spins, eye)
+    gaze = quaternions.rotate_vectors(spins, np.array([1.0, 0.0, 2.0]) / np.sqrt(5.0))
+    ways = point - eyes
+    assert solved.reached.all()
+    assert np.all(np.sum(gaze * ways, axis=1) / np.linalg.norm(ways, axis=1) > np.cos(1.01e-3))
+
+
+def test_the_body_looks_straight_behind_itself(body: Skeleton) -> None:
+    rest = Motion(body.offsets[:1].copy(), body.rest_rotations[None].copy(), np.zeros((1, 0, 3)), ())
+    head = body.index_of("Head")
+    behind = rest.positions(body)[0, head] - (0.0, 0.0, 3.0)
+    for solver in ITERATIVE:
+        assert solver(body, rest, [LookAtTarget(head, behind, axis=(0.0, 0.0, 1.0))]).reached[0]
+
+
+def test_only_the_axes_that_count_are_met(body: Skeleton) -> None:
+    motion = _moved(body, frames=5)
+    wrist = body.index_of("RightHand")
+    before = motion.positions(body)[:, wrist]
+    for solver in ITERATIVE:
+        solved = solver(body, motion, [PositionTarget(wrist, (9.0, 1.3, 9.0), axes="y")])
+        after = solved.motion.positions(body)[:, wrist]
+        assert np.abs(after[:, 1] - 1.3).max() <= 1e-4
+        assert np.abs(after[:, (0, 2)] - before[:, (0, 2)]).max() < 0.35
+
+
+def test_weights_decide_between_targets_that_contradict_each_other(body: Skeleton) -> None:
+    motion = _moved(body, frames=1)
+    wrist = body.index_of("LeftHand")
+    place = motion.positions(body)[0, wrist]
+    first, second = place + np.array([0.0, 0.1, 0.0]), place - np.array([0.0, 0.1, 0.0])
+    for solver in ITERATIVE:
+        targets = [PositionTarget(wrist, first, weight=3.0), PositionTarget(wrist, second)]
+        solved = solver(body, motion, targets, options=SolverOptions(most_iterations=1000))
+        np.testing.assert_allclose(solved.motion.positions(body)[0, wrist], 0.75 * first + 0.25 * second, atol=2e-3)
+
+
+def test_the_root_moves_only_where_it_may(body: Skeleton) -> None:
+    motion = _moved(body, frames=2)
+    ankle = body.index_of("LeftFoot")
+    target = [PositionTarget(ankle, (3.0, 0.1, 2.0))]
+    held = solve_least_squares(body, motion, target)
+    free = solve_least_squares(body, motion, target, freedom=Freedom(root_moves=True))
+    assert np.array_equal(held.motion.root_translations, motion.root_translations)
+    assert not held.reached.any()
+    assert free.reached.all()
+    with pytest.raises(EditError, match="cannot shift the root"):
+        solve_ccd(body, motion, target, freedom=Freedom(root_moves=True))
+
+
+def _swing_and_twist(limit: JointLimit, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    turns = quaternions.multiply(quaternions.conjugate(limit.reference), rotations)
+    twist, swing = quaternions.twist_swing(turns, limit.axis)
+    vector = quaternions.as_rotation_vector(swing)
+    across = np.stack((vector @ np.array(limit.side), vector @ np.cross(limit.axis, limit.side)), axis=-1)
+    return across, quaternions.as_rotation_vector(twist) @ np.array(limit.axis)
+
+
+@pytest.mark.parametrize("solver", ITERATIVE)
+def test_limits_are_never_left(body: Skeleton, solver: Callable[..., SolvedPoses]) -> None:
+    axes = JointAxes(twist=(1.0, 0.0, 0.0), swing=(0.0, 1.0, 0.0))
+    elbow, shoulder, spine = (body.index_of(name) for name in ("LeftForeArm", "LeftArm", "Spine1"))
+    limits = {
+        elbow: JointLimit.hinge(axes, -2.4, 0.1),
+        shoulder: JointLimit.cone(axes, (0.9, 0.5), (-0.6, 0.4)),
+        spine: JointLimit.cone(JointAxes((0.0, 1.0, 0.0), (1.0, 0.0, 0.0)), 0.2, (-0.1, 0.1)),
+    }
+    motion = _moved(body, frames=60, size_rad=0.5)
+    wrist = body.index_of("LeftHand")
+    target = motion.positions(body)[:, wrist] + np.random.default_rng(2).normal(0.0, 0.3, (60, 3))
+    freedom = Freedom(chain_of(body, wrist, body.index_of("Spine")), limits=limits)
+    solved = solver(body, motion, [PositionTarget(wrist, target)], freedom=freedom)
+    for joint, limit in limits.items():
+        across, twist = _swing_and_twist(limit, solved.motion.rotations[:, joint])
+        halves = np.array(limit.swing_rad)
+        assert np.all(twist >= limit.twist_rad[0] - 1e-9)
+        assert np.all(twist <= limit.twist_rad[1] + 1e-9)
+        if halves.all():
+            assert np.all(np.linalg.norm(across / halves, axis=1) <= 1.0 + 1e-9)
+        else:
+            assert np.abs(across).max() < 1e-9
+    random = np.random.default_rng(4)
+    ways = random.normal(size=(200, 3))
+    ways *= random.uniform(abs(first - second), first + second, (200, 1)) / np.linalg.norm(ways, axis=1, keepdims=True)
+    target = places[:, limb.start] + ways
+    solved = solve_two_bone(skeleton, motion, limb, PositionTarget(end, target))
+    assert np.abs(solved.motion.positions(skeleton)[:, end] - target).max() < 1e-9
+    assert solved.reached.all()
+    assert np.array_equal(solved.motion.rotations[:, end], motion.rotations[:, end])
+
+
+def test_two_bones_stay_in_the_plane_of_the_limb(body: Skeleton) -> None:
+    motion = _moved(body, frames=50)
+    limb = Limb(*(body.index_of(name) for name in ("LeftUpLeg", "LeftLeg", "LeftFoot")))
+    places = motion.positions(body)
+    nearer = places[:, limb.start] + 0.8 * (places[:, limb.end] - places[:, limb.start])
+    after = solve_two_bone(body, motion, limb, PositionTarget(limb.end, nearer)).motion.positions(body)
+
+    def normals(points: np.ndarray) -> np.ndarray:
+        across = np.cross(points[:, limb.middle] - points[:, limb.start], points[:, limb.end] - points[:, limb.middle])
+        return across / np.linalg.norm(across, axis=1, keepdims=True)
+
+    np.testing.assert_allclose(normals(after), normals(places), atol=1e-9)
+
+
+@pytest.mark.parametrize("far", [0.9, 100.0])
+def test_two_bones_stretch_towards_what_they_cannot_reach(body: Skeleton, far: float) -> None:
+    motion = _moved(body, frames=20)
+    limb = Limb(*(body.index_of(name) for name in ("LeftArm", "LeftForeArm", "LeftHand")))
+    way = np.array([2.0, 1.0, -2.0]) / 3.0
+    start = motion.positions(body)[:, limb.start]
+    solved = solve_two_bone(body, motion, limb, PositionTarget(limb.end, start + far * way))
+    np.testing.assert_allclose(solved.motion.positions(body)[:, limb.end], start + 0.54 * way, atol=1e-7)
+    assert not solved.reached.any()
+
+
+def test_a_limb_that_is_straight_or_folded_bends_about_its_hinge(body: Skeleton) -> None:
+    rest = Motion(body.offsets[:1].copy(), body.rest_rotations[None].copy(), np.zeros((1, 0, 3)), ())
+    knee_axes = guess_axes(body, map_joints(body))
+    ankle = body.index_of("LeftFoot")
+    limb = limb_ending_at(body, map_joints(body), ankle, knee_axes)
+    assert limb is not None
+    hip = rest.positions(body)[0, limb.start]
+    solved = solve_two_bone(body, rest, limb, PositionTarget(ankle, hip - (0.0, 0.6, 0.0)))
+    knee = solved.motion.positions(body)[0, limb.middle]
+    assert solved.reached.all()
+    assert knee[2] > hip[2] + 0.2  # forwards, as knees do
+    assert abs(knee[0] - hip[0]) < 1e-9
+    for target in (hip, hip + 1e-14):
+        folded = solve_two_bone(body, rest, limb, PositionTarget(ankle, target))
+        assert np.isfinite(folded.motion.rotations).all()
+
+
+def test_the_end_of_a_limb_keeps_or_gets_an_orientation(body: Skeleton) -> None:
+    motion = _moved(body, frames=30)
+    limb = Limb(*(body.index_of(name) for name in ("LeftArm", "LeftForeArm", "LeftHand")))
+    places, spins = motion.positions(body), _spins(body, motion, limb.end)
+    near = places[:, limb.start] + 0.7 * (places[:, limb.end] - places[:, limb.start])
+    held = solve_two_bone(body, motion, limb, PositionTarget(limb.end, near), ending="held")
+    assert quaternions.angle_between(_spins(body, held.motion, limb.end), spins).max() < 1e-9
+    wanted = quaternions.multiply(quaternions.from_rotation_vector((0.3, -0.5, 0.9)), spins)
+    tool = (0.08, 0.01, 0.0)
+    given = solve_two_bone(
+        body, motion, limb, PositionTarget(limb.end, near, offset=tool), orientation=OrientationTarget(limb.end, wanted)
+    )
+    assert given.reached.all()
+    tips = given.motion.positions(body)[:, limb.end] + quaternions.rotate_vectors(wanted, tool)
+    assert np.abs(tips - near).max() < 1e-9
+
+
+def test_damping_keeps_a_stretching_limb_from_snapping_straight(body: Skeleton) -> None:
+    frames = 101
+    rest = Motion(
+        np.repeat(body.offsets[:1], frames, axis=0),
+        np.repeat(body.rest_rotations[None], frames, axis=0),
+        np.zeros((frames, 0, 3)),
+        (),
+    )
+    limb = Limb(*(body.index_of(name) for name in ("LeftUpLeg", "LeftLeg", "LeftFoot")))
+    rest.rotations[:, limb.middle] = quaternions.from_axis_angle((1.0, 0.0, 0.0), 0.8)
+    hip = rest.positions(body)[:, limb.start]
+    target = hip - np.linspace(0.75, 0.86, frames)[:, None] * (0.0, 1.0, 0.0)
+
+    def knee_angles(zone: float) -> np.ndarray:
+        solved = solve_two_bone(body, rest, limb, PositionTarget(limb.end, target), damping_zone_rad=zone)
+        return 2.0 * np.arccos(np.clip(np.abs(solved.motion.rotations[:, limb.middle, 0]), 0.0, 1.0))
+
+    snapping, damped = knee_angles(0.0), knee_angles(0.6)
+    assert np.abs(np.diff(damped)).max() < 0.5 * np.abs(np.diff(snapping)).max()
+    assert snapping[-1] < 1e-6
+    np.testing.assert_allclose(damped[:30], snapping[:30], atol=1e-12)
+
+
+@pytest.mark.parametrize("solver", ["ccd", "least_squares", "two_bone"])
+def test_frames_together_are_solved_as_each_alone(skeleton: Skeleton, solver: str) -> None:
+    motion = _moved(skeleton, frames=40)
+    wrist = _joint(skeleton, "left_wrist")
+    limb = limb_ending_at(skeleton, map_joints(skeleton), wrist)
+    places = motion.positions(skeleton)[:, wrist] + np.random.default_rng(1).normal(0, 0.1, (40, 3))
+    together = solve(skeleton, motion, [PositionTarget(wrist, places)], limb=limb, solver=solver)
+    for frame in range(40):
+        one = motion.at_frames(np.array([frame]))
+        alone = solve(skeleton, one, [PositionTarget(wrist, places[frame])], limb=limb, solver=solver)
+        assert alone.motion.rotations.tobytes() == together.motion.rotations[frame : frame + 1].tobytes()
+        assert alone.residual_after.tobytes() == together.residual_after[frame : frame + 1].tobytes()
+
+
+def test_joints_that_may_not_turn_keep_their_bits(skeleton: Skeleton) -> None:
+    motion = _moved(skeleton, frames=6)
+    wrist = _joint(skeleton, "left_wrist")
+    chain = chain_of(skeleton, wrist, _joint(skeleton, "left_shoulder"))
+    others = np.setdiff1d(np.arange(skeleton.joint_count), chain)
+    kept = motion.rotations.copy()
+    for solver in ITERATIVE:
+        solved = solver(skeleton, motion, [PositionTarget(wrist, (0.3, 1.2, 0.4))], freedom=Freedom(chain))
+        assert np.array_equal(solved.motion.rotations[:, others], motion.rotations[:, others])
+        assert np.array_equal(solved.motion.root_translations, motion.root_translations)
+        np.testing.assert_allclose(np.linalg.norm(solved.motion.rotations, axis=-1), 1.0, atol=1e-12)
+    assert np.array_equal(motion.rotations, kept)
+
+
+def test_joints_with_translations_of_their_own_are_reckoned_with(body: Skeleton, tumbling: Callable[..., Clip]) -> None:
+    motion = Motion.of(tumbling(body, 10, translated=(14, 15)))
+    wrist = body.index_of("LeftHand")
+    target = motion.positions(body)[:, wrist] + (0.05, 0.1, 0.0)
+    for solver in ITERATIVE:
+        solved = solver(body, motion, [PositionTarget(wrist, target)])
+        missed = np.linalg.norm(solved.motion.positions(body)[:, wrist] - target, axis=1)
+        np.testing.assert_allclose(missed, solved.residual_after[:, 0], atol=1e-12)
+        assert solved.reached.mean() >= 0.9
+
+
+def test_the_solver_that_fits_is_chosen(body: Skeleton) -> None:
+    motion = _moved(body, frames=1)
+    limb = Limb(*(body.index_of(name) for name in ("LeftArm", "LeftForeArm", "LeftHand")))
+    near = motion.positions(body)[0, limb.start] + (0.3, 0.1, 0.1)
+    exact = solve(body, motion, [PositionTarget(limb.end, near)], limb=limb)
+    assert exact.residual_after[0, 0] < 1e-12
+    with pytest.raises(EditError, match="two bones reach one position"):
+        solve(body, motion, [PositionTarget(limb.end, near, axes="xy")], limb=limb, solver="two_bone")
+    several = [PositionTarget(limb.end, near), LookAtTarget(body.index_of("Head"), near, axis=(0, 0, 1))]
+    assert solve(body, motion, several).reached.all()
+
+
+@pytest.mark.parametrize(
+    ("target", "says"),
+    [
+        (PositionTarget(99, (0, 0, 0)), "joint 99 of 22"),
+        (PositionTarget(3, (0, np.nan, 0)), "finite"),
+        (PositionTarget(3, (0, 0)), "shape"),
+        (PositionTarget(3, np.zeros((7, 3))), "7 values for 2 frames"),
+        (PositionTarget(3, (0, 0, 0), axes="ab"), "are no axes"),  # type: ignore[arg-type]
+        (PositionTarget(3, (0, 0, 0), weight=0.0), "positive"),
+        (OrientationTarget(3, (0, 0, 0, 0)), "length zero"),
+        (LookAtTarget(3, (0, 0, 1), axis=(0, 0, 0)), "looks nowhere"),
+    ],
+)
+def test_targets_that_make_no_sense_are_refused_by_name(body: Skeleton, target: Target, says: str) -> None:
+    motion = _moved(body, frames=2)
+    good = PositionTarget(2, (0.0, 0.0, 0.0))
+    for solver in ITERATIVE:
+        with pytest.raises(MotionError, match=says) as raised:
+            solver(body, motion, [good, target])
+        assert "targets[1]" in str(raised.value)
+
+
+def test_chains_and_limits_that_make_no_sense_are_refused(body: Skeleton) -> None:
+    with pytest.raises(EditError, match="LeftHand does not hang from RightArm"):
+        chain_of(body, body.index_of("LeftHand"), body.index_of("RightArm"))
+    with pytest.raises(EditError, match="carries a target"):
+        solve_ccd(body, _moved(body), [PositionTarget(3, (0, 0, 0))], freedom=Freedom((15,)))
+    with pytest.raises(EditError, match="twist"):
+        JointLimit.hinge(JointAxes((1, 0, 0), (0, 1, 0)), 0.5, 0.1)
+    with pytest.raises(EditError, match="right angle"):
+        JointLimit.cone(JointAxes((1, 0, 0), (1, 0, 0)), 0.5)
+    with pytest.raises(EditError, match="at least one target"):
+        solve_least_squares(body, _moved(body), [])
+
+
+def test_walking_people_reach_with_either_hand() -> None:
+    clip = generate_gait(1.2, 0.1, 1.0)
+    motion = Motion.of(clip)
+    for side in ("left", "right"):
+        wrist = _joint(clip.skeleton, f"{side}_wrist")
+        top = _joint(clip.skeleton, "spine")
+        target = motion.positions(clip.skeleton)[:, wrist] + np.random.default_rng(0).normal(0, 0.08, (60, 3))
+        freedom = Freedom(chain_of(clip.skeleton, wrist, top))
+        for solver in ITERATIVE:
+            assert solver(clip.skeleton, motion, [PositionTarget(wrist, target)], freedom=freedom).reached.all()
