@@ -1,0 +1,153 @@
+"""Generative models of motion: what training can be asked for, and part `model` of an item of the kind `model`.
+
+The options are those of `marey_motion.modelling.options`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from marey_schemas.arrays import ArrayOf
+from marey_schemas.base import Request
+from marey_schemas.names import ItemName, JointName, Tag
+from marey_schemas.references import OutputRef, RevisionRef
+
+MOST_JOINTS = 4096
+MOST_SAMPLES = 1000
+MOST_SEED = 2**63 - 1
+LONGEST_SAMPLE_S = 120.0
+
+Vector = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=1)]
+Matrix = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=2)]
+Stack = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=3)]
+Share = Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)]
+
+
+class ModelParams(Request):
+    """Parameters of `model`."""
+
+    name: ItemName = Field("model", description="Name of the result, and of the action.")
+    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the result.")
+    scaling: Literal["jacobian", "root_max", "sfpca", "none"] = Field(
+        "jacobian",
+        description="How channels are weighed. jacobian: by how far they move the body; sfpca: optimised for the "
+        "positions of joints; root_max: root axes to a maximum of 1; none: as they are.",
+    )
+    inner_product: Literal["coefficients", "l2"] = Field(
+        "coefficients", description="l2: integrals of products of functions, which do not depend on the knots."
+    )
+    spatial_share: Share = Field(0.95, description="Share of the variance that the spatial components hold.")
+    spatial_components: int | None = Field(None, ge=0, le=1000, description="Exactly so many, in place of the share.")
+    spatial_coefficients: int | None = Field(
+        None, ge=4, le=10_000, description="Of each channel's spline; default: a fifth of the frames, at least 7."
+    )
+    temporal_share: Share = Field(0.99, description="Share of the variance that the time components hold.")
+    most_temporal_components: int = Field(3, ge=0, le=1000, description="The time components are at most so many.")
+    temporal_coefficients: int = Field(8, ge=4, le=1000, description="Of the spline of the time function.")
+    temporal_weight: float | None = Field(
+        None, ge=1e-9, le=1e9, allow_inf_nan=False, description="Of time in latent vectors; default: as much as space."
+    )
+    criterion: Literal["bic", "aic"] = Field("bic", description="What chooses the number of mixture components.")
+    most_mixture_components: int = Field(10, ge=1, le=100, description="Tried at most.")
+    mixture_components: int | None = Field(None, ge=1, le=100, description="Exactly so many, in place of a choice.")
+    regularisation: float = Field(
+        1e-4, ge=1e-12, le=1, allow_inf_nan=False, description="Added to variances, as a share of the mean variance."
+    )
+    starts: int = Field(5, ge=1, le=100, description="Of expectation maximisation; the best counts.")
+    leave_one_out: bool = Field(True, description="Measure how well each example is reconstructed by the others.")
+    folds: int = Field(5, ge=0, le=100, description="Parts held out in turn for likelihoods; 0: none.")
+    report_samples: int = Field(200, ge=0, le=10_000, description="Drawn to measure feet and durations.")
+    report: bool = Field(True, description="Write the report and its figures.")
+
+
+class FunctionalComponentsDocument(Request):
+    """Functions of canonical time with D channels: a mean and k principal functions in n B-spline coefficients."""
+
+    degree: int = Field(3, ge=0, le=9)
+    knots: Vector = Field(description="[n + degree + 1] in canonical frames.")
+    mean: Matrix = Field(description="[n, D] coefficients.")
+    directions: Stack = Field(description="[k, n, D] what one unit of each score adds to the coefficients.")
+    projections: Stack = Field(description="[k, n, D] products with which give the scores of coefficients.")
+    variances: Vector = Field(description="[k] of the examples' scores.")
+    energy: Vector = Field(description="[k] share of all variance that the first 1, 2, ... components hold.")
+
+    @model_validator(mode="after")
+    def _check_shapes(self) -> Self:
+        n, channels = self.mean.shape
+        if len(self.knots) != n + self.degree + 1:
+            raise ValueError(f"knots: {len(self.knots)}, but {n} coefficients need {n + self.degree + 1}")
+        count = len(self.directions)
+        for name in ("directions", "projections"):
+            if getattr(self, name).shape != (count, n, channels):
+                raise ValueError(f"{name}: shape {getattr(self, name).shape}, expected {(count, n, channels)}")
+        for name in ("variances", "energy"):
+            if getattr(self, name).shape != (count,):
+                raise ValueError(f"{name}: {len(getattr(self, name))} values for {count} components")
+        return self
+
+
+class MixtureDocument(Request):
+    """K normal distributions over latent vectors of L numbers."""
+
+    weights: Vector = Field(description="[K] positive, of sum 1.")
+    means: Matrix = Field(description="[K, L]")
+    covariances: Stack = Field(description="[K, L, L] symmetric, positive definite.")
+
+    @model_validator(mode="after")
+    def _check_shapes(self) -> Self:
+        count, dimensions = self.means.shape
+        if count < 1 or self.weights.shape != (count,):
+            raise ValueError(f"weights: {len(self.weights)} for {count} means")
+        if self.covariances.shape != (count, dimensions, dimensions):
+            expected = (count, dimensions, dimensions)
+            raise ValueError(f"covariances: shape {self.covariances.shape}, expected {expected}")
+        if not (self.weights > 0).all() or abs(float(self.weights.sum()) - 1.0) > 1e-6:
+            raise ValueError("weights: must be positive and add up to 1")
+        return self
+
+
+class MotionPrimitiveDocument(Request):
+    """Part `model`: a generative model of one action.
+
+    A latent vector holds the scores of the spatial components, then `temporal_weight` times those of the temporal ones.
+    The spatial functions give root translation (m) and local quaternions, to be brought to unit length, at canonical
+    frames; the temporal function the natural logarithm of how many frames of real time pass in each canonical step.
+    """
+
+    schema_: Literal["marey/motion-primitive@1"] = Field("marey/motion-primitive@1", alias="schema")
+    name: ItemName = Field(description="Of the action.")
+    verdict: str = Field("", max_length=2000, description="How good the model is, in a sentence or two.")
+    headline: dict[str, float | int | str | None] = Field(
+        default_factory=dict, max_length=64, description="The numbers that lists show, by name."
+    )
+    skeleton: RevisionRef | OutputRef
+    joints: tuple[JointName, ...] = Field(min_length=1, max_length=MOST_JOINTS, description="Order of the rotations.")
+    frame_rate_hz: float = Field(gt=0, le=100_000, allow_inf_nan=False, description="Of canonical frames.")
+    spatial: FunctionalComponentsDocument
+    temporal: FunctionalComponentsDocument
+    temporal_weight: float = Field(gt=0, allow_inf_nan=False)
+    mixture: MixtureDocument
+    keyframes: dict[str, Annotated[int, Field(ge=0)]] = Field(
+        default_factory=dict, max_length=10_000, description="Canonical frame by label."
+    )
+    duration_range_s: tuple[float, float] | None = Field(None, description="Within which samples last.")
+    scaling: dict[str, Any] | None = Field(None, description="Method and weights of the channels; undone above.")
+    options: dict[str, Any] | None = Field(None, description="What it was trained with.")
+    provenance: dict[str, Any] = Field(default_factory=dict, description="The examples, and where they come from.")
+    training: dict[str, Any] | None = Field(None, description="How good it is, in numbers.")
+
+    @model_validator(mode="after")
+    def _check_shapes(self) -> Self:
+        width = 3 + 4 * len(self.joints)
+        if self.spatial.mean.shape[1] != width:
+            raise ValueError(f"spatial: {self.spatial.mean.shape[1]} channels, but the joints need {width}")
+        if self.temporal.mean.shape[1] != 1:
+            raise ValueError(f"temporal: {self.temporal.mean.shape[1]} channels where there is 1")
+        dimensions = len(self.spatial.directions) + len(self.temporal.directions)
+        if self.mixture.means.shape[1] != dimensions:
+            raise ValueError(f"mixture: {self.mixture.means.shape[1]} dimensions for {dimensions} components")
+        return self

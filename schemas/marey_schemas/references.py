@@ -1,0 +1,20 @@
+"""How documents refer to revisions of items."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from marey_schemas.base import Request
+
+
+class RevisionRef(Request):
+    """A pinned revision of an item."""
+
+    item: str
+    revision: int = Field(ge=1)
+
+
+class OutputRef(Request):
+    """A reference to another output of the same write; the store replaces it by the item it becomes."""
+
+    output: str
