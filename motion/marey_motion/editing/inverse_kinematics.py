@@ -8,7 +8,7 @@ metres, where `ANGLE_LENGTH_M` is a radian); where that pose is outside of limit
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -144,8 +144,10 @@ def solve(
             )
         position, orientation = asked
         return solve_two_bone(skeleton, motion, limb, position, orientation=orientation, options=options)
-    if limb is not None and freedom.joints is None:
-        freedom = Freedom(limb.joints, freedom.root_moves, freedom.limits, freedom.stiffness)
+    if limb is not None and all(isinstance(one, OrientationTarget) and one.joint == limb.end for one in targets):
+        freedom = replace(freedom, joints=(limb.end,))  # an orientation alone does not move the limb
+    elif limb is not None and freedom.joints is None:
+        freedom = replace(freedom, joints=limb.joints)
     chosen = solve_ccd if solver == "ccd" else solve_least_squares
     return chosen(skeleton, motion, targets, freedom=freedom, options=options)
 

@@ -1,0 +1,62 @@
+"""The last step after a model's sample or a search: what constraints are still missed by, taken out of the motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.editing.constraining import Constraint, constrain_motion
+from marey_motion.editing.inverse_kinematics_targets import Freedom, PositionTarget, SolverOptions
+from marey_motion.motion import Motion
+from marey_motion.skeleton import Skeleton
+
+FAR_M = 0.05
+"""A model that misses a position by more does not reach there: inverse kinematics would hide that."""
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedMotion:
+    """A motion that meets its constraints.
+
+    Parameters
+    ----------
+    motion : the whole motion
+    residual_before, residual_after : (C,) the most each constraint is missed by in its frames: metres, or radians
+    far : (C,) positions that were missed by more than `FAR_M` before
+    """
+
+    motion: Motion
+    residual_before: NDArray[np.float64]
+    residual_after: NDArray[np.float64]
+    far: NDArray[np.bool_]
+
+
+def finish(
+    skeleton: Skeleton,
+    motion: Motion,
+    constraints: Sequence[Constraint],
+    *,
+    window_frames: int = 20,
+    freedom: Freedom | None = None,
+    options: SolverOptions | None = None,
+) -> FinishedMotion:
+    """Bring constrained joints exactly to where they are wanted, blended over a window with a cubic spline (S2 4.1.1).
+
+    Parameters
+    ----------
+    motion : F frames, such as a sample brought close by search and refinement
+    constraints : what is wanted in which frames, and which joints may turn for it (`constraining.Constraint`;
+        `inverse_kinematics.limb_ending_at` and `inverse_kinematics_targets.chain_of` find these)
+    window_frames : frames before and after the constrained ones that may change
+
+    Raises `EditError` naming the constraint that cannot be asked for.
+    """
+    made = constrain_motion(skeleton, motion, constraints, blend_frames=window_frames, freedom=freedom, options=options)
+    before, after = (
+        np.array([float(one.max()) for one in many]) for many in (made.residuals_before, made.residuals_after)
+    )
+    positions = np.array([isinstance(one.target, PositionTarget) for one in constraints], dtype=np.bool_)
+    return FinishedMotion(made.motion, before, after, positions & (before > FAR_M))
