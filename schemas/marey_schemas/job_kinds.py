@@ -20,6 +20,7 @@ from marey_schemas.evaluation import EvaluateParams, count_evaluation_tasks
 from marey_schemas.improvement import CompareParams, OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
 from marey_schemas.jobs import ExportParams, ImportParams, InputSpec, JobKind, RetargetParams
 from marey_schemas.kinds import Kind
+from marey_schemas.modelling import ModelParams
 
 ENTRY_POINT_GROUP = "marey.job_kinds"
 MOST_TASKS = 1000
@@ -291,7 +292,19 @@ ALIGN = KindDeclaration(
     outputs={"processed": Kind.PROCESSED},
 )
 
-BUILT_IN = (IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN)
+MODEL = KindDeclaration(
+    name="model",
+    description="Learns a generative model of one action from aligned clips.",
+    params=ModelParams,
+    implementation="marey_worker.kinds.model:run",
+    version=1,
+    inputs={
+        "aligned": InputSpec(kind=Kind.PROCESSED, many=True, description="Examples that were aligned with each other.")
+    },
+    outputs={"model": Kind.MODEL},
+)
+
+BUILT_IN = (IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN, MODEL)
 
 
 class UnknownKindError(LookupError):

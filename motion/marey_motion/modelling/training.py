@@ -126,7 +126,8 @@ def check_examples(aligned: AlignedSet) -> None:
 def fit_examples(aligned: AlignedSet, options: ModelOptions) -> FittedExamples:
     """The functional components of space and time."""
     frames = aligned.frame_count
-    reference = next(clip for clip in aligned.clips if clip.uid == aligned.reference)
+    # The reference itself may be among the examples that somebody left out.
+    reference = next((clip for clip in aligned.clips if clip.uid == aligned.reference), aligned.clips[0])
     poses = consistent_poses(aligned.poses, reference.motion.poses)
     wanted = options.spatial_coefficients or coefficient_count(frames)
     basis = SplineBasis.clamped(frames, min(wanted, frames))

@@ -68,11 +68,6 @@ def _likelihood(example: ExampleReport) -> float:
 
 def _of_mixture(report: TrainingReport) -> list[Warned]:
     found = []
-    refused = [candidate.components for candidate in report.candidates if candidate.refusal]
-    if refused:
-        numbers = ", ".join(map(str, refused))
-        message = f"mixtures of {numbers} components leave one with too few examples, or fit these examples alone"
-        found.append(Warned("components-refused", message))
     slow = [candidate.components for candidate in report.candidates if not candidate.converged]
     if slow:
         found.append(

@@ -73,20 +73,23 @@ class ReferenceCheck:
     def require(self, kind: Kind, bodies: Mapping[str, Tree]) -> None:
         """Raise `Invalid` where something the new parts of an item refer to is not there or does not fit."""
         if kind in (Kind.CLIP, Kind.PROCESSED) and "motion" in bodies:
-            self._require_joints(bodies["motion"])
+            self._require_joints(bodies["motion"], "/motion")
+        elif kind is Kind.MODEL and "model" in bodies:
+            self._require_joints(bodies["model"], "/model")
         elif kind is Kind.ANNOTATION:
             self._require_frames(bodies["annotation"])
 
-    def _require_joints(self, motion: Tree) -> None:
-        hierarchy = self._referred(motion["skeleton"], Kind.SKELETON, "hierarchy", "/motion/skeleton")
+    def _require_joints(self, motion: Tree, pointer: str) -> None:
+        hierarchy = self._referred(motion["skeleton"], Kind.SKELETON, "hierarchy", f"{pointer}/skeleton")
         known = [joint["name"] for joint in hierarchy["joints"]]
         if sorted(known) != sorted(motion["joints"]):
             odd = sorted(set(known) ^ set(motion["joints"]))[:5]
-            detail = f"The joints of the motion and of its skeleton differ: {', '.join(odd) or 'a name stands twice'}."
-            raise _invalid("/motion/joints", "wrong-joints", detail)
+            what = pointer.removeprefix("/")
+            detail = f"The joints of the {what} and of its skeleton differ: {', '.join(odd) or 'a name stands twice'}."
+            raise _invalid(f"{pointer}/joints", "wrong-joints", detail)
         if known[0] in motion.get("translated_joints", ()):
             detail = f"The root {known[0]!r} has its translation in the poses already."
-            raise _invalid("/motion/translated_joints", "root-translated", detail)
+            raise _invalid(f"{pointer}/translated_joints", "root-translated", detail)
 
     def _require_frames(self, annotation: Tree) -> None:
         frames = self._referred(annotation["clip"], Kind.CLIP, "motion", "/annotation/clip")["poses"]["shape"][0]

@@ -28,6 +28,8 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
         return Summary({"joints": len(bodies["hierarchy"]["joints"])})
     if kind is Kind.EVALUATION:
         return Summary({"verdict": bodies["evaluation"]["verdict"], **bodies["evaluation"]["headline"]})
+    if kind is Kind.MODEL:
+        return _learned(bodies["model"])
     if kind is Kind.ANNOTATION:
         return Summary(_said(bodies["annotation"]))
     if kind is Kind.CLIP:
@@ -64,6 +66,12 @@ def _aligned(info: Mapping[str, Any]) -> dict[str, Any]:
         "cost": info.get("cost", 0.0),
         "keyframes": len(info.get("keyframes", {})),
     }
+
+
+def _learned(model: Mapping[str, Any]) -> Summary:
+    skeleton = model["skeleton"]["item"]
+    shown = {"verdict": model.get("verdict", ""), "skeleton": skeleton, **model.get("headline", {})}
+    return Summary(shown, skeleton_id=skeleton)
 
 
 def _said(annotation: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,171 @@
+"""Motion primitives and their training reports to and from trees of plain values and arrays that travel and are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import ModelError
+from marey_motion.modelling.mixture import LatentMixture
+from marey_motion.modelling.mixture_fitting import Candidate
+from marey_motion.modelling.primitive import FunctionalComponents, MotionPrimitive
+from marey_motion.modelling.reconstruction import ReconstructionErrors
+from marey_motion.modelling.sample_quality import FootQuality
+from marey_motion.modelling.splines import SplineBasis
+from marey_motion.modelling.training import TrainedPrimitive
+from marey_motion.modelling.training_report import Durations, ExampleReport, TrainingReport
+from marey_motion.modelling.verdict import headline_of, verdict_of
+from marey_motion.skeleton import Skeleton
+
+PRIMITIVE_SCHEMA = "marey/motion-primitive@1"
+
+Tree = dict[str, Any]
+Floats = NDArray[np.float64]
+
+
+def primitive_to_tree(primitive: MotionPrimitive, skeleton: Mapping[str, Any]) -> Tree:
+    """Part `model` of a primitive whose skeleton is stored as `skeleton`, a reference to a revision."""
+    duration_range = primitive.duration_range_s
+    return {
+        "schema": PRIMITIVE_SCHEMA,
+        "name": primitive.name,
+        "skeleton": dict(skeleton),
+        "joints": list(primitive.skeleton.joint_names),
+        "frame_rate_hz": primitive.frame_rate_hz,
+        "spatial": _components_to_tree(primitive.spatial),
+        "temporal": _components_to_tree(primitive.temporal),
+        "temporal_weight": primitive.temporal_weight,
+        "mixture": {
+            "weights": _leaf(primitive.mixture.weights),
+            "means": _leaf(primitive.mixture.means),
+            "covariances": _leaf(primitive.mixture.covariances),
+        },
+        "keyframes": {label: int(frame) for label, frame in primitive.keyframes.items()},
+        "duration_range_s": None if duration_range is None else list(duration_range),
+    }
+
+
+def trained_to_tree(trained: TrainedPrimitive, skeleton: Mapping[str, Any], provenance: Mapping[str, Any]) -> Tree:
+    """Part `model` with how it was trained and how good it is.
+
+    Parameters
+    ----------
+    provenance : where the examples come from
+    """
+    return {
+        **primitive_to_tree(trained.primitive, skeleton),
+        "verdict": verdict_of(trained),
+        "headline": headline_of(trained),
+        "scaling": {"method": trained.options.scaling, "weights": _leaf(trained.weights)},
+        "options": trained.options.as_tree(),
+        "provenance": dict(provenance),
+        "training": {
+            **_report_to_tree(trained.report),
+            "warnings": [asdict(warning) for warning in trained.warnings],
+        },
+    }
+
+
+def primitive_from_tree(tree: Mapping[str, Any], skeleton: Skeleton) -> MotionPrimitive:
+    """The primitive of a part `model`; its joints must be those of the skeleton, in any order.
+
+    Raises `ModelError` where they are not, and where the numbers describe no model.
+    """
+    if tree.get("schema") != PRIMITIVE_SCHEMA:
+        raise ModelError(f"a document of the schema {tree.get('schema')!r}, not {PRIMITIVE_SCHEMA!r}")
+    duration_range = tree.get("duration_range_s")
+    return MotionPrimitive(
+        name=tree["name"],
+        skeleton=skeleton,
+        frame_rate_hz=float(tree["frame_rate_hz"]),
+        spatial=_components_from_tree(tree["spatial"], _columns(tree["joints"], skeleton)),
+        temporal=_components_from_tree(tree["temporal"], None),
+        temporal_weight=float(tree["temporal_weight"]),
+        mixture=LatentMixture(**{name: np.asarray(tree["mixture"][name]) for name in _MIXTURE}),
+        keyframes=dict(tree.get("keyframes") or {}),
+        duration_range_s=None if duration_range is None else (float(duration_range[0]), float(duration_range[1])),
+    )
+
+
+def report_from_tree(tree: Mapping[str, Any]) -> TrainingReport | None:
+    """How good the model of a part `model` is; None where it was not trained here."""
+    training = tree.get("training")
+    if training is None:
+        return None
+    errors = training["reconstruction"]
+    feet = {name: training[name] and FootQuality(**training[name]) for name in ("training_feet", "sample_feet")}
+    drawn = training["sample_durations"]
+    return TrainingReport(
+        spatial_energy=training["spatial_energy"],
+        temporal_energy=training["temporal_energy"],
+        mixture_method=training["mixture_method"],
+        candidates=tuple(Candidate(**one) for one in training["candidates"]),
+        log_likelihood=training["log_likelihood"],
+        held_out_log_likelihood=training["held_out_log_likelihood"],
+        examples=tuple(ExampleReport(**one) for one in training["examples"]),
+        reconstruction=None if errors is None else ReconstructionErrors(**errors),
+        time_error_frames=training["time_error_frames"],
+        training_durations=Durations(**training["training_durations"]),
+        sample_durations=None if drawn is None else Durations(**drawn),
+        **feet,
+    )
+
+
+_MIXTURE = ("weights", "means", "covariances")
+_COMPONENTS = ("mean", "directions", "projections", "variances", "energy")
+
+
+def _components_to_tree(components: FunctionalComponents) -> Tree:
+    return {
+        "degree": components.basis.degree,
+        "knots": _leaf(components.basis.knots),
+        **{name: _leaf(getattr(components, name)) for name in _COMPONENTS},
+    }
+
+
+def _components_from_tree(tree: Mapping[str, Any], columns: NDArray[np.int64] | None) -> FunctionalComponents:
+    """With channels in the order `columns` of those of the tree."""
+    arrays = {name: np.asarray(tree[name]) for name in _COMPONENTS}
+    if columns is not None:
+        for name in ("mean", "directions", "projections"):
+            arrays[name] = np.ascontiguousarray(arrays[name][..., columns])
+    return FunctionalComponents(basis=SplineBasis(np.asarray(tree["knots"]), int(tree["degree"])), **arrays)
+
+
+def _columns(joints: list[str], skeleton: Skeleton) -> NDArray[np.int64] | None:
+    """Where the channels of the skeleton's joints are among those of a document; None where they are in order."""
+    if tuple(joints) == skeleton.joint_names:
+        return None
+    if sorted(joints) != sorted(skeleton.joint_names) or joints[0] != skeleton.joint_names[0]:
+        odd = sorted(set(joints) ^ set(skeleton.joint_names)) or ["the root, or a name that stands twice"]
+        raise ModelError(f"the model's joints are not the skeleton's: {', '.join(odd[:5])}", where="joints")
+    places = {name: place for place, name in enumerate(joints)}
+    order = np.array([places[name] for name in skeleton.joint_names])
+    return np.concatenate((np.arange(3), (3 + 4 * order[:, None] + np.arange(4)).ravel()))
+
+
+def _report_to_tree(report: TrainingReport) -> Tree:
+    errors = report.reconstruction
+    return {
+        "spatial_energy": _leaf(report.spatial_energy),
+        "temporal_energy": _leaf(report.temporal_energy),
+        "mixture_method": report.mixture_method,
+        "candidates": [asdict(one) for one in report.candidates],
+        "log_likelihood": report.log_likelihood,
+        "held_out_log_likelihood": report.held_out_log_likelihood,
+        "examples": [asdict(one) for one in report.examples],
+        "reconstruction": None if errors is None else {name: np.asarray(value) for name, value in vars(errors).items()},
+        "time_error_frames": report.time_error_frames,
+        "training_durations": asdict(report.training_durations),
+        "sample_durations": None if report.sample_durations is None else asdict(report.sample_durations),
+        "training_feet": None if report.training_feet is None else asdict(report.training_feet),
+        "sample_feet": None if report.sample_feet is None else asdict(report.sample_feet),
+    }
+
+
+def _leaf(array: Floats) -> Floats:
+    return np.ascontiguousarray(array, dtype=np.float64)

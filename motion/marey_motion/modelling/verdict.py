@@ -1,0 +1,56 @@
+"""A trained model in one sentence, and in the few numbers that lists show."""
+
+from __future__ import annotations
+
+from marey_motion.modelling.training import TrainedPrimitive
+
+Headline = dict[str, float | int | str | None]
+
+
+def verdict_of(trained: TrainedPrimitive) -> str:
+    """How good the model is, in a sentence or two."""
+    report, primitive = trained.report, trained.primitive
+    count = len(report.examples)
+    parts = [f"{count} example{'s' if count != 1 else ''} in {primitive.dimensions} dimensions"]
+    kinds = len(primitive.mixture.weights)
+    parts.append(f"{kinds} kind{'s' if kinds != 1 else ''} of motion")
+    error = _left_out_cm(trained)
+    if error is not None:
+        parts.append(f"an unseen example is reconstructed {error:.1f} cm off on average")
+    feet = report.sample_feet
+    if feet is not None:
+        below = f"{feet.below_floor_mean_cm:.1f} cm below the floor in {feet.below_floor_share:.0%} of the frames"
+        parts.append(f"samples' feet are {below}" if feet.below_floor_share else "samples' feet stay above the floor")
+    sentence = "; ".join(parts) + "."
+    noted = [warning.code for warning in trained.warnings]
+    return f"{sentence} To look at: {', '.join(noted)}." if noted else sentence
+
+
+def headline_of(trained: TrainedPrimitive) -> Headline:
+    """The numbers that lists show; units stand at the ends of the names."""
+    report, primitive = trained.report, trained.primitive
+    durations, feet = report.training_durations, report.sample_feet
+    return {
+        "examples": len(report.examples),
+        "frames": primitive.frame_count,
+        "frame_rate_hz": primitive.frame_rate_hz,
+        "spatial_components": primitive.spatial.count,
+        "temporal_components": primitive.temporal.count,
+        "mixture_components": len(primitive.mixture.weights),
+        "log_likelihood": report.log_likelihood,
+        "held_out_log_likelihood": report.held_out_log_likelihood,
+        "left_out_error_cm": _left_out_cm(trained),
+        "least_duration_s": durations.least_s,
+        "most_duration_s": durations.most_s,
+        "feet_below_floor_share": None if feet is None else feet.below_floor_share,
+        "feet_below_floor_cm": None if feet is None else feet.below_floor_mean_cm,
+        "foot_slide_m_s": None if feet is None else feet.slide_m_s,
+        "warnings": len(trained.warnings),
+    }
+
+
+def _left_out_cm(trained: TrainedPrimitive) -> float | None:
+    errors = trained.report.reconstruction
+    if errors is None or len(trained.report.examples) < 2:
+        return None
+    return float(errors.left_out_cm[min(trained.primitive.spatial.count, len(errors.components) - 1)])

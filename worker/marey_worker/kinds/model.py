@@ -1,0 +1,113 @@
+"""A generative model of one action, learned from aligned clips."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from marey_motion import documents
+from marey_motion.alignment.aligned import AlignedSet
+from marey_motion.alignment.aligned_documents import StoredExample, set_from_examples, uid_of
+from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.primitive_documents import trained_to_tree
+from marey_motion.modelling.training import train_primitive
+from marey_schemas.alignment import AlignmentInfo
+from marey_schemas.documents import Motion, RevisionRef, SkeletonHierarchy
+from marey_schemas.jobs import PinnedInput, StagedOutput
+from marey_schemas.kinds import Kind
+from marey_schemas.modelling import ModelParams
+from marey_worker.context import Context, JobRefused
+from marey_worker.kinds.matching_clips import place_of, refusing_motion_errors
+
+NOT_OPTIONS = {"name", "tags", "report"}
+
+
+def run(context: Context, params: ModelParams) -> dict[str, Any]:
+    """Train a model on the aligned clips of the job and stage it.
+
+    Raises `JobRefused` where the clips were not aligned together, or no model can be made of them.
+    """
+    started = time.monotonic()
+    pins = context.inputs["aligned"]
+    motions, infos = _read(context, pins)
+    skeleton = _common_skeleton(pins, motions)
+    with refusing_motion_errors():
+        aligned = _aligned(context, pins, skeleton, motions, infos)
+        trained = train_primitive(
+            aligned,
+            ModelOptions(**params.model_dump(exclude=NOT_OPTIONS)),
+            name=params.name,
+            seed=context.seed,
+            threads=context.threads,
+            progress=context.progress,
+        )
+    tree = trained_to_tree(trained, skeleton.model_dump(), _provenance(context, pins, aligned, infos))
+    parts = {"model": tree}
+    context.stage(
+        [StagedOutput(name=params.name, kind=Kind.MODEL, item_name=params.name, tags=params.tags, parts=parts)]
+    )
+    return {
+        "verdict": tree["verdict"],
+        **tree["headline"],
+        "notes": [warning.message for warning in trained.warnings],
+        "training_s": round(time.monotonic() - started, 4),
+    }
+
+
+def _read(context: Context, pins: Sequence[PinnedInput]) -> tuple[list[Motion], list[dict[str, Any]]]:
+    """Motion and info of each aligned clip."""
+    motions, infos = [], []
+    for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
+        context.progress(done, len(pins), f"reading {pin.name}")
+        motions.append(Motion.model_validate(tree))
+    for pin, tree in context.documents(pins, "info"):
+        try:
+            AlignmentInfo.model_validate(tree)
+        except ValidationError as error:
+            raise JobRefused("bad-document", f"{place_of(pin)}: {error}") from error
+        infos.append(tree)
+    return motions, infos
+
+
+def _common_skeleton(pins: Sequence[PinnedInput], motions: Sequence[Motion]) -> RevisionRef:
+    """The skeleton of all clips, at the newest revision in use. Raises `JobRefused` where there are several."""
+    used = [RevisionRef.model_validate(motion.skeleton.model_dump()) for motion in motions]
+    for pin, ref in zip(pins, used, strict=True):
+        if ref.item != used[0].item:
+            raise JobRefused(
+                "several-skeletons",
+                f"{place_of(pin)} moves another skeleton than {place_of(pins[0])}; align clips of one skeleton",
+            )
+    return max(used, key=lambda ref: ref.revision)
+
+
+def _aligned(
+    context: Context,
+    pins: Sequence[PinnedInput],
+    ref: RevisionRef,
+    motions: Sequence[Motion],
+    infos: Sequence[dict[str, Any]],
+) -> AlignedSet:
+    hierarchy = context.document(Kind.SKELETON, ref.item, ref.revision, "hierarchy")
+    skeleton = documents.skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
+    return set_from_examples(
+        [
+            StoredExample(uid_of(pin.item, pin.revision), documents.clip_from_document(motion, skeleton), info)
+            for pin, motion, info in zip(pins, motions, infos, strict=True)
+        ]
+    )
+
+
+def _provenance(
+    context: Context, pins: Sequence[PinnedInput], aligned: AlignedSet, infos: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    """Where the examples come from."""
+    return {
+        "aligned": [{"item": pin.item, "revision": pin.revision, "name": place_of(pin)} for pin in pins],
+        "set": infos[0].get("set"),
+        "reference": aligned.reference,
+        "seed": context.seed,
+    }
