@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict
 
 from marey_client.annotations import AnnotationHandle
+from marey_client.edits import Commands, preview_edit
 from marey_client.items import ItemHandle, Items
+from marey_schemas.annotations import AnnotationImport
 from marey_schemas.documents import Annotation, ClipInfo, Motion, SkeletonHierarchy, SkeletonMapping
+from marey_schemas.edit_previews import EditPreview
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 
@@ -73,6 +76,26 @@ class ClipHandle(ItemHandle):
             {"annotation": document.model_dump(mode="json", by_alias=True)},
             collection=self.item.collection,
         )
+
+    def preview(self, commands: Commands, *, frames: slice | None = None, **options: Any) -> EditPreview:
+        """Frames of what commands would make of the clip; nothing is stored.
+
+        `options` are those of `EditPreviewRequest`, such as `piece=1` or `fields=("positions",)`. `RequestFailed`
+        where the commands cannot be applied, or would take too long for a preview.
+        """
+        frames_text(frames)
+        bounds = (0, None) if frames is None else (frames.start or 0, frames.stop)
+        given = {"revision": self.item.revision, **options}
+        return preview_edit(self.transport, self.url, commands, frames=bounds, **given)
+
+    def import_annotation(self, document: Mapping[str, Any], **options: Any) -> AnnotationHandle:
+        """Make an annotation beside the clip from a document of the predecessor.
+
+        `options` are those of `AnnotationImport`, such as `layer="phases"` or `end_index="exclusive"`.
+        """
+        wanted = AnnotationImport.model_validate({"document": document, **options})
+        made = self.transport.post(Item, f"{self.url}/annotations", wanted)
+        return AnnotationHandle(self.transport, self.project, made)
 
 
 class SkeletonHandle(ItemHandle):

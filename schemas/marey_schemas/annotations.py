@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, StringConstraints, field_validator, model_validator
 
 from marey_schemas.base import Request
-from marey_schemas.names import Message, Tag
+from marey_schemas.names import ItemName, Message, Tag
 
 MAX_FRAME = 2**31 - 1
 MAX_COMMANDS = 1000
@@ -236,6 +236,26 @@ class AnnotationChange(Request):
 
     commands: tuple[AnnotationCommand, ...] = Field(min_length=1, max_length=MAX_COMMANDS)
     message: Message = Field("", description="Shown in the history.")
+
+
+# Exchange
+
+
+class AnnotationImport(Request):
+    """An annotation of a clip in one of the predecessor's forms: `sections`, or `semantic_annotation`."""
+
+    document: dict[str, Any] = Field(description="The document, as the predecessor keeps or exports it.")
+    layer: LayerName = "imported"
+    name: ItemName | None = Field(None, description="Of the annotation; default: that of the clip and the layer's.")
+    end_index: Literal["inclusive", "exclusive"] = Field(
+        "inclusive",
+        description="Whether a section holds its frame `end_idx`, as the predecessor's editor means it, or ends before "
+        "it, as its time warping means it.",
+    )
+    labels: tuple[Label, ...] | None = Field(
+        None, max_length=1000, description="Only these: labels that overlap make layers of their own."
+    )
+    message: Message = ""
 
 
 def command_arguments(command: Request) -> dict[str, Any]:

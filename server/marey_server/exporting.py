@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from marey_schemas import codecs
-from marey_schemas.documents import Motion, SkeletonHierarchy
+from marey_schemas.documents import Annotation, Motion, SkeletonHierarchy
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_server.errors import Invalid, NotFound
@@ -17,6 +17,14 @@ WITH_MOTION = (Kind.CLIP, Kind.PROCESSED)
 """The kinds whose part `motion` can be written as a file of motion."""
 
 ExportFormat = Literal["original", "bvh", "npz", "predecessor", "json"]
+
+
+@dataclass(frozen=True, slots=True)
+class ExportOptions:
+    """How a format that leaves things open is written: annotations of the predecessor."""
+
+    end_index: Literal["inclusive", "exclusive"] = "inclusive"
+    form: Literal["labels", "list", "frames"] = "labels"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +78,10 @@ def find_original(tx: Transaction, project: str, kind: Kind, item_id: str, revis
     raise NotFound("It was not made from a file; ask for another format, such as bvh.", code="no-original")
 
 
-def write_file(source: ExportSource, file_format: ExportFormat, unit: str) -> ExportedFile:
+def write_file(source: ExportSource, file_format: ExportFormat, unit: str, options: ExportOptions) -> ExportedFile:
     """The file of an item. Raises `Invalid` where the format cannot hold it."""
+    if file_format == "predecessor" and source.item.kind is Kind.ANNOTATION:
+        return _write_annotation(source, options)
     if file_format == "json":
         return ExportedFile(f"{source.item.name}.json", codecs.JSON, codecs.encode_tree(_as_tree(source), codecs.JSON))
     if source.item.kind not in WITH_MOTION or source.hierarchy is None:
@@ -87,6 +97,17 @@ def write_file(source: ExportSource, file_format: ExportFormat, unit: str) -> Ex
     except MotionError as error:
         raise Invalid(str(error), code="cannot-be-exported") from error
     return ExportedFile(source.item.name + written.suffix, written.media_type, written.data)
+
+
+def _write_annotation(source: ExportSource, options: ExportOptions) -> ExportedFile:
+    from marey_motion.documents import layer_from_document
+    from marey_motion.formats.predecessor_annotation import write_predecessor_annotation
+
+    annotation = Annotation.model_validate(source.parts["annotation"])
+    ends = [segment.end for segment in annotation.segments] + [one.frame + 1 for one in annotation.keyframes]
+    layer = layer_from_document(annotation, max(ends, default=1))
+    data = write_predecessor_annotation(layer, form=options.form, end_index=options.end_index)
+    return ExportedFile(f"{source.item.name}_sections.json", codecs.JSON, data)
 
 
 def _as_tree(source: ExportSource) -> dict[str, Any]:

@@ -19,13 +19,15 @@ SUBJECTS = ("02", "05", "07", "09", "16")
 def annotate(folder: Path, pattern: str, propose) -> dict[str, tuple[float, Layer]]:
     """Frame rate and layer of every take."""
     names = sorted(str(path.relative_to(folder)) for path in folder.glob(pattern))
+    companions = {pairing.motion: pairing.skeleton for pairing in pair_companions(names)}
     layers = {}
-    for pairing in pair_companions(names):
-        companion = None if pairing.skeleton is None else (folder / pairing.skeleton).read_bytes()
-        clip = read_motion((folder / pairing.motion).read_bytes(), pairing.motion, companion=companion).clip
+    for name in names:
+        companion = companions.get(name)
+        data = None if companion is None else (folder / companion).read_bytes()
+        clip = read_motion((folder / name).read_bytes(), name, companion=data).clip
         if clip is not None:
             body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
-            layers[pairing.motion] = clip.frame_rate_hz, propose(clip, body)
+            layers[name] = clip.frame_rate_hz, propose(clip, body)
     return layers
 
 

@@ -47,7 +47,18 @@ def read_predecessor_annotation(
     ------
     FormatError    naming the label and section; also where sections overlap or go beyond the clip
     """
-    document = decode_document(data, file)
+    return layer_of_document(decode_document(data, file), file, frame_count, end_index=end_index, labels=labels)
+
+
+def layer_of_document(
+    document: Mapping[str, Any],
+    file: str,
+    frame_count: int,
+    *,
+    end_index: EndIndex = "inclusive",
+    labels: Sequence[str] | None = None,
+) -> Layer:
+    """As `read_predecessor_annotation`, of a document that was decoded."""
     if isinstance(document.get(SEMANTIC), dict):
         found = _frames_by_label(document[SEMANTIC], file)
     else:

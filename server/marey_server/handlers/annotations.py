@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from marey_schemas.annotations import AnnotationChange
+from marey_schemas.annotations import AnnotationChange, AnnotationImport
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_server.errors import NotFound
-from marey_server.handlers.declarations import Access, writes
-from marey_server.handlers.items import kind_of
-from marey_server.handlers.reply import Rendered
+from marey_server.handlers.declarations import Access, Body, writes
+from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
+from marey_server.handlers.reply import Rendered, Reply
 from marey_server.handlers.resource import Resource
 from marey_server.store import items
 
@@ -39,4 +39,33 @@ class AnnotationCommands(Resource):
         return await self.answer(items.apply_commands, project, item, body, expected_rev=expected_rev)
 
 
-RESOURCES: tuple[type[Resource], ...] = (AnnotationCommands,)
+class ClipAnnotations(Resource):
+    """What is said about a clip."""
+
+    path = "/projects/{project}/{kind}/{item}/annotations"
+    tag = "Annotations"
+
+    @writes(
+        access=Access.CONTRIBUTOR,
+        body=Body(AnnotationImport, max_bytes=MAX_DOCUMENT_BYTES),
+        answer=Item,
+        status=201,
+        etag=True,
+        idempotency="key",
+    )
+    async def post(self, project: str, kind: str, item: str, body: AnnotationImport) -> Rendered:
+        """Make an annotation of a clip (kind `clips`) from a document of the predecessor, beside the clip."""
+        if kind_of(kind) is not Kind.CLIP:
+            raise NotFound(f"Clips are annotated, not {kind}.", code="no-annotations")
+        clip = await self.look_up(items.find_annotated_clip, project, item)
+        prepared = await self.compute(items.prepare_annotation, clip, body)
+        return await self.answer_with(
+            lambda made: Reply(made, rev=made.rev, location=f"/projects/{project}/annotations/{made.id}"),
+            items.create_item,
+            project,
+            Kind.ANNOTATION,
+            prepared,
+        )
+
+
+RESOURCES: tuple[type[Resource], ...] = (AnnotationCommands, ClipAnnotations)

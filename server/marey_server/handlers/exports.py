@@ -8,7 +8,7 @@ from pydantic import Field
 
 from marey_schemas.base import Request
 from marey_server import exporting
-from marey_server.exporting import ExportFormat
+from marey_server.exporting import ExportFormat, ExportOptions
 from marey_server.handlers.declarations import Access, Bytes, reads
 from marey_server.handlers.items import kind_of
 from marey_server.handlers.queries import MAX_INTEGER
@@ -22,6 +22,12 @@ class ExportQuery(Request):
 
     format: ExportFormat = Field("original", description="original: the file exactly as it was imported.")
     unit: Literal["m", "cm"] = Field("cm", description="Unit of length of a BVH.")
+    end_index: Literal["inclusive", "exclusive"] = Field(
+        "inclusive", description="Of an annotation of the predecessor: whether a section holds its frame `end_idx`."
+    )
+    form: Literal["labels", "list", "frames"] = Field(
+        "labels", description="Of an annotation of the predecessor: sections by label, a list, or frames by label."
+    )
     revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Absent: the newest.")
 
 
@@ -52,7 +58,8 @@ class Export(BlobSender):
             original = await self.look_up(exporting.find_original, *place)
             return await self.send_blob(original.digest, disposition=attachment(original.name))
         source = await self.look_up(exporting.read_source, *place)
-        file = await self.compute(exporting.write_file, source, query.format, query.unit)
+        options = ExportOptions(query.end_index, query.form)
+        file = await self.compute(exporting.write_file, source, query.format, query.unit, options)
         headers = {"Content-Disposition": attachment(file.name), "Cache-Control": "private, no-cache"}
         return Reply(file.data, media_type=file.media_type, headers=headers)
 

@@ -1,6 +1,6 @@
 """Items: named things with revisions. This package is the only one that writes them."""
 
-from marey_server.store.items.annotating import apply_commands
+from marey_server.store.items.annotating import apply_commands, find_annotated_clip, prepare_annotation
 from marey_server.store.items.changing import (
     change_item,
     create_item,
@@ -27,10 +27,12 @@ __all__ = [
     "change_item",
     "create_item",
     "delete_item",
+    "find_annotated_clip",
     "find_part",
     "list_items",
     "list_revisions",
     "load_part",
+    "prepare_annotation",
     "prepare_part",
     "prepare_parts",
     "publish",

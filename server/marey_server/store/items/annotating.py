@@ -1,15 +1,17 @@
-"""Commands that change annotations."""
+"""Annotations changed by commands, and made of documents of the predecessor."""
 
 from __future__ import annotations
 
-from marey_schemas.annotations import AnnotationChange, command_arguments
+from dataclasses import dataclass
+
+from marey_schemas.annotations import MAX_NAME_LENGTH, AnnotationChange, AnnotationImport, command_arguments
 from marey_schemas.documents import Annotation, RevisionRef
-from marey_schemas.items import Item
+from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
 from marey_server.errors import Invalid, NotFound
-from marey_server.store.items.changing import put_part
-from marey_server.store.items.reading import read_part
+from marey_server.store.items.changing import prepare_parts, put_part
+from marey_server.store.items.reading import read_item, read_part
 from marey_server.store.revs import moved_on
 from marey_server.store.transaction import Transaction
 
@@ -48,6 +50,43 @@ def apply_commands(
         changed.model_dump(mode="json", by_alias=True),
         expected_rev=found.rev,
         message=change.message,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class AnnotatedClip:
+    """A clip at its newest revision, and how many frames that has."""
+
+    item: Item
+    frame_count: int
+
+
+def find_annotated_clip(tx: Transaction, project: str, item_id: str) -> AnnotatedClip:
+    """The clip that shall be annotated. Raises `NotFound`."""
+    item = read_item(tx, project, Kind.CLIP, item_id)
+    return AnnotatedClip(item, int(item.summary["frames"]))
+
+
+def prepare_annotation(clip: AnnotatedClip, given: AnnotationImport) -> ItemCreate:
+    """The annotation that a document of the predecessor makes of a clip, beside it. Raises `Invalid`."""
+    from marey_motion import documents
+    from marey_motion.errors import MotionError
+    from marey_motion.formats.predecessor_annotation import layer_of_document
+
+    try:
+        layer = layer_of_document(
+            given.document, "document", clip.frame_count, end_index=given.end_index, labels=given.labels
+        )
+    except MotionError as error:
+        wrong = FieldError(pointer="/document", code=error.code, detail=str(error))
+        raise Invalid(f"This is no annotation of the clip: {error}", code=error.code, errors=[wrong]) from error
+    ref = RevisionRef(item=clip.item.id, revision=clip.item.revision)
+    annotation = documents.layer_to_document(layer, ref, given.layer)
+    return ItemCreate(
+        name=given.name or f"{clip.item.name} {given.layer}"[:MAX_NAME_LENGTH],
+        collection=clip.item.collection,
+        parts=prepare_parts(Kind.ANNOTATION, {"annotation": annotation.model_dump(mode="json", by_alias=True)}),
+        message=given.message,
     )
 
 
