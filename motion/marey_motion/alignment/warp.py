@@ -86,19 +86,18 @@ def warped(motion: Motion, times: ArrayLike) -> Motion:
     places = np.clip(places, 0.0, last)
     whole = np.round(places)
     places = np.where(np.abs(places - whole) <= _WHOLE, whole, places)
-    frames = np.minimum(places.astype(np.int64), max(last - 1, 0))
-    after = np.minimum(frames + 1, last)
-    share = places - frames
-    if not share.any():
-        return motion.at_frames(frames)
-    rotations = quaternions.slerp(motion.rotations[frames], motion.rotations[after], share[:, None])
-    return motion._replace(
-        root_translations=_between(motion.root_translations, frames, after, share),
-        rotations=np.asarray(rotations, dtype=np.float64),
-        translations=_between(motion.translations, frames, after, share),
-    )
+    frames = places.astype(np.int64)
+    made = motion.at_frames(frames)
+    (between,) = np.nonzero(places != frames)
+    if len(between):
+        before, share = frames[between], (places - frames)[between]
+        turned = quaternions.slerp(motion.rotations[before], motion.rotations[before + 1], share[:, None])
+        made.rotations[between] = turned
+        made.root_translations[between] = _between(motion.root_translations, before, share)
+        made.translations[between] = _between(motion.translations, before, share)
+    return made
 
 
-def _between(values: Floats, frames: NDArray[np.int64], after: NDArray[np.int64], share: Floats) -> Floats:
+def _between(values: Floats, frames: NDArray[np.int64], share: Floats) -> Floats:
     fraction = share.reshape(-1, *[1] * (values.ndim - 1))
-    return np.asarray((1.0 - fraction) * values[frames] + fraction * values[after])
+    return np.asarray((1.0 - fraction) * values[frames] + fraction * values[frames + 1])

@@ -70,7 +70,10 @@ def test_merging_takes_the_gap_along_and_the_label_of_the_one_that_was_named():
 
 
 def test_a_neighbour_that_touches_a_moved_boundary_follows_it_both_ways():
-    assert annotations.move_boundary(WALK, 6, "end", 12).segments[:2] == (Segment("left", 5, 12), Segment("right", 12, 18))
+    assert annotations.move_boundary(WALK, 6, "end", 12).segments[:2] == (
+        Segment("left", 5, 12),
+        Segment("right", 12, 18),
+    )
     assert annotations.move_boundary(WALK, 6, "end", 8).segments[:2] == (Segment("left", 5, 8), Segment("right", 8, 18))
     assert annotations.move_boundary(WALK, 15, "start", 7).segments[:2] == (
         Segment("left", 5, 7),

@@ -1,0 +1,124 @@
+"""The closed-form cost against minimisation, against plain loops, and against what was wrong before."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from marey_motion.alignment.cost import CostOptions, frame_costs
+from marey_motion.errors import MotionError
+
+POINTS = 9
+
+
+def cloud(frames, seed, points=POINTS):
+    """(frames, points, 3) of a body that wanders over the ground."""
+    random = np.random.default_rng(seed)
+    return random.normal(size=(frames, points, 3)) * 0.4 + random.normal(size=(frames, 1, 3)) + (2.0, 1.0, -5.0)
+
+
+def on_the_ground(points, turn_rad, x, z):
+    return Rotation.from_euler("y", turn_rad).apply(points.reshape(-1, 3)).reshape(points.shape) + (x, 0.0, z)
+
+
+def minimised(a, b, weights):
+    """The least weighted mean of squared distances of points a, b (P, 3) over turns and shifts, found by search."""
+    shares = weights / weights.sum()
+
+    def cost(parameters):
+        return float(shares @ ((a - on_the_ground(b, *parameters)) ** 2).sum(axis=1))
+
+    starts = [(turn, *(shares @ (a - on_the_ground(b, turn, 0.0, 0.0)))[[0, 2]]) for turn in np.arange(8) * np.pi / 4]
+    found = [minimize(cost, start, method="BFGS", options={"gtol": 1e-11}).fun for start in starts]
+    return min(found)
+
+
+def test_the_closed_form_is_what_minimising_over_turns_and_shifts_finds():
+    weights = np.random.default_rng(1).uniform(0.2, 3.0, POINTS)
+    a, b = cloud(4, 2), cloud(5, 3)
+    costs = frame_costs(a, b, CostOptions(weights=weights))
+    expected = [[minimised(one, other, weights) for other in b] for one in a]
+    assert costs == pytest.approx(np.array(expected), abs=1e-9)
+
+
+@pytest.mark.parametrize("angle_deg", [10, 45, 90, 180])
+def test_a_pose_costs_nothing_against_itself_turned_and_moved_on_the_ground(angle_deg):
+    a = cloud(3, 4)
+    b = on_the_ground(a, np.radians(angle_deg), 3.0, -7.0)
+    assert np.diagonal(frame_costs(a, b)) == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+@given(st.floats(-10, 10), st.floats(-20, 20), st.floats(-20, 20), st.integers(0, 1000))
+def test_no_turn_and_no_shift_on_the_ground_changes_a_cost(turn_rad, x, z, seed):
+    a, b = cloud(3, seed), cloud(2, seed + 1)
+    assert frame_costs(a, on_the_ground(b, turn_rad, x, z)) == pytest.approx(frame_costs(a, b), abs=1e-9)
+
+
+def test_heights_count_as_they_are():
+    a = cloud(1, 5)
+    assert frame_costs(a, a + (0.0, 0.3, 0.0))[0, 0] == pytest.approx(0.09, abs=1e-12)
+
+
+def test_costs_are_means_over_points_in_square_metres():
+    a = np.zeros((1, 4, 3))
+    b = a.copy()
+    b[0, 0] = (0.0, 0.2, 0.0)
+    assert frame_costs(a, b)[0, 0] == pytest.approx(0.04 / 4)
+    assert frame_costs(a, b, CostOptions(weights=(3, 0, 0, 1)))[0, 0] == pytest.approx(0.04 * 3 / 4)
+    assert frame_costs(a, b, CostOptions(weights=(300, 0, 0, 100)))[0, 0] == pytest.approx(0.04 * 3 / 4)
+
+
+def test_plain_costs_keep_turns_and_shifts():
+    a, b = cloud(3, 6), cloud(4, 7)
+    expected = ((a[:, None] - b[None]) ** 2).sum(axis=-1).mean(axis=-1)
+    assert frame_costs(a, b, CostOptions("plain")) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("method", ["turned", "plain"])
+@pytest.mark.parametrize("window", [3, 5])
+def test_a_window_compares_the_frames_around_as_one_cloud(method, window):
+    a, b = cloud(7, 8), cloud(6, 9)
+    around = window // 2
+
+    def clouds(points):
+        frames = np.arange(len(points))[:, None] + np.arange(-around, around + 1)
+        return points[np.clip(frames, 0, len(points) - 1)].reshape(len(points), -1, 3)
+
+    weights = np.random.default_rng(10).uniform(0.1, 1.0, POINTS)
+    expected = frame_costs(clouds(a), clouds(b), CostOptions(method, weights=np.tile(weights, window)))
+    costs = frame_costs(a, b, CostOptions(method, window, weights))
+    assert costs == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def test_no_cost_is_negative_where_rounding_could_make_it_so():
+    a = cloud(1, 11) + (1e4, 0.0, 1e4)
+    for window in (1, 5):
+        assert frame_costs(a, a, CostOptions(window=window))[0, 0] >= 0.0
+
+
+def test_both_directions_cost_the_same():
+    a, b = cloud(6, 12), cloud(4, 13)
+    assert frame_costs(a, b) == pytest.approx(frame_costs(b, a).T, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"a": np.zeros((3, 4, 2))}, "points must be"),
+        ({"b": np.zeros((3, 5, 3))}, "the same points in both"),
+        ({"a": np.full((3, 4, 3), np.nan)}, "frame 0: positions must be finite"),
+        ({"weights": (1, 2)}, "weights: .* weights where 4 points"),
+        ({"weights": (1, 1, 1, -1)}, "not negative"),
+        ({"weights": (0, 0, 0, 0)}, "not all zero"),
+        ({"window": 4}, "window: a window is an odd number"),
+        ({"window": 63}, "window: a window is an odd number"),
+        ({"method": "best"}, "'best' is no cost"),
+    ],
+)
+def test_what_makes_no_cost_is_refused(arguments, said):
+    given = {"a": np.zeros((3, 4, 3)), "b": np.zeros((3, 4, 3)), **arguments}
+    a, b = given.pop("a"), given.pop("b")
+    with pytest.raises(MotionError, match=said):
+        frame_costs(a, b, CostOptions(**given))
