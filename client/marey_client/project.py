@@ -13,6 +13,8 @@ from marey_client.annotation_jobs import AnnotationPlaces, annotate_request, cut
 from marey_client.annotations import AnnotationHandle
 from marey_client.blobs import Blobs
 from marey_client.coverage_streams import CoverageStreams
+from marey_client.edit_jobs import edit_request
+from marey_client.edits import Commands, EditHandle, Edits
 from marey_client.evaluations import EvaluationHandle, Places, evaluate_request, items_at
 from marey_client.imports import Imports
 from marey_client.items import ItemHandle, Items
@@ -20,6 +22,7 @@ from marey_client.jobs import Jobs
 from marey_client.motions import ClipHandle, SkeletonHandle
 from marey_client.paging import pages
 from marey_client.pipelines import PipelineRun, submit_pipeline
+from marey_client.reports import ReportedHandle
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.access import Project, ProjectChange
 from marey_schemas.alignment import AlignParams
@@ -87,6 +90,11 @@ class ProjectHandle:
         return Items(self.transport, self.name, Kind.PROCESSED, ProcessedHandle)
 
     @cached_property
+    def edits(self) -> Edits:
+        """Its edits."""
+        return Edits(self.transport, self.name, Kind.EDIT, EditHandle)
+
+    @cached_property
     def evaluations(self) -> Items[EvaluationHandle]:
         """Its evaluations."""
         return Items(self.transport, self.name, Kind.EVALUATION, EvaluationHandle)
@@ -98,7 +106,9 @@ class ProjectHandle:
             Kind.SKELETON: SkeletonHandle,
             Kind.ANNOTATION: AnnotationHandle,
             Kind.PROCESSED: ProcessedHandle,
+            Kind.EDIT: EditHandle,
             Kind.EVALUATION: EvaluationHandle,
+            Kind.MODEL: ReportedHandle,
         }
         return Items(self.transport, self.name, kind, known.get(kind, ItemHandle))
 
@@ -194,6 +204,15 @@ class ProjectHandle:
         """
         request = align_request(self, clips, annotations, AlignParams.model_validate(options))
         return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
+
+    def edit(self, clips: Places, commands: Commands, *, into: str = "", priority: int = 0, **options: Any) -> Job:
+        """Hand in the editing of clips, a folder by its path, or folders and clips, by commands or a stored edit.
+
+        The results go to the folder `into`, or get a `suffix`, or with `in_place=True` are the next revisions of the
+        clips themselves. `options` are those of `EditParams`.
+        """
+        request = edit_request(self, clips, commands, **options)
+        return self.submit(request.model_copy(update={"into": into, "priority": priority}))
 
     def evaluate(
         self,

@@ -1,0 +1,71 @@
+"""Edits: lists of commands that are saved as items, applied to clips, and looked at before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pydantic import BaseModel
+
+from marey_client.items import ItemHandle, Items
+from marey_client.transport import BLOCKS, Transport, as_json, read_tree
+from marey_schemas.edit_previews import EditPreview, EditPreviewRequest
+from marey_schemas.editing import EditDocument
+from marey_schemas.items import Item
+
+
+class EditHandle(ItemHandle):
+    """One edit."""
+
+    def document(self, *, revision: int | None = None) -> EditDocument:
+        """Its title and its commands."""
+        return EditDocument.model_validate(self.part("edit", revision=revision))
+
+    def put(self, edit: EditDocument, *, message: str | None = None) -> Item:
+        """Make a revision with other commands; `PreconditionFailed` if it was changed since it was read."""
+        return self.put_part("edit", edit.model_dump(mode="json", by_alias=True), message=message)
+
+
+Commands = EditHandle | EditDocument | Sequence[Mapping[str, Any] | BaseModel]
+"""An edit that is stored or not, or its commands, such as `{"command": "trim", "start": 10}`."""
+
+
+class Edits(Items[EditHandle]):
+    """The edits of a project."""
+
+    def save(
+        self,
+        name: str,
+        commands: EditDocument | Sequence[Mapping[str, Any] | BaseModel],
+        *,
+        title: str = "",
+        collection: str = "",
+        message: str = "",
+    ) -> EditHandle:
+        """Keep commands as an edit: a new one, or a revision of the one that has this name in the collection."""
+        edit = as_edit(commands, title=title)
+        held = next(self.list(path=f"{collection}/{name}".lstrip("/"), page_size=1), None)
+        if held is not None:
+            held.put(edit, message=message or None)
+            return held
+        parts = {"edit": edit.model_dump(mode="json", by_alias=True)}
+        return self.create(name, parts, collection=collection, message=message)
+
+
+def as_edit(commands: EditDocument | Sequence[Mapping[str, Any] | BaseModel], *, title: str = "") -> EditDocument:
+    """Commands as the document of an edit; pydantic's `ValidationError` names what is wrong with which."""
+    if isinstance(commands, EditDocument):
+        return commands if not title else commands.model_copy(update={"title": title})
+    return EditDocument.model_validate({"title": title, "commands": list(commands)})
+
+
+def preview_edit(transport: Transport, url: str, commands: Commands, **options: Any) -> EditPreview:
+    """Frames of what commands make of the clip at `url`; `options` are those of `EditPreviewRequest`."""
+    if isinstance(commands, EditHandle):
+        request = EditPreviewRequest.model_validate({"edit": commands.as_input().model_dump(), **options})
+    else:
+        request = EditPreviewRequest.model_validate({"commands": as_edit(commands).commands, **options})
+    response = transport.send(
+        "POST", f"{url}/edit-preview", content=as_json(request), headers={"Accept": BLOCKS}, repeatable=True
+    )
+    return EditPreview.model_validate(read_tree(response))

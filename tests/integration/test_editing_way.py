@@ -1,0 +1,177 @@
+"""The way of an edit as its users walk it: SDK and command line, a real server, a real worker."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from math import radians
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from marey_client import Marey
+from marey_client.errors import JobUnsuccessful, RequestFailed
+from marey_client.imports import find_files
+from marey_client.motions import ClipHandle
+from marey_client.project import ProjectHandle
+from marey_motion.clip import Clip
+from marey_motion.documents import clip_from_document, commands_of_edit, skeleton_from_document
+from marey_motion.editing.registry import edit_clip
+from marey_motion.formats import write_bvh
+from marey_motion.gait import generate_gait
+from marey_schemas.access import ProjectCreate
+from marey_schemas.editing import EditDocument
+from marey_schemas.imports import ImportOptions
+from marey_schemas.jobs import Job
+from server_process import ServerProcess
+
+pytestmark = pytest.mark.timeout(300)
+
+CLEAN_UP: list[dict[str, Any]] = [
+    {"command": "trim", "start": 30, "stop": 150},
+    {"command": "smooth", "window_s": 0.2},
+    {"command": "face", "heading_deg": 90},
+    {"command": "move_to_origin"},
+    {"command": "find_contacts"},
+]
+
+
+@pytest.fixture
+def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
+    process = ServerProcess(tmp_path, database_url)
+    process.start(workers=1)
+    yield process
+    process.stop()
+
+
+@pytest.fixture
+def marey(server: ServerProcess) -> Iterator[Marey]:
+    with server.client() as client:
+        yield client
+
+
+@pytest.fixture
+def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
+    """A project with three walks: straight ahead, to the left and to the right."""
+    project = marey.create_project(ProjectCreate(name="lab"))
+    for turn_rate_deg_s in (-30, 0, 30):
+        walk = generate_gait(1.3, radians(turn_rate_deg_s), 4.0)
+        (tmp_path / f"walk {turn_rate_deg_s}.bvh").write_bytes(write_bvh(walk))
+    project.imports.upload(find_files(sorted(tmp_path.glob("*.bvh"))).files, ImportOptions(collection="walks"))
+    return project
+
+
+def clips_of(project: ProjectHandle, folder: str) -> dict[str, ClipHandle]:
+    return {clip.name: clip for clip in project.clips.list(collection=folder)}
+
+
+def as_motion(project: ProjectHandle, clip: ClipHandle) -> Clip:
+    document = clip.motion()
+    hierarchy = project.skeletons.get(document.skeleton.item).hierarchy()
+    return clip_from_document(document, skeleton_from_document(hierarchy))
+
+
+def ended(marey: Marey, job: Job) -> Job:
+    return marey.jobs.wait(job.id)
+
+
+def test_an_edit_is_saved_applied_to_a_folder_and_replayed_exactly(marey: Marey, lab: ProjectHandle) -> None:
+    edit = lab.edits.save("clean up", CLEAN_UP, title="Middle of the take", collection="edits")
+    job = ended(marey, lab.edit("walks", edit, into="clean", tags=("clean",)))
+    assert job.result is not None
+    assert (job.result["clips"], job.result["refused"]) == (3, [])
+    assert {finding["command"] for finding in job.result["findings"]} == {"find_contacts"}
+
+    originals, made = clips_of(lab, "walks"), clips_of(lab, "clean/walks")
+    assert made.keys() == originals.keys()
+    commands = commands_of_edit(edit.document())
+    for name, clip in made.items():
+        assert clip.item.tags == ("clean",)
+        (here,) = edit_clip(as_motion(lab, originals[name]), commands)
+        assert np.array_equal(as_motion(lab, clip).poses, here.clip.poses)
+        assert {edge.item for edge in clip.lineage().inputs} == {originals[name].id, edit.id}
+
+    again = ended(marey, lab.edit("walks", CLEAN_UP, into="again"))
+    assert again.result is not None
+    for name, clip in clips_of(lab, "again/walks").items():
+        assert np.array_equal(clip.motion().poses, made[name].motion().poses)
+
+
+def test_the_originals_stay_unless_they_are_edited_in_place(marey: Marey, lab: ProjectHandle) -> None:
+    before = clips_of(lab, "walks")
+    ended(marey, lab.edit("walks", [{"command": "mirror"}], suffix=" mirrored"))
+    beside = clips_of(lab, "walks")
+    assert beside.keys() == before.keys() | {f"{name} mirrored" for name in before}
+    assert all(beside[name].item.revision == 1 for name in before)
+
+    straight = before["walk 0"]
+    ended(marey, lab.edit(straight, [{"command": "trim", "stop": 60}], in_place=True))
+    after = lab.clips.get(straight.id)
+    assert (after.item.revision, after.item.summary["frames"]) == (2, 60)
+    assert len(after.motion(revision=1).poses) == straight.item.summary["frames"]
+    assert after.info().source is not None
+    assert after.info().source.file is not None  # type: ignore[union-attr]
+
+
+def test_where_results_should_go_must_be_clear(marey: Marey, lab: ProjectHandle) -> None:
+    with pytest.raises(JobUnsuccessful, match="would take the place of the clips"):
+        ended(marey, lab.edit("walks", [{"command": "mirror"}]))
+    with pytest.raises(JobUnsuccessful, match="cannot both take the place"):
+        ended(marey, lab.edit("walks", [{"command": "mirror"}], in_place=True, into="elsewhere"))
+    (first, *_) = clips_of(lab, "walks").values()
+    ended(marey, lab.edit(first, [{"command": "trim", "start": 10}], in_place=True))
+    stale = ended(marey, lab.edit(first, [{"command": "trim", "start": 20}], in_place=True))
+    assert stale.result is not None
+    (refusal,) = stale.result["refused"]
+    assert refusal["code"] == "clip-changed"
+    assert lab.clips.get(first.id).item.revision == 2
+
+
+def test_a_split_makes_several_clips_and_others_are_appended_by_name(marey: Marey, lab: ProjectHandle) -> None:
+    walks = clips_of(lab, "walks")
+    ended(marey, lab.edit(walks["walk 0"], [{"command": "split", "at": [60, 90]}], into="cut"))
+    pieces = clips_of(lab, "cut")
+    assert {name: clip.item.summary["frames"] for name, clip in pieces.items()} == {
+        "walk 0-1": 60,
+        "walk 0-2": 30,
+        "walk 0-3": walks["walk 0"].item.summary["frames"] - 90,
+    }
+    joined = [{"command": "concatenate", "source": walks["walk 30"].id}]
+    ended(marey, lab.edit(walks["walk 0"], joined, into="joined"))
+    (long,) = clips_of(lab, "joined").values()
+    assert long.item.summary["frames"] == sum(walks[name].item.summary["frames"] for name in ("walk 0", "walk 30"))
+    assert {edge.item for edge in long.lineage().inputs} == {walks["walk 0"].id, walks["walk 30"].id}
+
+
+def test_a_clip_that_cannot_be_edited_is_refused_and_the_others_are_made(marey: Marey, lab: ProjectHandle) -> None:
+    short = clips_of(lab, "walks")["walk -30"]
+    ended(marey, lab.edit(short, [{"command": "trim", "stop": 20}], in_place=True))
+    job = ended(marey, lab.edit("walks", CLEAN_UP, into="clean"))
+    assert job.result is not None
+    (refusal,) = job.result["refused"]
+    assert (refusal["name"], refusal["code"]) == ("walks/walk -30", "frames-missing")
+    assert "commands[0] (trim)" in refusal["detail"]
+    assert clips_of(lab, "clean").keys() == {"walk 0", "walk 30"}
+
+
+def test_a_preview_shows_what_the_job_makes_and_stores_nothing(marey: Marey, lab: ProjectHandle) -> None:
+    walk = clips_of(lab, "walks")["walk 30"]
+    shown = walk.preview(CLEAN_UP, frames=slice(20, 50), fields=("motion", "positions", "findings"))
+    assert (shown.pieces, shown.frame_count, shown.frames) == (1, 120, (20, 50))
+    assert [finding["command"] for finding in shown.findings] == ["find_contacts"]
+    assert {clip.path for clip in lab.clips.list()} == {f"walks/walk {rate}" for rate in (-30, 0, 30)}
+    assert walk.item.revision == 1
+
+    edit = lab.edits.save("clean up", EditDocument.model_validate({"commands": CLEAN_UP}))
+    ended(marey, lab.edit(walk, edit, into="clean"))
+    (made,) = clips_of(lab, "clean").values()
+    assert shown.motion is not None
+    assert np.array_equal(shown.motion.poses, made.motion(frames=slice(20, 50)).poses)
+    assert np.array_equal(walk.preview(edit, frames=slice(20, 50)).motion.poses, shown.motion.poses)  # type: ignore[union-attr]
+    with pytest.raises(RequestFailed, match=r"commands\[0\] \(trim\)"):
+        walk.preview([{"command": "trim", "start": 100_000}])
