@@ -21,6 +21,7 @@ from marey_schemas.improvement import CompareParams, OptimiseParams, SuggestPara
 from marey_schemas.jobs import ExportParams, ImportParams, InputSpec, JobKind, RetargetParams
 from marey_schemas.kinds import Kind
 from marey_schemas.modelling import ModelParams
+from marey_schemas.sample_trees import TreeParams
 
 ENTRY_POINT_GROUP = "marey.job_kinds"
 MOST_TASKS = 1000
@@ -304,7 +305,32 @@ MODEL = KindDeclaration(
     outputs={"model": Kind.MODEL},
 )
 
-BUILT_IN = (IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN, MODEL)
+TREE = KindDeclaration(
+    name="tree",
+    description="Draws samples of a model and groups them, so that motions that meet constraints are found quickly.",
+    params=TreeParams,
+    implementation="marey_worker.kinds.tree:run",
+    version=1,
+    inputs={"model": InputSpec(kind=Kind.MODEL, description="The model, which gets the tree as a part.")},
+    outputs={"model": Kind.MODEL},
+)
+
+BUILT_IN = (
+    IMPORT,
+    RETARGET,
+    EXPORT,
+    EVALUATE,
+    COMPARE,
+    SUGGEST,
+    OPTIMISE,
+    SWEEP,
+    EDIT,
+    ANNOTATE,
+    CUT,
+    ALIGN,
+    MODEL,
+    TREE,
+)
 
 
 class UnknownKindError(LookupError):

@@ -86,7 +86,8 @@ def _best(tree: SampleTree, samples: Indices, costs: Floats, top: int, evaluatio
 
 def _smallest(costs: Floats, places: Indices, count: int) -> Indices:
     """Where the smallest costs are, in order; of equal costs the first places."""
-    return np.asarray(np.lexsort((places, costs))[:count])
+    order: Indices = np.lexsort((places, costs))[:count]
+    return order
 
 
 def _ranges(starts: NDArray[np.int32], counts: NDArray[np.int32]) -> Indices:

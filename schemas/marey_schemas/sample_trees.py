@@ -1,0 +1,56 @@
+"""Trees over samples of a model: how one is made, and part `tree` of an item of the kind `model`.
+
+The options are those of `marey_motion.modelling.tree`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from marey_schemas.arrays import ArrayOf
+from marey_schemas.base import Request
+from marey_schemas.names import Digest
+
+MOST_TREE_SAMPLES = 100_000
+
+
+class TreeParams(Request):
+    """Parameters of `tree`."""
+
+    samples: int = Field(10_000, ge=1, le=MOST_TREE_SAMPLES, description="Drawn from the model.")
+    branching: int = Field(4, ge=2, le=64, description="Children of a node, at most.")
+    leaf_size: int = Field(1, ge=1, le=MOST_TREE_SAMPLES, description="Nodes of so few samples are not split.")
+    depth: int = Field(64, ge=1, le=64, description="Levels below the root, at most.")
+    features: Literal["end_effectors", "latent"] = Field(
+        "end_effectors", description="What is grouped: where hands, feet and head are, or the spatial scores."
+    )
+
+
+class SampleTreeDocument(Request):
+    """Part `tree` of a model: samples of it, grouped by k-means in k-means.
+
+    Nodes come level by level from the root; the children of a node follow one another, and each holds a part of its
+    samples, which stand side by side. A node without children is a leaf.
+    """
+
+    schema_: Literal["marey/sample-tree@1"] = Field("marey/sample-tree@1", alias="schema")
+    model_digest: Digest = Field(
+        description="The part `model` that the samples are of; the tree is of use to no other."
+    )
+    seed: int = Field(ge=0, lt=2**63, description="That they were drawn with.")
+    options: TreeParams
+    samples: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=2)] = Field(description="[n, L] latent vectors.")
+    sizes: Annotated[NDArray[np.int32], ArrayOf("<i4", ndim=1)] = Field(description="[M] samples of each node.")
+    children: Annotated[NDArray[np.int32], ArrayOf("<i4", ndim=1)] = Field(description="[M] children of each node.")
+
+    @model_validator(mode="after")
+    def _check_shapes(self) -> Self:
+        if len(self.sizes) != len(self.children):
+            raise ValueError(f"children: {len(self.children)} values for {len(self.sizes)} nodes")
+        if not len(self.sizes) or self.sizes[0] != len(self.samples):
+            raise ValueError(f"sizes: the first node holds all {len(self.samples)} samples")
+        return self

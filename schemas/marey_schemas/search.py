@@ -1,0 +1,205 @@
+"""Motions of models that meet constraints: what can be asked for, and what was found."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, StringConstraints, model_validator
+
+from marey_schemas.base import Answer, Request
+from marey_schemas.documents import Motion
+from marey_schemas.references import RevisionRef
+
+MOST_CONSTRAINTS = 64
+MOST_STEPS = 16
+MOST_CANDIDATES = 256
+MOST_SEED = 2**63 - 1
+
+Moment = Annotated[str, StringConstraints(min_length=1, max_length=255)] | Annotated[float, Field(allow_inf_nan=False)]
+"""The label of a keyframe, `start`, `end`, or a canonical frame."""
+
+JointLabel = Annotated[str, StringConstraints(min_length=1, max_length=255)]
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Component = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Positive = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
+Degrees = Annotated[float, Field(ge=-36_000, le=36_000, allow_inf_nan=False)]
+ItemId = Annotated[str, StringConstraints(min_length=1, max_length=64)]
+
+
+# --- constraints -----------------------------------------------------------------------------------------------------
+
+
+class _Constraint(Request):
+    at: Moment = Field(description="Label of a keyframe of the model, start, end, or a canonical frame.")
+    weight: Positive = Field(1.0, description="How much it counts.")
+
+
+class JointPositionConstraint(_Constraint):
+    """A joint is at a place."""
+
+    type: Literal["joint_position"]
+    joint: JointLabel = Field(description="Its own name, or its standard name.")
+    target_m: tuple[Coordinate | None, Coordinate | None, Coordinate | None] = Field(
+        description="(x, y, z) in the world; null where it is free."
+    )
+    tolerance_cm: Positive = Field(1.0, description="The error that counts as 1.")
+
+
+class JointOrientationConstraint(_Constraint):
+    """A joint is turned so."""
+
+    type: Literal["joint_orientation"]
+    joint: JointLabel = Field(description="Its own name, or its standard name.")
+    rotation: tuple[Component, Component, Component, Component] = Field(description="(w, x, y, z) in the world.")
+    tolerance_deg: Positive = Field(5.0, description="The error that counts as 1.")
+
+
+class LookDirectionConstraint(_Constraint):
+    """An axis of a joint points in a direction, or at a point."""
+
+    type: Literal["look_direction"]
+    joint: JointLabel = Field(description="Its own name, or its standard name.")
+    direction: tuple[Component, Component, Component] | None = Field(None, description="(x, y, z) in the world.")
+    point_m: tuple[Coordinate, Coordinate, Coordinate] | None = Field(None, description="In place of a direction.")
+    axis: tuple[Component, Component, Component] = Field((0.0, 0.0, 1.0), description="In the joint's own frame.")
+    tolerance_deg: Positive = Field(5.0, description="The error that counts as 1.")
+
+
+class RootPositionConstraint(_Constraint):
+    """The body stands over a place on the ground."""
+
+    type: Literal["root_position"]
+    target_m: tuple[Coordinate | None, Coordinate | None] = Field(description="(x, z); null where it is free.")
+    tolerance_cm: Positive = Field(1.0, description="The error that counts as 1.")
+
+
+class RootHeadingConstraint(_Constraint):
+    """The body faces a heading on the ground."""
+
+    type: Literal["root_heading"]
+    heading_deg: Degrees = Field(description="0 along +z, positive to the left.")
+    tolerance_deg: Positive = Field(5.0, description="The error that counts as 1.")
+
+
+class KeyframeTimeConstraint(_Constraint):
+    """A moment comes so long after the motion's beginning."""
+
+    type: Literal["keyframe_time"]
+    seconds: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
+    tolerance_s: Positive = Field(0.05, description="The error that counts as 1.")
+
+
+SearchConstraint = Annotated[
+    JointPositionConstraint
+    | JointOrientationConstraint
+    | LookDirectionConstraint
+    | RootPositionConstraint
+    | RootHeadingConstraint
+    | KeyframeTimeConstraint,
+    Field(discriminator="type"),
+]
+SearchConstraints = Annotated[tuple[SearchConstraint, ...], Field(max_length=MOST_CONSTRAINTS)]
+
+
+# --- questions and answers -------------------------------------------------------------------------------------------
+
+
+class StartPlacement(Request):
+    """Where a motion begins: the model's canonical frame in the world."""
+
+    x: Coordinate = Field(0.0, description="Metres.")
+    z: Coordinate = Field(0.0, description="Metres.")
+    heading_deg: Degrees = Field(0.0, description="0 along +z, positive to the left.")
+
+
+class SearchStep(Request):
+    """One motion of several."""
+
+    model: ItemId | None = Field(None, description="A model of the project; absent: that of the address.")
+    constraints: SearchConstraints = ()
+
+
+class SearchRequest(Request):
+    """Ask for a motion, or for several that follow one another, that meet constraints."""
+
+    constraints: SearchConstraints = Field((), description="On one motion.")
+    steps: tuple[SearchStep, ...] = Field(
+        (), max_length=MOST_STEPS, description="Several motions, each placed where the one before it ends."
+    )
+    start: StartPlacement = StartPlacement()
+    candidates: int = Field(8, ge=1, le=MOST_CANDIDATES, description="Nodes that are followed down the tree.")
+    refine: bool = Field(True, description="Improve what the tree has by numerical optimisation.")
+    likelihood_weight: float = Field(
+        1.0,
+        ge=0,
+        le=1e6,
+        allow_inf_nan=False,
+        alias="lambda",
+        description="What a likely motion is worth; the less, the nearer it comes to the targets.",
+    )
+    iterations: int = Field(50, ge=1, le=200, description="Of the optimisation, at most.")
+    transition_tolerance_cm: Positive = Field(2.0, description="For hands, feet and height from step to step.")
+    finish: bool = Field(False, description="Remove what is left of joint positions by inverse kinematics.")
+    seed: int = Field(0, ge=0, le=MOST_SEED, description="Of the samples, where the model has no tree of its own.")
+    motion: bool = Field(True, description="Send the motion, too.")
+
+    @model_validator(mode="after")
+    def _check_steps(self) -> Self:
+        if self.steps and self.constraints:
+            raise ValueError("constraints: on several motions they stand in steps")
+        total = sum(len(step.constraints) for step in self.steps)
+        if total > MOST_CONSTRAINTS:
+            raise ValueError(f"steps: {total} constraints in all, over {MOST_CONSTRAINTS}")
+        return self
+
+    @property
+    def asked_steps(self) -> tuple[SearchStep, ...]:
+        """The steps; one where there are constraints alone."""
+        return self.steps or (SearchStep(constraints=self.constraints),)
+
+
+class ConstraintError(Answer):
+    """How far a constraint is missed, in the unit that its name ends in."""
+
+    step: int = Field(description="From 0.")
+    constraint: int = Field(description="Within the step, from 0.")
+    type: str
+    joint: str | None = None
+    error_cm: float | None = None
+    error_deg: float | None = None
+    error_s: float | None = None
+    sampled_error: float = Field(description="Of the sample that the tree gave, in the same unit.")
+    finished_error: float | None = Field(None, description="After inverse kinematics, in the same unit.")
+    reached: bool = Field(description="Within its tolerance, at the end.")
+
+
+class FoundStep(Answer):
+    """One motion that was found."""
+
+    model: RevisionRef
+    tree: Literal["stored", "drawn"] = Field(description="drawn: the model has no tree of its own, or an outdated one.")
+    latent: tuple[float, ...]
+    log_likelihood: float
+    likelihood_percentile: float | None = Field(
+        None, description="Percent of the training examples that are less likely; null where those are not known."
+    )
+    duration_s: float
+    placement: StartPlacement
+    jumps_cm: dict[str, float] = Field(
+        default_factory=dict, description="By which joints jump from the step before this one, and the root."
+    )
+    evaluations: int = Field(description="Motions that the search of the tree looked at.")
+
+
+class SearchAnswer(Answer):
+    """What was found."""
+
+    steps: tuple[FoundStep, ...]
+    errors: tuple[ConstraintError, ...]
+    reached: bool = Field(description="Whether all constraints are.")
+    out_of_reach: tuple[int, ...] = Field(
+        (), description="Places in `errors` that are off by more than 5 cm before inverse kinematics."
+    )
+    iterations: int = Field(description="Of the optimisation.")
+    search_ms: float = Field(description="Time that searching and refining took.")
+    motion: Motion | None = None

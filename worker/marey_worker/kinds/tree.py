@@ -1,0 +1,66 @@
+"""A tree over samples of a model, for searches."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from marey_motion.modelling.primitive_documents import primitive_from_tree
+from marey_motion.modelling.sample_tree_documents import sample_tree_to_tree
+from marey_motion.modelling.tree import END_EFFECTORS, TreeOptions, build_tree
+from marey_schemas.canonical import document_digest
+from marey_schemas.documents import RevisionRef
+from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
+from marey_schemas.kinds import Kind
+from marey_schemas.sample_trees import TreeParams
+from marey_worker.context import Context, JobRefused
+from marey_worker.kinds.matching_clips import place_of, refusing_motion_errors
+from marey_worker.kinds.rigged import Rig, read_rigged
+
+
+def run(context: Context, params: TreeParams) -> dict[str, Any]:
+    """Make a tree of a model and stage it as a part of that model, whose other parts stay.
+
+    Raises `JobRefused` where the tree has no place to go to, and where no tree can be made of the model.
+    """
+    started = time.monotonic()
+    (pin,) = context.inputs["model"]
+    _require_same_place(context, pin)
+    context.progress(0, 2, "reading the model")
+    model = context.document(Kind.MODEL, pin.item, pin.revision, "model")
+    options = TreeOptions(**params.model_dump())
+    with refusing_motion_errors():
+        skeleton, mapping, _axes = read_rigged(context, Rig.as_stored(RevisionRef.model_validate(model["skeleton"])))
+        primitive = primitive_from_tree(model, skeleton)
+        known = [name for name in END_EFFECTORS if name in mapping.joints]
+        context.progress(1, 2, "grouping samples")
+        tree = build_tree(primitive, context.seed, options, end_effectors=mapping.indices(skeleton, known))
+    part = sample_tree_to_tree(tree, model_digest=document_digest(model), seed=context.seed, options=options)
+    _require_same_place(context, pin)
+    context.stage(
+        [
+            StagedOutput(
+                name=pin.name,
+                kind=Kind.MODEL,
+                item_name=pin.name,
+                collection=pin.collection,
+                parts={"tree": part},
+                sources={"model": (ItemInput(item=pin.item, revision=pin.revision),)},
+            )
+        ]
+    )
+    return {
+        "samples": len(tree.samples),
+        "nodes": len(tree.sizes),
+        "features": params.features,
+        "seconds": round(time.monotonic() - started, 4),
+    }
+
+
+def _require_same_place(context: Context, pin: PinnedInput) -> None:
+    """Raise `JobRefused` unless what is published under the model's name becomes a part of this model."""
+    if context.into:
+        raise JobRefused("ambiguous-place", f"a tree becomes a part of its model; it cannot go to {context.into}")
+    now = context.item(Kind.MODEL, pin.item)
+    if (now.collection, now.name) != (pin.collection, pin.name):
+        raise JobRefused("model-moved", f"{place_of(pin)} was moved or renamed while the job waited; try again")
