@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +47,24 @@ def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
     files = find_files([write_walks(tmp_path / "takes")]).files
     project.imports.upload(files, ImportOptions(collection="walks"))
     return project
+
+
+@pytest.fixture
+def run(server: ServerProcess, tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs the command line against the server, in a folder of its own."""
+
+    def run(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
+        surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
+        known = {"MAREY_URL": server.url, "MAREY_DATA": str(server.data), "HOME": str(tmp_path)}
+        ended = subprocess.run(
+            [sys.executable, "-m", "marey_client.cli", *map(str, arguments)],
+            env={**surroundings, **known, "XDG_CONFIG_HOME": str(tmp_path)},
+            capture_output=True, text=True, cwd=tmp_path, timeout=240,
+        )  # fmt: skip
+        assert ended.returncode == status, ended.stdout + ended.stderr
+        return ended
+
+    return run
 
 
 def done(project: ProjectHandle, job: Job) -> Job:
@@ -122,3 +144,40 @@ def test_two_pieces_of_one_name_are_refused_before_any_is_made(lab: ProjectHandl
     assert not list(lab.clips.list(collection="pieces"))
     done(lab, lab.cut("walks", into="pieces", layer="mine"))
     assert len(list(lab.clips.list(collection="pieces"))) == 1
+
+
+def test_annotations_are_made_corrected_and_exchanged_from_the_command_line(
+    lab: ProjectHandle, run: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    clip, place = "lab/walks/walk 1 0", "lab/walks/walk 1 0 parts"
+    told = run("annotation", "create", clip, "--layer", "parts", "--segment", "b=50:90", "--segment", "a=0:50")
+    assert told.stdout.strip() == place
+    run("annotation", "split", place, 20, "--label", "c")
+    run("annotation", "move", place, 60, "--end", 100)
+    run("annotation", "keyframe", place, "middle", 70)
+    run("annotation", "keyframe", place, "middle", 70, "--move", 75)
+    run("annotation", "add", place, "d", "100:110")
+    run("annotation", "merge", place, 105, "--with", "previous")
+    run("annotation", "relabel", place, 105, "e")
+    assert "revision 9, 2 segments, 1 keyframes" in run("annotation", "remove", place, 0).stdout
+    shown = run("annotation", "show", place).stdout
+    assert "middle" in shown
+    document = json.loads(run("annotation", "show", place, "--json").stdout)
+    assert document["segments"] == [
+        {"label": "c", "start": 20, "end": 50},
+        {"label": "e", "start": 50, "end": 110},
+    ]
+    refused = run("annotation", "split", place, 300, status=1)
+    assert "frame 300: no segment holds this frame" in refused.stderr
+
+    file = run("annotation", "export", place, "-o", "out", "--end-index", "exclusive").stdout.strip()
+    written = json.loads((tmp_path / file).read_text(encoding="utf-8"))
+    assert written["sections"] == {"c": [{"start_idx": 20, "end_idx": 50}], "e": [{"start_idx": 50, "end_idx": 110}]}
+    again = run("annotation", "import", clip, file, "--end-index", "exclusive", "--layer", "again").stdout.strip()
+    imported = json.loads(run("annotation", "show", again, "--json").stdout)
+    assert (imported["segments"], imported["keyframes"]) == (document["segments"], document["keyframes"])
+    assert "exclusive" in run("annotation", "import", clip, file, "--layer", "inclusive", status=1).stderr
+
+    assert "2 clips, 1 c, 1 e" in run("cut", place, "--into", "pieces", "--before", 0.1).stdout
+    assert "annotations" in run("annotation", "propose", "lab/walks", "--set", "most_turn_deg=20").stdout
+    assert "most_turn" in run("annotation", "propose", "lab/walks", "--set", "most_turn=20", status=2).stderr

@@ -10,6 +10,7 @@ import typer
 from marey_client.cli import (
     accounts,
     alignments,
+    annotating,
     evaluations,
     files,
     improvements,
@@ -17,6 +18,7 @@ from marey_client.cli import (
     pipelines,
     processes,
     projects,
+    reports,
     skeletons,
 )
 from marey_client.cli.invocation import Invocation
@@ -62,7 +64,9 @@ for register in (
     files,
     skeletons,
     alignments,
+    annotating,
     evaluations,
+    reports,
     improvements,
     jobs,
     pipelines,

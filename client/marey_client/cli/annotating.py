@@ -1,0 +1,375 @@
+"""`annotation` and `cut`."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marey_client.cli.addresses import Address, find_item, require_item
+from marey_client.cli.failures import Refused, WrongUsage
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.jobs import clips_at, follow
+from marey_client.cli.output import print_json, print_pairs, print_table, tell
+
+if TYPE_CHECKING:
+    from marey_client.annotations import AnnotationHandle
+    from marey_client.marey import Marey
+    from marey_schemas.jobs import Job
+
+
+annotation = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Segments and keyframes of clips.")
+
+Place = Annotated[str, typer.Argument(help="An annotation: project/folder/name, or project/id.")]
+At = Annotated[int, typer.Argument(min=0, help="Any frame of the segment.")]
+Label = Annotated[str, typer.Argument(help="The label.")]
+
+
+class Method(StrEnum):
+    """How annotations are proposed."""
+
+    STEPS = "steps"
+    VELOCITY_MINIMA = "velocity_minima"
+    WRIST_CONTACT = "wrist_contact"
+
+
+class Neighbour(StrEnum):
+    """Which segment to merge with."""
+
+    NEXT = "next"
+    PREVIOUS = "previous"
+    NEAREST = "nearest"
+
+
+class EndIndex(StrEnum):
+    """Whether a section of the predecessor holds its last index."""
+
+    INCLUSIVE = "inclusive"
+    EXCLUSIVE = "exclusive"
+
+
+class Form(StrEnum):
+    """Forms of the predecessor's annotations."""
+
+    LABELS = "labels"
+    LIST = "list"
+    FRAMES = "frames"
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    app.add_typer(annotation, name="annotation")
+    app.command()(cut)
+
+
+@annotation.command()
+def show(context: typer.Context, place: Place, as_json: AsJson = False) -> None:
+    """Show the segments and keyframes of an annotation."""
+    with connect(context) as marey:
+        found = annotation_at(marey, place)
+        document = found.document()
+        clip = marey.project(found.project).clips.get(found.item.summary["clip"])
+    if as_json:
+        return print_json(document)
+    print_pairs(
+        [
+            ("clip", f"{clip.path}, revision {found.item.summary['clip_revision']}"),
+            ("layer", document.layer),
+            ("made by", document.made_by),
+        ]
+    )
+    rate_hz = clip.item.summary["frame_rate_hz"]
+    rows = [(one.label, one.start, one.end, f"{(one.end - one.start) / rate_hz:.3f}") for one in document.segments]
+    rows += [(one.label, one.frame, "", "") for one in document.keyframes]
+    return print_table(("label", "frame", "end", "s"), rows, right=("frame", "end", "s"))
+
+
+@annotation.command()
+def create(
+    context: typer.Context,
+    clip: Annotated[str, typer.Argument(help="The clip: project/folder/name, or project/id.")],
+    layer: Annotated[str, typer.Option(help="What the layer is called.")] = "default",
+    name: Annotated[str | None, typer.Option(help="Name; default: that of the clip and the layer's.")] = None,
+    segment: Annotated[list[str] | None, typer.Option(help="label=first:end; may be repeated.")] = None,
+    keyframe: Annotated[list[str] | None, typer.Option(help="label=frame; may be repeated.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make an annotation of a clip, with segments and keyframes or without any."""
+    from marey_schemas.kinds import Kind
+
+    segments = [dict(zip(("label", "start", "end"), _segment(text), strict=True)) for text in segment or ()]
+    keyframes = [dict(zip(("label", "frame"), _keyframe(text), strict=True)) for text in keyframe or ()]
+    with connect(context) as marey:
+        found = require_item(marey, Address.parse(clip), [Kind.CLIP])
+        segments.sort(key=lambda one: one["start"])
+        keyframes.sort(key=lambda one: (one["frame"], one["label"]))
+        made = found.annotate(layer, name=name, segments=segments, keyframes=keyframes)
+    return print_json(made.item) if as_json else typer.echo(f"{made.project}/{made.path}")
+
+
+@annotation.command()
+def add(
+    context: typer.Context,
+    place: Place,
+    label: Label,
+    frames: Annotated[str, typer.Argument(help="first:end; the last frame is the one before the end.")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Segments that are there give way.")] = False,
+) -> None:
+    """Put frames under a label."""
+    _, start, end = _segment(f"{label}={frames}")
+    _apply(context, place, command="create_segment", label=label, start=start, end=end, overwrite=overwrite)
+
+
+@annotation.command()
+def split(
+    context: typer.Context,
+    place: Place,
+    at: Annotated[int, typer.Argument(min=0, help="First frame of the second part.")],
+    label: Annotated[str | None, typer.Option(help="Of the second part; default: that of the first.")] = None,
+) -> None:
+    """Cut a segment in two."""
+    _apply(context, place, command="split_segment", at=at, label=label)
+
+
+@annotation.command()
+def merge(
+    context: typer.Context,
+    place: Place,
+    at: At,
+    neighbour: Annotated[Neighbour, typer.Option("--with", help="Which neighbour.")] = Neighbour.NEXT,
+) -> None:
+    """Make one of a segment and its neighbour, with the gap between them."""
+    _apply(context, place, command="merge_segment", at=at, neighbour=neighbour.value)
+
+
+@annotation.command()
+def move(
+    context: typer.Context,
+    place: Place,
+    at: At,
+    start: Annotated[int | None, typer.Option(min=0, help="Where the segment shall start.")] = None,
+    end: Annotated[int | None, typer.Option(min=0, help="Where the segment shall end.")] = None,
+) -> None:
+    """Let a segment start or end at another frame; a neighbour at that edge follows or gives way."""
+    edges = [(edge, to) for edge, to in (("start", start), ("end", end)) if to is not None]
+    if len(edges) != 1:
+        raise WrongUsage("give --start or --end, one of them")
+    _apply(context, place, command="move_boundary", at=at, edge=edges[0][0], to=edges[0][1])
+
+
+@annotation.command()
+def relabel(context: typer.Context, place: Place, at: At, label: Label) -> None:
+    """Give a segment another label."""
+    _apply(context, place, command="relabel_segment", at=at, label=label)
+
+
+@annotation.command()
+def remove(context: typer.Context, place: Place, at: At) -> None:
+    """Leave the frames of a segment without a label."""
+    _apply(context, place, command="remove_segment", at=at)
+
+
+@annotation.command("keyframe")
+def mark(
+    context: typer.Context,
+    place: Place,
+    label: Label,
+    frame: Annotated[int, typer.Argument(min=0, help="The frame.")],
+    move_to: Annotated[int | None, typer.Option("--move", min=0, help="Move it to this frame.")] = None,
+    remove_it: Annotated[bool, typer.Option("--remove", help="Take it away.")] = False,
+) -> None:
+    """Mark a frame; or move a mark, or take it away."""
+    if move_to is not None and remove_it:
+        raise WrongUsage("give --move or --remove, not both")
+    if move_to is not None:
+        _apply(context, place, command="move_keyframe", label=label, frame=frame, to=move_to)
+    else:
+        _apply(context, place, command="remove_keyframe" if remove_it else "add_keyframe", label=label, frame=frame)
+
+
+@annotation.command()
+def clear(context: typer.Context, place: Place) -> None:
+    """Take every segment and keyframe away."""
+    _apply(context, place, command="clear")
+
+
+@annotation.command()
+def propose(
+    context: typer.Context,
+    sources: Annotated[list[str], typer.Argument(help="Clips or folders of clips: project/folder[/name].")],
+    method: Annotated[Method, typer.Option(help="How.")] = Method.STEPS,
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="name=value of the method, as in most_turn_deg=30; may be repeated."),
+    ] = None,
+    layer: Annotated[str | None, typer.Option(help="What the layer is called; default: as the method.")] = None,
+    into: Annotated[str, typer.Option(help="Above the clips' own folders; default: beside the clips.")] = "",
+    tag: Annotated[list[str] | None, typer.Option(help="Tag of the annotations; may be repeated.")] = None,
+    priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
+    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Annotate clips by an algorithm: steps, pauses, or where a hand arrives."""
+    addresses = _of_one_project(sources)
+    given: dict[str, Any] = {"layer": layer} if layer else {}
+    proposal = {"method": method.value, **dict(map(_assignment, option or ()))}
+    with connect(context) as marey:
+        project = marey.project(addresses[0].project)
+        places = [clips_at(marey, address) for address in addresses]
+        options = {"into": into.strip("/"), "priority": priority, "tags": tuple(tag or ()), **given}
+        job = project.annotate(places, proposal=proposal, **options)
+        _finish(marey, job, wait, as_json)
+
+
+@annotation.command("import")
+def import_annotation(
+    context: typer.Context,
+    clip: Annotated[str, typer.Argument(help="The clip: project/folder/name, or project/id.")],
+    file: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="A JSON file of the predecessor.")],
+    layer: Annotated[str, typer.Option(help="What the layer is called.")] = "imported",
+    name: Annotated[str | None, typer.Option(help="Name; default: that of the clip and the layer's.")] = None,
+    end_index: Annotated[
+        EndIndex, typer.Option(help="Whether a section holds its frame end_idx; the predecessor's editor means so.")
+    ] = EndIndex.INCLUSIVE,
+    label: Annotated[list[str] | None, typer.Option(help="Only this label; may be repeated.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Annotate a clip from a file of the predecessor: sections, or the frames of labels."""
+    from marey_schemas.kinds import Kind
+
+    try:
+        document = json.loads(file.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise WrongUsage(f"{file} is no JSON: {error}") from None
+    if not isinstance(document, dict):
+        raise WrongUsage(f"{file} holds no JSON object")
+    options = {"layer": layer, "name": name, "end_index": end_index.value, "labels": tuple(label) if label else None}
+    with connect(context) as marey:
+        found = require_item(marey, Address.parse(clip), [Kind.CLIP])
+        made = found.import_annotation(document, **{key: value for key, value in options.items() if value is not None})
+    return print_json(made.item) if as_json else typer.echo(f"{made.project}/{made.path}")
+
+
+@annotation.command("export")
+def export_annotation(
+    context: typer.Context,
+    place: Place,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write to.")] = Path(),
+    form: Annotated[
+        Form, typer.Option(help="Sections by label, a list of sections, or frames by label.")
+    ] = Form.LABELS,
+    end_index: Annotated[
+        EndIndex, typer.Option(help="Whether a section holds its frame end_idx.")
+    ] = EndIndex.INCLUSIVE,
+) -> None:
+    """Write an annotation to a file of the predecessor."""
+    with connect(context) as marey:
+        found = annotation_at(marey, place)
+        typer.echo(found.export(output, format="predecessor", form=form.value, end_index=end_index.value))
+
+
+def cut(
+    context: typer.Context,
+    sources: Annotated[list[str], typer.Argument(help="Annotations or folders of them: project/folder[/name].")],
+    into: Annotated[str, typer.Option(help="The folder in the project that the pieces go to.")],
+    label: Annotated[list[str] | None, typer.Option(help="Only segments of this label; may be repeated.")] = None,
+    layer: Annotated[str | None, typer.Option(help="Only annotations of this layer.")] = None,
+    by_label: Annotated[bool, typer.Option("--by-label", help="A folder for each label.")] = False,
+    before: Annotated[float, typer.Option(min=0, help="Seconds before each segment that are taken along.")] = 0.0,
+    after: Annotated[float, typer.Option(min=0, help="Seconds after each segment that are taken along.")] = 0.0,
+    shortest: Annotated[float, typer.Option(min=0, help="Leave shorter segments out, seconds.")] = 0.0,
+    longest: Annotated[float | None, typer.Option(min=0, help="Leave longer segments out, seconds.")] = None,
+    name: Annotated[str | None, typer.Option(help="Names of the pieces; default {clip} {label} {number:2}.")] = None,
+    tag: Annotated[list[str] | None, typer.Option(help="Tag of the pieces; may be repeated.")] = None,
+    priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
+    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Cut clips along the segments of annotations; keyframes within stay with the pieces."""
+    from marey_schemas.jobs import CollectionInput
+    from marey_schemas.kinds import Kind
+
+    addresses = _of_one_project(sources)
+    given = {"layer": layer, "longest_s": longest, "name": name}
+    options = {
+        "labels": tuple(label or ()), "by_label": by_label, "margin_before_s": before, "margin_after_s": after,
+        "shortest_s": shortest, "tags": tuple(tag or ()), **{key: one for key, one in given.items() if one is not None},
+    }  # fmt: skip
+    with connect(context) as marey:
+        places = [
+            find_item(marey, address, [Kind.ANNOTATION]) or CollectionInput(collection=address.path)
+            for address in addresses
+        ]
+        job = marey.project(addresses[0].project).cut(places, into=into.strip("/"), priority=priority, **options)
+        _finish(marey, job, wait, as_json)
+
+
+def annotation_at(marey: Marey, place: str) -> AnnotationHandle:
+    """The annotation at a place. Raises `WrongUsage` where there is none."""
+    from marey_schemas.kinds import Kind
+
+    found: AnnotationHandle = require_item(marey, Address.parse(place), [Kind.ANNOTATION])
+    return found
+
+
+def _apply(context: typer.Context, place: str, **command: Any) -> None:
+    with connect(context) as marey:
+        found = annotation_at(marey, place)
+        item = found.apply([{name: value for name, value in command.items() if value is not None}])
+    summary = item.summary
+    typer.echo(f"{place}: revision {item.revision}, {summary['segments']} segments, {summary['keyframes']} keyframes")
+
+
+def _finish(marey: Marey, job: Job, wait: bool, as_json: bool) -> None:
+    if not wait:
+        return print_json(job) if as_json else typer.echo(job.id)
+    ended = follow(marey, job)
+    if as_json:
+        return print_json(ended)
+    result = ended.result or {}
+    counts = result.get("segments") or result.get("labels") or {}
+    made = f"{result['clips']} clips" if "clips" in result else f"{result['annotations']} annotations"
+    typer.echo(", ".join([made, *(f"{count} {label}" for label, count in counts.items())]))
+    for one in result.get("refused", ()):
+        tell(f"{one['name']}: {one['detail']} ({one['code']})")
+    if empty := result.get("empty"):
+        tell(f"nothing was found in {len(empty)} clips, such as {empty[0]}")
+    if result.get("refused"):
+        raise Refused
+    return None
+
+
+def _of_one_project(sources: list[str]) -> list[Address]:
+    addresses = [Address.parse(source) for source in sources]
+    if len({address.project for address in addresses}) > 1:
+        raise WrongUsage("all must be in one project")
+    return addresses
+
+
+def _segment(text: str) -> tuple[str, int, int]:
+    label, _, frames = text.rpartition("=")
+    first, colon, end = frames.partition(":")
+    if not (label and colon and first.isdecimal() and end.isdecimal()):
+        raise WrongUsage(f"{text!r}: write label=first:end, as in step_left=120:180")
+    return label, int(first), int(end)
+
+
+def _keyframe(text: str) -> tuple[str, int]:
+    label, _, frame = text.rpartition("=")
+    if not (label and frame.isdecimal()):
+        raise WrongUsage(f"{text!r}: write label=frame, as in contact=120")
+    return label, int(frame)
+
+
+def _assignment(text: str) -> tuple[str, Any]:
+    """name=value, where the value is JSON or else text; values with commas are lists of texts."""
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise WrongUsage(f"{text!r}: write name=value, as in most_turn_deg=30")
+    try:
+        return name, json.loads(value)
+    except ValueError:
+        return name, value.split(",") if "," in value or name == "joints" else value
