@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from marey_motion.editing.pose_kernels import place_joints
 from marey_motion.editing.rotation_kernels import (
     between,
@@ -121,3 +123,15 @@ def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):
         rotation = rotation_at(target_rotations, min(f, target_rotations.shape[0] - 1))
         offsets = body.offsets[min(f, body.offsets.shape[0] - 1)]
         _reach(limb, body, offsets, roots[f], rotations[f], target, rotation, work)
+
+
+@compiled
+def damped_reach(distances, starts, firsts, seconds, zone):  # type: ignore[no-untyped-def]
+    """How far (F,) limbs that span `starts` come when they are to span `distances`, their stretching damped."""
+    reach = np.empty(distances.shape[0])
+    for f in range(distances.shape[0]):
+        first, second = firsts[f], seconds[f]
+        wished = bend_at(min(max(distances[f], abs(first - second)), first + second), first, second)
+        bend = damped_bend(bend_at(starts[f], first, second), wished, zone)
+        reach[f] = math.sqrt(max(first * first + second * second - 2.0 * first * second * math.cos(bend), 0.0))
+    return reach

@@ -1,0 +1,269 @@
+"""Feet that stay where they stand.
+
+A contact of the toe keeps the toe at one place and height; one of the heel keeps the ankle there, so that a foot with
+both lies still and one with a toe alone rolls about it. The corrections are blended in and out with B-splines. Legs
+follow in closed form, their knees damped near straight; where a leg is too short, the root comes down a little
+(Kovar, Schreiner and Gleicher 2002, Footskate cleanup for motion capture editing).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import convolve1d, maximum_filter1d
+
+from marey_motion import kinematics, quaternions
+from marey_motion.editing.contacts import runs
+from marey_motion.editing.displacement import spread_displacements, windows_around
+from marey_motion.editing.inverse_kinematics import Limb, solve_two_bone
+from marey_motion.editing.inverse_kinematics_targets import OrientationTarget, PositionTarget
+from marey_motion.errors import EditError
+from marey_motion.motion import Motion
+from marey_motion.skeleton import Skeleton
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Run = tuple[int, int]
+
+MOST_LOWERING_M = 0.1
+LOWERING_PASSES = 6
+
+
+@dataclass(frozen=True)
+class Foot:
+    """One foot: its leg and its toe joint, which is the ankle where there is none."""
+
+    leg: Limb
+    toe: int
+
+
+@dataclass(frozen=True)
+class PlantOptions:
+    """How feet are planted.
+
+    Parameters
+    ----------
+    blend_s : seconds before and after a contact in which the foot goes over into its own motion
+    speed_m_s : joints slower than this touch the ground, where contacts are not given
+    shortest_s : shorter contacts are noise
+    knee_damping_rad : how long before straight a stretching knee is damped
+    """
+
+    blend_s: float = 0.15
+    speed_m_s: float = kinematics.CONTACT_SPEED_M_S
+    shortest_s: float = 0.06
+    knee_damping_rad: float = 0.3
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value >= 0):
+                raise EditError(f"{value} must be a number of at least 0", code="option-invalid", where=name)
+
+
+class FootContacts(NamedTuple):
+    """When a foot touches the ground with its toe and with its heel: flags (F,)."""
+
+    toe: Flags
+    heel: Flags
+
+
+@dataclass(frozen=True, eq=False)
+class PlantedMotion:
+    """A motion whose feet stay where they stand.
+
+    Parameters
+    ----------
+    motion : the whole motion
+    contacts : of each foot
+    slide_before_m, slide_after_m : ground that toes cover per contact, mean over contacts; 0 without contacts
+    lowered_m : the most that the root came down
+    """
+
+    motion: Motion
+    contacts: tuple[FootContacts, ...]
+    slide_before_m: float
+    slide_after_m: float
+    lowered_m: float
+
+
+class _Plan(NamedTuple):
+    """Where a foot should be: ankle (F, 3), the ankle's rotation in the world (F, 4), how firmly it stands (F,)."""
+
+    ankle: Floats
+    rotation: Floats
+    firmness: Floats
+
+
+def plant_feet(
+    skeleton: Skeleton,
+    motion: Motion,
+    frame_rate_hz: float,
+    feet: Sequence[Foot],
+    *,
+    contacts: Sequence[FootContacts] | None = None,
+    options: PlantOptions | None = None,
+) -> PlantedMotion:
+    """Keep feet where they stand.
+
+    Parameters
+    ----------
+    motion : F frames
+    contacts : of each foot; found by speed when None
+
+    Raises `EditError` where the contacts are not as long as the motion.
+    """
+    options = options or PlantOptions()
+    positions = motion.positions(skeleton)
+    contacts = contacts or tuple(find_contacts(positions, foot, frame_rate_hz, options) for foot in feet)
+    for one in contacts:
+        if len(one.toe) != motion.frame_count or len(one.heel) != motion.frame_count:
+            raise EditError(f"flags for {len(one.toe)} of {motion.frame_count} frames", where="contacts")
+    blend = max(1, round(options.blend_s * frame_rate_hz))
+    spins = np.asarray(kinematics.as_global_rotations(skeleton, motion.rotations), dtype=np.float64)
+    plans = [_plan(positions, spins, foot, touching, blend) for foot, touching in zip(feet, contacts, strict=True)]
+    lowering = _lowering(positions, feet, plans, options.knee_damping_rad, blend)
+    planted = motion._replace(root_translations=motion.root_translations - lowering[:, None] * (0.0, 1.0, 0.0))
+    for foot, plan in zip(feet, plans, strict=True):
+        planted = _with_leg(skeleton, planted, motion, foot, plan, lowering, options.knee_damping_rad)
+    slides = [_slide(points, feet, contacts) for points in (positions, planted.positions(skeleton))]
+    return PlantedMotion(planted, tuple(contacts), *slides, float(lowering.max(initial=0.0)))
+
+
+def find_contacts(positions: Floats, foot: Foot, frame_rate_hz: float, options: PlantOptions) -> FootContacts:
+    """When toe and ankle of a foot are slow, from joint positions (F, J, 3) in metres."""
+    points = positions[:, (foot.toe, foot.leg.end)]
+    touching = kinematics.foot_contacts(points, frame_rate_hz, speed_limit_m_s=options.speed_m_s)
+    for side in touching.T:
+        for start, stop in runs(side):
+            if stop - start < options.shortest_s * frame_rate_hz:
+                side[start:stop] = False
+    return FootContacts(touching[:, 0], touching[:, 1])
+
+
+def foot_slide_m(positions: Floats, foot: Foot, contacts: FootContacts) -> Floats:
+    """Ground that the toe covers (n,) in metres during each of its n contacts, from joint positions (F, J, 3)."""
+    steps = np.linalg.norm(np.diff(positions[:, foot.toe][:, (0, 2)], axis=0), axis=1)
+    return np.array([steps[start : stop - 1].sum() for start, stop in runs(contacts.toe)])
+
+
+def _slide(positions: Floats, feet: Sequence[Foot], contacts: Sequence[FootContacts]) -> float:
+    slides = np.concatenate([foot_slide_m(positions, *one) for one in zip(feet, contacts, strict=True)])
+    return float(slides.mean()) if slides.size else 0.0
+
+
+def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, blend: int) -> _Plan:
+    """Where ankle and toe go: the toe to its places, the ankle with it, and to its own while the heel stands."""
+    ankle, toe = positions[:, foot.leg.end], positions[:, foot.toe]
+    places = toe.copy()
+    for start, stop in runs(contacts.toe):
+        places[start:stop] = np.median(toe[start:stop], axis=0)
+    shift = _blended(contacts.toe, places - toe, blend)
+    firm_toe = np.clip(_blended(contacts.toe, np.ones((len(toe), 1)), blend), 0.0, 1.0)
+    led, length = ankle + shift, np.linalg.norm(ankle - toe, axis=1, keepdims=True)
+    own = led.copy()
+    for start, stop in _heel_runs(contacts):
+        place = np.median(led[start:stop], axis=0)
+        if contacts.toe[start:stop].any():
+            touching = start + int(np.argmax(contacts.toe[start:stop]))
+            place = _at_distance(place, places[touching], length[touching])
+        own[start:stop] = place
+    target = led + _blended(contacts.heel, own - led, blend)
+    target += firm_toe * (_at_distance(target, toe + shift, length) - target)
+    turn = _turn_between(toe - ankle, toe + shift - target)
+    firm = np.maximum(firm_toe, np.clip(_blended(contacts.heel, np.ones((len(toe), 1)), blend), 0.0, 1.0))
+    rotation = quaternions.multiply(turn, spins[:, foot.leg.end])
+    return _Plan(target, np.asarray(rotation, dtype=np.float64), firm[:, 0])
+
+
+def _heel_runs(contacts: FootContacts) -> list[Run]:
+    """Contacts of the heel, cut where they meet another contact of the toe."""
+    cut = []
+    toes = [start for start, _ in runs(contacts.toe)]
+    for start, stop in runs(contacts.heel):
+        standing = contacts.toe[start:stop].any()
+        inner = [one for one in toes if start < one < stop]
+        bounds = [start, *(inner if contacts.toe[start] or not standing else inner[1:]), stop]
+        cut += list(pairwise(bounds))
+    return cut
+
+
+def _blended(flags: Flags, values: Floats, blend: int) -> Floats:
+    """Values (F, c) where flags (F,) are set, and smoothly from and to zero within `blend` frames around them."""
+    frames = np.flatnonzero(flags)
+    blended = np.zeros_like(values)
+    for window in windows_around(frames, blend, len(flags)):
+        here = frames[(frames >= window.start) & (frames < window.stop)]
+        blended[window.start : window.stop] = spread_displacements(here, values[here], window)
+    return blended
+
+
+def _at_distance(points: Floats, centres: Floats, lengths: Floats) -> Floats:
+    """The points (..., 3) moved towards or away from centres until they are `lengths` (..., 1) away."""
+    ways = points - centres
+    far = np.linalg.norm(ways, axis=-1, keepdims=True)
+    return np.asarray(centres + ways * (lengths / np.maximum(far, 1e-9)), dtype=np.float64)
+
+
+def _turn_between(before: Floats, after: Floats) -> Floats:
+    """Shortest rotations (F, 4) between vectors (F, 3); none where one has no length, as without a toe."""
+    known = np.minimum(np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)) > 1e-6
+    turns = quaternions.identity(len(before))
+    turns[known] = quaternions.between_vectors(before[known], after[known])
+    return np.asarray(turns, dtype=np.float64)
+
+
+def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], zone: float, blend: int) -> Floats:
+    """How far the root must come down (F,), metres, so that standing feet are within reach of damped knees."""
+    from marey_motion.editing import two_bone_kernels
+
+    lowering = np.zeros(len(positions))
+    for _ in range(LOWERING_PASSES):
+        wanted = np.zeros(len(positions))
+        for foot, plan in zip(feet, plans, strict=True):
+            hip, knee, ankle = (positions[:, joint] for joint in (foot.leg.start, foot.leg.middle, foot.leg.end))
+            bones = np.linalg.norm(knee - hip, axis=1), np.linalg.norm(ankle - knee, axis=1)
+            way = hip - lowering[:, None] * (0.0, 1.0, 0.0) - plan.ankle
+            reach = two_bone_kernels.damped_reach(
+                np.linalg.norm(way, axis=1), np.linalg.norm(hip - ankle, axis=1), *bones, zone
+            )
+            across = np.minimum(np.hypot(way[:, 0], way[:, 2]), reach)
+            short = np.maximum(way[:, 1] - np.sqrt(reach**2 - across**2), 0.0)
+            wanted = np.maximum(wanted, plan.firmness * short)
+        if wanted.max(initial=0.0) < 1e-5:
+            break
+        lowering = np.minimum(lowering + _enveloped(wanted, blend), MOST_LOWERING_M)
+    return lowering
+
+
+def _enveloped(values: Floats, blend: int) -> Floats:
+    """A smooth curve (F,) that is nowhere below the values and goes over into them within `blend` frames."""
+    weights = np.hanning(2 * blend + 3)[1:-1]
+    highest = maximum_filter1d(values, 2 * blend + 1, mode="nearest")
+    return np.asarray(convolve1d(highest, weights / weights.sum(), mode="nearest"), dtype=np.float64)
+
+
+def _with_leg(
+    skeleton: Skeleton, planted: Motion, motion: Motion, foot: Foot, plan: _Plan, lowering: Floats, zone: float
+) -> Motion:
+    """The leg brought to its plan in the frames in which the plan or the root differs from the motion."""
+    ankle = foot.leg.end
+    now = motion.positions(skeleton)[:, ankle]
+    frames = np.flatnonzero((np.abs(plan.ankle - now).max(axis=1) > 0.0) | (lowering > 0.0))
+    if not frames.size:
+        return planted
+    solved = solve_two_bone(
+        skeleton,
+        planted.at_frames(frames),
+        foot.leg,
+        PositionTarget(ankle, plan.ankle[frames]),
+        orientation=OrientationTarget(ankle, plan.rotation[frames]),
+        damping_zone_rad=zone,
+    )
+    rotations = planted.rotations.copy()
+    rotations[frames] = solved.motion.rotations
+    return planted._replace(rotations=rotations)
