@@ -58,7 +58,7 @@ def retarget(
         if not wait:
             return print_json(submitted) if as_json else typer.echo(submitted.id)
         ended = follow(marey, submitted)
-    return _print_ended(ended, as_json)
+    return print_ended(ended, as_json)
 
 
 def clips_at(marey: Marey, address: Address) -> ItemInput | CollectionInput:
@@ -88,7 +88,8 @@ def show_progress(now: Job, advance: Advance, count: int | None = None, unit: st
     return advance(unit or what, round(now.progress.done / now.size * count), count)
 
 
-def _print_ended(ended: Job, as_json: bool) -> None:
+def print_ended(ended: Job, as_json: bool) -> None:
+    """How a job about clips ended; the exit status tells of refused ones."""
     result = ended.result or {}
     refused: list[dict[str, Any]] = list(result.get("refused", ()))
     if as_json:
@@ -273,7 +274,7 @@ def retry_job(
         if not wait:
             return print_json(again) if as_json else typer.echo(again.id)
         ended = follow(marey, again)
-    return _print_ended(ended, as_json)
+    return print_ended(ended, as_json)
 
 
 def why(
