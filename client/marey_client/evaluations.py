@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_client.downloads import safe_file_name, saved_atomically
 from marey_client.findings import Findings, OnProgress, find_out
-from marey_client.items import ItemHandle
 from marey_client.motions import ClipHandle
+from marey_client.reports import ReportedHandle
 from marey_schemas.base import Request
-from marey_schemas.evaluation import EvaluateParams, EvaluationReport, StoredFigure
+from marey_schemas.evaluation import EvaluateParams
 from marey_schemas.improvement import CompareParams, OptimiseParams, SuggestParams, SweepParams
 from marey_schemas.items import Item
 from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
@@ -32,7 +30,7 @@ Place = str | CollectionInput | ItemInput | ClipHandle
 Places = Place | Sequence[Place]
 
 
-class EvaluationHandle(ItemHandle):
+class EvaluationHandle(ReportedHandle):
     """One evaluation."""
 
     @property
@@ -59,35 +57,6 @@ class EvaluationHandle(ItemHandle):
     def records(self) -> dict[str, dict[str, NDArray[Any]]]:
         """Every tick of every trial, by the trial's name: arrays by what they hold, see `record_arrays`."""
         return record_arrays(self.part("records"))
-
-    def figures(self) -> tuple[StoredFigure, ...]:
-        """The figures that the report has."""
-        return EvaluationReport.model_validate(self.part("report")).figures
-
-    def report(self) -> bytes:
-        """The report: one page of HTML that needs nothing else."""
-        return self._fetch(f"{self.url}/report", "text/html")
-
-    def figure(
-        self,
-        name: str,
-        format: str = "png",  # noqa: A002
-        *,
-        trial: str | None = None,
-        table: str | None = None,
-    ) -> bytes:
-        """A figure as png or svg, or what it plots as json, or one table of that as csv."""
-        params = {"format": format, "trial": trial, "table": table}
-        return self._fetch(f"{self.url}/figures/{name}", "*/*", params)
-
-    def save_report(self, path: Path) -> Path:
-        """Write the report to a file."""
-        return _saved(path, self.report())
-
-    def save_figures(self, folder: Path) -> list[Path]:
-        """Write every figure to a folder, in every form."""
-        files = (file for figure in self.figures() for file in self._files_of(figure))
-        return [_saved(folder / safe_file_name(name), data) for name, data in files]
 
     # -- what follows from it: each hands in a job, waits for it, and raises `JobUnsuccessful` where it is refused --
 
@@ -130,17 +99,6 @@ class EvaluationHandle(ItemHandle):
         self, kind: str, inputs: Mapping[str, Any], params: Request, on_progress: OnProgress | None
     ) -> Findings:
         return find_out(self.transport, self.project, kind, inputs, params, on_progress)
-
-    def _files_of(self, figure: StoredFigure) -> Iterator[tuple[str, bytes]]:
-        name = figure.name if figure.trial is None else f"{figure.name} {figure.trial}"
-        for form in ("png", "svg", "json"):
-            yield f"{name}.{form}", self.figure(figure.name, form, trial=figure.trial)
-        for table in figure.csv:
-            yield f"{name} {table}.csv", self.figure(figure.name, "csv", trial=figure.trial, table=table)
-
-    def _fetch(self, path: str, accept: str, params: Mapping[str, str | None] | None = None) -> bytes:
-        given = {name: value for name, value in (params or {}).items() if value is not None}
-        return self.transport.send("GET", path, params=given, headers={"Accept": accept}).content
 
 
 def evaluate_request(
@@ -233,9 +191,3 @@ def record_arrays(document: Mapping[str, Any]) -> dict[str, dict[str, NDArray[An
         trial: {name: column[start:stop] for name, column in columns.items()}
         for trial, start, stop in zip(document["trials"], starts, starts[1:], strict=False)
     }
-
-
-def _saved(path: Path, data: bytes) -> Path:
-    with saved_atomically(path) as file:
-        file.write(data)
-    return path

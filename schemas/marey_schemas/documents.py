@@ -15,8 +15,13 @@ from marey_schemas.alignment import AlignmentInfo
 from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Request
 from marey_schemas.editing import EditDocument
-from marey_schemas.evaluation import EvaluationDocument, EvaluationRecords, EvaluationReport
+from marey_schemas.evaluation import EvaluationDocument, EvaluationRecords
+from marey_schemas.modelling import MotionPrimitiveDocument
 from marey_schemas.names import Digest, JointName, Tag
+from marey_schemas.references import OutputRef as OutputRef
+from marey_schemas.references import RevisionRef as RevisionRef
+from marey_schemas.reports import EvaluationReport, ModelReport
+from marey_schemas.sample_trees import SampleTreeDocument
 
 MAX_JOINTS = 4096
 MAX_FRAME_RATE_HZ = 100_000.0
@@ -82,19 +87,6 @@ class SkeletonMapping(Request):
     joints: dict[str, JointName] = Field(default_factory=dict, description="Standard joint name to joint name.")
     axes: dict[JointName, JointAxes] = Field(default_factory=dict)
     notes: tuple[str, ...] = ()
-
-
-class RevisionRef(Request):
-    """A pinned revision of an item."""
-
-    item: str
-    revision: int = Field(ge=1)
-
-
-class OutputRef(Request):
-    """A reference to another output of the same write; the store replaces it by the item it becomes."""
-
-    output: str
 
 
 class Motion(Request):
@@ -233,9 +225,9 @@ SCHEMAS: dict[str, type[Request]] = {
     "marey/evaluation-report@1": EvaluationReport,
     "marey/edit@1": EditDocument,
     "marey/alignment@1": AlignmentInfo,
-    "marey/motion-primitive@1": OpenDocument,
-    "marey/sample-tree@1": OpenDocument,
-    "marey/model-report@1": OpenDocument,
+    "marey/motion-primitive@1": MotionPrimitiveDocument,
+    "marey/sample-tree@1": SampleTreeDocument,
+    "marey/model-report@1": ModelReport,
     "marey/model-graph@1": OpenDocument,
     "marey/document@1": OpenDocument,
 }

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from marey_schemas.base import Request
-from marey_schemas.names import Digest, ItemName, Tag
+from marey_schemas.names import ItemName, Tag
 
 MOST_TRIALS = 2000
 MOST_SIMULATED_S = 100_000.0
@@ -23,11 +23,7 @@ Speed = Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)]
 TurnRate = Annotated[float, Field(ge=-720, le=720, allow_inf_nan=False)]
 Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False, description="Weight of these features.")]
 ItemId = Annotated[str, StringConstraints(min_length=1, max_length=64)]
-ScriptDigest = Annotated[str, StringConstraints(pattern=r"^sha256-[A-Za-z0-9+/]{43}=$")]
-"""A script by its content, as a Content-Security-Policy names it."""
-
 TrialName = Annotated[str, StringConstraints(min_length=1, max_length=100)]
-FigureName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
 
 DEFAULT_SPEEDS_M_S = tuple(1.0 + 0.25 * step for step in range(9))
 DEFAULT_TURN_RATES_DEG_S = tuple(-100.0 + 25.0 * step for step in range(9))
@@ -190,34 +186,3 @@ class EvaluationRecords(Request):
     model_config = ConfigDict(extra="allow")
 
     schema_: Literal["marey/evaluation-records@1"] = Field("marey/evaluation-records@1", alias="schema")
-
-
-class StoredFile(Request):
-    """A file that a document names."""
-
-    blob: Digest
-    size_bytes: int = Field(ge=0)
-
-
-class StoredFigure(Request):
-    """A figure in each of its forms: picture, drawing, and what is plotted, as one JSON and as tables of CSV."""
-
-    name: FigureName
-    number: str = Field("", description="The published figure it corresponds to.")
-    title: str
-    caption: str
-    trial: TrialName | None = Field(None, description="The trial it was asked for; others show the worst, or all.")
-    png: StoredFile
-    svg: StoredFile
-    json_: StoredFile = Field(alias="json")
-    csv: dict[str, StoredFile] = Field(default_factory=dict, max_length=64, description="By name of the table.")
-
-
-class EvaluationReport(Request):
-    """Part `report` of an evaluation: one page for people, and its figures."""
-
-    schema_: Literal["marey/evaluation-report@1"] = Field("marey/evaluation-report@1", alias="schema")
-    title: str
-    html: StoredFile
-    scripts: tuple[ScriptDigest, ...] = Field((), max_length=16, description="The scripts that the page may run.")
-    figures: tuple[StoredFigure, ...] = Field((), max_length=10_000)

@@ -1,4 +1,4 @@
-"""`evaluate` and `report`."""
+"""`evaluate`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ MOST_VALUES = 200
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
     app.command()(evaluate)
-    app.command()(report)
 
 
 def evaluate(
@@ -104,29 +103,6 @@ def evaluate(
     if out is not None:
         tell(f"report: {out}")
     return None
-
-
-def report(
-    context: typer.Context,
-    place: Annotated[str, typer.Argument(help="An evaluation: project/folder/name, or project/id.")],
-    out: Annotated[Path, typer.Option(help="The file to write.")] = Path("report.html"),
-    figures: Annotated[
-        Path | None, typer.Option(help="Write every figure to this folder: PNG, SVG, JSON, CSV.")
-    ] = None,
-    open_it: Annotated[bool, typer.Option("--open", help="Show it in a browser.")] = False,
-) -> None:
-    """Write the report of an evaluation to a file."""
-    with connect(context) as marey:
-        found = evaluation_at(marey, place)
-        found.save_report(out)
-        drawn = found.save_figures(figures) if figures is not None else []
-    typer.echo(out)
-    if figures is not None:
-        tell(f"{len(drawn)} files of figures in {figures}")
-    if open_it:
-        import webbrowser
-
-        webbrowser.open(out.absolute().as_uri())
 
 
 def _clips_in(marey: Marey, address: Address) -> list[Any]:

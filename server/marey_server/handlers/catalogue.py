@@ -8,7 +8,6 @@ from marey_server.handlers import (
     coverage_streams,
     documentation,
     edits,
-    evaluations,
     events,
     exports,
     health,
@@ -19,6 +18,8 @@ from marey_server.handlers import (
     parts,
     pipelines,
     projects,
+    reports,
+    samples,
     uploads,
 )
 from marey_server.handlers.resource import Resource
@@ -32,7 +33,8 @@ RESOURCES: tuple[type[Resource], ...] = (
     *annotations.RESOURCES,
     *edits.RESOURCES,
     *exports.RESOURCES,
-    *evaluations.RESOURCES,
+    *reports.RESOURCES,
+    *samples.RESOURCES,
     *coverage_streams.RESOURCES,
     *imports.RESOURCES,
     *jobs.RESOURCES,

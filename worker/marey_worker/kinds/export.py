@@ -13,9 +13,9 @@ from marey_motion.exporting import write_clip_file
 from marey_motion.skeleton import Skeleton
 from marey_schemas import codecs
 from marey_schemas.documents import Motion, RevisionRef, SkeletonHierarchy
-from marey_schemas.evaluation import StoredFile
 from marey_schemas.jobs import ExportParams, PinnedInput
 from marey_schemas.kinds import Kind
+from marey_schemas.reports import StoredFile
 from marey_worker.context import Context, JobRefused, NoSuchThing
 
 EPOCH = (1980, 1, 1, 0, 0, 0)

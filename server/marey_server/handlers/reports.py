@@ -1,4 +1,4 @@
-"""The reports of evaluations and their figures, as they were written when the evaluation was made."""
+"""The reports of evaluations and models, and their figures, as they were written when these were made."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import Any, Literal
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_schemas.evaluation import EvaluationReport, StoredFigure, StoredFile
 from marey_schemas.kinds import Kind
+from marey_schemas.reports import REPORTS, StoredFigure, StoredFile
+from marey_schemas.reports import Report as ReportDocument
 from marey_server.errors import NotFound
 from marey_server.handlers.declarations import Access, Bytes, reads
 from marey_server.handlers.items import kind_of
@@ -58,10 +59,10 @@ class StoredFileSender(BlobSender):
 
 
 class Report(StoredFileSender):
-    """The report of an evaluation."""
+    """The report of an evaluation or a model."""
 
     path = "/projects/{project}/{kind}/{item}/report"
-    tag = "Evaluations"
+    tag = "Reports"
 
     @reads(
         access=Access.READER,
@@ -73,16 +74,16 @@ class Report(StoredFileSender):
         headers=("Range", "If-Range"),
     )
     async def get(self, project: str, kind: str, item: str, query: ReportQuery) -> Rendered | None:
-        """The report of an evaluation (kind `evaluations`): one page that needs nothing else."""
+        """The report of an evaluation or a model (kinds `evaluations`, `models`): one page that needs nothing else."""
         report = await self.look_up(read_report, project, kind_of(kind), item, query.revision)
         return await self.send_file(report.html, query, "text/html; charset=utf-8", _scripts(report))
 
 
 class Figure(StoredFileSender):
-    """A figure of an evaluation."""
+    """A figure of a report."""
 
     path = "/projects/{project}/{kind}/{item}/figures/{figure}"
-    tag = "Evaluations"
+    tag = "Reports"
 
     @reads(
         access=Access.READER,
@@ -94,26 +95,29 @@ class Figure(StoredFileSender):
         headers=("Range", "If-Range"),
     )
     async def get(self, project: str, kind: str, item: str, figure: str, query: FigureQuery) -> Rendered | None:
-        """A figure of an evaluation's report (kind `evaluations`): as a picture, a drawing, or the numbers in it."""
+        """A figure of a report (kinds `evaluations`, `models`): as a picture, a drawing, or the numbers in it."""
         report = await self.look_up(read_report, project, kind_of(kind), item, query.revision)
         file = file_of(find_figure(report, figure, query.trial), query)
         return await self.send_file(file, query, FIGURE_TYPES[query.format], "sandbox")
 
 
-def _scripts(report: EvaluationReport) -> str:
+def _scripts(report: ReportDocument) -> str:
     """The part of the policy that lets the page run its own scripts, named by content, and no others."""
     if not report.scripts:
         return "sandbox"
     return f"script-src {' '.join(repr(digest) for digest in report.scripts)}; sandbox allow-scripts"
 
 
-def read_report(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> EvaluationReport:
-    """The report of an evaluation. Raises `NotFound`."""
+def read_report(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ReportDocument:
+    """The report of an item, of whichever kind it is. Raises `NotFound`."""
     part: dict[str, Any] = items.read_part(tx, project, kind, item_id, "report", revision=revision, arrays="none").tree
-    return EvaluationReport.model_validate(part)
+    return _REPORT_OF[part["schema"]].model_validate(part)
 
 
-def find_figure(report: EvaluationReport, name: str, trial: str | None) -> StoredFigure:
+_REPORT_OF = {str(one.model_fields["schema_"].default): one for one in REPORTS}
+
+
+def find_figure(report: ReportDocument, name: str, trial: str | None) -> StoredFigure:
     """A figure of a report. Raises `NotFound`, and says what there is."""
     named = [figure for figure in report.figures if figure.name == name]
     for figure in named:

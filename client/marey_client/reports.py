@@ -1,0 +1,63 @@
+"""Items with a report: a page for people, and figures of what it tells."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from marey_client.downloads import safe_file_name, saved_atomically
+from marey_client.items import ItemHandle
+from marey_schemas.reports import StoredFigure
+
+
+class ReportedHandle(ItemHandle):
+    """An item that may have a part `report`."""
+
+    def figures(self) -> tuple[StoredFigure, ...]:
+        """The figures that the report has."""
+        return tuple(StoredFigure.model_validate(figure) for figure in self.part("report")["figures"])
+
+    def report(self) -> bytes:
+        """The report: one page of HTML that needs nothing else."""
+        return self._fetch(f"{self.url}/report", "text/html")
+
+    def figure(
+        self,
+        name: str,
+        format: str = "png",  # noqa: A002
+        *,
+        trial: str | None = None,
+        table: str | None = None,
+    ) -> bytes:
+        """A figure as png or svg, or what it plots as json, or one table of that as csv.
+
+        `trial` names one of an evaluation, for figures that were asked for of it.
+        """
+        params = {"format": format, "trial": trial, "table": table}
+        return self._fetch(f"{self.url}/figures/{name}", "*/*", params)
+
+    def save_report(self, path: Path) -> Path:
+        """Write the report to a file."""
+        return _saved(path, self.report())
+
+    def save_figures(self, folder: Path) -> list[Path]:
+        """Write every figure to a folder, in every form."""
+        files = (file for figure in self.figures() for file in self._files_of(figure))
+        return [_saved(folder / safe_file_name(name), data) for name, data in files]
+
+    def _files_of(self, figure: StoredFigure) -> Iterator[tuple[str, bytes]]:
+        name = figure.name if figure.trial is None else f"{figure.name} {figure.trial}"
+        for form in ("png", "svg", "json"):
+            yield f"{name}.{form}", self.figure(figure.name, form, trial=figure.trial)
+        for table in figure.csv:
+            yield f"{name} {table}.csv", self.figure(figure.name, "csv", trial=figure.trial, table=table)
+
+    def _fetch(self, path: str, accept: str, params: Mapping[str, str | None] | None = None) -> bytes:
+        given = {name: value for name, value in (params or {}).items() if value is not None}
+        return self.transport.send("GET", path, params=given, headers={"Accept": accept}).content
+
+
+def _saved(path: Path, data: bytes) -> Path:
+    with saved_atomically(path) as file:
+        file.write(data)
+    return path
