@@ -19,10 +19,10 @@ from marey_client.evaluations import EvaluationHandle, Places, evaluate_request,
 from marey_client.imports import Imports
 from marey_client.items import ItemHandle, Items
 from marey_client.jobs import Jobs
+from marey_client.models import AlignedPlaces, ModelHandle, model_request
 from marey_client.motions import ClipHandle, SkeletonHandle
 from marey_client.paging import pages
 from marey_client.pipelines import PipelineRun, submit_pipeline
-from marey_client.reports import ReportedHandle
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.access import Project, ProjectChange
 from marey_schemas.alignment import AlignParams
@@ -31,6 +31,7 @@ from marey_schemas.evaluation import EvaluateParams
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
 from marey_schemas.jobs import CollectionInput, ItemInput, Job, JobCreate, RetargetParams
 from marey_schemas.kinds import Kind
+from marey_schemas.modelling import ModelParams
 from marey_schemas.pipelines import PipelineCreate
 
 
@@ -95,6 +96,11 @@ class ProjectHandle:
         return Edits(self.transport, self.name, Kind.EDIT, EditHandle)
 
     @cached_property
+    def models(self) -> Items[ModelHandle]:
+        """Its models."""
+        return Items(self.transport, self.name, Kind.MODEL, ModelHandle)
+
+    @cached_property
     def evaluations(self) -> Items[EvaluationHandle]:
         """Its evaluations."""
         return Items(self.transport, self.name, Kind.EVALUATION, EvaluationHandle)
@@ -108,7 +114,7 @@ class ProjectHandle:
             Kind.PROCESSED: ProcessedHandle,
             Kind.EDIT: EditHandle,
             Kind.EVALUATION: EvaluationHandle,
-            Kind.MODEL: ReportedHandle,
+            Kind.MODEL: ModelHandle,
         }
         return Items(self.transport, self.name, kind, known.get(kind, ItemHandle))
 
@@ -238,6 +244,31 @@ class ProjectHandle:
         jobs.wait(job.id, on_progress=on_progress)
         (made,) = jobs.outputs(job.id)
         return self.evaluations.get(made.item)
+
+    def train_model(
+        self,
+        aligned: AlignedPlaces,
+        *,
+        into: str = "",
+        seed: int = 0,
+        priority: int = 0,
+        cache: Literal["use", "refresh", "off"] = "use",
+        **options: Any,
+    ) -> Job:
+        """Hand in the training of a model on clips that were aligned with each other: a folder, or several of them.
+
+        `options` are those of `ModelParams`, for example `name="step"` or `spatial_share=0.98`.
+        """
+        request = model_request(aligned, ModelParams.model_validate(options))
+        update = {"into": into, "seed": seed, "priority": priority, "cache": cache}
+        return self.submit(request.model_copy(update=update))
+
+    def model(self, job: Job, *, on_progress: Callable[[Job], None] | None = None) -> ModelHandle:
+        """The model that a job makes, once it is there. Raises `JobUnsuccessful`."""
+        jobs = Jobs(self.transport)
+        jobs.wait(job.id, on_progress=on_progress)
+        (made,) = jobs.outputs(job.id)
+        return self.models.get(made.item)
 
     def edited_rigs(self, clips: Iterable[Item]) -> tuple[ItemInput, ...]:
         """The skeletons of clips that have more than their first revision: their mapping may have been edited."""

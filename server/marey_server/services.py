@@ -13,6 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 from marey_server.access.limits import TryLimit
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.handlers.answer_cache import AnswerCache
+from marey_server.models import ModelCache
 from marey_server.observe import Metrics
 from marey_server.settings import Settings
 from marey_server.store import tokens
@@ -45,6 +46,7 @@ class Services:
         self.description = description
         self.metrics = Metrics()
         self.answers = AnswerCache(settings.answer_cache_bytes)
+        self.models = ModelCache()
         self.draining = asyncio.Event()
         self.in_flight: set[Any] = set()
         self.sign_in_places = asyncio.Semaphore(SIGN_INS_AT_ONCE)

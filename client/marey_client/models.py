@@ -1,0 +1,140 @@
+"""Generative models of motion: ask for one, read how good it is, and draw motions from it."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_client.alignments import ProcessedHandle
+from marey_client.downloads import download, safe_file_name, saved_atomically
+from marey_client.items import Items
+from marey_client.motions import ClipHandle, MotionArrays
+from marey_client.reports import ReportedHandle
+from marey_schemas.codecs import JSON, encode_tree
+from marey_schemas.documents import ClipInfo, Source
+from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
+from marey_schemas.kinds import Kind
+from marey_schemas.modelling import ModelParams
+
+if TYPE_CHECKING:
+    pass
+
+AlignedPlace = str | CollectionInput | ItemInput | ProcessedHandle
+"""A folder of aligned clips by its path, an aligned clip, or either as an input of jobs."""
+
+AlignedPlaces = AlignedPlace | Sequence[AlignedPlace]
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Motions drawn from a model.
+
+    Parameters
+    ----------
+    latents : (n, L) what they are in the model
+    log_densities : (n,) natural logarithm of how likely each is
+    motions : n of them, in the canonical frame: the body begins at x = z = 0 and faces +z
+    """
+
+    latents: NDArray[np.float64]
+    log_densities: NDArray[np.float64]
+    motions: tuple[MotionArrays, ...]
+
+
+class ModelHandle(ReportedHandle):
+    """One model."""
+
+    @property
+    def verdict(self) -> str:
+        """How good the model is, in a sentence or two."""
+        return str(self.item.summary["verdict"])
+
+    def summary(self) -> dict[str, Any]:
+        """The verdict and the headline numbers; units stand at the ends of the names."""
+        return dict(self.item.summary)
+
+    def document(self, *, revision: int | None = None) -> dict[str, Any]:
+        """All of it: functions, mixture, options, examples, training report; arrays are numpy arrays."""
+        return self.part("model", revision=revision)
+
+    def training(self) -> dict[str, Any]:
+        """How good it is, in numbers: errors, likelihoods, examples, feet, warnings."""
+        return dict(self.document()["training"] or {})
+
+    def sample(self, n: int = 1, seed: int = 0, *, revision: int | None = None) -> Samples:
+        """Draw `n` motions; the same for the same seed, and the first are those of a smaller number."""
+        tree = self._samples(n, seed, revision)
+        motions = tuple(MotionArrays.model_validate(motion) for motion in tree["motions"])
+        return Samples(tree["latents"], tree["log_densities"], motions)
+
+    def save_samples(
+        self,
+        folder: Path,
+        format: str = "bvh",  # noqa: A002
+        *,
+        n: int = 1,
+        seed: int = 0,
+        unit: str | None = None,
+        revision: int | None = None,
+    ) -> list[Path]:
+        """Draw `n` motions and write each to a file: bvh, npz or predecessor; or all to one, as json."""
+        if format == "json":
+            target = folder / safe_file_name(f"{self.name} {seed}.json")
+            return [_saved(target, encode_tree(self._samples(n, seed, revision), JSON))]
+        params = {"n": str(n), "seed": str(seed), "format": format, "unit": unit, "revision": revision}
+        if n == 1:
+            name = f"{self.name} {seed}.{format}"
+            return [download(self.transport, f"{self.url}/samples/export", folder, params=params, name=name)]
+        given = {name: str(value) for name, value in params.items() if value is not None}
+        response = self.transport.send("GET", f"{self.url}/samples/export", params=given, headers={"Accept": "*/*"})
+        with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
+            return [_saved(folder / safe_file_name(name), archive.read(name)) for name in archive.namelist()]
+
+    def add_samples(
+        self, n: int = 1, seed: int = 0, *, into: str, tags: tuple[str, ...] = (), names: str | None = None
+    ) -> list[ClipHandle]:
+        """Draw `n` motions and make clips of them in the folder `into`, on the model's skeleton.
+
+        They are called `names`, by default as the model, then seed and number. `Conflict` where a name is taken.
+        """
+        tree = self._samples(n, seed, self.item.revision)
+        clips = Items(self.transport, self.project, Kind.CLIP, ClipHandle)
+        made = []
+        for place, motion in enumerate(tree["motions"], start=1):
+            details = {"model": tree["model"], "seed": seed, "place": place}
+            info = ClipInfo(action=self.name, source=Source(format="sampled", details=details))
+            parts = {"motion": motion, "info": info.model_dump(mode="json", by_alias=True, exclude_none=True)}
+            name = f"{names or self.name} {seed} {place:04d}"
+            made.append(clips.create(name, parts, collection=into, tags=tags))
+        return made
+
+    def _samples(self, n: int, seed: int, revision: int | None) -> dict[str, Any]:
+        tree, _ = self.transport.get_tree(f"{self.url}/samples", {"n": str(n), "seed": str(seed), "revision": revision})
+        return dict(tree)
+
+
+def model_request(aligned: AlignedPlaces, params: ModelParams) -> JobCreate:
+    """The job that trains a model on aligned clips."""
+    single = isinstance(aligned, str | CollectionInput | ItemInput | ProcessedHandle)
+    places = [aligned] if single else list(aligned)  # type: ignore[arg-type, list-item]
+    inputs = {"aligned": tuple(map(_as_input, places))}
+    return JobCreate(kind="model", inputs=inputs, params=params.model_dump(mode="json", exclude_defaults=True))
+
+
+def _as_input(place: Any) -> CollectionInput | ItemInput:
+    if isinstance(place, str):
+        return CollectionInput(collection=place.strip("/"))
+    return place.as_input() if isinstance(place, ProcessedHandle) else place
+
+
+def _saved(path: Path, data: bytes) -> Path:
+    with saved_atomically(path) as file:
+        file.write(data)
+    return path

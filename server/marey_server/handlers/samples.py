@@ -1,0 +1,104 @@
+"""Samples of models: motions that were never captured, the same for the same seed."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from marey_schemas.base import Request
+from marey_schemas.modelling import MOST_SAMPLES, MOST_SEED
+from marey_server import models
+from marey_server.handlers.declarations import Access, Bytes, Document, reads
+from marey_server.handlers.items import kind_of
+from marey_server.handlers.queries import MAX_INTEGER
+from marey_server.handlers.reply import Rendered, Reply, render
+from marey_server.handlers.resource import Resource
+from marey_server.handlers.streaming import IMMUTABLE, attachment
+from marey_server.models import FoundModel, SampleFormat, UsableModel
+
+
+class SampleQuery(Request):
+    """Which samples."""
+
+    n: int = Field(1, ge=1, le=MOST_SAMPLES, description="How many; the first are those of a smaller number.")
+    seed: int = Field(0, ge=0, le=MOST_SEED, description="The same seed gives the same samples.")
+    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Absent: the newest.")
+
+
+class SampleFileQuery(SampleQuery):
+    """Which samples, and as which files."""
+
+    format: SampleFormat = Field("bvh", description="Of the files; several come as one ZIP archive.")
+    unit: Literal["m", "cm"] = Field("cm", description="Unit of length of a BVH.")
+
+
+class ModelUser(Resource):
+    """Resources that let a model generate motion."""
+
+    async def usable_model(
+        self, project: str, kind: str, item: str, revision: int | None
+    ) -> tuple[FoundModel, UsableModel]:
+        """The model that is asked for, parsed; those used last are kept."""
+        found = await self.look_up(models.find_model, project, kind_of(kind), item, revision)
+        known = self.services.models.get(found.part.digest)
+        if known is None:
+            loaded = await self.look_up(models.load_model, project, found)
+            known = await self.compute(self.services.models.parse, found.part.digest, loaded)
+        return found, known
+
+
+class Samples(ModelUser):
+    """Samples of a model as a document."""
+
+    path = "/projects/{project}/{kind}/{item}/samples"
+    tag = "Models"
+
+    @reads(access=Access.READER, query=SampleQuery, answer=Document, etag=True)
+    async def get(self, project: str, kind: str, item: str, query: SampleQuery) -> Rendered:
+        """Motions drawn from a model (kind `models`), with their latent vectors and likelihoods.
+
+        The same for the same seed and revision. `motions` are documents like the part `motion` of a clip.
+        """
+        found, model = await self.usable_model(project, kind, item, query.revision)
+        form, answers = self.answer_form, self.services.answers
+
+        def drawn() -> Rendered:
+            document = models.sample_document(found, model, query.n, query.seed)
+            return render(Reply(document, rev=_state(found, query), headers=_caching(query)), form, answers)
+
+        return await self.compute(drawn)
+
+
+class SampleFiles(ModelUser):
+    """Samples of a model as files."""
+
+    path = "/projects/{project}/{kind}/{item}/samples/export"
+    tag = "Models"
+
+    @reads(
+        access=Access.READER,
+        query=SampleFileQuery,
+        answer=Bytes,
+        answer_types=("text/plain", "application/x-npz", "application/x-bzip2", "application/zip"),
+    )
+    async def get(self, project: str, kind: str, item: str, query: SampleFileQuery) -> Reply:
+        """Motions drawn from a model (kind `models`) as files: one as it is, several as a ZIP archive."""
+        found, model = await self.usable_model(project, kind, item, query.revision)
+        file = await self.compute(models.sample_file, found, model, query.n, query.seed, query.format, query.unit)
+        headers = {"Content-Disposition": attachment(file.name), **_caching(query)}
+        return Reply(file.data, media_type=file.media_type, headers=headers)
+
+
+def _state(found: FoundModel, query: SampleQuery) -> str:
+    """What names these samples: the model by its content, how many, and the seed."""
+    return f"{found.part.digest.removeprefix('sha256:')[:32]}.{query.n}.{query.seed}"
+
+
+def _caching(query: SampleQuery) -> dict[str, str]:
+    """What names a revision never changes."""
+    return {"Cache-Control": IMMUTABLE if query.revision is not None else "private, no-cache"}
+
+
+RESOURCES: tuple[type[Resource], ...] = (Samples, SampleFiles)
+"""Samples of models."""

@@ -1,0 +1,189 @@
+"""Models in use: read once, kept parsed between requests, and made to generate motion."""
+
+from __future__ import annotations
+
+import io
+import threading
+import zipfile
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from marey_schemas.documents import RevisionRef, SkeletonHierarchy
+from marey_schemas.kinds import Kind
+from marey_server.errors import Invalid, NotFound
+from marey_server.store import items
+from marey_server.store.items.reading import FoundPart
+from marey_server.store.transaction import Transaction
+
+if TYPE_CHECKING:
+    from marey_motion.clip import Clip
+    from marey_motion.modelling.primitive import Floats, MotionPrimitive
+
+
+MIB = 1 << 20
+MOST_KEPT_BYTES = 64 * MIB
+LARGEST_ANSWER_BYTES = 32 * MIB
+"""Of the poses of all samples of one request."""
+
+SAMPLES_SCHEMA = "marey/motion-samples@1"
+EPOCH = (1980, 1, 1, 0, 0, 0)
+"""The date of files in archives: the same samples are the same bytes."""
+
+SampleFormat = Literal["bvh", "npz", "predecessor"]
+
+
+@dataclass(frozen=True, slots=True)
+class FoundModel:
+    """A revision of a model that the caller may read."""
+
+    item: str
+    name: str
+    part: FoundPart
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedModel:
+    """The documents that a model is made of."""
+
+    model: dict[str, Any]
+    hierarchy: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class UsableModel:
+    """A model that generates motion."""
+
+    primitive: MotionPrimitive
+    skeleton: RevisionRef
+
+
+def find_model(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> FoundModel:
+    """A model by its item. Raises `NotFound`."""
+    if kind is not Kind.MODEL:
+        raise NotFound(f"A {kind} generates no motion; only models do.", code="not-a-model")
+    part = items.find_part(tx, project, kind, item_id, "model", revision=revision)
+    return FoundModel(item_id, items.read_item(tx, project, kind, item_id).name, part)
+
+
+def load_model(tx: Transaction, project: str, found: FoundModel) -> LoadedModel:
+    """Its documents. Raises `NotFound` where its skeleton is gone."""
+    model = items.load_part(tx, found.part, arrays="decoded")
+    ref = model["skeleton"]
+    skeleton = items.read_part(tx, project, Kind.SKELETON, ref["item"], "hierarchy", revision=ref["revision"])
+    return LoadedModel(model, skeleton.tree)
+
+
+def parse_model(loaded: LoadedModel) -> UsableModel:
+    """The model itself. Raises `Invalid` where its numbers describe none."""
+    from marey_motion.documents import skeleton_from_document
+    from marey_motion.errors import MotionError
+    from marey_motion.modelling.primitive_documents import primitive_from_tree
+
+    skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(loaded.hierarchy))
+    try:
+        primitive = primitive_from_tree(loaded.model, skeleton)
+        primitive.mixture.cholesky  # noqa: B018    computed here so that an impossible mixture is told of here
+    except MotionError as error:
+        raise Invalid(f"The model cannot be used: {error}", code=error.code) from error
+    return UsableModel(primitive, RevisionRef.model_validate(loaded.model["skeleton"]))
+
+
+class ModelCache:
+    """The models used last, as many as fit into `max_bytes`. Any thread may use it."""
+
+    def __init__(self, max_bytes: int = MOST_KEPT_BYTES) -> None:
+        self._max_bytes = max_bytes
+        self._models: OrderedDict[str, tuple[UsableModel, int]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, digest: str) -> UsableModel | None:
+        """The model of a document, if it is kept."""
+        with self._lock:
+            if digest not in self._models:
+                return None
+            self._models.move_to_end(digest)
+            return self._models[digest][0]
+
+    def parse(self, digest: str, loaded: LoadedModel) -> UsableModel:
+        """The model of a document, kept from now on. Raises `Invalid`."""
+        model = parse_model(loaded)
+        size = _size_bytes(model.primitive)
+        with self._lock:
+            self._models[digest] = (model, size)
+            while len(self._models) > 1 and sum(held for _, held in self._models.values()) > self._max_bytes:
+                self._models.popitem(last=False)
+        return model
+
+
+def _size_bytes(primitive: MotionPrimitive) -> int:
+    parts = (primitive.spatial, primitive.temporal)
+    arrays = [array for part in parts for array in (part.mean, part.directions, part.projections)]
+    return 3 * primitive.mixture.covariances.nbytes + sum(array.nbytes for array in arrays)
+
+
+# -- samples -----------------------------------------------------------------------------------------------------------
+
+
+def sample_document(found: FoundModel, model: UsableModel, count: int, seed: int) -> dict[str, Any]:
+    """Samples as a document: latent vectors, likelihoods, motions. Raises `Invalid` where they are too many."""
+    from marey_motion.documents import clip_to_document
+
+    latents, clips = _draw(model.primitive, count, seed)
+    return {
+        "schema": SAMPLES_SCHEMA,
+        "model": {"item": found.item, "revision": found.part.revision, "digest": found.part.digest},
+        "seed": seed,
+        "latents": latents,
+        "log_densities": model.primitive.log_density(latents),
+        "motions": [clip_to_document(clip, model.skeleton).model_dump(by_alias=True) for clip in clips],
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class SampleFile:
+    """A file of samples: one motion, or an archive of several."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+def sample_file(
+    found: FoundModel, model: UsableModel, count: int, seed: int, file_format: SampleFormat, unit: str
+) -> SampleFile:
+    """One sample as a file, or several as a ZIP archive of files. Raises `Invalid`."""
+    from marey_motion.errors import MotionError
+    from marey_motion.exporting import write_clip_file
+
+    _, clips = _draw(model.primitive, count, seed)
+    try:
+        files = [write_clip_file(clip, file_format, unit=unit) for clip in clips]
+    except MotionError as error:
+        raise Invalid(str(error), code="cannot-be-exported") from error
+    stem = f"{found.name} {seed}"
+    if count == 1:
+        return SampleFile(stem + files[0].suffix, files[0].media_type, files[0].data)
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for place, file in enumerate(files, start=1):
+            archive.writestr(_entry(f"{stem} {place:04d}{file.suffix}"), file.data, compresslevel=6)
+    return SampleFile(f"{stem}.zip", "application/zip", packed.getvalue())
+
+
+def _entry(name: str) -> zipfile.ZipInfo:
+    entry = zipfile.ZipInfo(name, EPOCH)
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    return entry
+
+
+def _draw(primitive: MotionPrimitive, count: int, seed: int) -> tuple[Floats, list[Clip]]:
+    """Latent vectors (count, L) and their motions."""
+    latents = primitive.sample(count, seed)
+    frames = float((primitive.time_functions(latents)[:, -1] + 1.5).sum())
+    size = frames * primitive.spatial.mean.shape[1] * 4
+    if not size <= LARGEST_ANSWER_BYTES:
+        shown = f"{size / MIB:,.0f} MiB of poses, over {LARGEST_ANSWER_BYTES // MIB}"
+        raise Invalid(f"These samples are {shown}; ask for fewer at a time.", code="samples-too-large")
+    motions = primitive.motions(latents)
+    return latents, [motion.as_clip(primitive.skeleton, primitive.frame_rate_hz) for motion in motions]
