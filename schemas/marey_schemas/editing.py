@@ -29,6 +29,7 @@ from marey_schemas.edit_commands import (
     Translate,
     Trim,
 )
+from marey_schemas.edit_constraints import Constrain, PlantFeet
 from marey_schemas.names import Tag
 
 MOST_COMMANDS = 256
@@ -54,6 +55,8 @@ AnyCommand = (
     | Smooth
     | RotateJoint
     | Paste
+    | Constrain
+    | PlantFeet
 )
 EditCommand = Annotated[AnyCommand, Field(discriminator="command")]
 

@@ -8,6 +8,7 @@ follow in closed form, their knees damped near straight; where a leg is too shor
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -57,7 +58,7 @@ class PlantOptions:
     blend_s: float = 0.15
     speed_m_s: float = kinematics.CONTACT_SPEED_M_S
     shortest_s: float = 0.06
-    knee_damping_rad: float = 0.3
+    knee_damping_rad: float = math.radians(17.0)
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from marey_motion.clip import Clip
+from marey_motion.editing.constraint_commands import constrain, plant_feet
 from marey_motion.editing.drift import fix_drift
 from marey_motion.editing.ground import find_contacts, find_ground, move_to_ground
 from marey_motion.editing.joining import concatenate
@@ -56,6 +57,8 @@ COMMANDS: Mapping[str, Command] = {
         smooth,
         rotate_joint,
         paste,
+        constrain,
+        plant_feet,
     )
 }
 """By name. A new one gets its line here and its schema in `marey_schemas.editing`."""

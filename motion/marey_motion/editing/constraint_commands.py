@@ -1,0 +1,246 @@
+"""The commands of an edit that use inverse kinematics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.editing.constraining import Constraint, constrain_motion, current_values
+from marey_motion.editing.foot_plants import Foot, FootContacts, PlantOptions, find_contacts
+from marey_motion.editing.foot_plants import plant_feet as plant
+from marey_motion.editing.inverse_kinematics import Solver, limb_ending_at
+from marey_motion.editing.inverse_kinematics_targets import (
+    Freedom,
+    JointLimit,
+    LookAtTarget,
+    OrientationTarget,
+    PositionTarget,
+    SolverOptions,
+    Target,
+    chain_of,
+)
+from marey_motion.editing.take import Finding, Take
+from marey_motion.errors import EditError, MappingError, MotionError
+from marey_motion.rigs import JointAxes, guess_axes
+
+Tree = Mapping[str, Any]
+
+_OPTIONS = SolverOptions()
+# Joints that look with their front; others point along their bone.
+_LOOKING = ("pelvis", "spine", "spine_1", "spine_2", "neck", "head")
+
+
+def constrain(
+    take: Take,
+    *,
+    constraints: Sequence[Tree],
+    solver: Solver = "auto",
+    blend_s: float = 0.3,
+    root_moves: bool = False,
+    limits: Sequence[Tree] = (),
+    stiffness: Mapping[str, float] | None = None,
+) -> Take:
+    """Meet constraints in ranges of frames, and note what they are missed by before and after.
+
+    Parameters
+    ----------
+    constraints, limits : trees as of `marey_schemas.edit_constraints`, with radians
+
+    Raises
+    ------
+    UnknownJoint    naming a joint that there is not
+    MappingError    where limits or a look need axes that the skeleton's joints do not tell
+    EditError    naming the constraint that cannot be asked for
+    """
+    rig = _Rig(take)
+    wanted = [_named(number, _constraint, rig, tree) for number, tree in enumerate(constraints)]
+    freedom = Freedom(
+        root_moves=root_moves,
+        limits={rig.joint(tree["joint"]): _limit(rig, tree) for tree in limits},
+        stiffness={rig.joint(name): value for name, value in (stiffness or {}).items()},
+    )
+    made = constrain_motion(
+        take.skeleton, take.motion, wanted, blend_frames=take.count_frames(blend_s), freedom=freedom, solver=solver
+    )
+    found = [
+        _finding(tree, constraint, before, after)
+        for tree, constraint, before, after in zip(
+            constraints, wanted, made.residuals_before, made.residuals_after, strict=True
+        )
+    ]
+    return take.moved(made.motion).with_finding(Finding("constrain", {"constraints": found}))
+
+
+def plant_feet(
+    take: Take,
+    *,
+    contacts: Sequence[Tree] | None = None,
+    speed_m_s: float = PlantOptions.speed_m_s,
+    blend_s: float = PlantOptions.blend_s,
+    knee_damping_rad: float = PlantOptions.knee_damping_rad,
+) -> Take:
+    """Keep feet where they stand, and note how far they slid before and after.
+
+    Parameters
+    ----------
+    contacts : {"foot": "left" or "right", "frames": (start, stop)}, when feet stand; None to find out by their speed
+
+    Raises `MappingError` where legs are not known, `EditError` where the frames are not there.
+    """
+    rig = _Rig(take)
+    feet = [_foot(rig, side) for side in ("left", "right")]
+    options = PlantOptions(blend_s=blend_s, speed_m_s=speed_m_s, knee_damping_rad=knee_damping_rad)
+    given = None if contacts is None else _given_contacts(take, feet, contacts, options)
+    made = plant(take.skeleton, take.motion, take.frame_rate_hz, feet, contacts=given, options=options)
+    values = {
+        "slide_before_m": made.slide_before_m,
+        "slide_after_m": made.slide_after_m,
+        "lowered_m": made.lowered_m,
+    }
+    return take.moved(made.motion).with_finding(Finding("plant_feet", values))
+
+
+class _Rig:
+    """Names and axes of a take's joints."""
+
+    def __init__(self, take: Take) -> None:
+        self.take = take
+        self._axes: dict[str, JointAxes] | None = None
+
+    def joint(self, name: str) -> int:
+        """Index of a joint by its own or its standard name."""
+        skeleton = self.take.skeleton
+        standard = None if name in skeleton else self.take.body.mapping.joints.get(name)
+        return skeleton.index_of(standard or name)
+
+    @property
+    def axes(self) -> dict[str, JointAxes]:
+        """Axes of the mapped joints by name; of limbs that the rest pose does not tell, from the motion."""
+        if self._axes is None:
+            take = self.take
+            clip = take.motion.as_clip(take.skeleton, take.frame_rate_hz)
+            self._axes = guess_axes(take.skeleton, take.body.mapping, clip)
+        return self._axes
+
+    def axes_of(self, joint: int) -> JointAxes:
+        """Axes of a joint. Raises `MappingError` where it is not mapped."""
+        name = self.take.skeleton.joint_names[joint]
+        if name not in self.axes:
+            raise MappingError("the mapping does not say what this joint is, so that it has no axes", where=name)
+        return self.axes[name]
+
+    def axes_if_known(self) -> dict[str, JointAxes] | None:
+        """Axes of the mapped joints; None where the mapping does not suffice for them."""
+        try:
+            return self.axes
+        except MappingError:
+            return None
+
+
+def _named(number: int, make: Any, *arguments: Any) -> Any:
+    """What `make` makes of its arguments; its errors name the constraint."""
+    try:
+        return make(*arguments)
+    except MotionError as error:
+        place = f"constraints[{number}]"
+        error.where = place if error.where is None else f"{place}, {error.where}"
+        raise
+
+
+def _constraint(rig: _Rig, tree: Tree) -> Constraint:
+    start, stop = rig.take.frames(tree.get("frames"))
+    joint, top = rig.joint(tree["joint"]), tree.get("top")
+    skeleton = rig.take.skeleton
+    target = _target(rig, joint, tree, start, stop)
+    limb = limb_ending_at(skeleton, rig.take.body.mapping, joint, rig.axes_if_known())
+    if top is not None:
+        joints = chain_of(skeleton, joint, rig.joint(top))
+        return Constraint(target, start, stop, joints, limb if limb is not None and joints[-1] == limb.start else None)
+    if limb is not None:
+        return Constraint(target, start, stop, limb.joints, limb)
+    path = skeleton.path_to_root(joint)
+    return Constraint(target, start, stop, path[:-1] or path)
+
+
+def _target(rig: _Rig, joint: int, tree: Tree, start: int, stop: int) -> Target:
+    part, skeleton = rig.take.motion.at_frames(np.arange(start, stop)), rig.take.skeleton
+    weight = tree.get("weight", 1.0)
+    offset = tree.get("offset_m", (0.0, 0.0, 0.0))
+    if tree["kind"] == "look_at":
+        return LookAtTarget(joint, tree["point_m"], tree.get("axis") or _looking_axis(rig, joint), offset, weight)
+    if tree["kind"] == "orientation":
+        asked = OrientationTarget(joint, tree.get("rotation") or (1.0, 0.0, 0.0, 0.0), weight)
+        if tree.get("rotation") is not None:
+            return asked
+        return OrientationTarget(joint, current_values(skeleton, part.at_frames(np.arange(1)), asked)[0], weight)
+    point, axes = tree.get("point_m"), tree.get("axes", "xyz")
+    if point is not None:
+        return PositionTarget(joint, point, axes, offset, weight)
+    now = current_values(skeleton, part, PositionTarget(joint, (0.0, 0.0, 0.0), axes, offset))
+    shift = tree.get("shift_m")
+    return PositionTarget(joint, now[0] if shift is None else now + np.array(shift), axes, offset, weight)
+
+
+def _looking_axis(rig: _Rig, joint: int) -> NDArray[np.float64]:
+    """The front of head and trunk, the direction of other bones, in the joint's frame."""
+    axes = rig.axes_of(joint)
+    mapping = rig.take.body.mapping.joints
+    name = rig.take.skeleton.joint_names[joint]
+    looks = any(mapping.get(standard) == name for standard in _LOOKING)
+    return np.cross(axes.swing, axes.twist) if looks else np.array(axes.twist)
+
+
+def _limit(rig: _Rig, tree: Tree) -> JointLimit:
+    joint = rig.joint(tree["joint"])
+    axes, rest = rig.axes_of(joint), rig.take.skeleton.rest_rotations[joint]
+    if tree["kind"] == "hinge":
+        low, high = tree["angle_rad"]
+        return JointLimit.hinge(axes, low, high, rest)
+    return JointLimit.cone(axes, tuple(tree["swing_rad"]), tuple(tree.get("twist_rad", (-np.pi, np.pi))), rest)
+
+
+def _finding(tree: Tree, constraint: Constraint, before: Any, after: Any) -> dict[str, Any]:
+    """What a constraint was and is missed by at most, in metres or radians, and in how many frames it is reached."""
+    is_position = isinstance(constraint.target, PositionTarget)
+    unit = "m" if is_position else "rad"
+    tolerance = _OPTIONS.tolerance_m if is_position else _OPTIONS.tolerance_rad
+    return {
+        "joint": tree["joint"],
+        "kind": tree["kind"],
+        f"residual_before_{unit}": float(before.max()),
+        f"residual_after_{unit}": float(after.max()),
+        "frames": len(after),
+        "frames_reached": int((after <= 1.01 * tolerance).sum()),
+    }
+
+
+def _foot(rig: _Rig, side: str) -> Foot:
+    mapping, skeleton = rig.take.body.mapping, rig.take.skeleton
+    *_, ankle = mapping.indices(skeleton, (f"{side}_hip", f"{side}_knee", f"{side}_ankle"))
+    leg = limb_ending_at(skeleton, mapping, ankle, rig.axes_if_known())
+    if leg is None:
+        raise MappingError("hip, knee and ankle are not one leg", where=f"{side}_ankle")
+    toe = f"{side}_toe"
+    return Foot(leg, mapping.indices(skeleton, (toe,))[0] if toe in mapping.joints else ankle)
+
+
+def _given_contacts(
+    take: Take, feet: Sequence[Foot], given: Sequence[Tree], options: PlantOptions
+) -> tuple[FootContacts, ...]:
+    """Toes as given; heels where they are slow meanwhile."""
+    positions = take.motion.positions(take.skeleton)
+    contacts = []
+    for side, foot in zip(("left", "right"), feet, strict=True):
+        toe = np.zeros(take.frame_count, dtype=np.bool_)
+        for one in given:
+            if one["foot"] not in ("left", "right"):
+                raise EditError(f"{one['foot']!r} is no foot; there are left and right", where="contacts")
+            if one["foot"] == side:
+                start, stop = take.frames(one["frames"])
+                toe[start:stop] = True
+        slow = find_contacts(positions, foot, take.frame_rate_hz, options)
+        contacts.append(FootContacts(toe, slow.heel & toe))
+    return tuple(contacts)
