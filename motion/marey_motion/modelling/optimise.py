@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
 from marey_motion.modelling.mixture import LatentMixture
-from marey_motion.modelling.objective import Objective, as_row
 
 Floats = NDArray[np.float64]
 
@@ -78,24 +77,6 @@ class Problem(Protocol):
 
     def linearise(self, stacked: Floats) -> tuple[Floats, Floats]:
         """Residuals (r,) and their derivatives (r, W)."""
-
-
-@dataclass(frozen=True, eq=False)
-class OneStep:
-    """The constraints on one motion."""
-
-    objective: Objective
-
-    @property
-    def priors(self) -> Sequence[LatentMixture]:
-        """That of the primitive."""
-        return (self.objective.primitive.mixture,)
-
-    def linearise(self, stacked: Floats) -> tuple[Floats, Floats]:
-        """Errors in tolerances and their derivatives."""
-        still = np.zeros((3, len(stacked)))
-        found = self.objective.linearise(stacked, 0, as_row(self.objective.placement), still)
-        return found.residuals, found.slopes
 
 
 def refine(problem: Problem, start: Floats, options: RefineOptions = DEFAULT_REFINING) -> Refined:

@@ -38,7 +38,8 @@ class Step:
 
     Parameters
     ----------
-    standard_joints : joint index by standard name; with hips and shoulders, which tell where the body faces
+    standard_joints : joint index by standard name; where there are several steps, with hips and shoulders, which tell
+        where the body faces
     """
 
     primitive: MotionPrimitive
@@ -52,8 +53,8 @@ class TransitionOptions:
 
     Parameters
     ----------
-    joints : standard names, those of them that a step's skeleton has
-    tolerance_m, weight : of the distance that each of them jumps, and of the root's height
+    joints : standard names; those count that the skeletons of all steps have
+    tolerance_m, weight : of the distance that each of them jumps, and of the pelvis' height
     """
 
     joints: tuple[str, ...] = TRANSITION_JOINTS
@@ -78,7 +79,7 @@ class Measured(NamedTuple):
     ----------
     placements : of the steps' canonical frames in the world
     errors : of each step's constraints (m,): metres, radians or seconds
-    jumps_m : for each transition, how far the root and each transition joint jumps (1 + joints,)
+    jumps_m : for each transition, how far the pelvis and each transition joint jumps (1 + joints,)
     """
 
     placements: tuple[Placement, ...]
@@ -91,7 +92,7 @@ class _Link(NamedTuple):
 
     Parameters
     ----------
-    objective : tracks the root, where the body faces, and the transition joints, at the start and then at the end
+    objective : where there are several steps, tracks pelvis, facing and transition joints at the start, then at the end
     beginning : the first two of these at the start alone
     first : where its latent vector begins
     """
@@ -102,7 +103,7 @@ class _Link(NamedTuple):
 
 
 class _Walked(NamedTuple):
-    """A step in the world; jumps (j, 3) of root and transition joints; derivatives are by all latent vectors."""
+    """A step in the world; jumps (j, 3) of pelvis and transition joints; derivatives are by all latent vectors."""
 
     placement: Floats
     found: Linearised
@@ -131,11 +132,12 @@ class SeveralSteps:
         if not 1 <= len(steps) <= MOST_STEPS:
             raise ConstraintError(f"{len(steps)} steps are not within 1 to {MOST_STEPS}", where="steps")
         joints = tuple(name for name in transitions.joints if all(name in step.standard_joints for step in steps))
+        alone = len(steps) == 1
         links: list[_Link] = []
         first = 0
         for number, step in enumerate(steps):
             try:
-                links.append(_link(step, joints, first))
+                links.append(_link(step, () if alone else _ends(step, joints), first))
             except MotionError as error:
                 place = ".".join(part for part in (f"steps[{number}]", error.where) if part)
                 raise ConstraintError(error.message, code=error.code, where=place) from None
@@ -201,8 +203,9 @@ class SeveralSteps:
             before = found
 
 
-def _link(step: Step, joints: Sequence[str], first: int) -> _Link:
-    tracked = [
+def _ends(step: Step, joints: Sequence[str]) -> tuple[Tracked, ...]:
+    """What is tracked where a step begins, and then where it ends. Raises `MappingError`."""
+    return tuple(
         one
         for frame in (0.0, float(step.primitive.frame_count - 1))
         for one in (
@@ -210,9 +213,12 @@ def _link(step: Step, joints: Sequence[str], first: int) -> _Link:
             facing(frame, step.standard_joints),
             *(Tracked(frame, (step.standard_joints[name],)) for name in joints),
         )
-    ]
-    objective = build_objective(step.primitive, step.constraints, step.standard_joints, also=tracked)
-    return _Link(objective, track_points(step.primitive, tracked[:2]), first)
+    )
+
+
+def _link(step: Step, ends: Sequence[Tracked], first: int) -> _Link:
+    objective = build_objective(step.primitive, step.constraints, step.standard_joints, also=ends)
+    return _Link(objective, track_points(step.primitive, ends[:2]), first)
 
 
 def _carry_on(points: Floats, slopes: Floats, link: _Link, stacked: Floats) -> tuple[Floats, Floats]:
