@@ -128,11 +128,10 @@ class Imports:
     ) -> list[ImportEntry]:
         """Import files; one entry per file, in order. A file that is refused keeps no other from going in."""
         tell = notice or _say_nothing
-        digests = self._send_missing(files, tell)
+        sent = {file.name: file for file in self.send(files, notice=tell)}
         entries: dict[str, ImportEntry] = {}
         for portion in batches(files):
-            named = tuple(ImportFile(name=file.name, blob=digests[file.name]) for file in portion)
-            for entry in self.run(named, options):
+            for entry in self.run(tuple(sent[file.name] for file in portion), options):
                 entries.setdefault(entry.name, entry)
             tell("importing", len(entries), len(files))
         return list(entries.values())
@@ -150,8 +149,9 @@ class Imports:
         outputs = {output.name: output for output in self.jobs.outputs(job.id)}
         return tuple(_with_item(entry, outputs) for entry in ImportAnswer.model_validate(job.result).entries)
 
-    def _send_missing(self, files: Sequence[LocalFile], tell: Notice) -> dict[str, str]:
-        """Digest by name, once the server has all the bytes."""
+    def send(self, files: Sequence[LocalFile], *, notice: Notice | None = None) -> tuple[ImportFile, ...]:
+        """Send what the server lacks of the files' bytes; the files as an import names them, in order."""
+        tell = notice or _say_nothing
         digests: dict[str, str] = {}
         with ThreadPoolExecutor(UPLOADS_AT_ONCE, thread_name_prefix="marey-upload") as pool:
             for file, digest in zip(files, pool.map(lambda file: digest_of_file(file.path), files), strict=True):
@@ -163,7 +163,7 @@ class Imports:
             for done, upload in enumerate(list(sending), start=1):
                 upload.result()
                 tell("sending", done, len(by_digest))
-        return digests
+        return tuple(ImportFile(name=file.name, blob=digests[file.name]) for file in files)
 
 
 def _with_item(entry: ImportEntry, outputs: Mapping[str, JobOutput]) -> ImportEntry:

@@ -19,7 +19,7 @@ from marey_schemas.editing import EditParams
 from marey_schemas.evaluation import EvaluateParams, count_evaluation_tasks
 from marey_schemas.improvement import CompareParams, OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
 from marey_schemas.jobs import ExportParams, ImportParams, InputSpec, JobKind, RetargetParams
-from marey_schemas.kinds import Kind
+from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.modelling import ModelParams
 from marey_schemas.sample_trees import TreeParams
 
@@ -58,6 +58,9 @@ class KindDeclaration:
     def __post_init__(self) -> None:
         if self.fan_out is not None and not (self.fan_out in self.inputs and self.inputs[self.fan_out].many):
             raise ValueError(f"{self.name}: fan_out {self.fan_out!r} must be an input that takes many items")
+        for name, spec in self.inputs.items():
+            if unknown := set(spec.parts) - PARTS[spec.kind].keys():
+                raise ValueError(f"{self.name}: input {name!r}: a {spec.kind} has no part {sorted(unknown)[0]!r}")
         if self.batch_size < 1:
             raise ValueError(f"{self.name}: batch_size must be at least 1, not {self.batch_size}")
         if (self.task_count is None) != (self.gathering is None):
@@ -311,7 +314,9 @@ TREE = KindDeclaration(
     params=TreeParams,
     implementation="marey_worker.kinds.tree:run",
     version=1,
-    inputs={"model": InputSpec(kind=Kind.MODEL, description="The model, which gets the tree as a part.")},
+    inputs={
+        "model": InputSpec(kind=Kind.MODEL, parts=("model",), description="The model, which gets the tree as a part.")
+    },
     outputs={"model": Kind.MODEL},
 )
 

@@ -71,6 +71,9 @@ class InputSpec(Answer):
     kind: Kind
     many: bool = False
     required: bool = True
+    parts: tuple[str, ...] = Field(
+        (), description="Parts that are read, where the result depends on no others; none: all of them."
+    )
     description: str = ""
 
 
@@ -257,6 +260,12 @@ class PinnedInput(Answer):
     kind: Kind
     name: str
     collection: str
+    below: str | None = Field(None, description="Of what another job made: its collection below that job's `into`.")
+
+    @property
+    def folder(self) -> str:
+        """Where below the job's `into` results go that keep the place of this input."""
+        return self.collection if self.below is None else self.below
 
 
 class Lease(Answer):

@@ -7,7 +7,7 @@ whose inputs are there: the job is spread over tasks, gets its cache key, and is
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 from sqlalchemy import Row, and_, insert, select, update
@@ -105,9 +105,21 @@ def _write(tx: Transaction, heads: Sequence[NewJob], tasks: Sequence[NewJob]) ->
 # -- what the other jobs made -----------------------------------------------------------------------------------------
 
 
+class _Made(NamedTuple):
+    """What a job made, and the place its results went to."""
+
+    into: str
+    pins: list[Pin]
+
+    def below(self, one: Pin) -> str:
+        """Where an output stands below that place; its whole place, where it was moved elsewhere."""
+        path: str = one["collection"]
+        return f"{path}/".removeprefix(f"{self.into}/").rstrip("/") if self.into else path
+
+
 def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> PinnedInputs:
     pins: PinnedInputs = {}
-    made: dict[str, list[Pin]] = {}
+    made: dict[str, _Made] = {}
     for name, entries in row.inputs.items():
         spec = kind.inputs.get(name)
         if spec is None:
@@ -123,6 +135,8 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
             detail = f"The input {name!r} takes one {spec.kind}; {sources} made {len(chosen)}."
             raise UnbindableError("one-item", detail)
         pins[name] = list(chosen.values())
+        if len(entries) == 1 and "job" in entries[0]:  # of several makers, things of one name may stand in like places
+            pins[name] = [one | {"below": made[entries[0]["job"]].below(one)} for one in pins[name]]
     total = sum(map(len, pins.values()))
     if total > MOST_INPUTS:
         raise UnbindableError("too-many", f"The job has {total} inputs; at most {MOST_INPUTS} are possible.")
@@ -130,7 +144,7 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
 
 
 def _resolved(
-    tx: Transaction, project_id: str, name: str, spec: InputSpec, entry: dict[str, Any], made: dict[str, list[Pin]]
+    tx: Transaction, project_id: str, name: str, spec: InputSpec, entry: dict[str, Any], made: dict[str, _Made]
 ) -> list[Pin]:
     """What one entry of an input stands for: itself, or what the job it names made, which may be nothing only where the
     input is not required.
@@ -140,16 +154,16 @@ def _resolved(
     source: str = entry["job"]
     if source not in made:
         made[source] = _outputs(tx, project_id, source)
-    found = [one for one in made[source] if one["kind"] == spec.kind]
+    found = [one for one in made[source].pins if one["kind"] == spec.kind]
     if not found and spec.required:
         detail = f"{source} made no {spec.kind} that is there, which this job needs as its input {name!r}."
         raise UnbindableError("no-input", detail)
     return found
 
 
-def _outputs(tx: Transaction, project_id: str, job_id: str) -> list[Pin]:
+def _outputs(tx: Transaction, project_id: str, job_id: str) -> _Made:
     """What a job, or its tasks, made, in their order, each item at the last revision it was given; deleted ones not."""
-    columns = (job.c.size, job.c.gathers, job.c.outputs)
+    columns = (job.c.size, job.c.gathers, job.c.outputs, job.c.into_path)
     row = tx.execute(select(*columns).where(job.c.id == job_id)).one()
     published = [row.outputs]
     if row.size is not None and not row.gathers:
@@ -159,4 +173,4 @@ def _outputs(tx: Transaction, project_id: str, job_id: str) -> list[Pin]:
     for output in (one for outputs in published for one in outputs or ()):
         revisions[output["item"]] = max(output["revision"], revisions.get(output["item"], 0))
     found = items_by_id(tx, project_id, revisions)
-    return [pin(found[item], number) for item, number in revisions.items() if item in found]
+    return _Made(row.into_path, [pin(found[item], number) for item, number in revisions.items() if item in found])

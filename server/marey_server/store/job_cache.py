@@ -1,14 +1,14 @@
 """One computation for identical jobs: a finished one lends its result, a running one lets others wait for it.
 
 Jobs are identical when kind, version of the kind, parameters, seed and inputs are; an input counts with its item, its
-name, its place and the content of its documents, since results are named after inputs and refer to them. Results are
-published anew for each job, into the collection it names. Caching stays within a project.
+name, its place and the content of those of its documents that the kind reads, since results are named after inputs and
+refer to them. Results are published anew for each job, into the collection it names. Caching stays within a project.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from sqlalchemy import Row, and_, insert, or_, select, update
@@ -19,7 +19,7 @@ from marey_server.store import blobs, staging
 from marey_server.store.fencing import QUEUED, RUNNING, WAITING
 from marey_server.store.job_ends import Ended, end_jobs
 from marey_server.store.job_events import wake_workers
-from marey_server.store.job_inputs import PinnedInputs
+from marey_server.store.job_inputs import Pin, PinnedInputs
 from marey_server.store.tables import job, job_dependency, revision_part
 from marey_server.store.transaction import Transaction
 
@@ -64,15 +64,19 @@ def part_digests(tx: Transaction, inputs: Iterable[PinnedInputs]) -> dict[tuple[
     return found
 
 
-def input_contents(pins: Mapping[str, Any], parts: Mapping[tuple[str, int], dict[str, str]]) -> dict[str, Any]:
-    """What the inputs of a job are, apart from their revision numbers."""
+def input_contents(
+    kind: KindDeclaration, pins: Mapping[str, Any], parts: Mapping[tuple[str, int], dict[str, str]]
+) -> dict[str, Any]:
+    """What the inputs of a job are to it, apart from their revision numbers."""
     return {
-        name: [
-            [pin["item"], pin["collection"], pin["name"], sorted(parts[pin["item"], pin["revision"]].items())]
-            for pin in many
-        ]
+        name: [_content(pin, kind.inputs[name].parts, parts[pin["item"], pin["revision"]]) for pin in many]
         for name, many in pins.items()
     }
+
+
+def _content(pin: Pin, read: Collection[str], parts: Mapping[str, str]) -> list[Any]:
+    place = [pin["collection"], *([pin["below"]] if "below" in pin else ())]
+    return [pin["item"], *place, pin["name"], sorted(item for item in parts.items() if not read or item[0] in read)]
 
 
 # -- deciding ---------------------------------------------------------------------------------------------------------

@@ -139,7 +139,7 @@ def _set_cache_keys(tx: Transaction, jobs: Sequence[NewJob]) -> None:
     parts = job_cache.part_digests(tx, {id(one.submission): one.submission.pins for one in cached}.values())
     for one in cached:
         submission = one.submission
-        contents = job_cache.input_contents(one.pins, parts)
+        contents = job_cache.input_contents(submission.kind, one.pins, parts)
         task = None if one.parent_id is None or submission.kind.fan_out else (one.position, submission.task_count)
         one.cache_key = job_cache.cache_key(submission.kind, submission.params, submission.request.seed, contents, task)
 

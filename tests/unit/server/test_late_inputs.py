@@ -1,19 +1,21 @@
 """Jobs whose inputs are what other jobs make: they get them when those have succeeded, as if submitted only then."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from marey_schemas import job_kinds
 from marey_schemas.access import ProjectCreate
-from marey_schemas.jobs import JobCreate
+from marey_schemas.jobs import InputSpec, JobCreate
 from marey_schemas.kinds import Kind
 from marey_server.errors import Conflict, Invalid
 from marey_server.store import binding, items, job_inputs, jobs, projects, submission
 from marey_server.store.items.drafts import Draft
 from marey_server.store.retrying import retry_job
-from queue_desk import KINDS, Desk, document
+from queue_desk import KINDS, SUM, Desk, document
+from store_fixtures import skeleton_tree
 
 
 def make(desk: Desk, job: str, *names: str, **facts: Any) -> None:
@@ -68,7 +70,7 @@ def test_a_job_gets_what_another_made_once_that_has_succeeded(desk: Desk) -> Non
     assert ready.state == "queued"
     (made,) = desk.outputs(maker)
     assert ready.inputs == {
-        "things": [{"item": made.item, "revision": 1, "kind": "study", "name": "a", "collection": "made"}]
+        "things": [{"item": made.item, "revision": 1, "kind": "study", "name": "a", "collection": "made", "below": ""}]
     }
     assert square(desk) == [["a"]]
     (squared,) = desk.outputs(job)
@@ -161,6 +163,21 @@ def test_an_output_that_was_deleted_meanwhile_is_no_input(desk: Desk) -> None:
     assert [pin["item"] for pin in desk.job(job).inputs["things"]] == [kept.item]
 
 
+def test_what_one_job_made_is_known_by_its_place_below_where_that_put_it(desk: Desk) -> None:
+    maker = desk.submit("sum", into="made")
+    other = desk.submit("sum", params={"number": 1}, into="other")
+    (job,) = desk.submit_many(squares_of(maker))
+    both = desk.submit("square", inputs={"things": [{"job": maker}, {"job": other}]})
+    for one in (maker, other):
+        lease = desk.claim(job=one)
+        desk.stage(lease, "a", collection="deep/down")
+        desk.complete(lease)
+    leases = {lease.job: lease for lease in desk.claim_many()}
+    (pin,) = leases[job].inputs["things"]
+    assert (pin.collection, pin.folder) == ("made/deep/down", "deep/down")
+    assert [pin.folder for pin in leases[both].inputs["things"]] == ["made/deep/down", "other/deep/down"]
+
+
 # -- shared results ----------------------------------------------------------------------------------------------------
 
 
@@ -200,6 +217,20 @@ def test_only_what_depends_on_a_change_is_computed_again(desk: Desk) -> None:
     assert desk.job(job).children == {"succeeded": 2, "queued": 1}
     assert square(desk) == [["c", "d"]]
     assert desk.state(job) == "succeeded"
+
+
+@pytest.mark.parametrize(("read", "state"), [(("hierarchy",), "succeeded"), ((), "queued")])
+def test_parts_that_a_job_does_not_read_make_it_no_other_job(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, read: tuple[str, ...], state: str
+) -> None:
+    """As a tree that was added to a model is nothing to the job that makes trees of models."""
+    reads = {"rig": InputSpec(kind=Kind.SKELETON, parts=read)}
+    monkeypatch.setattr(job_kinds, "job_kinds", lambda: {**KINDS, "sum": replace(SUM, inputs=reads)})
+    (rig,) = desk.publish(Draft("r", Kind.SKELETON, "rig", {"hierarchy": skeleton_tree()}))
+    desk.submit("sum", inputs={"rig": {"item": rig.item}})
+    desk.complete(desk.claim())
+    desk.publish(Draft("r", Kind.SKELETON, "rig", {"mapping": {"joints": {"hips": "j0"}}}))
+    assert desk.state(desk.submit("sum", inputs={"rig": {"item": rig.item}})) == state
 
 
 def test_identical_jobs_that_get_their_inputs_at_one_time_are_computed_once(desk: Desk) -> None:

@@ -270,7 +270,7 @@ class _Job:
             name=f"{place_of(pin)}{mirrored}",
             kind=Kind.PROCESSED,
             item_name=f"{pin.name}{self._params.suffix}{mirrored}",
-            collection=pin.collection,
+            collection=pin.folder,
             tags=self._params.tags,
             parts={
                 "motion": motion.model_dump(by_alias=True),

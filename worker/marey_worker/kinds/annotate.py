@@ -133,7 +133,7 @@ def _output(
         name=f"{pin.collection}/{pin.name}",
         kind=Kind.ANNOTATION,
         item_name=f"{pin.name} {name}",
-        collection=pin.collection,
+        collection=pin.folder,
         tags=params.tags,
         parts={"annotation": document.model_dump(mode="json", by_alias=True)},
         sources=sources,

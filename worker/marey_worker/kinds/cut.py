@@ -113,7 +113,8 @@ class _Cutting:
             raise JobRefused("name-too-long", f"{long[0]!r} has {len(long[0])} of {MAX_NAME_LENGTH} characters")
 
     def _folder(self, one: _Annotated, segment: Segment) -> str:
-        below = (one.item.collection, segment.label.replace("/", "-") if self._params.by_label else "")
+        folder = one.item.folder if isinstance(one.item, PinnedInput) else one.item.collection
+        below = (folder, segment.label.replace("/", "-") if self._params.by_label else "")
         return "/".join(filter(None, below))
 
     # -- pieces --

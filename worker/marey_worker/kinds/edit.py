@@ -115,7 +115,7 @@ class _Editing:
             name=f"{pin.collection}/{name}",
             kind=Kind.CLIP,
             item_name=name,
-            collection=pin.collection,
+            collection=pin.collection if self._params.in_place else pin.folder,
             tags=self._params.tags,
             parts={
                 "motion": documents.clip_to_document(clip, motion.skeleton).model_dump(by_alias=True),

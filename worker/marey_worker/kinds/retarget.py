@@ -77,7 +77,7 @@ class _Retargeting:
             name=f"{pin.collection}/{pin.name}",
             kind=Kind.CLIP,
             item_name=f"{pin.name}{self._params.suffix}",
-            collection=pin.collection,
+            collection=pin.folder,
             tags=self._params.tags,
             parts={
                 "motion": documents.clip_to_document(clip, self._target.skeleton).model_dump(by_alias=True),

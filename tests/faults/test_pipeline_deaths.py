@@ -1,0 +1,167 @@
+"""Server and workers die under a pipeline: it goes on, computes nothing twice, and ends in the same results."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from marey_client.imports import LocalFile, find_files
+from marey_client.pipelines import PipelineRun
+from marey_client.project import ProjectHandle
+from marey_motion.clip import Clip
+from marey_motion.formats import write_motion
+from marey_motion.gait import game_skeleton, generate_gait
+from marey_schemas.access import ProjectCreate
+from marey_schemas.jobs import JobState
+from marey_schemas.pipelines import PipelineCreate
+from server_process import QUICK_LEASES, ServerProcess, WorkerProcess
+
+pytestmark = pytest.mark.timeout(240)
+
+TAKES = 40
+StartWorker = Callable[..., WorkerProcess]
+
+
+@pytest.fixture(scope="module")
+def takes(tmp_path_factory: pytest.TempPathFactory) -> list[LocalFile]:
+    """Different short walks as BVH files."""
+    folder = tmp_path_factory.mktemp("takes")
+    for number in range(TAKES):
+        clip = generate_gait(1.0 + number / 100, 0.0, 0.5, 30)
+        (folder / f"walk-{number:02d}.bvh").write_bytes(write_motion(clip, "bvh"))
+    return list(find_files([folder]).files)
+
+
+@pytest.fixture
+def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
+    process = ServerProcess(tmp_path, database_url, **QUICK_LEASES)
+    yield process
+    process.stop()
+
+
+@pytest.fixture
+def start_worker(tmp_path: Path, server: ServerProcess) -> Iterator[StartWorker]:
+    workers: list[WorkerProcess] = []
+
+    def start(name: str, *, fault: str | None = None) -> WorkerProcess:
+        worker = WorkerProcess(tmp_path / f"{name}.log")
+        workers.append(worker)
+        return worker.start(server.url, server.token, tmp_path, name=name, fault=fault)
+
+    yield start
+    for worker in workers:
+        worker.stop()
+
+
+def game_rig(lab: ProjectHandle, folder: Path) -> str:
+    """Id of the skeleton to carry the walks over to, which came with a clip."""
+    skeleton = game_skeleton()
+    at_rest = np.concatenate([skeleton.offsets[0], skeleton.rest_rotations.ravel()]).astype(np.float32)
+    file = folder / "game.bvh"
+    file.write_bytes(write_motion(Clip(skeleton, 30.0, np.tile(at_rest, (5, 1)), None, ()), "bvh"))
+    [entry] = lab.imports.upload(list(find_files([file]).files))
+    assert entry.skeleton is not None, entry
+    return entry.skeleton
+
+
+def to_game_and_back(lab: ProjectHandle, takes: list[LocalFile], folder: Path) -> PipelineCreate:
+    """Import the takes, carry them over to the game's skeleton, and what came of that once more."""
+    files = [file.model_dump() for file in lab.imports.send(takes)]
+    skeleton = {"item": game_rig(lab, folder)}
+    steps: dict[str, Any] = {
+        "import": {"kind": "import", "params": {"files": files}, "into": "raw"},
+        "game": {"kind": "retarget", "inputs": {"clips": {"step": "import"}, "skeleton": skeleton}, "into": "game"},
+        "again": {"kind": "retarget", "inputs": {"clips": {"step": "game"}, "skeleton": skeleton}, "into": "again"},
+    }
+    return PipelineCreate.model_validate({"steps": steps})
+
+
+def assert_made_once(lab: ProjectHandle, run: PipelineRun) -> None:
+    """Every step has succeeded, and every clip is there once, at its first revision, with what it was made from."""
+    assert {job.state for job in run.refresh().values()} == {JobState.SUCCEEDED}, run
+    for folder, inputs in (("raw", 0), ("game", 2), ("again", 2)):
+        clips = list(lab.clips.list(collection=folder))
+        assert [clip.item.revision for clip in clips] == [1] * TAKES, folder
+        assert len({clip.path for clip in clips}) == TAKES, folder
+        assert len(clips[0].lineage().inputs) >= inputs
+    assert all(not clip.staleness().stale for clip in lab.clips.list(collection="again"))
+
+
+@pytest.mark.parametrize("nth", ["@1", "@2"])
+@pytest.mark.parametrize("place", ["bind.before_commit", "bind.after_commit"])
+def test_a_server_killed_where_a_job_gets_its_inputs_goes_on_with_all_of_them_or_none(
+    server: ServerProcess,
+    takes: list[LocalFile],
+    tmp_path: Path,
+    start_worker: StartWorker,
+    place: str,
+    nth: str,
+) -> None:
+    server.start()
+    with server.client() as marey:
+        wanted = to_game_and_back(marey.create_project(ProjectCreate(name="lab")), takes, tmp_path)
+    server.stop()
+    server.start(fault=f"{place}{nth}:kill")
+    with server.client() as marey:
+        run = marey.project("lab").pipeline(wanted)
+        start_worker("steady")
+        assert server.wait_until_dead() == -signal.SIGKILL
+        server.start()
+        run.wait(timeout_s=120)
+        assert_made_once(marey.project("lab"), run)
+    server.check_database()
+
+
+@pytest.mark.parametrize("place", ["submit.before_commit", "submit.after_commit"])
+def test_a_server_killed_where_a_pipeline_is_handed_in_has_all_of_it_or_nothing(
+    server: ServerProcess,
+    takes: list[LocalFile],
+    tmp_path: Path,
+    start_worker: StartWorker,
+    place: str,
+    nth: str,
+) -> None:
+    server.start()
+    with server.client() as marey:
+        wanted = to_game_and_back(marey.create_project(ProjectCreate(name="lab")), takes, tmp_path)
+    server.stop()
+    server.start(fault=f"{place}:kill")
+    with server.client() as marey, ThreadPoolExecutor(1) as pool:
+        handing_in = pool.submit(marey.project("lab").pipeline, wanted)
+        assert server.wait_until_dead() == -signal.SIGKILL
+        server.start()
+        run = handing_in.result(60)  # the client asks again, with the same Idempotency-Key
+        assert len(list(marey.project("lab").jobs())) == 3
+        start_worker("steady")
+        run.wait(timeout_s=120)
+        assert_made_once(marey.project("lab"), run)
+    server.check_database()
+
+
+@pytest.mark.parametrize("place", ["after_claim", "after_blob", "before_complete", "after_complete"])
+def test_a_worker_killed_under_a_pipeline_is_replaced_and_nothing_is_there_twice(
+    server: ServerProcess,
+    takes: list[LocalFile],
+    tmp_path: Path,
+    start_worker: StartWorker,
+    place: str,
+    nth: str,
+) -> None:
+    server.start()
+    with server.client() as marey:
+        lab = marey.create_project(ProjectCreate(name="lab"))
+        wanted = to_game_and_back(lab, takes, tmp_path)
+        dying = [start_worker(f"dying-{n}", fault=f"worker.{place}@{n}:kill") for n in (1, 3)]
+        run = lab.pipeline(wanted)
+        for worker in dying:
+            assert worker.wait_until_dead() == -signal.SIGKILL
+        start_worker("healthy")
+        run.wait(timeout_s=120)
+        assert_made_once(lab, run)
+    server.check_database()
