@@ -38,7 +38,7 @@ def moved(clip, heading_rad, x, z):
     """The clip turned to the left about the origin, then moved on the ground."""
     turn = Rotation.from_euler("y", heading_rad)
     poses = clip.poses.astype(float).copy()
-    poses[:, :3] = turn.apply(poses[:, :3]) + (x, 0.0, z)
+    poses[:, :3] = turn.apply(poses[:, :3]) + np.array((x, 0.0, z))
     poses[:, 3:7] = (turn * Rotation.from_quat(poses[:, 3:7], scalar_first=True)).as_quat(scalar_first=True)
     return Clip(clip.skeleton, clip.frame_rate_hz, poses.astype(np.float32))
 

@@ -72,6 +72,7 @@ def compile_kernels() -> None:
     result = retarget(read, plan_retarget(*rigs[0], *rigs[1]))
     global_rotations(result)
     _match(clip)
+    _align(clip)
     _measure(clip)
 
 
@@ -110,6 +111,20 @@ def _compare(points: NDArray[np.float32]) -> None:
     align(distances(points, points), max_run=2)
     warped_distance(points, points)
     nearest_poses(points, groups, points, groups)
+
+
+def _align(clip: Clip) -> None:
+    """Align a clip with itself by every cost, as quickly and as slowly as it likes."""
+    from marey_motion.alignment.aligning import AlignOptions, SourceExample, align_clips
+    from marey_motion.alignment.cost import CostOptions
+    from marey_motion.matching.body import MatchingBody
+    from marey_motion.rigs import map_joints
+
+    body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
+    examples = [SourceExample(uid, uid, clip) for uid in ("one", "other")]
+    for cost in (CostOptions(), CostOptions("plain"), CostOptions(window=3), CostOptions("plain", window=3)):
+        for max_run in (None, 3):
+            align_clips(examples, body, AlignOptions(cost=cost, max_run=max_run))
 
 
 def _measure(clip: Clip) -> None:

@@ -200,7 +200,7 @@ class _Aligning:
         for example, made in zip(examples, tries, strict=True):
             if isinstance(made, MotionError):
                 if self.on_refusal is None or example.uid == self._options.reference:
-                    raise type(made)(f"{example.name}: {made.message}", code=made.code, where=made.where) from made
+                    raise MotionError(str(made), code=made.code, where=example.name) from made
                 self.on_refusal(example, made)
         kept = [made for made in tries if not isinstance(made, MotionError)]
         if len(kept) < LEAST_CLIPS:
@@ -229,7 +229,7 @@ class _Aligning:
             if not 0 <= cut.frame < clip.frame_count:
                 shown = ", ".join(cut.labels)
                 raise MotionError(
-                    f"it has the frames 0:{clip.frame_count}", code="outside-clip", where=f"{shown}: {cut.frame}"
+                    f"it has the frames 0:{clip.frame_count}", code="outside-clip", where=f"{shown}, frame {cut.frame}"
                 )
         motion = resample_motion(Motion.of(clip), clip.frame_rate_hz, rate_hz)
         frames = motion.frame_count

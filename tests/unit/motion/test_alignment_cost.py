@@ -16,11 +16,14 @@ POINTS = 9
 def cloud(frames, seed, points=POINTS):
     """(frames, points, 3) of a body that wanders over the ground."""
     random = np.random.default_rng(seed)
-    return random.normal(size=(frames, points, 3)) * 0.4 + random.normal(size=(frames, 1, 3)) + (2.0, 1.0, -5.0)
+    return (
+        random.normal(size=(frames, points, 3)) * 0.4 + random.normal(size=(frames, 1, 3)) + np.array((2.0, 1.0, -5.0))
+    )
 
 
 def on_the_ground(points, turn_rad, x, z):
-    return Rotation.from_euler("y", turn_rad).apply(points.reshape(-1, 3)).reshape(points.shape) + (x, 0.0, z)
+    turned = Rotation.from_euler("y", turn_rad).apply(points.reshape(-1, 3)).reshape(points.shape)
+    return turned + np.array((x, 0.0, z))
 
 
 def minimised(a, b, weights):
@@ -58,7 +61,7 @@ def test_no_turn_and_no_shift_on_the_ground_changes_a_cost(turn_rad, x, z, seed)
 
 def test_heights_count_as_they_are():
     a = cloud(1, 5)
-    assert frame_costs(a, a + (0.0, 0.3, 0.0))[0, 0] == pytest.approx(0.09, abs=1e-12)
+    assert frame_costs(a, a + np.array((0.0, 0.3, 0.0)))[0, 0] == pytest.approx(0.09, abs=1e-12)
 
 
 def test_costs_are_means_over_points_in_square_metres():
@@ -93,7 +96,7 @@ def test_a_window_compares_the_frames_around_as_one_cloud(method, window):
 
 
 def test_no_cost_is_negative_where_rounding_could_make_it_so():
-    a = cloud(1, 11) + (1e4, 0.0, 1e4)
+    a = cloud(1, 11) + np.array((1e4, 0.0, 1e4))
     for window in (1, 5):
         assert frame_costs(a, a, CostOptions(window=window))[0, 0] >= 0.0
 

@@ -67,6 +67,7 @@ def test_costs_of_pairs_are_those_of_aligning_each_section_of_each_two(max_run, 
             else:
                 lengths = np.diff(bounds[i]), np.diff(bounds[j])
                 ratio = np.maximum(*lengths) / np.minimum(*lengths)
-                assert max_run is not None and ratio.max() > max_run
+                assert max_run is not None
+                assert ratio.max() > max_run
     assert told[-1] == (10, 10)
     assert [done for done, _ in told] == sorted(done for done, _ in told)

@@ -1,0 +1,163 @@
+"""The way from examples of an action to aligned clips: command line and SDK, a real server, a real worker."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alignment_examples import warped_walks
+from marey_client import Marey
+from marey_client.errors import JobUnsuccessful
+from marey_client.imports import find_files
+from marey_client.jobs import Jobs
+from marey_client.project import ProjectHandle
+from marey_motion.formats import read_motion, write_bvh
+from marey_schemas.access import ProjectCreate
+from marey_schemas.imports import ImportOptions
+from marey_schemas.jobs import Job
+from server_process import ServerProcess
+
+pytestmark = pytest.mark.timeout(300)
+
+NAMES = ("walk a", "walk b", "walk c", "walk d", "walk e")
+
+
+@pytest.fixture
+def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
+    process = ServerProcess(tmp_path, database_url)
+    process.start(workers=1)
+    yield process
+    process.stop()
+
+
+@pytest.fixture
+def marey(server: ServerProcess) -> Iterator[Marey]:
+    with server.client() as client:
+        yield client
+
+
+@pytest.fixture
+def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
+    """A project with five examples of one walk, and one clip that is too short to be aligned."""
+    project = marey.create_project(ProjectCreate(name="lab"))
+    folder = tmp_path / "takes"
+    folder.mkdir()
+    examples, _ = warped_walks(len(NAMES))
+    for one in examples:
+        (folder / f"{one.name}.bvh").write_bytes(write_bvh(one.clip))
+    (folder / "blink.bvh").write_bytes(write_bvh(examples[0].clip.sliced(0, 3)))
+    project.imports.upload(find_files([folder]).files, ImportOptions(collection="walks"))
+    return project
+
+
+@pytest.fixture
+def run(server: ServerProcess, tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs the command line against the server, in a folder of its own."""
+
+    def run(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
+        surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
+        known = {"MAREY_URL": server.url, "MAREY_DATA": str(server.data), "HOME": str(tmp_path)}
+        ended = subprocess.run(
+            [sys.executable, "-m", "marey_client.cli", *map(str, arguments)],
+            env={**surroundings, **known, "XDG_CONFIG_HOME": str(tmp_path)},
+            capture_output=True, text=True, cwd=tmp_path, timeout=240,
+        )  # fmt: skip
+        assert ended.returncode == status, ended.stdout + ended.stderr
+        return ended
+
+    return run
+
+
+def done(project: ProjectHandle, job: Job) -> dict[str, Any]:
+    result = Jobs(project.transport).wait(job.id).result
+    assert result is not None
+    return result
+
+
+def clip_id(project: ProjectHandle, name: str) -> str:
+    (found,) = project.clips.list(path=f"walks/{name}")
+    return found.id
+
+
+def test_clips_of_a_folder_are_aligned_listed_exported_and_traced_back(lab: ProjectHandle, tmp_path: Path) -> None:
+    result = done(lab, lab.align("walks", into="aligned", reference=clip_id(lab, "walk a"), tags=("model",)))
+    assert (result["clips"], result["frames"], result["reference"]) == (5, 60, "walks/walk a")
+    assert [(one["name"], one["code"]) for one in result["refused"]] == [("walks/blink", "too-short")]
+
+    made = {one.name: one for one in lab.processed.list(collection="aligned")}
+    assert sorted(made) == list(NAMES)
+    one = made["walk b"]
+    assert one.path == "aligned/walks/walk b"
+    assert one.item.tags == ("model",)
+    summary = one.item.summary
+    assert summary["frames"] == 60
+    assert summary["clip"] == clip_id(lab, "walk b")
+    assert summary["reference"] == clip_id(lab, "walk a")
+    assert summary["cost"] == pytest.approx(one.info().cost)
+    assert summary["set"] == result["set"]
+    skeleton = summary["skeleton"]
+    assert {found.id for found in lab.processed.list(filters={"skeleton": skeleton})} == {x.id for x in made.values()}
+
+    times = one.time_function()
+    source = one.source()
+    assert source is not None
+    assert source.name == "walk b"
+    assert times[-1] == len(source.motion().poses) - 1
+    assert np.diff(times).min() > 0.0
+    assert len(one.motion(frames=slice(10, 20)).poses) == 10
+    assert {edge.name for edge in one.lineage().inputs} == {"walk a", "walk b"}
+
+    file = one.export(tmp_path, format="bvh")
+    read = read_motion(file.read_bytes(), file.name).clip
+    assert read is not None
+    assert read.frame_count == 60
+
+
+def test_keyframes_of_annotations_are_matched_and_become_those_of_the_set(lab: ProjectHandle) -> None:
+    _, warps = warped_walks(len(NAMES))
+    frames = {}
+    for clip in lab.clips.list(collection="walks"):
+        if clip.name in NAMES:
+            frames[clip.name] = int(np.argmin(np.abs(warps[f"clip_{clip.name[-1]}@1"] - 30)))
+            clip.annotate("contacts", keyframes=[{"label": "down", "frame": frames[clip.name]}])
+    result = done(lab, lab.align("walks", into="aligned", layer="contacts", reference=clip_id(lab, "walk a")))
+    assert result["keyframes"] == {"down": 30}
+    assert [one["code"] for one in result["refused"]] == ["no-annotation"]
+    for made in lab.processed.list(collection="aligned"):
+        assert made.info().keyframes == {"down": 30}
+        assert made.time_function()[30] == frames[made.name]
+
+
+def test_the_command_tells_costs_slopes_and_refusals(lab: ProjectHandle, run: Callable[..., Any]) -> None:
+    told = run("align", "lab/walks", "--into", "aligned", "--reference", "lab/walks/walk c", status=1)
+    assert "walks/blink: it has 3 frames" in told.stderr
+    assert "reference" in next(line for line in told.stdout.splitlines() if "walk c" in line)
+    assert "5 clips of" in told.stdout
+
+    clips = [f"lab/walks/{name}" for name in NAMES]
+    again = json.loads(run("align", *clips, "--into", "plain", "--cost", "plain", "--json").stdout)
+    assert again["state"] == "succeeded"
+    assert again["result"]["refused"] == []
+    assert run("align", "lab/walks", "--into", "x", "--weight", "LeftFoot", status=2).stderr
+
+
+def test_the_same_alignment_again_makes_no_new_revisions(lab: ProjectHandle) -> None:
+    first = done(lab, lab.align("walks", into="aligned"))
+    again = done(lab, lab.align("walks", into="aligned", cache="refresh"))
+    assert again == first
+    assert {one.item.revision for one in lab.processed.list(collection="aligned")} == {1}
+
+
+def test_what_cannot_be_aligned_is_told_and_makes_nothing(lab: ProjectHandle) -> None:
+    job = lab.align("walks", into="aligned", weights={"Tail": 2.0})
+    with pytest.raises(JobUnsuccessful, match="Tail"):
+        done(lab, job)
+    assert list(lab.processed.list(collection="aligned")) == []
