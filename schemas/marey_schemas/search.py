@@ -13,7 +13,9 @@ from marey_schemas.references import RevisionRef
 MOST_CONSTRAINTS = 64
 MOST_STEPS = 16
 MOST_CANDIDATES = 256
-MOST_SEED = 2**63 - 1
+MOST_CANDIDATE_CONSTRAINTS = 4096
+"""Candidates times constraints: some seconds of one thread."""
+
 
 Moment = Annotated[str, StringConstraints(min_length=1, max_length=255)] | Annotated[float, Field(allow_inf_nan=False)]
 """The label of a keyframe, `start`, `end`, or a canonical frame."""
@@ -140,16 +142,19 @@ class SearchRequest(Request):
     iterations: int = Field(50, ge=1, le=200, description="Of the optimisation, at most.")
     transition_tolerance_cm: Positive = Field(2.0, description="For hands, feet and height from step to step.")
     finish: bool = Field(False, description="Remove what is left of joint positions by inverse kinematics.")
-    seed: int = Field(0, ge=0, le=MOST_SEED, description="Of the samples, where the model has no tree of its own.")
+    seed: int = Field(0, ge=0, lt=2**63, description="Of the samples, where the model has no tree of its own.")
     motion: bool = Field(True, description="Send the motion, too.")
 
     @model_validator(mode="after")
     def _check_steps(self) -> Self:
         if self.steps and self.constraints:
             raise ValueError("constraints: on several motions they stand in steps")
-        total = sum(len(step.constraints) for step in self.steps)
+        total = sum(len(step.constraints) for step in self.asked_steps)
         if total > MOST_CONSTRAINTS:
             raise ValueError(f"steps: {total} constraints in all, over {MOST_CONSTRAINTS}")
+        if total * self.candidates > MOST_CANDIDATE_CONSTRAINTS:
+            most = MOST_CANDIDATE_CONSTRAINTS // total
+            raise ValueError(f"candidates: at most {most} where there are {total} constraints")
         return self
 
     @property
@@ -201,5 +206,4 @@ class SearchAnswer(Answer):
         (), description="Places in `errors` that are off by more than 5 cm before inverse kinematics."
     )
     iterations: int = Field(description="Of the optimisation.")
-    search_ms: float = Field(description="Time that searching and refining took.")
     motion: Motion | None = None

@@ -108,7 +108,7 @@ class ModelCache:
     def parse(self, digest: str, loaded: LoadedModel) -> UsableModel:
         """The model of a document, kept from now on. Raises `Invalid`."""
         model = parse_model(loaded)
-        size = _size_bytes(model.primitive)
+        size = size_bytes(model.primitive)
         with self._lock:
             self._models[digest] = (model, size)
             while len(self._models) > 1 and sum(held for _, held in self._models.values()) > self._max_bytes:
@@ -116,7 +116,8 @@ class ModelCache:
         return model
 
 
-def _size_bytes(primitive: MotionPrimitive) -> int:
+def size_bytes(primitive: MotionPrimitive) -> int:
+    """Of its arrays, and of what follows from its mixture."""
     parts = (primitive.spatial, primitive.temporal)
     arrays = [array for part in parts for array in (part.mean, part.directions, part.projections)]
     return 3 * primitive.mixture.covariances.nbytes + sum(array.nbytes for array in arrays)

@@ -15,6 +15,7 @@ from marey_server.access.principal import SYSTEM, Principal
 from marey_server.handlers.answer_cache import AnswerCache
 from marey_server.models import ModelCache
 from marey_server.observe import Metrics
+from marey_server.searching import SearchableCache
 from marey_server.settings import Settings
 from marey_server.store import tokens
 from marey_server.store.database import Database
@@ -47,6 +48,7 @@ class Services:
         self.metrics = Metrics()
         self.answers = AnswerCache(settings.answer_cache_bytes)
         self.models = ModelCache()
+        self.searchables = SearchableCache()
         self.draining = asyncio.Event()
         self.in_flight: set[Any] = set()
         self.sign_in_places = asyncio.Semaphore(SIGN_INS_AT_ONCE)

@@ -27,13 +27,17 @@ class Sequel:
     ----------
     latents : one vector (L,) a step
     measured : where they take place, and what they miss
+    joints : standard names of the transition joints, whose jumps were measured after that of the pelvis
     searched : what the search of each tree came upon
+    sampled : what the best samples alone come to
     refined : how refining them ended, None where it was not asked for
     """
 
     latents: tuple[Floats, ...]
     measured: Measured
+    joints: tuple[str, ...]
     searched: tuple[Found, ...]
+    sampled: Measured
     refined: Refined | None
 
 
@@ -64,10 +68,12 @@ def search_steps(
         begun = problem.carried_on([one.latents[0] for one in searched])
         searched.append(_search_step(step, tree, begun, candidates, transitions))
     stacked = np.concatenate([one.latents[0] for one in searched])
+    measured = sampled = problem.measure(stacked)
     refined = None if refining is None else refine(problem, stacked, refining)
     if refined is not None:
         stacked = refined.latents
-    return Sequel(problem.parts(stacked), problem.measure(stacked), tuple(searched), refined)
+        measured = problem.measure(stacked)
+    return Sequel(problem.parts(stacked), measured, problem.joints, tuple(searched), sampled, refined)
 
 
 def _search_step(

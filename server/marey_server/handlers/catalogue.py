@@ -20,6 +20,7 @@ from marey_server.handlers import (
     projects,
     reports,
     samples,
+    searches,
     uploads,
 )
 from marey_server.handlers.resource import Resource
@@ -35,6 +36,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     *exports.RESOURCES,
     *reports.RESOURCES,
     *samples.RESOURCES,
+    *searches.RESOURCES,
     *coverage_streams.RESOURCES,
     *imports.RESOURCES,
     *jobs.RESOURCES,

@@ -1,0 +1,97 @@
+"""Searches: motions of models that meet constraints."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from marey_schemas.base import Request
+from marey_schemas.search import SearchRequest
+from marey_server import search_answers, searching
+from marey_server.handlers.declarations import Access, Bytes, Document, reads
+from marey_server.handlers.items import kind_of
+from marey_server.handlers.reply import Rendered, Reply, render
+from marey_server.handlers.resource import Resource
+from marey_server.handlers.streaming import attachment
+from marey_server.models import SampleFormat
+from marey_server.searching import FoundSearchable, Searchable
+
+
+class FoundFileQuery(Request):
+    """As which file."""
+
+    format: SampleFormat = Field("bvh", description="Of the file.")
+    unit: Literal["m", "cm"] = Field("cm", description="Unit of length of a BVH.")
+
+
+class Searcher(Resource):
+    """Resources that search models."""
+
+    async def searchables(
+        self, project: str, kind: str, item: str, request: SearchRequest
+    ) -> tuple[list[FoundSearchable], list[Searchable]]:
+        """The model of each step with its tree, parsed; those used last are kept."""
+        found = await self.look_up(searching.find_searchables, project, kind_of(kind), item, request)
+        return found, [await self._parsed(project, one, request.seed) for one in found]
+
+    async def _parsed(self, project: str, found: FoundSearchable, seed: int) -> Searchable:
+        key = found.key(seed)
+        known = self.services.searchables.get(key)
+        if known is None:
+            loaded = await self.look_up(searching.load_searchable, project, found)
+            known = await self.compute(self.services.searchables.parse, key, loaded, seed)
+        return known
+
+
+class Search(Searcher):
+    """Motions of a model that meet constraints."""
+
+    path = "/projects/{project}/{kind}/{item}/search"
+    tag = "Models"
+
+    @reads(access=Access.READER, body=SearchRequest, answer=Document)
+    async def post(self, project: str, kind: str, item: str, body: SearchRequest) -> Rendered:
+        """The motion of a model (kind `models`) that meets constraints best, or motions that follow one another.
+
+        The model's tree is searched, and the best sample refined. A model without a tree, or with that of another one,
+        gets one drawn for the search; `steps[].tree` says so. Nothing is stored, and the same request has the same
+        answer.
+        """
+        found, searchables = await self.searchables(project, kind, item, body)
+        form, answers = self.answer_form, self.services.answers
+
+        def answered() -> Rendered:
+            result = search_answers.search(searchables, body)
+            return render(Reply(search_answers.answer_of(result, searchables, found, body)), form, answers)
+
+        return await self.compute(answered)
+
+
+class SearchFile(Searcher):
+    """Motions of a model that meet constraints, as a file."""
+
+    path = "/projects/{project}/{kind}/{item}/search/export"
+    tag = "Models"
+
+    @reads(
+        access=Access.READER,
+        query=FoundFileQuery,
+        body=SearchRequest,
+        answer=Bytes,
+        answer_types=("text/plain", "application/x-npz", "application/x-bzip2"),
+    )
+    async def post(self, project: str, kind: str, item: str, query: FoundFileQuery, body: SearchRequest) -> Reply:
+        """What a search finds, as a file of motion: all steps in one."""
+        found, searchables = await self.searchables(project, kind, item, body)
+
+        def written() -> Reply:
+            result = search_answers.search(searchables, body)
+            file = search_answers.file_of(result, found, query.format, query.unit)
+            headers = {"Content-Disposition": attachment(file.name), "Cache-Control": "private, no-cache"}
+            return Reply(file.data, media_type=file.media_type, headers=headers)
+
+        return await self.compute(written)
+
+
+RESOURCES: tuple[type[Resource], ...] = (Search, SearchFile)
