@@ -1,7 +1,6 @@
 """Constraints on ranges of frames, met by inverse kinematics and blended into what is around them.
 
-Constraints that move the same joints, or joints that carry each other's, are solved together; others apart. Where one
-of them begins or ends while another one goes on, it is approached and left over the blend, too.
+Constraints that move the same joints, or joints that carry each other's, are solved together; others apart.
 """
 
 from __future__ import annotations
@@ -29,6 +28,11 @@ from marey_motion.skeleton import Skeleton
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+# Rounds in which constraints of different ranges are met in turn, and the metres or radians that they may still be
+# missed by to end them.
+MOST_ROUNDS = 12
+SETTLED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,26 +101,13 @@ def constrain_motion(
     return ConstrainedMotion(changed, before, after)
 
 
-def with_values(target: Target, values: Floats) -> Target:
-    """The same target with other values (n, 3) or (n, 4)."""
-    if isinstance(target, PositionTarget):
-        return replace(target, position=values)
-    return replace(target, point=values) if isinstance(target, LookAtTarget) else replace(target, rotation=values)
-
-
-def current_values(skeleton: Skeleton, motion: Motion, target: Target) -> Floats:
-    """The values (F, 3) or (F, 4) with which a target is met already; a look keeps the distance of what it looks at."""
+def current_values(skeleton: Skeleton, motion: Motion, target: PositionTarget | OrientationTarget) -> Floats:
+    """The values (F, 3) or (F, 4) with which a position or an orientation is met already."""
     spins = kinematics.as_global_rotations(skeleton, motion.rotations)[:, target.joint]
     if isinstance(target, OrientationTarget):
         return np.asarray(spins, dtype=np.float64)
     tips = motion.positions(skeleton)[:, target.joint]
-    tips = tips + quaternions.rotate_vectors(spins, np.asarray(target.offset, dtype=np.float64))
-    if isinstance(target, PositionTarget):
-        return tips
-    axis = np.asarray(target.axis, dtype=np.float64)
-    gaze = quaternions.rotate_vectors(spins, axis / np.linalg.norm(axis))
-    far = np.linalg.norm(target.values - tips, axis=1, keepdims=True)
-    return np.asarray(tips + far * gaze, dtype=np.float64)
+    return np.asarray(tips + quaternions.rotate_vectors(spins, np.asarray(target.offset)), dtype=np.float64)
 
 
 def _check_range(constraint: Constraint, number: int, frames: int) -> None:
@@ -168,59 +159,57 @@ class _Cluster:
     options: SolverOptions
 
     def constrained(self, motion: Motion, blend_frames: int) -> Motion:
-        """The motion with these constraints met and blended in and out."""
-        frames = np.unique(np.concatenate([np.arange(one.start, one.stop) for one in self.constraints]))
-        given = motion.at_frames(frames)
-        away = np.array([np.maximum(one.start - frames, frames - one.stop + 1) for one in self.constraints])
-        wished = [_wished(one, frames) for one in self.constraints]
-        solved = self._solve(given, away <= 0, wished)
-        near = away <= blend_frames
-        coming = np.flatnonzero((near & (away > 0)).any(axis=0))
-        if coming.size:
-            partly = solved.at_frames(coming)
-            shares = np.clip(1.0 - away[:, coming] / (blend_frames + 1.0), 0.0, 1.0)
-            approached = [
-                self._between(partly, one, values[coming], share)
-                for one, values, share in zip(self.constraints, wished, shares, strict=True)
-            ]
-            again = self._solve(partly, near[:, coming], approached)
-            solved.rotations[coming], solved.root_translations[coming] = again.rotations, again.root_translations
-        return displace(motion, frames, solved, windows_around(frames, blend_frames, motion.frame_count))
+        """The motion with these constraints met and blended in and out.
 
-    def _solve(self, given: Motion, active: NDArray[np.bool_], values: Sequence[Floats]) -> Motion:
-        """The n frames with those constraints met that are active (C, n) in each, at values (n, 3) or (n, 4)."""
-        first = self.constraints[0].limb
-        limb = first if all(one.limb == first for one in self.constraints) else None
-        joints = tuple(sorted({joint for one in self.constraints for joint in one.joints}))
+        Those of different ranges are first met in turn, each blended in and out on its own, until they hardly disturb
+        each other: what is left for solving them together changes little from where one is active to where it is not.
+        """
+        spans: dict[tuple[int, int], list[Constraint]] = {}
+        for one in self.constraints:
+            spans.setdefault((one.start, one.stop), []).append(one)
+        for _ in range(MOST_ROUNDS if len(spans) > 1 else 0):
+            for together in spans.values():
+                motion = self._met(motion, together, blend_frames)
+            if max(_residuals(self.skeleton, motion, one).max() for one in self.constraints) < SETTLED:
+                break
+        return self._met(motion, self.constraints, blend_frames)
+
+    def _met(self, motion: Motion, constraints: Sequence[Constraint], blend_frames: int) -> Motion:
+        frames = np.unique(np.concatenate([np.arange(one.start, one.stop) for one in constraints]))
+        active = np.array([(frames >= one.start) & (frames < one.stop) for one in constraints])
+        given = motion.at_frames(frames)
         rotations, roots = given.rotations.copy(), given.root_translations.copy()
         sets, which = np.unique(active, axis=1, return_inverse=True)
         for number, chosen in enumerate(sets.T):
             here = np.flatnonzero(which.reshape(-1) == number)
-            targets = [with_values(self.constraints[i].target, values[i][here]) for i in np.flatnonzero(chosen)]
-            solved = solve(
-                self.skeleton,
-                given.at_frames(here),
-                targets,
-                freedom=replace(self.freedom, joints=joints),
-                limb=limb,
-                solver=self.solver,
-                options=self.options,
-            )
-            rotations[here], roots[here] = solved.motion.rotations, solved.motion.root_translations
-        return given._replace(rotations=rotations, root_translations=roots)
+            asked = [constraints[i] for i in np.flatnonzero(chosen)]
+            solved = self._solve(given.at_frames(here), frames[here], asked)
+            rotations[here], roots[here] = solved.rotations, solved.root_translations
+        changed = given._replace(rotations=rotations, root_translations=roots)
+        return displace(motion, frames, changed, windows_around(frames, blend_frames, motion.frame_count))
 
-    def _between(self, given: Motion, constraint: Constraint, wished: Floats, share: Floats) -> Floats:
-        """Values (n, 3) or (n, 4) between what is, at a share of 0, and what is wished, at 1."""
-        smooth = share * share * (3.0 - 2.0 * share)
-        now = current_values(self.skeleton, given, with_values(constraint.target, wished))
-        if isinstance(constraint.target, OrientationTarget):
-            return np.asarray(quaternions.slerp(now, wished, smooth), dtype=np.float64)
-        between = now + smooth[:, None] * (wished - now)
-        return np.where(share[:, None] < 1.0, between, wished)
+    def _solve(self, given: Motion, frames: Ints, constraints: Sequence[Constraint]) -> Motion:
+        """Those frames of a motion with constraints met that count in all of them."""
+        limb = constraints[0].limb if all(one.limb == constraints[0].limb for one in constraints) else None
+        joints = tuple(sorted({joint for one in constraints for joint in one.joints}))
+        return solve(
+            self.skeleton,
+            given,
+            [_target_at(one, frames) for one in constraints],
+            freedom=replace(self.freedom, joints=joints),
+            limb=limb,
+            solver=self.solver,
+            options=self.options,
+        ).motion
 
 
-def _wished(constraint: Constraint, frames: Ints) -> Floats:
-    """A constraint's values (n, 3) or (n, 4) in frames, outside of its own those of the nearest."""
+def _target_at(constraint: Constraint, frames: Ints) -> Target:
+    """A constraint's target with its values for some of its frames."""
     values = constraint.target.values
-    rows = np.broadcast_to(values, (constraint.stop - constraint.start, values.shape[1]))
-    return rows[np.clip(frames, constraint.start, constraint.stop - 1) - constraint.start]
+    return constraint.target if len(values) == 1 else _with_values(constraint.target, values[frames - constraint.start])
+
+
+def _with_values(target: Target, values: Floats) -> Target:
+    if isinstance(target, PositionTarget):
+        return replace(target, position=values)
+    return replace(target, point=values) if isinstance(target, LookAtTarget) else replace(target, rotation=values)

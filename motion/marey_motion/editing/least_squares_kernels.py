@@ -40,8 +40,10 @@ from marey_motion.editing.rotation_kernels import (
 
 LONGEST_STEP_RAD = 1.0
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e8
-# An accepted step that improves the objective by less than this share is the last one.
-CONVERGED_SHARE = 1e-13
+EASING, TIGHTENING = 0.02, 8.0
+# An accepted step that improves the objective by less than this share is the last one: while targets are missed, and
+# once they are reached and only the displacement still shrinks.
+CONVERGED_SHARE, SETTLED_SHARE = 1e-13, 1e-3
 # Passes in which joints at a limit are found, for each step.
 LIMIT_PASSES = 6
 LIMIT_REACHED_RAD = 1e-9
@@ -328,7 +330,7 @@ def _solve_frame(body, targets, frame, offsets, ends, local, root, work, before,
         )
         trial += _displace(body, work.trial, work.trial_root, work.first, work.first_root, work)
         if not trial < cost:
-            damping *= 8.0
+            damping *= TIGHTENING
             # The displacements of the pose that is kept; its Jacobian and gradient still stand.
             _displace(body, local, root, work.first, work.first_root, work)
             if damping > MOST_DAMPING:
@@ -339,9 +341,9 @@ def _solve_frame(body, targets, frame, offsets, ends, local, root, work, before,
         store_residuals(work.errors, after)
         gained = cost - trial
         cost, reached = trial, arrived
-        if reached or gained < CONVERGED_SHARE * cost:
+        if gained < (SETTLED_SHARE if reached else CONVERGED_SHARE) * trial:
             break
-        damping = max(0.1 * damping, LEAST_DAMPING)
+        damping = max(EASING * damping, LEAST_DAMPING)
         _prepare(body, targets, frame, work)
     return steps, reached
 
