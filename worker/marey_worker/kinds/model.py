@@ -21,6 +21,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.modelling import ModelParams
 from marey_worker.context import Context, JobRefused
 from marey_worker.kinds.matching_clips import place_of, refusing_motion_errors
+from marey_worker.kinds.model_report import write_model_report
 
 NOT_OPTIONS = {"name", "tags", "report"}
 
@@ -44,8 +45,12 @@ def run(context: Context, params: ModelParams) -> dict[str, Any]:
             threads=context.threads,
             progress=context.progress,
         )
-    tree = trained_to_tree(trained, skeleton.model_dump(), _provenance(context, pins, aligned, infos))
+    origin = _provenance(context, pins, aligned, infos)
+    tree = trained_to_tree(trained, skeleton.model_dump(), origin)
     parts = {"model": tree}
+    if params.report:
+        context.progress(0, None, "writing the report")
+        parts["report"] = write_model_report(context, trained, aligned, origin)
     context.stage(
         [StagedOutput(name=params.name, kind=Kind.MODEL, item_name=params.name, tags=params.tags, parts=parts)]
     )

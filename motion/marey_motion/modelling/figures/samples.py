@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 
 CELL_IN = (1.2, 1.9)
 SHOWN = 20
+LEAST_REACHING = 200
 FRAMES = 40
 FOLLOWED = {
     "left wrist": ("left_wrist", COLOURS[0], "-"),
@@ -28,7 +29,24 @@ FOLLOWED = {
     "left ankle": ("left_ankle", COLOURS[0], (0, (3.0, 1.2))),
     "right ankle": ("right_ankle", COLOURS[1], (0, (3.0, 1.2))),
 }
-WIDTH, LEAST_HEIGHT, MOST_HEIGHT = 4.2, 1.0, 3.2
+WIDTH, LEAST_WIDTH, LEAST_HEIGHT, MOST_HEIGHT = 4.2, 2.6, 1.0, 3.2
+
+
+class Reach(NamedTuple):
+    """The space of one joint: (3, 2) least and greatest x (left), y (up) and z (forward) of its moments, metres."""
+
+    joint: str
+    examples_m: Floats
+    samples_m: Floats
+
+
+def reach_of(subject: ModelSubject) -> list[Reach]:
+    """Where wrists and ankles are in 98 of 100 moments, of the examples and of as many samples, at least 200."""
+    frames = evenly(subject.primitive.frame_count, FRAMES)
+    drawn = subject.primitive.sample(max(LEAST_REACHING, len(subject.poses)), subject.seed)
+    sets = [subject.points(poses) for poses in (subject.poses[:, frames], subject.primitive.poses(drawn, frames))]
+    spans = [np.quantile(points, (0.01, 0.99), axis=(0, 1)).transpose(1, 2, 0) for points in sets]
+    return [Reach(name, spans[0][joint], spans[1][joint]) for name, joint in _followed(subject).items()]
 
 
 def draw_samples(subject: ModelSubject) -> Sketch:
@@ -77,17 +95,18 @@ def draw_paths(subject: ModelSubject) -> Sketch:
     }
     everything = np.concatenate([points.reshape(-1, 3) for points in sets.values()])
     middle, reach = _extent(everything)
-    scale = min(WIDTH / reach[2], MOST_HEIGHT / reach[1], MOST_HEIGHT / reach[0])
+    scale = float(min(WIDTH / reach[2], MOST_HEIGHT / reach[1], MOST_HEIGHT / reach[0]))
+    width = max(LEAST_WIDTH, scale * float(reach[2]))
     heights = [max(LEAST_HEIGHT, scale * float(reach[axis])) for axis in (1, 0)]
-    figure = new_figure(2 * WIDTH + 1.5, sum(heights) + 1.95)
+    figure = new_figure(2 * width + 1.5, sum(heights) + 1.95)
     for column, (name, points) in enumerate(sets.items()):
         for row, (axis, label) in enumerate(((1, "height (m)"), (0, "to the left (m)"))):
             bottom = 0.95 + (heights[1] + 0.45 if row == 0 else 0.0)
-            place = Place(0.7 + column * (WIDTH + 0.55), bottom, WIDTH, heights[row])
+            place = Place(0.7 + column * (width + 0.55), bottom, width, heights[row])
             labels = {"title": f"{len(points)} {name}"} if row == 0 else {"x": "forward (m)"}
             panel = add_panel(figure, place, y=label if column == 0 else "", **labels)
             _draw_paths(panel, points, list(joints), axis)
-            wide, high = 0.5 * WIDTH / scale, 0.5 * heights[row] / scale
+            wide, high = 0.5 * width / scale, 0.5 * heights[row] / scale
             panel.set(xlim=(middle[2] - wide, middle[2] + wide), ylim=(middle[axis] - high, middle[axis] + high))
             if (row, column) == (1, 0):
                 add_keys(panel, loc="upper left", bbox_to_anchor=(-0.02, -0.48 / heights[1]), ncols=4)

@@ -1,0 +1,33 @@
+"""The report of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from marey_motion.alignment.aligned import AlignedSet
+from marey_motion.modelling.figures import ModelSubject, draw_alignment_figures, draw_model_figures
+from marey_motion.modelling.report import render_model_report
+from marey_motion.modelling.training import TrainedPrimitive
+from marey_schemas.job_kinds import find_kind
+from marey_schemas.reports import ModelReport
+from marey_worker.context import Context
+from marey_worker.kinds.stored_reports import store_report
+
+
+def write_model_report(
+    context: Context, trained: TrainedPrimitive, aligned: AlignedSet, origin: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Draw every figure of a model and of its alignment, and write the page; the document that names them.
+
+    Parameters
+    ----------
+    origin : where the examples come from, as the part `model` says it
+    """
+    title = trained.primitive.name
+    subject = ModelSubject(trained.primitive, aligned, trained.report, context.seed)
+    figures = {**draw_alignment_figures(aligned), **draw_model_figures(subject)}
+    page = render_model_report(
+        trained, subject, figures, title=title, origin=origin, code_version=find_kind("model").code_version
+    )
+    return store_report(context, ModelReport, title, page, ((None, figure) for figure in figures.values()))
