@@ -16,7 +16,7 @@ from marey_client.alignments import ProcessedHandle
 from marey_client.downloads import download, safe_file_name, saved_atomically
 from marey_client.items import Items
 from marey_client.motions import ClipHandle, MotionArrays
-from marey_client.reports import ReportedHandle
+from marey_client.searches import SearchableHandle
 from marey_schemas.codecs import JSON, encode_tree
 from marey_schemas.documents import ClipInfo, Source
 from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
@@ -48,7 +48,7 @@ class Samples:
     motions: tuple[MotionArrays, ...]
 
 
-class ModelHandle(ReportedHandle):
+class ModelHandle(SearchableHandle):
     """One model."""
 
     @property
@@ -123,7 +123,7 @@ class ModelHandle(ReportedHandle):
 def model_request(aligned: AlignedPlaces, params: ModelParams) -> JobCreate:
     """The job that trains a model on aligned clips."""
     single = isinstance(aligned, str | CollectionInput | ItemInput | ProcessedHandle)
-    places = [aligned] if single else list(aligned)  # type: ignore[arg-type, list-item]
+    places = [aligned] if single else list(aligned)  # type: ignore[arg-type]
     inputs = {"aligned": tuple(map(_as_input, places))}
     return JobCreate(kind="model", inputs=inputs, params=params.model_dump(mode="json", exclude_defaults=True))
 

@@ -1,0 +1,214 @@
+"""`search` and `tree`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marey_client.cli.failures import WrongUsage
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.jobs import show_progress
+from marey_client.cli.models import model_at
+from marey_client.cli.output import print_json, print_table, progress, tell
+
+if TYPE_CHECKING:
+    from marey_schemas.search import SearchAnswer
+
+FORMATS = ("bvh", "npz", "predecessor")
+
+Many = list[str] | None
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    app.command()(tree)
+    app.command()(search)
+
+
+def tree(
+    context: typer.Context,
+    place: Annotated[str, typer.Argument(help="A model: project/folder/name, or project/id.")],
+    samples: Annotated[int | None, typer.Option(help="Drawn from the model; default 10,000.")] = None,
+    features: Annotated[str | None, typer.Option(help="end_effectors (default) or latent.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the samples.")] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Group samples of a model, so that searches for motions that meet constraints are quick."""
+    given = {"samples": samples, "features": features}
+    with connect(context) as marey, progress() as advance:
+        job = model_at(marey, place).make_tree(
+            seed=seed,
+            on_progress=lambda now: show_progress(now, advance),
+            **{name: value for name, value in given.items() if value is not None},
+        )
+    if as_json:
+        return print_json(job)
+    made = job.result or {}
+    return typer.echo(f"{made['samples']} samples in {made['nodes']} nodes")
+
+
+def search(
+    context: typer.Context,
+    place: Annotated[str, typer.Argument(help="A model: project/folder/name, or project/id.")],
+    at: Annotated[
+        Many, typer.Option(help="A joint is at a place: WHEN:JOINT=x,y,z in metres; _ leaves a coordinate free.")
+    ] = None,
+    turned: Annotated[Many, typer.Option(help="A joint is turned: WHEN:JOINT=w,x,y,z.")] = None,
+    look: Annotated[Many, typer.Option(help="A joint's z axis points: WHEN:JOINT=x,y,z.")] = None,
+    look_at: Annotated[Many, typer.Option(help="A joint's z axis points at a place: WHEN:JOINT=x,y,z.")] = None,
+    stand: Annotated[Many, typer.Option(help="The body stands: WHEN=x,z in metres.")] = None,
+    face: Annotated[Many, typer.Option(help="The body faces: WHEN=degrees from +z, positive to the left.")] = None,
+    time: Annotated[Many, typer.Option(help="A moment comes: WHEN=seconds.")] = None,
+    start: Annotated[str | None, typer.Option(help="Where the motion begins: x,z,degrees.")] = None,
+    tolerance_cm: Annotated[float | None, typer.Option(help="Of places; default 1.")] = None,
+    tolerance_deg: Annotated[float | None, typer.Option(help="Of turns and directions; default 5.")] = None,
+    candidates: Annotated[int | None, typer.Option(help="Followed down the tree; default 8.")] = None,
+    likelihood: Annotated[
+        float | None, typer.Option("--lambda", help="What a likely motion is worth; the less, the nearer. Default 1.")
+    ] = None,
+    refine: Annotated[bool, typer.Option("--refine/--no-refine", help="Improve what the tree has.")] = True,
+    finish: Annotated[bool, typer.Option("--finish", help="Remove the rest by inverse kinematics.")] = False,
+    request: Annotated[
+        Path | None, typer.Option(help="File with the whole request as JSON, for several steps.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="File or folder to write the motion to.")] = None,
+    format: Annotated[str, typer.Option(help="bvh, npz or predecessor.")] = "bvh",  # noqa: A002
+    as_json: AsJson = False,
+) -> None:
+    """Find the motion of a model that meets constraints. WHEN is a keyframe, start, end, or a canonical frame."""
+    if format not in FORMATS:
+        raise WrongUsage(f"{format!r} is no format; there are {', '.join(FORMATS)}")
+    asked: dict[str, Any] = _read_request(request)
+    constraints = [
+        *_joint_constraints("joint_position", at, "target_m", 3, {"tolerance_cm": tolerance_cm}),
+        *_joint_constraints("joint_orientation", turned, "rotation", 4, {"tolerance_deg": tolerance_deg}),
+        *_joint_constraints("look_direction", look, "direction", 3, {"tolerance_deg": tolerance_deg}),
+        *_joint_constraints("look_direction", look_at, "point_m", 3, {"tolerance_deg": tolerance_deg}),
+        *_body_constraints("root_position", stand, "target_m", 2, {"tolerance_cm": tolerance_cm}),
+        *_body_constraints("root_heading", face, "heading_deg", 1, {"tolerance_deg": tolerance_deg}),
+        *_body_constraints("keyframe_time", time, "seconds", 1, {}),
+    ]
+    if constraints:
+        asked["constraints"] = constraints
+    if not (asked.get("constraints") or asked.get("steps")):
+        raise WrongUsage("nothing is asked for; give --at WHEN:JOINT=x,y,z or another constraint")
+    given = {
+        "candidates": candidates,
+        "lambda": likelihood,
+        "refine": None if refine else False,
+        "finish": finish or None,
+        "start": None if start is None else _start(start),
+    }
+    asked |= {name: value for name, value in given.items() if value is not None}
+    with connect(context) as marey:
+        found = model_at(marey, place)
+        answer = found.search(**{**asked, "motion": False})
+        written = None if out is None else found.save_search(out, format=format, **asked)
+    if as_json:
+        file = None if written is None else str(written)
+        return print_json({"answer": answer.model_dump(mode="json", exclude_none=True), "file": file})
+    _print(answer)
+    return None if written is None else typer.echo(written)
+
+
+# -- reading what is asked ---------------------------------------------------------------------------------------------
+
+
+def _read_request(path: Path | None) -> dict[str, Any]:
+    import json
+
+    if path is None:
+        return {}
+    try:
+        read = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise WrongUsage(f"{path}: {error}") from None
+    if not isinstance(read, dict):
+        raise WrongUsage(f"{path}: a request is a JSON object")
+    return read
+
+
+def _joint_constraints(
+    kind: str, texts: Sequence[str] | None, field: str, count: int, tolerance: dict[str, float | None]
+) -> list[dict[str, Any]]:
+    made = []
+    for text in texts or ():
+        place, _, values = text.partition("=")
+        moment, colon, joint = place.rpartition(":")
+        if not (colon and moment and joint and values):
+            raise WrongUsage(f"{text!r}: write WHEN:JOINT={','.join('wxyz'[-count:])}")
+        made.append({"joint": joint, **_constraint(kind, moment, field, _numbers(values, count, text), tolerance)})
+    return made
+
+
+def _body_constraints(
+    kind: str, texts: Sequence[str] | None, field: str, count: int, tolerance: dict[str, float | None]
+) -> list[dict[str, Any]]:
+    made = []
+    for text in texts or ():
+        moment, _, values = text.rpartition("=")
+        if not (moment and values):
+            raise WrongUsage(f"{text!r}: write WHEN={'x,z' if count == 2 else 'number'}")
+        numbers = _numbers(values, count, text)
+        made.append(_constraint(kind, moment, field, numbers if count > 1 else numbers[0], tolerance))
+    return made
+
+
+def _constraint(
+    kind: str, moment: str, field: str, value: object, tolerance: dict[str, float | None]
+) -> dict[str, Any]:
+    given = {name: size for name, size in tolerance.items() if size is not None}
+    return {"type": kind, "at": _moment(moment), field: value, **given}
+
+
+def _moment(text: str) -> str | float:
+    """A canonical frame where it is a number, else a label."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _numbers(text: str, count: int, whole: str) -> list[float | None]:
+    parts = text.split(",")
+    try:
+        numbers = [None if part.strip() == "_" else float(part) for part in parts]
+    except ValueError:
+        raise WrongUsage(f"{whole!r}: {text!r} is not {count} numbers") from None
+    if len(numbers) != count:
+        raise WrongUsage(f"{whole!r}: {len(numbers)} numbers where there are {count}")
+    return numbers
+
+
+def _start(text: str) -> dict[str, float | None]:
+    x, z, heading = _numbers(text, 3, f"--start {text}")
+    return {"x": x, "z": z, "heading_deg": heading}
+
+
+# -- telling -----------------------------------------------------------------------------------------------------------
+
+
+def _print(answer: SearchAnswer) -> None:
+    rows = []
+    for one in answer.errors:
+        unit, error = next(
+            (unit, value)
+            for unit, value in (("cm", one.error_cm), ("deg", one.error_deg), ("s", one.error_s))
+            if value is not None
+        )
+        left = error if one.finished_error is None else one.finished_error
+        what = f"{one.type} {one.joint}" if one.joint else one.type
+        rows.append((one.step, what, f"{one.sampled_error:.3f}", f"{left:.3f}", unit, "yes" if one.reached else "no"))
+    columns = ("step", "constraint", "of the sample", "at the end", "unit", "reached")
+    print_table(columns, rows, right=columns[2:4])
+    for number, step in enumerate(answer.steps):
+        likely = step.likelihood_percentile
+        told = "" if likely is None else f", likelier than {likely:.0f} % of the examples"
+        typer.echo(f"step {number}: {step.duration_s:.2f} s{told}")
+        if step.tree == "drawn":
+            tell("The model has no tree of its own; samples were drawn for this search. marey tree makes one.")
+    for place in answer.out_of_reach:
+        tell(f"constraint {place}: out of the model's reach; it was not trained on such motions.")

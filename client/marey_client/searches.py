@@ -1,0 +1,75 @@
+"""Motions of models that meet constraints, and the trees that make searching for them quick."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from marey_client.downloads import safe_file_name, saved_atomically
+from marey_client.findings import OnProgress
+from marey_client.jobs import Jobs
+from marey_client.reports import ReportedHandle
+from marey_client.transport import BLOCKS, as_json, read_tree
+from marey_schemas.jobs import Job, JobCreate
+from marey_schemas.sample_trees import TreeParams
+from marey_schemas.search import SearchAnswer, SearchRequest
+
+Constraints = Sequence[Mapping[str, Any] | BaseModel]
+"""Such as `{"type": "joint_position", "joint": "left_wrist", "at": "contact", "target_m": (0.3, 1.2, None)}`."""
+
+
+class SearchableHandle(ReportedHandle):
+    """An item whose motions can be searched."""
+
+    def search(self, constraints: Constraints = (), **options: Any) -> SearchAnswer:
+        """The motion that meets constraints best; `options` are those of `SearchRequest`.
+
+        Several motions that follow one another are asked for with `steps`, each with constraints and, where it is
+        another one, the id of its model. The answer tells what is missed by how much.
+        """
+        request = search_request(constraints, **options)
+        response = self.transport.send(
+            "POST", f"{self.url}/search", content=as_json(request), headers={"Accept": BLOCKS}, repeatable=True
+        )
+        return SearchAnswer.model_validate(read_tree(response))
+
+    def save_search(
+        self,
+        path: Path,
+        constraints: Constraints = (),
+        *,
+        format: str = "bvh",  # noqa: A002
+        unit: str = "cm",
+        **options: Any,
+    ) -> Path:
+        """Write what a search finds to a file of motion: bvh, npz or predecessor."""
+        response = self.transport.send(
+            "POST",
+            f"{self.url}/search/export",
+            params={"format": format, "unit": unit},
+            content=as_json(search_request(constraints, **options)),
+            headers={"Accept": "*/*"},
+            repeatable=True,
+        )
+        target = path / safe_file_name(f"{self.name} found.{format}") if path.is_dir() else path
+        with saved_atomically(target) as file:
+            file.write(response.content)
+        return target
+
+    def make_tree(self, *, seed: int = 0, on_progress: OnProgress | None = None, **options: Any) -> Job:
+        """Group samples of the model, as its part `tree`, and wait until that is done. Raises `JobUnsuccessful`.
+
+        `options` are those of `TreeParams`.
+        """
+        params = TreeParams.model_validate(options).model_dump(mode="json", exclude_defaults=True)
+        request = JobCreate(kind="tree", inputs={"model": self.as_input()}, params=params, seed=seed)
+        jobs = Jobs(self.transport)
+        return jobs.wait(jobs.submit(self.project, request).id, on_progress=on_progress)
+
+
+def search_request(constraints: Constraints, **options: Any) -> SearchRequest:
+    """A request with these constraints."""
+    return SearchRequest.model_validate({"constraints": list(constraints), **options})
