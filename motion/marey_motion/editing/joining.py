@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.editing.borders import blended, smooth_step
-from marey_motion.editing.offsets import add_offset, dying_away, offset_to, step_of
+from marey_motion.editing.offsets import VELOCITY_S, add_offset, dying_away, seam_offset
 from marey_motion.editing.placement import body_track, moved_over
 from marey_motion.editing.take import Take, motion_of
 from marey_motion.editing.translations import with_equal_joints
@@ -21,8 +21,6 @@ from marey_motion.skeleton import same_hierarchy
 Floats = NDArray[np.float64]
 
 SAME_SKELETON_M = 1e-5
-VELOCITY_S = 0.3
-"""A difference of velocities is used up after this, so that long blends do not swing out."""
 
 
 def concatenate(
@@ -92,11 +90,7 @@ def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
 def _inertialised(before: Take, after: Take, count: int) -> Motion:
     """The second motion, starting with the pose and velocity that the first one ends with."""
     first, second = before.motion, after.motion
-    last = before.frame_count - 1
-    arrival = step_of(first, max(0, last - 1))
-    going_on = add_offset(first.at_frames(np.array([last])), np.array([0]), arrival)
-    difference = offset_to(second, 0, going_on, 0)
-    velocity = arrival.minus(step_of(second, 0))
+    difference, velocity = seam_offset(first, second)
     ages = np.arange(min(count, after.frame_count), dtype=np.float64)
     velocity_life = min(float(count), max(1.0, VELOCITY_S * before.frame_rate_hz))
     left = dying_away(difference, velocity, ages, float(count), velocity_life)

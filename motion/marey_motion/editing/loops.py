@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.editing.offsets import add_offset, dying_away, offset_to, step_of
+from marey_motion.editing.offsets import VELOCITY_S, add_offset, dying_away, offset_to, step_of
 from marey_motion.editing.placement import body_track, carried, moved_over
 from marey_motion.editing.take import Take
 from marey_motion.errors import EditError
@@ -15,8 +15,6 @@ from marey_motion.motion import Motion
 Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 4
-VELOCITY_S = 0.3
-"""A difference of velocities is used up after this, so that poses far from the seam stay."""
 
 
 def close_loop(take: Take, *, in_place: bool = False, blend_s: float | None = None) -> Take:

@@ -18,6 +18,9 @@ from marey_motion.motion import Motion
 
 Floats = NDArray[np.float64]
 
+VELOCITY_S = 0.15
+"""A difference of velocities is used up after this, so that long blends do not swing out."""
+
 
 class PoseOffset(NamedTuple):
     """What takes a pose to another one of the same joints, or how fast that changes, per frame.
@@ -64,6 +67,18 @@ def offset_to(motion: Motion, frame: int, other: Motion, other_frame: int) -> Po
 def step_of(motion: Motion, frame: int) -> PoseOffset:
     """What takes a frame to the next one; nothing where there is no next."""
     return offset_to(motion, frame, motion, min(frame + 1, motion.frame_count - 1))
+
+
+def seam_offset(before: Motion, after: Motion) -> tuple[PoseOffset, PoseOffset]:
+    """What the start of `after` lacks to go on where `before` ends, and how fast that changes per frame.
+
+    The step over the seam is in neither motion: it is taken as the mean of its neighbours, half of whose difference is
+    left to the frames that follow.
+    """
+    arrival, departure = step_of(before, max(0, before.frame_count - 2)), step_of(after, 0)
+    velocity = arrival.minus(departure).times(0.5)
+    going_on = add_offset(before.at_frames(np.array([-1])), np.array([0]), arrival.minus(velocity))
+    return offset_to(after, 0, going_on, 0), velocity
 
 
 def add_offset(motion: Motion, frames: NDArray[np.int64], offset: PoseOffset) -> Motion:

@@ -1,0 +1,56 @@
+"""Walks to edit, and what holds of every clip that an edit makes."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import quaternions
+from marey_motion.clip import Clip
+from marey_motion.gait import generate_gait
+from marey_motion.kinematics import global_positions
+
+
+def make_walk(
+    turn_rate_rad_s: float = 0.0, seconds: float = 3.0, rate_hz: float = 60.0, speed_m_s: float = 1.3
+) -> Clip:
+    """A generated walk; feet that stand do not slide, and the floor is at height zero."""
+    return generate_gait(speed_m_s, turn_rate_rad_s, seconds, rate_hz)
+
+
+def make_breathing_walk(**given: float) -> Clip:
+    """A walk whose spine and left arm also move against their parents."""
+    walk = make_walk(**given)
+    joints = tuple(sorted(walk.skeleton.index_of(name) for name in ("Spine1", "LeftArm")))
+    phase = np.linspace(0.0, 6.0, walk.frame_count)[:, None, None]
+    offsets = walk.skeleton.offsets[list(joints)] * (1.0 + 0.1 * np.sin(phase))
+    return replace(walk, translations=offsets.astype(np.float32), translated_joints=joints)
+
+
+def same_poses(a: Clip, b: Clip, tolerance: float = 2e-6) -> bool:
+    """Whether two clips show the same motion, joint by joint, whatever the signs of their quaternions."""
+    if a.frame_count != b.frame_count or a.translated_joints != b.translated_joints:
+        return False
+    turned = quaternions.angle_between(a.rotations.astype(np.float64), b.rotations.astype(np.float64))
+    moved = a.translations is None or np.allclose(a.translations, b.translations, atol=tolerance)
+    return bool(turned.max() < 5 * tolerance and moved) and np.allclose(
+        a.root_translations, b.root_translations, atol=tolerance
+    )
+
+
+def are_exactly(a: NDArray[np.float32], b: NDArray[np.float32]) -> bool:
+    """Whether rotations are the same to the last bit, but for the sign of whole quaternions."""
+    return bool(np.all(np.all(a == b, axis=-1) | np.all(a == -b, axis=-1)))
+
+
+def require_sound(clip: Clip) -> None:
+    """Unit quaternions of continuous sign, in every frame."""
+    rotations = clip.rotations.astype(np.float64)
+    assert np.abs(np.linalg.norm(rotations, axis=-1) - 1.0).max() < 1e-6
+    assert np.einsum("fjc,fjc->fj", rotations[1:], rotations[:-1]).min(initial=1.0) >= -1e-6
+
+
+def largest_step(clip: Clip) -> float:
+    """How far any joint gets from one frame to the next at most, metres."""
+    steps = np.linalg.norm(np.diff(global_positions(clip).astype(np.float64), axis=0), axis=-1)
+    return float(steps.max())

@@ -1,0 +1,120 @@
+"""Clips put after one another."""
+
+import numpy as np
+import pytest
+
+from edited_takes import largest_step, make_breathing_walk, make_walk, require_sound, same_poses
+from marey_motion import kinematics
+from marey_motion.clip import Clip
+from marey_motion.editing.registry import apply_edit
+from marey_motion.errors import EditError
+from marey_motion.gait import game_skeleton, generate_gait
+from marey_motion.kinematics import global_positions
+from marey_motion.matching.body import MatchingBody
+from marey_motion.rigs import map_joints
+
+BLENDS = ("inertialise", "slerp")
+
+
+def join(first: Clip, second: Clip, **given: object) -> Clip:
+    return apply_edit(first, [("concatenate", {"source": "second", **given})], sources={"second": second})
+
+
+def heading_of(clip: Clip) -> np.ndarray:
+    body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
+    positions = global_positions(clip)
+    return kinematics.headings(kinematics.forward_directions(positions, body.lefts, body.rights))
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+@pytest.mark.parametrize("away", [0.0, 2.5])
+def test_the_second_goes_on_where_the_first_ends(blend: str, away: float) -> None:
+    first = make_walk(turn_rate_rad_s=0.6)
+    elsewhere = [("rotate", {"angle_rad": away}), ("translate", {"shift_m": (5.0, 0.0, -3.0)})]
+    second = apply_edit(make_walk(turn_rate_rad_s=-0.4), elsewhere)
+    joined = join(first, second, blend=blend)
+    require_sound(joined)
+    assert np.array_equal(joined.poses[: first.frame_count - 20], first.poses[: first.frame_count - 20])
+    assert largest_step(joined) < 2.0 * max(largest_step(first), largest_step(second))
+    assert np.abs(np.diff(heading_of(joined))).max() < 0.1
+
+
+def test_inertialising_keeps_all_frames_and_a_fade_overlaps_them() -> None:
+    first, second = make_walk(seconds=2.0), make_walk(seconds=1.5)
+    frames = first.frame_count + second.frame_count
+    assert join(first, second, blend="inertialise", blend_s=0.3).frame_count == frames
+    assert join(first, second, blend="slerp", blend_s=0.3).frame_count == frames - 18
+    assert join(first, second, blend="slerp", blend_s=0.0).frame_count == frames
+
+
+def test_pose_and_velocity_are_continuous_at_an_inertialised_seam() -> None:
+    first, second = make_breathing_walk(seconds=2.3), make_breathing_walk(seconds=2.0, speed_m_s=0.8)
+    joined = join(first, second, blend_s=0.5)
+    seam = first.frame_count
+    places = global_positions(joined).astype(np.float64)
+    steps = np.diff(places, axis=0)
+    jumps = np.linalg.norm(np.diff(steps, axis=0), axis=-1).max(axis=1)
+    hard = np.diff(np.diff(global_positions(join(first, second, blend_s=0.0)).astype(np.float64), axis=0), axis=0)
+    assert jumps[seam - 3 : seam + 2].max() < 0.3 * np.linalg.norm(hard, axis=-1)[seam - 3 : seam + 2].max()
+    # What dies away is gone at the end of the blend: from then on the second plays on, moved on the ground alone.
+    rest = slice(seam + 30, None)
+    assert np.allclose(joined.rotations[rest, 1:], second.rotations[30:, 1:], atol=1e-5) or same_joints(
+        joined, second, seam, 30
+    )
+
+
+def same_joints(joined: Clip, second: Clip, seam: int, after: int) -> bool:
+    dots = np.abs(np.sum(joined.rotations[seam + after :, 1:] * second.rotations[after:, 1:], axis=-1))
+    return bool(np.all(dots > 1.0 - 1e-5))
+
+
+def test_a_clip_of_another_rate_is_brought_to_this_one() -> None:
+    first, second = make_walk(rate_hz=60.0), make_walk(rate_hz=120.0)
+    joined = join(first, second)
+    assert joined.frame_rate_hz == 60.0
+    assert joined.frame_count == first.frame_count + (second.frame_count - 1) // 2 + 1
+
+
+def test_translations_that_only_one_of_them_has_become_offsets_in_the_other() -> None:
+    still, breathing = make_walk(), make_breathing_walk()
+    for first, second in ((still, breathing), (breathing, still)):
+        joined = join(first, second, blend_s=0.0)
+        assert joined.translated_joints == breathing.translated_joints
+        assert joined.translations is not None
+        own = joined.translations[: still.frame_count] if first is still else joined.translations[-still.frame_count :]
+        assert np.allclose(own, still.skeleton.offsets[list(joined.translated_joints)], atol=1e-6)
+
+
+def test_a_pose_can_be_appended_to_a_pose() -> None:
+    pose = make_walk().sliced(0, 1)
+    joined = join(pose, make_walk().sliced(30, 31), blend_s=0.0)
+    assert joined.frame_count == 2
+    require_sound(joined)
+
+
+def test_clips_of_other_skeletons_are_refused() -> None:
+    stranger = game_skeleton()
+    pose = np.concatenate((stranger.offsets[0], stranger.rest_rotations.ravel())).astype(np.float32)
+    with pytest.raises(EditError, match="moves another skeleton; retarget it first"):
+        join(make_walk(), Clip(stranger, 60.0, pose[None]))
+
+
+def test_unknown_sources_are_told_with_those_that_there_are() -> None:
+    with pytest.raises(EditError, match=r"no source is called 'third'; there is second"):
+        apply_edit(make_walk(), [("concatenate", {"source": "third"})], sources={"second": make_walk()})
+
+
+def test_joining_stops_before_memory_does() -> None:
+    walk = make_walk()
+    again = [("concatenate", {"source": "walk"})] * 40
+    with pytest.raises(EditError, match="the result would have") as refused:
+        apply_edit(walk, again, sources={"walk": walk}, most_numbers=20 * walk.poses.size)
+    assert refused.value.code == "edit-too-large"
+
+
+def test_a_walk_joined_to_itself_at_the_same_phase_walks_on() -> None:
+    whole = generate_gait(1.3, 0.0, 4.0)
+    first, second = whole.sliced(0, 100), whole.sliced(100, 240)
+    assert np.abs(global_positions(join(first, second)) - global_positions(whole)).max() < 0.02
+    assert np.abs(global_positions(join(first, second, blend_s=0.0)) - global_positions(whole)).max() < 1e-3
+    assert same_poses(join(first, second, place="keep", blend_s=0.0), whole, 1e-6)

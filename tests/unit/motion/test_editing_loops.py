@@ -1,0 +1,72 @@
+"""Loops that close."""
+
+import numpy as np
+import pytest
+
+from edited_takes import make_breathing_walk, make_walk, require_sound, same_poses
+from marey_motion import kinematics
+from marey_motion.clip import Clip
+from marey_motion.editing.registry import apply_edit
+from marey_motion.errors import EditError
+from marey_motion.kinematics import global_positions
+from marey_motion.looping import LoopSeam, continue_motion, loop_seam
+from marey_motion.matching.body import MatchingBody
+from marey_motion.motion import Motion
+from marey_motion.rigs import map_joints
+
+
+def seam_of(clip: Clip) -> LoopSeam:
+    body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
+    positions = global_positions(clip).astype(np.float64)
+    directions = kinematics.forward_directions(positions, body.lefts, body.rights)
+    return loop_seam(positions[:, body.hips][:, [0, 2]], kinematics.headings(directions))
+
+
+def accelerations_around_the_seam(clip: Clip, seam: LoopSeam) -> np.ndarray:
+    """Change of the steps of any joint around the seam, metres per frame."""
+    rounds = continue_motion(Motion.of(clip), seam, 3, 3)
+    both = rounds.positions(clip.skeleton)[: 3 + 3]
+    return np.linalg.norm(np.diff(both, n=2, axis=0), axis=-1).max(axis=1)
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+@pytest.mark.parametrize("turn_rate_rad_s", [0.0, 0.7])
+def test_the_last_frame_leads_into_the_first(in_place: bool, turn_rate_rad_s: float) -> None:
+    walk = make_breathing_walk(turn_rate_rad_s=turn_rate_rad_s).sliced(5, 100)
+    closed = apply_edit(walk, [("close_loop", {"in_place": in_place})])
+    assert closed.frame_count == walk.frame_count
+    require_sound(closed)
+    seam = LoopSeam(0.0, np.zeros(2)) if in_place else seam_of(closed)
+    usual = np.linalg.norm(np.diff(global_positions(closed).astype(np.float64), n=2, axis=0), axis=-1).max()
+    open_jump = accelerations_around_the_seam(walk, seam_of(walk)).max()
+    closed_jump = accelerations_around_the_seam(closed, seam).max()
+    assert closed_jump < 1.5 * usual
+    assert closed_jump < 0.5 * open_jump
+
+
+def test_a_loop_in_place_ends_where_it_starts() -> None:
+    walk = make_walk(turn_rate_rad_s=0.7).sliced(5, 100)
+    closed = apply_edit(walk, [("close_loop", {"in_place": True})])
+    seam = seam_of(closed)
+    assert abs(seam.turn_rad) < 0.02
+    assert np.abs(seam.shift_m).max() < 0.02
+
+
+def test_poses_far_from_the_seam_stay_where_the_blend_is_short() -> None:
+    walk = make_walk().sliced(5, 125)
+    closed = apply_edit(walk, [("close_loop", {"blend_s": 0.3})])
+    assert same_poses(closed.sliced(18, 102), walk.sliced(18, 102))
+    assert not same_poses(closed.sliced(0, 10), walk.sliced(0, 10))
+
+
+def test_what_loops_already_hardly_changes() -> None:
+    walk = make_walk().sliced(5, 100)
+    once = apply_edit(walk, [("close_loop", {})])
+    twice = apply_edit(once, [("close_loop", {})])
+    assert np.abs(global_positions(twice) - global_positions(once)).max() < 0.02
+    assert np.abs(global_positions(once) - global_positions(walk)).max() > 0.05
+
+
+def test_a_loop_needs_some_frames() -> None:
+    with pytest.raises(EditError, match="at least 4 frames, there are 3"):
+        apply_edit(make_walk().sliced(0, 3), [("close_loop", {})])

@@ -1,0 +1,53 @@
+"""Frames kept, and clips cut into pieces."""
+
+import numpy as np
+import pytest
+
+from edited_takes import make_breathing_walk, make_walk
+from marey_motion.editing.registry import apply_edit, edit_clip
+from marey_motion.errors import EditError
+
+
+def test_trimming_keeps_the_bytes_of_the_frames() -> None:
+    walk = make_breathing_walk()
+    kept = apply_edit(walk, [("trim", {"start": 20, "stop": 90})])
+    assert np.array_equal(kept.poses, walk.poses[20:90])
+    assert kept.translations is not None
+    assert walk.translations is not None
+    assert np.array_equal(kept.translations, walk.translations[20:90])
+
+
+def test_trimming_without_a_stop_goes_to_the_end() -> None:
+    walk = make_walk()
+    assert apply_edit(walk, [("trim", {"start": 100})]).frame_count == walk.frame_count - 100
+
+
+@pytest.mark.parametrize(("start", "stop"), [(0, 10_000), (500, None), (7, 7), (9, 3), (-3, 10)])
+def test_frames_that_are_not_there_cannot_be_kept(start: int, stop: int | None) -> None:
+    with pytest.raises(EditError, match=r"commands\[0\] \(trim\): the frames .* are not there") as refused:
+        edit_clip(make_walk(), [("trim", {"start": start, "stop": stop})])
+    assert refused.value.code == "frames-missing"
+
+
+def test_pieces_put_together_again_are_the_motion() -> None:
+    walk = make_breathing_walk()
+    pieces = edit_clip(walk, [("split", {"at": [40, 41, 120]})])
+    assert [one.pieces for one in pieces] == [(1,), (2,), (3,), (4,)]
+    first, *others = pieces
+    sources = {str(number): one.clip for number, one in enumerate(others)}
+    commands = [("concatenate", {"source": name, "place": "keep", "blend_s": 0.0}) for name in sources]
+    whole = apply_edit(first.clip, commands, sources=sources)
+    assert np.array_equal(whole.poses, walk.poses)
+    assert np.array_equal(whole.translations, walk.translations)  # type: ignore[arg-type]
+
+
+def test_what_follows_a_split_is_done_to_every_piece() -> None:
+    pieces = edit_clip(make_walk(), [("split", {"at": [60]}), ("trim", {"stop": 30}), ("split", {"at": [10]})])
+    assert [one.pieces for one in pieces] == [(1, 1), (1, 2), (2, 1), (2, 2)]
+    assert [one.clip.frame_count for one in pieces] == [10, 20, 10, 20]
+
+
+@pytest.mark.parametrize("at", [[0], [10_000], [50, 50], [60, 50]])
+def test_no_piece_may_be_without_frames(at: list[int]) -> None:
+    with pytest.raises(EditError, match="leave a piece without frames"):
+        edit_clip(make_walk(), [("split", {"at": at})])
