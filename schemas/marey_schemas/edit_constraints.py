@@ -150,5 +150,5 @@ class PlantFeet(Request):
     )
     blend_s: Seconds = Field(0.15, description="Time before and after a contact in which the foot is blended.")
     knee_damping_deg: float = Field(
-        17.0, ge=0, le=90, allow_inf_nan=False, description="How long before straight a stretching knee is damped."
+        10.0, ge=0, le=90, allow_inf_nan=False, description="How long before straight a stretching knee is damped."
     )

@@ -32,7 +32,8 @@ Flags = NDArray[np.bool_]
 Run = tuple[int, int]
 
 MOST_LOWERING_M = 0.1
-LOWERING_PASSES = 6
+# Less than this is rounding.
+SHORTEST_LOWERING_M = 1e-9
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class PlantOptions:
     blend_s: float = 0.15
     speed_m_s: float = kinematics.CONTACT_SPEED_M_S
     shortest_s: float = 0.06
-    knee_damping_rad: float = math.radians(17.0)
+    knee_damping_rad: float = math.radians(10.0)
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -219,26 +220,20 @@ def _turn_between(before: Floats, after: Floats) -> Floats:
 
 
 def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], zone: float, blend: int) -> Floats:
-    """How far the root must come down (F,), metres, so that standing feet are within reach of damped knees."""
+    """How far the root must come down (F,), metres, so that standing feet are in reach without stretching knees."""
     from marey_motion.editing import two_bone_kernels
 
-    lowering = np.zeros(len(positions))
-    for _ in range(LOWERING_PASSES):
-        wanted = np.zeros(len(positions))
-        for foot, plan in zip(feet, plans, strict=True):
-            hip, knee, ankle = (positions[:, joint] for joint in (foot.leg.start, foot.leg.middle, foot.leg.end))
-            bones = np.linalg.norm(knee - hip, axis=1), np.linalg.norm(ankle - knee, axis=1)
-            way = hip - lowering[:, None] * (0.0, 1.0, 0.0) - plan.ankle
-            reach = two_bone_kernels.damped_reach(
-                np.linalg.norm(way, axis=1), np.linalg.norm(hip - ankle, axis=1), *bones, zone
-            )
-            across = np.minimum(np.hypot(way[:, 0], way[:, 2]), reach)
-            short = np.maximum(way[:, 1] - np.sqrt(reach**2 - across**2), 0.0)
-            wanted = np.maximum(wanted, plan.firmness * short)
-        if wanted.max(initial=0.0) < 1e-5:
-            break
-        lowering = np.minimum(lowering + _enveloped(wanted, blend), MOST_LOWERING_M)
-    return lowering
+    wanted = np.zeros(len(positions))
+    for foot, plan in zip(feet, plans, strict=True):
+        hip, knee, ankle = (positions[:, joint] for joint in (foot.leg.start, foot.leg.middle, foot.leg.end))
+        bones = np.linalg.norm(knee - hip, axis=1), np.linalg.norm(ankle - knee, axis=1)
+        reach = two_bone_kernels.undamped_reach(np.linalg.norm(hip - ankle, axis=1), *bones, zone)
+        way = hip - plan.ankle
+        across = np.minimum(np.hypot(way[:, 0], way[:, 2]), reach)
+        short = way[:, 1] - np.sqrt(reach**2 - across**2)
+        wanted = np.maximum(wanted, plan.firmness * short)
+    wanted[wanted < SHORTEST_LOWERING_M] = 0.0
+    return np.minimum(_enveloped(wanted, blend), MOST_LOWERING_M)
 
 
 def _enveloped(values: Floats, blend: int) -> Floats:

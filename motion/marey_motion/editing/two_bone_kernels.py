@@ -126,12 +126,11 @@ def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):
 
 
 @compiled
-def damped_reach(distances, starts, firsts, seconds, zone):  # type: ignore[no-untyped-def]
-    """How far (F,) limbs that span `starts` come when they are to span `distances`, their stretching damped."""
-    reach = np.empty(distances.shape[0])
-    for f in range(distances.shape[0]):
+def undamped_reach(starts, firsts, seconds, zone):  # type: ignore[no-untyped-def]
+    """How far (F,) limbs that span `starts` can come before damping takes anything from their stretching."""
+    reach = np.empty(starts.shape[0])
+    for f in range(starts.shape[0]):
         first, second = firsts[f], seconds[f]
-        wished = bend_at(min(max(distances[f], abs(first - second)), first + second), first, second)
-        bend = damped_bend(bend_at(starts[f], first, second), wished, zone)
+        bend = max(bend_at(starts[f], first, second), math.pi - zone)
         reach[f] = math.sqrt(max(first * first + second * second - 2.0 * first * second * math.cos(bend), 0.0))
     return reach
