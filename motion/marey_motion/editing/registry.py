@@ -114,9 +114,9 @@ def edit_clip(
             place = f"commands[{number}] ({name})"
             error.where = place if error.where is None else f"{place}, {error.where}"
             raise
-    return tuple(
-        EditedClip(take.motion.as_clip(take.skeleton, take.frame_rate_hz), take.pieces, take.findings) for take in takes
-    )
+    with np.errstate(over="ignore"):  # what is too large in single precision is refused as not finite
+        clips = [take.motion.as_clip(take.skeleton, take.frame_rate_hz) for take in takes]
+    return tuple(EditedClip(clip, take.pieces, take.findings) for clip, take in zip(clips, takes, strict=True))
 
 
 def apply_edit(clip: Clip, commands: Sequence[NamedCommand], **given: Any) -> Clip:

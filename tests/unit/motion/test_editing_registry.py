@@ -1,0 +1,125 @@
+"""Lists of commands: what can be asked for, what goes wrong, and that the same list gives the same bytes."""
+
+import inspect
+from math import degrees
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic_core import PydanticUndefined
+
+from edit_examples import EXAMPLES, SOURCE, commands_of_all
+from edited_takes import make_breathing_walk, make_walk, require_sound
+from marey_motion.clip import Clip
+from marey_motion.documents import commands_of_edit
+from marey_motion.editing.registry import COMMANDS, EditedClip, apply_edit, edit_clip
+from marey_motion.errors import EditError, MotionError
+from marey_schemas.editing import COMMAND_MODELS, EditDocument
+
+
+def edit_of(*commands: dict[str, Any]) -> EditDocument:
+    return EditDocument.model_validate({"commands": list(commands)})
+
+
+def applied(clip: Clip, *commands: dict[str, Any]) -> tuple[EditedClip, ...]:
+    return edit_clip(clip, commands_of_edit(edit_of(*commands)), sources={SOURCE: make_walk(speed_m_s=2.5)})
+
+
+def test_every_command_has_a_schema_and_every_schema_a_command() -> None:
+    assert set(COMMANDS) == set(COMMAND_MODELS) == set(EXAMPLES)
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_schema_and_function_take_the_same_parameters_with_the_same_defaults(name: str) -> None:
+    _take, *parameters = inspect.signature(COMMANDS[name]).parameters.values()
+    assert all(parameter.kind is parameter.KEYWORD_ONLY for parameter in parameters)
+    functions = {parameter.name: parameter.default for parameter in parameters}
+    schema = {
+        field: info.get_default(call_default_factory=True)
+        for field, info in COMMAND_MODELS[name].model_fields.items()
+        if field != "command"
+    }
+    assert {field.replace("_deg", "_rad") for field in schema} == set(functions)
+    for field, default in schema.items():
+        wanted = functions[field.replace("_deg", "_rad")]
+        if default is PydanticUndefined:
+            assert wanted is inspect.Parameter.empty, field
+        elif field.endswith("_deg"):
+            assert default == pytest.approx(degrees(wanted)), field
+        else:
+            assert (default or None) == (wanted or None), field
+
+
+@pytest.mark.parametrize("command", commands_of_all(), ids=lambda command: command["command"])
+@pytest.mark.parametrize("walk", [make_walk(turn_rate_rad_s=0.3), make_breathing_walk()], ids=["plain", "breathing"])
+def test_every_command_gives_sound_clips_of_the_frames_it_promises(command: dict[str, Any], walk: Clip) -> None:
+    made = applied(walk, command)
+    for one in made:
+        require_sound(one.clip)
+        assert set(walk.translated_joints) <= set(one.clip.translated_joints)
+    frames = sum(one.clip.frame_count for one in made)
+    name = command["command"]
+    expected = {
+        "trim": (command.get("stop") or walk.frame_count) - command.get("start", 0),
+        "concatenate": walk.frame_count + 180 - (30 if command.get("blend") == "slerp" else 0),
+        "resample": int((walk.frame_count - 1) * 45 / 60) + 1,
+        "retime": int((walk.frame_count - 1) / 0.7) + 1,
+    }
+    assert frames == expected.get(name, walk.frame_count)
+
+
+def test_a_saved_edit_gives_the_same_bytes_every_time() -> None:
+    long_list = [one for one in commands_of_all() if one["command"] != "split"]
+    edit = EditDocument.model_validate({"commands": long_list, "title": "all of it"})
+    again = EditDocument.model_validate_json(edit.model_dump_json(by_alias=True))
+    assert again == edit
+    walk = make_breathing_walk()
+    sources = {SOURCE: make_walk(speed_m_s=2.5)}
+    (first,) = edit_clip(walk, commands_of_edit(edit), sources=sources)
+    (second,) = edit_clip(walk, commands_of_edit(again), sources=sources)
+    assert first.clip.poses.tobytes() == second.clip.poses.tobytes()
+    assert first.clip.translations is not None
+    assert second.clip.translations is not None
+    assert first.clip.translations.tobytes() == second.clip.translations.tobytes()
+    assert first.findings == second.findings
+
+
+def test_the_clip_that_is_edited_stays_as_it_is() -> None:
+    walk = make_breathing_walk()
+    before = walk.poses.copy()
+    for command in commands_of_all():
+        applied(walk, command)
+    assert np.array_equal(walk.poses, before)
+
+
+def test_several_commands_are_rounded_once() -> None:
+    walk = make_walk()
+    there_and_back = [("rotate", {"angle_rad": sign * 0.1}) for sign in (1.0, -1.0) for _ in range(30)]
+    assert np.abs(apply_edit(walk, there_and_back).poses - walk.poses).max() < 3e-7
+
+
+def test_what_goes_wrong_is_told_with_the_number_of_the_command() -> None:
+    with pytest.raises(MotionError, match=r"commands\[1\] \(rotate_joint\), .*LeftHand") as refused:
+        applied(
+            make_walk(),
+            {"command": "mirror"},
+            {"command": "rotate_joint", "joint": "LeftHans", "axis": [1, 0, 0], "angle_deg": 5},
+        )
+    assert refused.value.code == "unknown-joint"
+
+
+def test_unknown_commands_and_parameters_are_refused_by_name() -> None:
+    with pytest.raises(EditError, match="no command is called 'wobble'; there are trim, split"):
+        apply_edit(make_walk(), [("wobble", {})])
+    with pytest.raises(EditError, match="unexpected keyword argument 'to'"):
+        apply_edit(make_walk(), [("trim", {"to": 5})])
+
+
+def test_one_clip_is_not_asked_of_what_makes_several() -> None:
+    with pytest.raises(EditError, match="make 2 clips of one"):
+        apply_edit(make_walk(), [("split", {"at": [50]})])
+
+
+def test_numbers_that_overflow_are_refused_with_their_frame() -> None:
+    with pytest.raises(MotionError, match="not finite"):
+        apply_edit(make_walk(), [("scale", {"factor": 1e30}), ("scale", {"factor": 1e30})])
