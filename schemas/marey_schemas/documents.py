@@ -16,6 +16,7 @@ from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Request
 from marey_schemas.editing import EditDocument
 from marey_schemas.evaluation import EvaluationDocument, EvaluationRecords
+from marey_schemas.graphs import ModelGraph
 from marey_schemas.modelling import MotionPrimitiveDocument
 from marey_schemas.names import Digest, JointName, Tag
 from marey_schemas.references import OutputRef as OutputRef
@@ -228,7 +229,7 @@ SCHEMAS: dict[str, type[Request]] = {
     "marey/motion-primitive@1": MotionPrimitiveDocument,
     "marey/sample-tree@1": SampleTreeDocument,
     "marey/model-report@1": ModelReport,
-    "marey/model-graph@1": OpenDocument,
+    "marey/model-graph@1": ModelGraph,
     "marey/document@1": OpenDocument,
 }
 """Model by schema name."""

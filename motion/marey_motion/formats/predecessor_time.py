@@ -1,0 +1,133 @@
+"""The time functions of the predecessor's models, and ours made of them and the other way round.
+
+Both models tell which frame of an example stands at each canonical frame x = 0 to N - 1, as functions of a score vector
+g. Ours keeps ln(t(x + 1) - t(x)), linear in g. The predecessor has two forms:
+
+* `coefficients` (layouts 1 and 3, and layout 2 by its later trainer): t(x) is a spline whose coefficients are
+  cumsum(exp(mean + g · eigen)) - 1. The logarithm of its slope is not linear in g, so what is made of it is the best
+  linear function over the scores that the model draws; how far off that is comes along.
+* `increments` (layout 2 by its first trainer): t(x + 1) - t(x) = exp(spline(x + 1)), where the spline is linear in g.
+  This is our own form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import FormatError
+from marey_motion.modelling.primitive import FunctionalComponents, MotionPrimitive
+from marey_motion.modelling.splines import DEGREE, SplineBasis
+
+Floats = NDArray[np.float64]
+TimeForm = Literal["coefficients", "increments"]
+
+DRAWN, SEED = 512, 0
+"""Scores that a linear function is fitted over: so many, drawn with this seed."""
+MOST_LOG_SLOPE = 20.0
+WRITTEN_COEFFICIENTS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class PredecessorTime:
+    """A time function as a model of the predecessor has it.
+
+    Parameters
+    ----------
+    form : what the spline is of
+    basis : over canonical time 0 to N - 1
+    mean : (n,)
+    directions : (k, n) what one unit of each score adds
+    """
+
+    form: TimeForm
+    basis: SplineBasis
+    mean: Floats
+    directions: Floats
+
+    def time_functions(self, scores: Floats) -> Floats:
+        """Frames of the example (m, N) at each canonical frame, from 0, of scores (m, k)."""
+        logarithms = self.mean + scores @ self.directions
+        if self.form == "coefficients":
+            values = np.cumsum(np.exp(logarithms), axis=1) @ self.basis.at_frames.T
+            return np.asarray(values - values[:, :1])
+        steps = np.exp(logarithms @ self.basis.at_frames[1:].T)
+        return np.asarray(np.concatenate((np.zeros((len(scores), 1)), np.cumsum(steps, axis=1)), axis=1))
+
+
+def as_log_slopes(
+    time: PredecessorTime, scores: Floats, variances: Floats, file: str
+) -> tuple[FunctionalComponents, float]:
+    """Our form of a time function, and by how many frames it is off at most over scores (m, k) that the model draws.
+
+    Parameters
+    ----------
+    variances : (k,) of the scores
+    """
+    wanted = time.time_functions(scores)
+    steps = np.diff(wanted, axis=1)
+    if not (np.isfinite(steps).all() and (steps > 0).all() and (np.abs(np.log(steps)) < MOST_LOG_SLOPE).all()):
+        raise FormatError(
+            "the time function does not run forward at a speed that makes sense", code="bad-time", file=file
+        )
+    # As many coefficients as steps: the function is taken over as it is, whatever its own knots.
+    basis = SplineBasis.clamped(steps.shape[1], max(DEGREE + 1, steps.shape[1]))
+    mean, directions = _linear_fit(scores, np.asarray(basis.fit(np.log(steps)[..., None]))[..., 0])
+    components = components_of(basis, mean[:, None], directions[..., None], variances)
+    made = np.exp((mean + scores @ directions) @ basis.at_frames.T)
+    error = np.abs(np.cumsum(made, axis=1) - wanted[:, 1:]).max()
+    return components, float(error)
+
+
+def components_of(basis: SplineBasis, mean: Floats, directions: Floats, variances: Floats) -> FunctionalComponents:
+    """Components with mean (n, D), directions (k, n, D) and the projections that undo them.
+
+    How much of the variance of the examples was left out is not known: the energy is that of what is kept.
+    """
+    flat = directions.reshape(len(directions), mean.size)
+    projections = np.linalg.pinv(flat).T.reshape(directions.shape) if len(flat) else directions
+    total = float(variances.sum())
+    energy = np.cumsum(variances) / total if total > 0 else np.ones(len(variances))
+    return FunctionalComponents(basis, mean, directions, projections, variances, energy)
+
+
+def as_coefficients(primitive: MotionPrimitive) -> PredecessorTime:
+    """The time function of a primitive in the predecessor's form `coefficients`, over the scores of its own latents."""
+    scores, times = _drawn(primitive)
+    count = min(WRITTEN_COEFFICIENTS, primitive.frame_count)
+    basis = SplineBasis.clamped(primitive.frame_count, max(DEGREE + 1, count))
+    coefficients = np.asarray(basis.fit(times[..., None]))[..., 0]
+    coefficients[:, 0], coefficients[:, -1] = 0.0, times[:, -1]
+    # A spline runs forward if its coefficients do.
+    least = 1e-3 * times[:, -1:] / count
+    coefficients = np.maximum.accumulate(coefficients + least * np.arange(coefficients.shape[1]), axis=1)
+    steps = np.diff(coefficients + 1.0, axis=1, prepend=0.0)
+    mean, directions = _linear_fit(scores, np.log(np.maximum(steps, least)))
+    return PredecessorTime("coefficients", basis, mean, directions)
+
+
+def as_increments(primitive: MotionPrimitive) -> PredecessorTime:
+    """The time function of a primitive in the predecessor's form `increments`, over the scores of its own latents."""
+    count = min(WRITTEN_COEFFICIENTS, primitive.frame_count)
+    basis = SplineBasis.clamped(primitive.frame_count, max(DEGREE + 1, count))
+    fitting = np.linalg.pinv(basis.at_frames[1:])
+    slopes = primitive.temporal.basis.at_frames
+    mean = fitting @ (slopes @ primitive.temporal.mean[:, 0])
+    directions = primitive.temporal.directions[..., 0] @ slopes.T @ fitting.T / primitive.temporal_weight
+    return PredecessorTime("increments", basis, np.asarray(mean), np.asarray(directions))
+
+
+def _drawn(primitive: MotionPrimitive) -> tuple[Floats, Floats]:
+    """Temporal parts (m, k) of latent vectors that the model draws, and their time functions (m, N)."""
+    latents = primitive.sample(DRAWN, SEED)
+    return latents[:, primitive.spatial.count :], primitive.time_functions(latents)
+
+
+def _linear_fit(scores: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Mean (n,) and directions (k, n) of the best linear function of scores (m, k) with values (m, n)."""
+    columns = np.concatenate((np.ones((len(scores), 1)), scores), axis=1)
+    solution = np.linalg.lstsq(columns, values, rcond=None)[0]
+    return np.asarray(solution[0]), np.asarray(solution[1:])

@@ -1,0 +1,112 @@
+"""Graphs of motion primitives: which action may follow which."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, StringConstraints, model_validator
+
+from marey_schemas.base import Request
+from marey_schemas.names import Digest
+from marey_schemas.references import OutputRef, RevisionRef
+
+MOST_PRIMITIVES = 10_000
+TYPES_TO_END_IN = ("end", "idle", "single")
+
+NodeName = Annotated[str, StringConstraints(min_length=1, max_length=255)]
+
+
+class GraphPlace(Request):
+    """A primitive of an action."""
+
+    action: NodeName
+    primitive: NodeName
+
+    def __str__(self) -> str:
+        return f"{self.action}/{self.primitive}"
+
+
+class GraphPrimitive(Request):
+    """One node: a model, what part it plays, and what may follow it."""
+
+    model: RevisionRef | OutputRef
+    type: Literal["start", "standard", "end", "idle", "single", "cycle_end"] = "standard"
+    transitions: tuple[GraphPlace, ...] = Field((), max_length=MOST_PRIMITIVES)
+    source_id: str | None = Field(None, max_length=255, description="What a file it comes from calls the model.")
+
+
+class GraphAction(Request):
+    """An action, such as walk, made of primitives, such as leftStance."""
+
+    primitives: dict[NodeName, GraphPrimitive] = Field(min_length=1, max_length=MOST_PRIMITIVES)
+
+
+class StoredOriginal(Request):
+    """The file that something was imported from, and the digest of what it became then."""
+
+    blob: Digest
+    content: Digest
+
+
+class ModelGraph(Request):
+    """Part `graph` of an item of the kind `graph`.
+
+    Every primitive can be reached from the start, from every primitive one can come to an end (of type end, idle or
+    single), and an idle primitive may follow itself.
+    """
+
+    schema_: Literal["marey/model-graph@1"] = Field("marey/model-graph@1", alias="schema")
+    actions: dict[NodeName, GraphAction] = Field(min_length=1, max_length=MOST_PRIMITIVES)
+    start: GraphPlace = Field(description="Where every sequence of actions begins.")
+    description: str = Field("", max_length=10_000)
+    original: StoredOriginal | None = Field(None, description="The file it was imported from.")
+
+    @model_validator(mode="after")
+    def _check_graph(self) -> Self:
+        nodes = {
+            GraphPlace(action=action, primitive=name): node
+            for action, group in self.actions.items()
+            for name, node in group.primitives.items()
+        }
+        if len(nodes) > MOST_PRIMITIVES:
+            raise ValueError(f"actions: {len(nodes)} primitives; {MOST_PRIMITIVES} are accepted")
+        _require_known(nodes, "start", [self.start])
+        for place, node in nodes.items():
+            _require_known(nodes, f"{place}: transitions", node.transitions)
+            if node.type == "idle" and place not in node.transitions:
+                raise ValueError(f"{place}: an idle primitive must have a transition to itself")
+        follows = {place: set(node.transitions) for place, node in nodes.items()}
+        if lost := nodes.keys() - _reached([self.start], follows):
+            raise ValueError(f"{_first(lost)}: it cannot be reached from the start, {self.start}")
+        ends = [place for place, node in nodes.items() if node.type in TYPES_TO_END_IN]
+        if not ends:
+            raise ValueError(f"actions: no primitive is of a type to end in: {', '.join(TYPES_TO_END_IN)}")
+        precedes: dict[GraphPlace, set[GraphPlace]] = {place: set() for place in nodes}
+        for place, following in follows.items():
+            for other in following:
+                precedes[other].add(place)
+        if stuck := nodes.keys() - _reached(ends, precedes):
+            raise ValueError(f"{_first(stuck)}: no primitive to end in can be reached from it")
+        return self
+
+
+def _require_known(nodes: Mapping[GraphPlace, Any], where: str, places: Iterable[GraphPlace]) -> None:
+    for place in places:
+        if place not in nodes:
+            raise ValueError(f"{where}: there is no primitive {place}")
+
+
+def _reached(starts: Iterable[GraphPlace], follows: Mapping[GraphPlace, set[GraphPlace]]) -> set[GraphPlace]:
+    """Everything that can be come to from the starts, which count themselves."""
+    reached = set(starts)
+    waiting = list(reached)
+    while waiting:
+        new = follows[waiting.pop()] - reached
+        reached |= new
+        waiting.extend(new)
+    return reached
+
+
+def _first(places: Iterable[GraphPlace]) -> GraphPlace:
+    return min(places, key=str)

@@ -1,0 +1,79 @@
+"""The predecessor's graphs of models, in and out."""
+
+import copy
+import json
+
+import pytest
+
+from marey_motion.errors import FormatError
+from marey_motion.formats.predecessor_graph import graph_of_document, is_graph, write_predecessor_graph
+
+
+def transition(action, name, model_id):
+    return {f"{action}:{name}": {"action_name": action, "model_name": name, "model_id": model_id}}
+
+
+DOCUMENT = {
+    "nodes": {
+        "idle": {
+            "11": {
+                "name": "stand", "type": "idle",
+                "transitions": transition("idle", "stand", 11) | transition("walk", "begin", 12),
+            }
+        },
+        "walk": {
+            "12": {"name": "begin", "type": "start", "transitions": transition("walk", "end", 13)},
+            "13": {"name": "end", "type": "end", "transitions": transition("idle", "stand", 11)},
+        },
+    },
+    "start_node": ["idle", "11"],
+}  # fmt: skip
+
+
+def test_nodes_are_known_by_action_and_name_with_what_follows_them():
+    graph = graph_of_document(DOCUMENT, "g.json")
+    assert graph.start == ("idle", "stand")
+    assert graph.nodes["idle", "stand"].transitions == (("idle", "stand"), ("walk", "begin"))
+    assert (graph.nodes["walk", "end"].model_id, graph.nodes["walk", "end"].type) == ("13", "end")
+
+
+@pytest.mark.parametrize("start", [["idle", "11"], ["idle", 11], ["idle", "stand"]])
+@pytest.mark.parametrize("field", ["start_node", "startNode"])
+def test_the_start_stands_under_either_name_and_names_a_model_by_id_or_name(field, start):
+    document = {"nodes": DOCUMENT["nodes"], field: start}
+    assert is_graph(document)
+    assert graph_of_document(document, "g.json").start == ("idle", "stand")
+
+
+def test_a_graph_that_was_written_is_read_as_the_same_and_begins_under_both_names():
+    graph = graph_of_document(DOCUMENT, "g.json")
+    written = json.loads(write_predecessor_graph(graph))
+    assert graph_of_document(written, "again.json") == graph
+    assert written["start_node"] == written["startNode"] == ["idle", "11"]
+    assert json.loads(write_predecessor_graph(graph_of_document(written, "again.json"))) == written
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "told"),
+    [
+        (["nodes"], [], "'nodes' must be dict"),
+        (["nodes", "walk"], [], "'walk' must be dict"),
+        (["nodes", "walk", "12", "name"], 3, "'name' must be str"),
+        (["nodes", "walk", "12", "name"], "end", "walk: two nodes are called 'end'"),
+        (["nodes", "walk", "12", "type"], "begin", "walk/begin: 'begin' is no type"),
+        (["nodes", "walk", "12", "transitions"], [], "walk/begin: 'transitions' must be an object"),
+        (["nodes", "walk", "12", "transitions"], {"walk:99": {}}, "walk/begin: there is no node 'walk:99'"),
+        (["start_node"], "idle", "'start_node' must be an action and a model"),
+        (["start_node"], ["idle", "99"], "there is no node"),
+    ],
+)
+def test_damaged_graphs_are_refused_by_the_node(path, value, told):
+    document = copy.deepcopy(DOCUMENT)
+    *above, last = path
+    place = document
+    for step in above:
+        place = place[step]
+    place[last] = value
+    with pytest.raises(FormatError, match=told) as refused:
+        graph_of_document(document, "g.json")
+    assert refused.value.file == "g.json"

@@ -1,0 +1,93 @@
+"""Graphs of models: what holds together."""
+
+import copy
+
+import pytest
+from pydantic import ValidationError
+
+from marey_schemas.documents import SCHEMAS
+from marey_schemas.graphs import ModelGraph
+
+
+def node(number, kind, *following):
+    return {
+        "model": {"item": f"model_{number}", "revision": 1},
+        "type": kind,
+        "transitions": [dict(zip(("action", "primitive"), one.split("/"), strict=True)) for one in following],
+    }
+
+
+GRAPH = {
+    "schema": "marey/model-graph@1",
+    "actions": {
+        "idle": {"primitives": {"stand": node(1, "idle", "idle/stand", "walk/begin")}},
+        "walk": {
+            "primitives": {
+                "begin": node(2, "start", "walk/left"),
+                "left": node(3, "standard", "walk/right", "walk/end"),
+                "right": node(4, "standard", "walk/left"),
+                "end": node(5, "end", "idle/stand"),
+            }
+        },
+    },
+    "start": {"action": "idle", "primitive": "stand"},
+    "description": "A worker.",
+}
+
+
+def test_a_graph_whose_parts_hold_together_is_accepted_and_known_by_its_schema():
+    graph = ModelGraph.model_validate(GRAPH)
+    assert SCHEMAS["marey/model-graph@1"] is ModelGraph
+    assert graph.model_dump(mode="json", by_alias=True, exclude_none=True) == GRAPH
+
+
+def changed(change):
+    graph = copy.deepcopy(GRAPH)
+    change(graph)
+    return graph
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda one: one["start"].update(primitive="sit"), "start: there is no primitive idle/sit"),
+        (
+            lambda one: one["actions"]["walk"]["primitives"]["left"]["transitions"].append(
+                {"action": "run", "primitive": "left"}
+            ),
+            "walk/left: transitions: there is no primitive run/left",
+        ),
+        (
+            lambda one: one["actions"]["idle"]["primitives"]["stand"]["transitions"].pop(0),
+            "idle/stand: an idle primitive must have a transition to itself",
+        ),
+        (
+            lambda one: one["actions"]["walk"]["primitives"]["left"]["transitions"].pop(0),
+            "walk/right: it cannot be reached from the start",
+        ),
+        (
+            lambda one: (
+                one["actions"].update(fall={"primitives": {"down": node(9, "start", "fall/down")}})
+                or one["actions"]["idle"]["primitives"]["stand"]["transitions"].append(
+                    {"action": "fall", "primitive": "down"}
+                )
+            ),
+            "fall/down: no primitive to end in can be reached from it",
+        ),
+        (lambda one: one["actions"]["walk"]["primitives"]["left"].update(type="turn"), "type"),
+        (lambda one: one.update(actions={}), "actions"),
+        (lambda one: one["actions"]["walk"]["primitives"]["left"].pop("model"), "model"),
+    ],
+)
+def test_a_graph_that_does_not_hold_together_is_refused_by_the_primitive(change, told):
+    with pytest.raises(ValidationError, match=told):
+        ModelGraph.model_validate(changed(change))
+
+
+def test_a_graph_without_any_end_is_refused():
+    graph = copy.deepcopy(GRAPH)
+    for action in graph["actions"].values():
+        for primitive in action["primitives"].values():
+            primitive["type"] = "standard"
+    with pytest.raises(ValidationError, match="no primitive is of a type to end in: end, idle, single"):
+        ModelGraph.model_validate(graph)
