@@ -132,6 +132,14 @@ def without_shared_folder(names: Sequence[str]) -> list[str]:
     return ["/".join(place[shared:]) for place in places]
 
 
+def told_apart(names: Sequence[str]) -> list[str]:
+    """Names as they read within the folder that all of them lie in, and without the words that all begin with."""
+    within = without_shared_folder(names)
+    words = [re.split(r"(?<=[ _-])", name) for name in within]
+    shared = sum(1 for _ in takewhile(lambda each: len(set(each)) == 1, zip(*words, strict=False)))
+    return ["".join(own[shared:]) for own in words] if all(len(own) > shared for own in words) else within
+
+
 def shortened(name: str, longest: int = LONGEST_NAME) -> str:
     """A name cut in its middle, where names of takes differ least."""
     if len(name) <= longest:

@@ -172,7 +172,7 @@ def _draw_cell(axes: Axes, stage: _Stage, shapes: _Shapes, row: StripRow, column
     (left, bottom), (width, height) = stage.corner, stage.size
     floor = bottom + FLOOR_SHARE * height
     frame = Rectangle((left, bottom - GAP), width, height + 2 * GAP, visible=False)
-    axes.add_patch(frame)
+    axes.add_artist(frame)
     axes.plot([left + 0.03, left + width - 0.03], [floor] * 2, color=HAIRLINE, lw=0.8)
     for way in row.ways:
         _draw_way(axes, stage.placed(way * (1.0, 0.0, 1.0)), frame)
@@ -224,17 +224,17 @@ def _draw_body(axes: Axes, shapes: _Shapes, stage: _Stage, points: Floats, look:
     for place, side in enumerate(sides):
         if look.rim and place:
             rim = _path(_middles(seen[shapes.bones[side], :2]))
-            axes.add_patch(PathPatch(rim, edgecolor=PAPER, lw=look.width + 1.8, **{**options, "capstyle": "butt"}))
+            axes.add_artist(PathPatch(rim, edgecolor=PAPER, lw=look.width + 1.8, **{**options, "capstyle": "butt"}))
         lines = _path([seen[run, :2] for run in shapes.runs[side]])
         colour = look.colour or SIDE_COLOURS[side]
-        axes.add_patch(PathPatch(lines, edgecolor=colour, lw=look.width, alpha=look.alpha, **options))
+        axes.add_artist(PathPatch(lines, edgecolor=colour, lw=look.width, alpha=look.alpha, **options))
     if shapes.head is not None:
         (outer, inner), share = shapes.head
         centre = share * seen[inner, :2] + (1.0 - share) * seen[outer, :2]
         fill = PAPER if look.rim else "none"
         circle = Circle(tuple(centre), shapes.head_m * stage.scale, facecolor=fill, edgecolor=look.colour or INK)
         circle.set(linewidth=0.75 * look.width, alpha=look.alpha, clip_path=frame)
-        axes.add_patch(circle)
+        axes.add_artist(circle)
 
 
 def _middles(bones: Floats) -> list[Floats]:

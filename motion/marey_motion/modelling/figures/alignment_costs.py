@@ -20,7 +20,7 @@ from marey_motion.drawing.paper import (
     add_panel,
     new_figure,
     shortened,
-    without_shared_folder,
+    told_apart,
 )
 from marey_motion.modelling.figures.subjects import evenly
 
@@ -51,12 +51,12 @@ def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None
     if not views:
         return None
     ceiling = max(float(np.quantile(view.costs_cm, 0.98)) for view in views) or 1.0
-    figure = new_figure(0.75 + len(views) * (SIDE + 0.85) + 0.6, SIDE + 1.25)
+    figure = new_figure(0.75 + len(views) * (SIDE + 0.85) + 0.35, SIDE + 1.15)
     rate = aligned.frame_rate_hz
     names = dict(
         zip(
             (clip.uid for clip in aligned.clips),
-            without_shared_folder([clip.name for clip in aligned.clips]),
+            told_apart([clip.name for clip in aligned.clips]),
             strict=True,
         )
     )
@@ -76,9 +76,9 @@ def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None
         f"{view.clip.name}, {view.role} ({100.0 * np.sqrt(view.clip.cost):.1f} cm along its way)" for view in views
     ]
     caption = (
-        "How far poses of a clip are from poses of the reference, after the best turn and shift on the floor, for every "
-        f"pair of moments; the line is the way that was taken: {'; '.join(parts)}. A way along a light valley, without "
-        "long straight runs, is a good alignment. Clips are rebuilt from their aligned form."
+        "How far poses of a clip are from poses of the reference, after the best turn and shift on the floor, for "
+        f"every pair of moments; the line is the way that was taken: {'; '.join(parts)}. A way along a light valley, "
+        "without long straight runs, is a good alignment. Clips are rebuilt from their aligned form."
     )
     table = {
         "clip": [view.clip.uid for view in views for _ in range(aligned.frame_count)],

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from marey_motion.drawing.drawn import Sketch
 from marey_motion.drawing.paper import REFERENCE
 from marey_motion.drawing.strips import StripRow, draw_strips
-from marey_motion.modelling.figures.subjects import SEEN_FROM_RAD, ModelSubject, position_table
+from marey_motion.modelling.figures.subjects import ModelSubject, position_table
 
 Floats = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ def draw_mean(subject: ModelSubject) -> Sketch:
     points = subject.points(subject.mean_poses[frames])
     duration_s = float(subject.primitive.durations_s(np.zeros((1, subject.primitive.dimensions)))[0])
     row = StripRow("mean", f"{duration_s:.2f} s", points[None], _ways(subject, subject.mean_poses[None]))
-    figure = draw_strips(subject.body, [row], moments, SEEN_FROM_RAD, cell_in=(CELL_IN[0], 1.9))
+    figure = draw_strips(subject.body, [row], moments, subject.seen_from_rad, cell_in=(CELL_IN[0], 1.9))
     caption = (
         f"The mean motion of the model, {duration_s:.2f} s, at {len(frames)} moments of canonical time, seen from its "
         "front right. The line on the floor is where the root goes."
@@ -44,7 +44,7 @@ def draw_component(subject: ModelSubject, component: int) -> Sketch:
         for place, deviation in enumerate(DEVIATIONS)
     ]
     figure = draw_strips(
-        subject.body, rows, moments, SEEN_FROM_RAD, cell_in=CELL_IN, legend=[("mean motion", REFERENCE)]
+        subject.body, rows, moments, subject.seen_from_rad, cell_in=CELL_IN, legend=[("mean motion", REFERENCE)]
     )
     share = float(np.diff(subject.primitive.spatial.energy, prepend=0.0)[component])
     joint, moved_cm = most_moved(subject, points)
@@ -71,7 +71,7 @@ def written(deviation: float) -> str:
 
 
 def most_moved(subject: ModelSubject, points: Floats) -> tuple[str, float]:
-    """The joint that differs most between the first and the last row of (rows, T, P, 3), and by how many centimetres."""
+    """The joint that differs most between the first and the last row of (rows, T, P, 3), and by how much, in cm."""
     joints = subject.primitive.skeleton.joint_names
     apart = np.linalg.norm(points[-1] - points[0], axis=-1)[:, : len(joints)].max(axis=0)
     joint = int(np.argmax(apart))

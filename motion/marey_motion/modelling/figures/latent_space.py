@@ -10,21 +10,19 @@ from numpy.typing import NDArray
 from marey_motion.drawing.drawn import Sketch, Tables
 from marey_motion.drawing.paper import (
     COLOURS,
-    INK,
     PAPER,
     QUIET,
     REFERENCE,
     Place,
     add_keys,
     add_panel,
+    name_ticks,
     new_figure,
-    plain,
-    shortened,
     write,
 )
 from marey_motion.drawing.words import amount
 from marey_motion.modelling.figures.subjects import ModelSubject
-from marey_motion.modelling.training_report import ExampleReport
+from marey_motion.modelling.training_report import DEVIATION_OF_MEDIAN, OUTLIER_DEVIATIONS, ExampleReport
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,6 +35,8 @@ SIDE = 2.7
 NAMED = 12
 MOST_ROWS = 30
 ROW = 0.2
+FARTHEST = 20.0
+"""Robust deviations that are drawn to scale."""
 
 
 def draw_latent_space(subject: ModelSubject) -> Sketch | None:
@@ -56,8 +56,8 @@ def draw_latent_space(subject: ModelSubject) -> Sketch | None:
     components = len(primitive.mixture.weights)
     odd = [example.name for example in subject.report.examples if example.outlier]
     caption = (
-        f"Each example as a point in the latent space of the model, with {SCATTERED_SAMPLES} samples; {_mixture(components)} "
-        f"(outlines hold two standard deviations). {_odd_ones(len(odd))}"
+        f"Each example as a point in the latent space of the model, with {SCATTERED_SAMPLES} samples; "
+        f"{_mixture(components)} (outlines hold two standard deviations). {_odd_ones(len(odd))}"
     )
     tables: Tables = {
         "examples": {
@@ -128,40 +128,48 @@ def ellipse(mean: Floats, covariance: Floats) -> Floats:
 
 
 def draw_likelihood(subject: ModelSubject) -> Sketch:
-    """How likely each example is, the least likely first."""
+    """How likely each example is, compared with the others, the least likely first."""
     examples = subject.report.examples
     order = sorted(range(len(examples)), key=lambda place: (_judged(examples[place]), examples[place].uid))
+    below = _deviations(np.array([_judged(example) for example in examples]))
     shown = order[:MOST_ROWS]
-    figure = new_figure(8.4, ROW * len(shown) + 1.35)
-    panel = add_panel(figure, Place(2.7, 0.65, 3.6, ROW * len(shown)), x="log-likelihood", y="")
-    rows = np.arange(len(shown))
-    own = np.array([examples[place].log_likelihood for place in shown])
-    held_out = [examples[place].held_out_log_likelihood for place in shown]
+    figure = new_figure(8.4, ROW * len(shown) + 0.95)
+    label = "how much likelier or less likely than the middle example (robust deviations)"
+    panel = add_panel(figure, Place(2.6, 0.65, 5.6, ROW * len(shown)), x=label)
+    values, rows = below[shown], np.arange(len(shown))
+    drawn = np.maximum(values, -FARTHEST)
     odd = np.array([examples[place].outlier for place in shown], dtype=bool)
-    if None not in held_out:
-        panel.hlines(rows, np.array(held_out, dtype=np.float64), own, color=REFERENCE, lw=0.9)
-        panel.plot(held_out, rows, ls="", marker="s", ms=4.5, color=COLOURS[1], label="by a mixture without it")
-    panel.plot(own, rows, ls="", marker="o", ms=4.5, color=COLOURS[0], label="by the model")
-    if odd.any():
-        panel.plot(own[odd], rows[odd], ls="", marker="o", ms=10, mfc="none", mec=INK, label="odd")
-    names = [plain(shortened(subject.names[place], 34)) for place in shown]
-    panel.set_yticks(rows, names, parse_math=False)
-    panel.tick_params(axis="y", length=0, labelcolor=INK)
-    panel.set_ylim(len(shown) - 0.4, -0.6)
-    add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
-    if len(order) > len(shown):
-        write(panel, (1.04, 0.0), f"{len(order) - len(shown)} likelier ones\nare not shown", transform=panel.transAxes,
-              color=QUIET, va="bottom")  # fmt: skip
+    panel.hlines(rows, 0.0, drawn, color=REFERENCE, lw=1.0)
+    for chosen, colour, marker in (
+        (~odd, COLOURS[0], "o"),
+        (odd & (values >= -FARTHEST), COLOURS[1], "X"),
+        (odd & (values < -FARTHEST), COLOURS[1], "<"),
+    ):
+        panel.plot(drawn[chosen], rows[chosen], ls="", marker=marker, ms=6, color=colour, mec=PAPER, mew=0.5)
+    for row in np.flatnonzero(values < -FARTHEST):
+        write(panel, (drawn[row] + 0.4, rows[row] - 0.02), f"{values[row]:.0f}", color=QUIET, va="bottom")
+    panel.axvline(-OUTLIER_DEVIATIONS, color=QUIET, lw=0.9, ls=(0, (4, 3)))
+    name_ticks(panel, rows, [subject.names[place] for place in shown])
+    panel.set(xlim=(-FARTHEST - 1.0, max(2.5, 1.1 * float(drawn.max()))), ylim=(len(shown) - 0.4, -0.6))
     tables: Tables = {
         "examples": {
             "example": [examples[place].uid for place in order],
             "name": [examples[place].name for place in order],
             "log_likelihood": [examples[place].log_likelihood for place in order],
             "held_out_log_likelihood": [examples[place].held_out_log_likelihood for place in order],
+            "robust_deviations": below[order],
             "outlier": [examples[place].outlier for place in order],
         }
     }
-    return Sketch(figure, tables, _likelihood_caption(subject, [place for place in order if examples[place].outlier]))
+    odd_ones = [place for place in order if examples[place].outlier]
+    return Sketch(figure, tables, _likelihood_caption(subject, odd_ones, len(order) - len(shown)))
+
+
+def _deviations(judged: Floats) -> Floats:
+    """Log-likelihoods as robust deviations from the middle one; 0 where they do not differ."""
+    away = judged - np.median(judged)
+    spread = DEVIATION_OF_MEDIAN * float(np.median(np.abs(away)))
+    return np.asarray(away / spread if spread > 0.0 else np.zeros(len(judged)), dtype=np.float64)
 
 
 def _judged(example: ExampleReport) -> float:
@@ -170,13 +178,13 @@ def _judged(example: ExampleReport) -> float:
     return example.log_likelihood if held_out is None else held_out
 
 
-def _likelihood_caption(subject: ModelSubject, odd: list[int]) -> str:
+def _likelihood_caption(subject: ModelSubject, odd: list[int], hidden: int) -> str:
     start = (
-        "How well each example fits what the model expects, the worst at the top. Squares come from mixtures that "
-        "were fitted without the example."
+        "How well each example fits what the others let expect, the worst at the top. Left of the dashed line an "
+        f"example is odd{f'; the {hidden} likeliest are not shown' if hidden else ''}."
     )
     if not odd:
-        return f"{start} None falls out of the ordinary."
+        return f"{start} None is."
     named = ", ".join(subject.names[place] for place in odd[:NAMED])
     more = f" and {len(odd) - NAMED} more" if len(odd) > NAMED else ""
-    return f"{start} Out of the ordinary: {named}{more}. Look whether they show the same action as the others."
+    return f"{start} Look at {named}{more}: do they show the same action as the others?"

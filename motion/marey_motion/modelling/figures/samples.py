@@ -11,7 +11,7 @@ from marey_motion.drawing.drawn import Sketch
 from marey_motion.drawing.paper import COLOURS, REFERENCE, Place, add_keys, add_panel, new_figure
 from marey_motion.drawing.strips import StripRow, draw_strips
 from marey_motion.drawing.words import amount
-from marey_motion.modelling.figures.subjects import SEEN_FROM_RAD, ModelSubject, evenly, position_table
+from marey_motion.modelling.figures.subjects import ModelSubject, evenly, position_table
 from marey_motion.rigs import map_joints
 
 if TYPE_CHECKING:
@@ -59,11 +59,11 @@ def draw_samples(subject: ModelSubject) -> Sketch:
         StripRow("examples", _count(len(chosen), len(subject.poses)), examples, examples[:0, :, 0]),
         StripRow("samples", str(len(samples)), samples, samples[:0, :, 0]),
     ]
-    figure = draw_strips(subject.body, rows, moments, SEEN_FROM_RAD, cell_in=CELL_IN)
+    figure = draw_strips(subject.body, rows, moments, subject.seen_from_rad, cell_in=CELL_IN)
     spread = [_spread_cm(subject, points) for points in (examples, samples)]
     caption = (
-        f"{amount(len(chosen), 'training example')} above, {amount(len(samples), 'sample')} of the model below, drawn on "
-        "top of each other at the same moments of canonical time and from the same place. Where the lower row is "
+        f"{amount(len(chosen), 'training example')} above, {amount(len(samples), 'sample')} of the model below, on top "
+        "of each other at the same moments of canonical time, and seen from the same place. Where the lower row is "
         "tighter than the upper one, the model varies less than what it was made of; where it is wider, more. On "
         f"average joints lie {spread[0]:.0f} cm from the middle of the examples, and {spread[1]:.0f} cm from that of "
         "the samples."

@@ -46,6 +46,6 @@ def _caption(searched_cm: Floats, refined_cm: Floats, about: str) -> str:
         return "No target was searched for."
     found = [f"{np.median(values):.1f} cm (worst {values.max():.1f} cm)" for values in (searched_cm, refined_cm)]
     return (
-        f"How near the model comes to {amount(len(searched_cm), 'target')}{f', {about}' if about else ''}: half of them "
-        f"within {found[0]} by the search of its tree alone, and within {found[1]} after refinement."
+        f"How near the model comes to {amount(len(searched_cm), 'target')}{f', {about}' if about else ''}: half of "
+        f"them within {found[0]} by the search of its tree alone, and within {found[1]} after refinement."
     )

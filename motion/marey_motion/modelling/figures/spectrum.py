@@ -36,7 +36,10 @@ def draw_variance(subject: ModelSubject) -> Sketch:
         kind: {"components": np.arange(1, len(energy) + 1), "share": energy, "kept": np.arange(len(energy)) < kept}
         for kind, (energy, kept) in kinds.items()
     }
-    return Sketch(figure, tables, " ".join(_held(kind, *known) for kind, known in kinds.items()))
+    held = " ".join(_held(kind, *known) for kind, known in kinds.items())
+    return Sketch(
+        figure, tables, f"How much of what varies the first components hold together; blue ones are kept. {held}"
+    )
 
 
 def _draw_bars(panel: Axes, energy: Floats, kept: int) -> None:
@@ -46,16 +49,13 @@ def _draw_bars(panel: Axes, energy: Floats, kept: int) -> None:
         panel.set(xticks=[], yticks=[])
         return
     numbers = np.arange(1, len(shown) + 1)
-    for chosen, colour, label in ((numbers <= kept, COLOURS[0], "kept"), (numbers > kept, REFERENCE, "dropped")):
-        panel.bar(
-            numbers[chosen], 100.0 * shown[chosen], width=0.8, color=colour, label=label if chosen.any() else None
-        )
-    panel.set(xlim=(0.3, max(len(shown), 4) + 0.7), ylim=(0.0, 103.0))
+    for chosen, colour, alpha in ((numbers <= kept, COLOURS[0], 1.0), (numbers > kept, REFERENCE, 0.35)):
+        panel.bar(numbers[chosen], 100.0 * shown[chosen], width=0.8, color=colour, alpha=alpha)
+    panel.set(xlim=(0.3, max(len(shown), 4) + 0.7), ylim=(0.0, 109.0))
     panel.xaxis.get_major_locator().set_params(integer=True)
     if kept:
         write(panel, (kept, 100.0 * shown[min(kept, len(shown)) - 1] + 1.0), f"{100.0 * energy[kept - 1]:.0f} %",
               ha="center", va="bottom", color=INK)  # fmt: skip
-    add_keys(panel, loc="lower right", facecolor="none")
 
 
 def _held(kind: str, energy: Floats, kept: int) -> str:
@@ -78,28 +78,28 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
     kept = subject.primitive.spatial.count
     figure = new_figure(8.2, 3.6)
     panel = add_panel(figure, Place(0.75, 0.65, 5.2, 2.5), x="spatial components", y="mean distance of joints (cm)")
+    low, high = np.quantile(errors.left_out_each_cm, (0.1, 0.9), axis=0)
     if len(errors.left_out_each_cm) > 1:
-        low, high = np.quantile(errors.left_out_each_cm, (0.1, 0.9), axis=0)
         panel.fill_between(errors.components, low, high, color=COLOURS[1], alpha=0.18, lw=0, label="8 of 10 examples")
         panel.plot(errors.components, errors.left_out_cm, color=COLOURS[1], marker="s", ms=3.5, lw=1.4,
                    label="examples it has not seen")  # fmt: skip
     panel.plot(errors.components, errors.training_cm, color=COLOURS[0], marker="o", ms=3.5, lw=1.4,
                label="examples it was made of")  # fmt: skip
     panel.axvline(kept, color=QUIET, lw=0.9, ls=(0, (4, 3)))
-    top = 1.08 * max(float(errors.left_out_each_cm.max(initial=0.0)), float(errors.training_cm.max()), 1e-3)
+    top = 1.15 * max(float(curve.max()) for curve in (high, errors.left_out_cm, errors.training_cm)) or 1.0
     panel.set(xlim=(-0.4, max(float(errors.components[-1]), 1.0) + 0.4), ylim=(0.0, top))
     write(panel, (kept, top), f" kept: {kept}", color=QUIET, va="top")
     panel.xaxis.get_major_locator().set_params(integer=True)
     add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
     at = min(kept, len(errors.components) - 1)
     caption = (
-        f"How far joints are from where they should be when examples are rebuilt by so many components. With the {kept} "
-        f"that are kept, examples the model was made of are off by {errors.training_cm[at]:.1f} cm on average"
+        "How far joints are from where they should be when examples are rebuilt by so many components. With the "
+        f"{kept} that are kept, examples the model was made of are off by {errors.training_cm[at]:.1f} cm on average"
     )
     if len(errors.left_out_each_cm) > 1:
         caption += (
-            f", and examples that were left out by {errors.left_out_cm[at]:.1f} cm: so well does it follow motions that "
-            "it does not know"
+            f", and examples that were left out by {errors.left_out_cm[at]:.1f} cm: so well does it follow motions "
+            "that it does not know"
         )
     tables: Tables = {
         "errors": {

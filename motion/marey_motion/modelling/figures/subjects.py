@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from marey_motion import kinematics
 from marey_motion.alignment.aligned import AlignedSet
-from marey_motion.drawing.paper import without_shared_folder
+from marey_motion.drawing.paper import told_apart
 from marey_motion.drawing.stick_figures import Body, body_of
 from marey_motion.drawing.strips import Moments
 from marey_motion.modelling.primitive import MotionPrimitive
@@ -24,8 +24,10 @@ Floats = NDArray[np.float64]
 MOMENTS = 7
 SAMPLES = 16
 
-SEEN_FROM_RAD = float(np.radians(-50.0))
+FROM_ASIDE_RAD, FROM_AHEAD_RAD = float(np.radians(-50.0)), float(np.radians(-25.0))
 """Where canonical motions, which begin facing +z, are seen from: their front right, so that walks go to the right."""
+
+TRAVELS_M = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +54,8 @@ class ModelSubject:
 
     @cached_property
     def names(self) -> list[str]:
-        """Of the examples, within the folder that all lie in."""
-        return without_shared_folder([clip.name for clip in self.examples.clips])
+        """Of the examples, without what all of them begin with."""
+        return told_apart([clip.name for clip in self.examples.clips])
 
     @cached_property
     def poses(self) -> Floats:
@@ -64,6 +66,12 @@ class ModelSubject:
     def latents(self) -> Floats:
         """(m, L) of the examples."""
         return self.primitive.latents_of(self.poses, self.examples.time_functions)
+
+    @cached_property
+    def seen_from_rad(self) -> float:
+        """Where strips look from: motions that travel are seen more from the side than those that stay in place."""
+        way = self.mean_poses[[0, -1], :3]
+        return FROM_ASIDE_RAD if np.linalg.norm((way[1] - way[0])[[0, 2]]) > TRAVELS_M else FROM_AHEAD_RAD
 
     @cached_property
     def samples(self) -> Floats:

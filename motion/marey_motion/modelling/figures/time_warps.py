@@ -19,7 +19,7 @@ from marey_motion.drawing.paper import (
     add_panel,
     new_figure,
     shortened,
-    without_shared_folder,
+    told_apart,
 )
 from marey_motion.drawing.words import amount
 from marey_motion.modelling.figures.canonical_time import CANONICAL_TIME, mark_keyframes, percents
@@ -42,10 +42,10 @@ def draw_time_warps(aligned: AlignedSet) -> Sketch:
     speeds = 1.0 / np.diff(aligned.time_functions, axis=1)
     reference = [clip.uid for clip in aligned.clips].index(aligned.reference)
     odd = _most_unlike(aligned, reference)
-    names = [shortened(name, 26) for name in without_shared_folder([clip.name for clip in aligned.clips])]
+    names = [shortened(name, 26) for name in told_apart([clip.name for clip in aligned.clips])]
     figure = new_figure(10.4, 4.1)
     left = add_panel(figure, Place(0.7, 0.65, 3.4, 2.9), x=CANONICAL_TIME, y="time in the clip (s)", title="when")
-    right = add_panel(figure, Place(4.85, 0.65, 3.4, 2.9), x=CANONICAL_TIME, y="speed (1: as the reference)",
+    right = add_panel(figure, Place(4.85, 0.65, 3.4, 2.9), x=CANONICAL_TIME, y="speed (2: twice as the reference)",
                       title="how fast")  # fmt: skip
     share = percents(aligned.frame_count)
     _draw_lines(left, share, times_s, reference, odd, names)
@@ -121,7 +121,7 @@ def _caption(aligned: AlignedSet, reference: int) -> str:
     )
     return (
         f"How {amount(len(aligned.clips), 'clip')} of {durations.min():.2f} to {durations.max():.2f} s were laid over "
-        f"{aligned.clips[reference].name}, the reference: on the left, which moment of each clip belongs to which moment "
-        "of canonical time; on the right, how fast the clip plays there, compared with the reference. The clips whose "
-        f"timing is least like the reference's are in colour.{keyframes}"
+        f"{aligned.clips[reference].name}, the reference: on the left, which moment of each clip belongs to which "
+        "moment of canonical time; on the right, how fast the clip plays there, compared with the reference. The clips "
+        f"whose timing is least like the reference's are in colour.{keyframes}"
     )

@@ -42,7 +42,7 @@ def draw_time_components(subject: ModelSubject) -> Sketch | None:
         above = add_panel(figure, Place(left, HEIGHT + 1.15, WIDTH, HEIGHT), title=f"time component {component + 1}",
                           y="time passed (s)" if first else "")  # fmt: skip
         below = add_panel(figure, Place(left, 0.7, WIDTH, HEIGHT), x=CANONICAL_TIME,
-                          y="speed (1: as the reference)" if first else "")  # fmt: skip
+                          y="speed (2: twice as fast)" if first else "")  # fmt: skip
         for panel, values, places in ((above, passed, shares), (below, rate, 0.5 * (shares[1:] + shares[:-1]))):
             for row, (colour, style, width) in enumerate(SWEEP):
                 panel.plot(places, values[row], color=colour, ls=style, lw=width, label=written(DEVIATIONS[row]))

@@ -164,10 +164,10 @@ def making_chapter(subject: ModelSubject, figures: Figures) -> Section:
     listing = None
     if keys:
         rows = [(label, number(float(frame), 0), number(frame / aligned.frame_rate_hz)) for label, frame in keys]
-        listing = table("Keyframes that all examples share", ("keyframe", "canonical frame", "in the reference (s)"), rows,
-                        numbers=(1, 2), sortable=False)  # fmt: skip
-    return Section("making", "How the examples were aligned",
-                   (element("p", text), listing, shown(figures, "time-warps", "alignment-costs")))  # fmt: skip
+        heads = ("keyframe", "canonical frame", "in the reference (s)")
+        listing = table("Keyframes that all examples share", heads, rows, numbers=(1, 2), sortable=False)
+    pictures = shown(figures, "time-warps", "alignment-costs")
+    return Section("making", "How the examples were aligned", (element("p", text), listing, pictures))
 
 
 def numbers_chapter(figures: Figures) -> Section:

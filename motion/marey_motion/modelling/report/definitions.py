@@ -66,8 +66,9 @@ def definitions() -> Html:
             table("What the numbers mean", ("name", "unit", "meaning"), _NUMBERS, numbers=(), sortable=False),
             element(
                 "p",
-                "The method is that of Min and Chai, Motion Graphs++ (ACM Transactions on Graphics 31, 2012), in the form "
-                "of Herrmann et al., Motion Data and Model Management for Applied Statistical Motion Synthesis (2019).",
+                "The method is that of Min and Chai, Motion Graphs++ (ACM Transactions on Graphics 31, 2012), in the "
+                "form of Herrmann et al., Motion Data and Model Management for Applied Statistical Motion Synthesis "
+                "(2019).",
             ),
         )
     )
