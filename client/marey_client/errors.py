@@ -49,6 +49,10 @@ class SameName(MareyError):
     """Two files would get the same name."""
 
 
+class NoAnnotations(MareyError):
+    """Clips have no annotations where some were expected."""
+
+
 # How jobs end
 
 

@@ -19,6 +19,7 @@ from marey_client.evaluations import EvaluationHandle, Places, evaluate_request,
 from marey_client.imports import Imports
 from marey_client.items import ItemHandle, Items
 from marey_client.jobs import Jobs
+from marey_client.model_building import Takes, plan_model
 from marey_client.models import AlignedPlaces, ModelHandle, model_request
 from marey_client.motions import ClipHandle, SkeletonHandle
 from marey_client.paging import pages
@@ -31,6 +32,7 @@ from marey_schemas.evaluation import EvaluateParams
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
 from marey_schemas.jobs import CollectionInput, ItemInput, Job, JobCreate, RetargetParams
 from marey_schemas.kinds import Kind
+from marey_schemas.model_pipelines import model_pipeline
 from marey_schemas.modelling import ModelParams
 from marey_schemas.pipelines import PipelineCreate
 
@@ -147,6 +149,25 @@ class ProjectHandle:
     def pipeline(self, pipeline: PipelineCreate) -> PipelineRun:
         """Hand in jobs that work on what others of them make: all, or none."""
         return submit_pipeline(self.transport, self.name, pipeline)
+
+    def build_model(
+        self,
+        takes: Takes,
+        *,
+        name: str,
+        seed: int = 0,
+        priority: int = 0,
+        cache: Literal["use", "refresh", "off"] = "use",
+        **choices: Any,
+    ) -> PipelineRun:
+        """Hand in all that leads from takes to a model: import, retarget, annotate, cut, align, model, tree.
+
+        `takes` are clips and folders of clips, or files that `find_files` found. The `choices` are those of
+        `model_building.plan_model`, for example `skeleton={"item": id}`, `annotate={"proposal": {"method": "steps"}}`,
+        `cut={"labels": ["left"]}`. Of takes of which some have changed, only what depends on those is computed again.
+        """
+        plan = plan_model(self, takes, name=name, **choices)
+        return self.pipeline(model_pipeline(plan, seed=seed, priority=priority, cache=cache))
 
     def retarget(
         self,

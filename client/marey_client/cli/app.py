@@ -16,11 +16,13 @@ from marey_client.cli import (
     files,
     improvements,
     jobs,
+    model_building,
     models,
     pipelines,
     processes,
     projects,
     reports,
+    searches,
     skeletons,
 )
 from marey_client.cli.invocation import Invocation
@@ -72,7 +74,9 @@ for register in (
     reports,
     improvements,
     models,
+    searches,
     jobs,
+    model_building,
     pipelines,
 ):
     register.add_to(app)

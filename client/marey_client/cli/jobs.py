@@ -161,7 +161,7 @@ def submit_job(
         wanted = JobCreate(
             kind=kind,
             inputs={role: tuple(found) if roles[role].many else found[-1] for role, found in places.items()},
-            params={name: _json_or_text(value) for name, value in map(_assigned, params or ())},
+            params={name: json_or_text(value) for name, value in map(_assigned, params or ())},
             into=into.strip("/"),
             priority=priority,
         )
@@ -199,7 +199,8 @@ def _assigned(text: str) -> tuple[str, str]:
     return name, value
 
 
-def _json_or_text(text: str) -> Any:
+def json_or_text(text: str) -> Any:
+    """A value of a parameter: JSON where it is, else the text itself."""
     try:
         return json.loads(text)
     except ValueError:

@@ -1,0 +1,141 @@
+"""`build-model`: from takes to a model in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marey_client.cli.addresses import Address, require_item
+from marey_client.cli.failures import WrongUsage
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.jobs import clips_at, json_or_text
+from marey_client.cli.output import progress, tell
+from marey_client.cli.pipelines import Wait, follow_run
+
+if TYPE_CHECKING:
+    from marey_client.marey import Marey
+
+STEPS = ("import", "annotate", "cut", "align", "model", "tree")
+
+
+class Method(StrEnum):
+    """How annotations are proposed."""
+
+    STEPS = "steps"
+    VELOCITY_MINIMA = "velocity_minima"
+    WRIST_CONTACT = "wrist_contact"
+
+
+class Cache(StrEnum):
+    """What becomes of results that were computed before."""
+
+    USE = "use"
+    REFRESH = "refresh"
+    OFF = "off"
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    app.command()(build_model)
+
+
+def build_model(
+    context: typer.Context,
+    takes: Annotated[
+        list[str],
+        typer.Argument(help="Clips or folders of clips, project/folder[/name]; with --project, files of this machine."),
+    ],
+    name: Annotated[str, typer.Option(help="Of the model, and of the action.")],
+    project: Annotated[str | None, typer.Option(help="The project that files of this machine go to.")] = None,
+    to: Annotated[str | None, typer.Option(help="Skeleton to carry the takes over to: project/folder/name.")] = None,
+    into: Annotated[str | None, typer.Option(help="Folder of the results; default: the model's name.")] = None,
+    propose: Annotated[Method | None, typer.Option(help="Propose annotations in this way, and go by them.")] = None,
+    layer: Annotated[str | None, typer.Option(help="Annotations of this layer; with --propose, its name.")] = None,
+    label: Annotated[list[str] | None, typer.Option(help="Only segments of this label; may be repeated.")] = None,
+    whole: Annotated[bool, typer.Option("--whole", help="Cut nothing: annotations align whole takes.")] = False,
+    rate: Annotated[float | None, typer.Option(help="Frames per second of the aligned clips.")] = None,
+    mirror: Annotated[bool, typer.Option("--mirror", help="Learn from mirrored examples, too.")] = False,
+    tree: Annotated[bool, typer.Option("--tree/--no-tree", help="Make a tree for searches.")] = True,
+    choices: Annotated[
+        list[str] | None, typer.Option("--set", help="step.parameter=value, such as align.window=5; may be repeated.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 0,
+    priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
+    cache: Annotated[Cache, typer.Option(help="What becomes of results that are there.")] = Cache.USE,
+    wait: Wait = True,
+    as_json: AsJson = False,
+) -> None:
+    """From takes to a model: import, retarget, annotate, cut, align, learn, make a tree.
+
+    What was computed before is not computed again: after a take has changed, only what depends on it is.
+    """
+    plan: dict[str, Any] = _chosen(choices or ())
+    if propose is not None:
+        plan.setdefault("annotate", {}).setdefault("proposal", {})["method"] = propose.value
+        plan["annotate"] |= {"layer": layer} if layer else {}
+    elif layer is not None:
+        plan["layer"] = layer
+    if label or ((propose or layer) and not whole):
+        plan.setdefault("align" if whole else "cut", {}).update({"labels": label} if label else {})
+    plan["align"] = {
+        **plan.get("align", {}),
+        **({"rate_hz": rate} if rate else {}),
+        **({"mirroring": "add"} if mirror else {}),
+    }
+    plan |= {} if tree else {"tree": None}
+    plan |= {"into": into.strip("/")} if into else {}
+    with connect(context) as marey:
+        place, found = _takes(marey, takes, project, plan.pop("import", {}))
+        if to is not None:
+            plan["skeleton"] = {"item": _skeleton(marey, to, place)}
+        with progress() as advance:
+            found |= {"name": name, "seed": seed, "priority": priority, "cache": cache.value, "notice": advance}
+            run = marey.project(place).build_model(**found, **plan)
+        follow_run(run, place, wait=wait, as_json=as_json)
+
+
+def _chosen(choices: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Parameters by step, and by the members of their objects."""
+    chosen: dict[str, dict[str, Any]] = {}
+    for text in choices:
+        path, equals, value = text.partition("=")
+        step, *names = path.split(".")
+        if not equals or step not in STEPS or not all(names) or not names:
+            raise WrongUsage(f"{text!r}: write step.parameter=value, the step one of {', '.join(STEPS)}")
+        place: Any = chosen.setdefault(step, {})
+        for name in names[:-1]:
+            place = place.setdefault(name, {})
+        place[names[-1]] = json_or_text(value)
+    return chosen
+
+
+def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """The project, and the takes as `build_model` wants them. Files are sent."""
+    if project is None:
+        addresses = [Address.parse(take) for take in takes]
+        if len({address.project for address in addresses}) > 1:
+            raise WrongUsage("the takes must be in one project")
+        if options:
+            raise WrongUsage("import.… is for files of this machine; name the project they go to with --project")
+        return addresses[0].project, {"takes": [clips_at(marey, address) for address in addresses]}
+    from marey_client.imports import find_files
+    from marey_schemas.imports import ImportOptions
+
+    found = find_files(map(Path, takes))
+    if found.left_out:
+        tell(f"left out {len(found.left_out)} files that are no motion, such as {found.left_out[0].name}")
+    return project, {"takes": found.files, "options": ImportOptions.model_validate(options)}
+
+
+def _skeleton(marey: Marey, to: str, project: str) -> str:
+    from marey_schemas.kinds import Kind
+
+    address = Address.parse(to)
+    if address.project != project:
+        raise WrongUsage("the takes and the skeleton must be in one project")
+    skeleton_id: str = require_item(marey, address, [Kind.SKELETON]).id
+    return skeleton_id

@@ -1,0 +1,89 @@
+"""From takes to a model of an action, as a pipeline: import, retarget, annotate, cut, align, model, tree."""
+
+from typing import Any, Self
+
+from pydantic import Field, model_validator
+
+from marey_schemas.alignment import AlignParams
+from marey_schemas.annotations import AnnotateParams, CutParams
+from marey_schemas.base import Request
+from marey_schemas.jobs import CollectionInput, ImportParams, ItemInput
+from marey_schemas.modelling import ModelParams
+from marey_schemas.names import CollectionPath, ItemName
+from marey_schemas.pipelines import PipelineCreate, PipelineStep
+from marey_schemas.sample_trees import TreeParams
+
+Inputs = tuple[ItemInput | CollectionInput, ...]
+
+
+class ModelPlan(Request):
+    """What a model is made of, and how.
+
+    Takes are files to import or clips that are there. They are carried over to a skeleton where one is named, cut into
+    examples along annotations, which are proposed or there already, and aligned; a model is learned of them, and a tree
+    made for searches.
+    """
+
+    name: ItemName = Field(description="Of the model, and of the action.")
+    into: CollectionPath = Field(min_length=1, description="The collection of the model; all else goes below it.")
+    files: ImportParams | None = Field(None, description="Takes to import.")
+    clips: Inputs = Field((), max_length=1000, description="Takes that are there.")
+    skeleton: ItemInput | None = Field(None, description="What the takes are carried over to; absent: nothing.")
+    rigs: tuple[ItemInput, ...] = Field(
+        (), max_length=1000, description="Skeletons of the clips whose mapping was edited since."
+    )
+    annotations: Inputs = Field((), max_length=1000, description="Annotations of the clips.")
+    annotate: AnnotateParams | None = Field(None, description="How annotations are proposed, where none are named.")
+    cut: CutParams | None = Field(None, description="Which examples are cut out; absent: every take is an example.")
+    align: AlignParams = AlignParams()
+    model: ModelParams = ModelParams()
+    tree: TreeParams | None = Field(TreeParams(), description="null: no tree.")
+
+    @model_validator(mode="after")
+    def _check_takes(self) -> Self:
+        if (self.files is None) == (not self.clips):
+            raise ValueError("takes are either files to import or clips that are there")
+        if self.annotations and (self.files is not None or self.annotate is not None):
+            raise ValueError("annotations are named for clips that are there, or proposed")
+        if self.cut is not None and not self.annotations and self.annotate is None:
+            raise ValueError("what is cut out needs annotations: name some, or have them proposed")
+        if self.annotations and self.skeleton is not None and self.cut is None:
+            raise ValueError("annotations of clips do not go over to another skeleton; cut the clips along them")
+        return self
+
+
+def model_pipeline(plan: ModelPlan, **shared: Any) -> PipelineCreate:
+    """The pipeline that carries out a plan. `shared` are further fields of it, such as `seed` and `priority`."""
+    steps: dict[str, PipelineStep] = {}
+    clips: Any = plan.clips
+    annotations: Any = plan.annotations
+
+    def add(name: str, folder: str, params: Request, **inputs: Any) -> Any:
+        """Add a step; what it makes, as the input of others."""
+        into = f"{plan.into}/{folder}".rstrip("/")
+        given = {role: value for role, value in inputs.items() if value not in ((), None)}
+        steps[name] = PipelineStep(kind=name, inputs=given, params=_plain(params), into=into)
+        return {"step": name}
+
+    if plan.files is not None:
+        clips = add("import", "takes", plan.files)
+    if plan.cut is not None and plan.annotations:
+        clips = add("cut", "pieces", plan.cut, annotations=annotations, clips=clips)
+        annotations = clips if plan.skeleton is None else ()
+    if plan.skeleton is not None:
+        clips = add("retarget", "retargeted", Request(), clips=clips, skeleton=plan.skeleton, rigs=plan.rigs)
+    if plan.annotate is not None:
+        rigs = plan.rigs if plan.skeleton is None else ()
+        annotations = add("annotate", "annotations", plan.annotate, clips=clips, rigs=rigs)
+        if plan.cut is not None:
+            clips = annotations = add("cut", "pieces", plan.cut, annotations=annotations, clips=clips)
+    rig = plan.rigs[0] if plan.skeleton is None and len(plan.rigs) == 1 else None
+    aligned = add("align", "aligned", plan.align, clips=clips, annotations=annotations, rig=rig)
+    model = add("model", "", plan.model.model_copy(update={"name": plan.name}), aligned=aligned)
+    if plan.tree is not None:  # it becomes a part of the model, wherever that is
+        steps["tree"] = PipelineStep(kind="tree", inputs={"model": model}, params=_plain(plan.tree), into="")
+    return PipelineCreate(steps=steps, **shared)
+
+
+def _plain(params: Request) -> dict[str, Any]:
+    return params.model_dump(mode="json", exclude_unset=True)
