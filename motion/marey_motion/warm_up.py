@@ -74,6 +74,7 @@ def compile_kernels() -> None:
     _match(clip)
     _align(clip)
     _measure(clip)
+    _search(clip)
 
 
 def _match(clip: Clip) -> None:
@@ -136,6 +137,33 @@ def _measure(clip: Clip) -> None:
     online = OnlineCoverage(clip.frame_rate_hz)
     online.add_frames(MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton)), clip)
     online.end_take()
+
+
+def _search(clip: Clip) -> None:
+    """Search a model of a single motion for two steps, and refine them."""
+    from marey_motion.modelling.constraints import RootPosition
+    from marey_motion.modelling.mixture import LatentMixture
+    from marey_motion.modelling.primitive import FunctionalComponents, MotionPrimitive
+    from marey_motion.modelling.splines import SplineBasis
+    from marey_motion.modelling.step_search import search_steps
+    from marey_motion.modelling.steps import Step
+    from marey_motion.modelling.tree import END_EFFECTORS, TreeOptions, build_tree
+    from marey_motion.motion import Motion
+    from marey_motion.rigs import map_joints
+
+    poses = Motion.of(clip).poses
+    functions = []
+    for values in (poses, np.zeros((len(poses) - 1, 1))):
+        basis = SplineBasis.clamped(len(values), 7)
+        mean = basis.fit(values)
+        directions = np.ones((1, *mean.shape)) / mean.size
+        functions.append(FunctionalComponents(basis, mean, directions, directions, np.ones(1), np.ones(1)))
+    mixture = LatentMixture(np.ones(1), np.zeros((1, 2)), 1e-4 * np.eye(2)[None])
+    primitive = MotionPrimitive("walk", clip.skeleton, clip.frame_rate_hz, *functions, 1.0, mixture)
+    joints = {name: clip.skeleton.index_of(joint) for name, joint in map_joints(clip.skeleton).joints.items()}
+    tree = build_tree(primitive, 0, TreeOptions(64), end_effectors=[joints[name] for name in END_EFFECTORS])
+    step = Step(primitive, (RootPosition("end", (0.0, None)),), joints)
+    search_steps([step, step], [tree, tree])
 
 
 if __name__ == "__main__":
