@@ -72,9 +72,20 @@ def compile_kernels() -> None:
     result = retarget(read, plan_retarget(*rigs[0], *rigs[1]))
     global_rotations(result)
     _match(clip)
+    _edit(clip)
     _align(clip)
     _measure(clip)
     _search(clip)
+
+
+def _edit(clip: Clip) -> None:
+    """Constrain a wrist by every solver and plant the feet."""
+    from marey_motion.editing.registry import edit_clip
+
+    wrist = {"kind": "position", "joint": "left_wrist", "frames": (10, 12), "shift_m": (0.0, 0.05, 0.0)}
+    solvers = ("ccd", "two_bone", "least_squares")
+    constraining = [("constrain", {"constraints": (wrist,), "solver": solver}) for solver in solvers]
+    edit_clip(clip, [*constraining, ("plant_feet", {})])
 
 
 def _match(clip: Clip) -> None:

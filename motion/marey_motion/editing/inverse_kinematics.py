@@ -174,7 +174,7 @@ def solve_ccd(
         raise EditError("cyclic coordinate descent cannot shift the root", code="solver-unfit", where="root_moves")
     problem = pose_problem(skeleton, motion, targets, freedom)
     found = problem.found
-    ends = (options.most_iterations, options.tolerance_m, options.tolerance_rad)
+    ends = (int(options.most_iterations), float(options.tolerance_m), float(options.tolerance_rad))
     ccd_kernels.descend(problem.body, problem.targets, ends, problem.roots, problem.rotations, problem.placing, found)
     return _solved(motion, problem, found)
 
@@ -198,7 +198,7 @@ def solve_least_squares(
 
     problem = pose_problem(skeleton, motion, targets, freedom)
     found, room = problem.found, problem.stepping(options.regularisation_m)
-    ends = (options.most_iterations, options.tolerance_m, options.tolerance_rad)
+    ends = (int(options.most_iterations), float(options.tolerance_m), float(options.tolerance_rad))
     least_squares_kernels.solve_frames(
         problem.body, problem.targets, ends, problem.roots, problem.rotations, room, found
     )
@@ -277,7 +277,7 @@ def _measure(problem: Problem, options: SolverOptions, residuals: Floats, found:
     pose_kernels.measure_frames(
         problem.body,
         problem.targets,
-        (options.tolerance_m, options.tolerance_rad),
+        (float(options.tolerance_m), float(options.tolerance_rad)),
         problem.roots,
         problem.rotations,
         problem.placing,

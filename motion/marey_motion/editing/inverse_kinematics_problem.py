@@ -178,8 +178,10 @@ def pose_problem(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], 
     carries = np.array([[joint in path for path in paths] for joint in joints.tolist()], dtype=np.bool_)
     body = _body(skeleton, motion, joints, carries, freedom)
     packed = _targets(joints, targets, motion.frame_count)
-    rotations = np.ascontiguousarray(motion.rotations[:, joints], dtype=np.float64)
-    return Problem(joints, body, packed, motion.root_translations.astype(np.float64), rotations)
+    roots, rotations = (
+        np.array(one, dtype=np.float64, order="C") for one in (motion.root_translations, motion.rotations[:, joints])
+    )
+    return Problem(joints, body, packed, roots, rotations)
 
 
 def _body(skeleton: Skeleton, motion: Motion, joints: Ints, carries: Flags, freedom: Freedom) -> Body:
@@ -202,7 +204,7 @@ def _body(skeleton: Skeleton, motion: Motion, joints: Ints, carries: Flags, free
         places = np.searchsorted(joints, np.array(motion.translated_joints)[moving])
         offsets[:, places] = motion.translations[:, moving]
     offsets = np.ascontiguousarray(offsets, dtype=np.float64)
-    return Body(parents, offsets, movable, stiffness, limited, limits, carries, freedom.root_moves)
+    return Body(parents, offsets, movable, stiffness, limited, limits, carries, bool(freedom.root_moves))
 
 
 def _targets(joints: Ints, targets: Sequence[Target], frames: int) -> Targets:
