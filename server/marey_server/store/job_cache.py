@@ -26,6 +26,9 @@ from marey_server.store.transaction import Transaction
 SHARED_AT_ONCE = 64
 """Jobs that get their cached result in the transaction of the submission; the leader serves the others."""
 
+MOST_SHARED_OUTPUTS = 256
+"""Results that are published for them in one transaction; of a job that has more, all are."""
+
 IN_LIST = 1000
 
 
@@ -158,6 +161,8 @@ def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
     """
     ended: list[Ended] = []
     for row in rows[:SHARED_AT_ONCE]:
+        if tx.shared_outputs >= MOST_SHARED_OUTPUTS:
+            break
         ended += _share_one(tx, row.id)
     return ended
 
@@ -198,6 +203,7 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     if not staging.take_up_documents(tx, drafts) or named - blobs.hold(tx, named):
         return _compute_again(tx, row)
     outputs = staging.publish_drafts(tx, row, staging.with_inputs(drafts, row.source_inputs, row.inputs))
+    tx.shared_outputs += len(outputs)
     blobs.keep_for_job(tx, row.id, named)
     return end_jobs(
         tx,

@@ -22,6 +22,8 @@ class Transaction:
         self.connection = connection
         self.principal = principal
         self.blobs = blobs
+        self.shared_outputs = 0
+        """How many results of earlier jobs it has published anew."""
         self._clock = clock
         self._now_us: int | None = None
         self._after_commit: list[Callable[[], None]] = []

@@ -10,9 +10,11 @@ from marey_schemas import job_kinds
 from marey_schemas.access import ProjectCreate
 from marey_schemas.jobs import InputSpec, JobCreate
 from marey_schemas.kinds import Kind
+from marey_server.access.principal import SYSTEM
 from marey_server.errors import Conflict, Invalid
-from marey_server.store import binding, items, job_inputs, jobs, projects, submission
+from marey_server.store import binding, items, job_cache, job_inputs, jobs, projects, submission
 from marey_server.store.items.drafts import Draft
+from marey_server.store.reaper import share_waiting
 from marey_server.store.retrying import retry_job
 from queue_desk import KINDS, SUM, Desk, document
 from store_fixtures import skeleton_tree
@@ -197,6 +199,32 @@ def test_a_chain_that_was_computed_before_is_done_when_it_is_submitted(desk: Des
         [output.model_copy(update={"created": True}) for output in desk.outputs(one)] for one in later
     ]
     assert {output.created for output in desk.outputs(later[2])} == {False}
+
+
+def test_a_long_chain_that_was_computed_before_is_served_in_portions(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No transaction holds the database for as long as a whole pipeline takes to publish."""
+    monkeypatch.setattr(job_cache, "MOST_SHARED_OUTPUTS", 3)
+
+    def submit_chain() -> list[str]:
+        chain = [desk.submit("sum", into="made")]
+        for step in range(3):
+            chain += desk.submit_many(squares_of(chain[-1], into=f"step{step}"))
+        return chain
+
+    first = submit_chain()
+    make(desk, first[0], *"abcde")
+    square(desk)
+    again = submit_chain()
+    assert [desk.state(job) for job in again][::3] == ["succeeded", "waiting"]
+    portions = 0
+    while desk.database.write(SYSTEM, share_waiting):
+        portions += 1
+    assert portions > 1
+    assert {desk.state(job) for job in again} == {"succeeded"}
+    assert [len(desk.outputs(job)) for job in again] == [5, 5, 5, 5]
+    assert desk.claim_many() == []
 
 
 def test_only_what_depends_on_a_change_is_computed_again(desk: Desk) -> None:
