@@ -99,7 +99,7 @@ class Resample(Request):
     """The same motion at another frame rate."""
 
     command: Literal["resample"]
-    frame_rate_hz: float = Field(ge=0.1, le=100_000, allow_inf_nan=False)
+    frame_rate_hz: float = Field(ge=0.1, le=100_000, allow_inf_nan=False, description="Frames per second.")
 
 
 class Retime(Request):
@@ -154,7 +154,7 @@ class MoveToOrigin(Request):
     """Shift the whole motion on the ground so that the body is above the origin in a frame; heights stay."""
 
     command: Literal["move_to_origin"]
-    frame: Frame = 0
+    frame: Frame = Field(0, description="The frame in which it is there.")
 
 
 class Scale(Request):
@@ -256,9 +256,9 @@ class RotateJoint(Request):
     """Add a rotation to a joint."""
 
     command: Literal["rotate_joint"]
-    joint: JointName
-    angle_deg: Degrees
-    axis: Axis
+    joint: JointName = Field(description="Which joint, by its name.")
+    angle_deg: Degrees = Field(description="How far it turns, in frames that are no borders.")
+    axis: Axis = Field(description="Direction of the axis that it turns about.")
     space: Literal["joint", "parent", "world"] = Field(
         "joint", description="Whose axes `axis` is given in: the joint's own, its parent's, or the world's."
     )

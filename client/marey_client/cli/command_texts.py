@@ -20,7 +20,7 @@ def parse_command(text: str) -> dict[str, Any]:
     from marey_schemas.editing import COMMAND_MODELS
 
     try:
-        name, *assigned = shlex.split(text)
+        name, *assigned = shlex.split(text) or [""]
     except ValueError as error:
         raise WrongUsage(f"{text!r}: {error}; write a command and its parameters, as in 'trim start=10'") from None
     if name not in COMMAND_MODELS:

@@ -1,0 +1,65 @@
+"""Commands of edits as people type them."""
+
+from typing import Any
+
+import pytest
+
+from marey_client.cli.command_texts import parameter_rows, parse_command
+from marey_client.cli.failures import WrongUsage
+from marey_schemas.editing import COMMAND_MODELS, EditDocument
+
+
+@pytest.mark.parametrize(
+    ("text", "command"),
+    [
+        ("mirror", {"command": "mirror"}),
+        ("trim start=10 stop=200", {"command": "trim", "start": 10, "stop": 200}),
+        ("trim stop=null", {"command": "trim", "stop": None}),
+        ("face heading_deg=-90", {"command": "face", "heading_deg": -90}),
+        ("split at=10,20", {"command": "split", "at": [10, 20]}),
+        ("split at=10", {"command": "split", "at": [10]}),
+        ("translate shift_m=1,0,-2.5", {"command": "translate", "shift_m": [1, 0, -2.5]}),
+        ("translate shift_m=[1,0,-2.5]", {"command": "translate", "shift_m": [1, 0, -2.5]}),
+        ("smooth joints=Head,Neck frames=10:200", {
+            "command": "smooth", "joints": ["Head", "Neck"], "frames": [10, 200],
+        }),
+        ("smooth frames=10: root_translation=false", {
+            "command": "smooth", "frames": [10, None], "root_translation": False,
+        }),
+        ("smooth joints='Left Arm'", {"command": "smooth", "joints": ["Left Arm"]}),
+        ("rotate_joint joint=7 axis=0,1,0 angle_deg=5", {
+            "command": "rotate_joint", "joint": "7", "axis": [0, 1, 0], "angle_deg": 5,
+        }),
+        ("flip_axes up=-y forward=+z", {"command": "flip_axes", "up": "-y", "forward": "+z"}),
+        ("constrain constraints='[{\"kind\": \"position\", \"joint\": \"Head\"}]'", {
+            "command": "constrain", "constraints": [{"kind": "position", "joint": "Head"}],
+        }),
+    ],
+)  # fmt: skip
+def test_a_line_becomes_a_command(text: str, command: dict[str, Any]) -> None:
+    assert parse_command(text) == command
+    EditDocument.model_validate({"commands": [command]})
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("wobble", "there is no command 'wobble'; there are trim"),
+        ("", "there is no command"),
+        ("trim begin=3", "trim has no parameter 'begin'; it has start, stop"),
+        ("mirror left=1", "mirror has no parameter 'left'; it has none"),
+        ("trim 3", "write parameter=value"),
+        ("smooth joints='Head", "No closing quotation"),
+    ],
+)
+def test_what_cannot_be_read_is_told_with_what_there_is(text: str, told: str) -> None:
+    with pytest.raises(WrongUsage) as refused:
+        parse_command(text)
+    assert told in str(refused.value)
+
+
+@pytest.mark.parametrize("name", sorted(COMMAND_MODELS))
+def test_every_parameter_is_listed_with_its_type_and_default(name: str) -> None:
+    rows = {row[0]: row for row in parameter_rows(COMMAND_MODELS[name])}
+    assert set(rows) == set(COMMAND_MODELS[name].model_fields) - {"command"}
+    assert all(kind and default for _, kind, default, _ in rows.values())
