@@ -80,23 +80,23 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None) -> Flo
 
 def cost_points(points: Floats, options: CostOptions) -> CostPoints:
     """Points (n, P, 3) of a motion, ready to be compared."""
-    if not np.isfinite(points).all():
+    columns = np.array(points.transpose(1, 2, 0), dtype=np.float64, order="C")
+    if not np.isfinite(columns).all():
         raise MotionError("positions must be finite", where=f"frame {int(np.argwhere(~np.isfinite(points))[0, 0])}")
     shares = _shares(options.weights, points.shape[1])
-    around = options.window // 2
-    padded = np.pad(points.astype(np.float64), ((around, around), (0, 0), (0, 0)), mode="edge")
-    centres = np.zeros((len(points), 2))
+    window = options.window
+    if window > 1:
+        columns = np.pad(columns, ((0, 0), (0, 0), (window // 2, window // 2)), mode="edge")
+    ground, centres = columns[:, ::2], np.zeros((2, len(points)))
     if options.method == "turned":
-        if around:
-            padded[..., ::2] -= np.einsum("fpc,p->c", padded[..., ::2], shares) / len(padded)
-            centres = _boxed(np.einsum("fpc,p->fc", padded[..., ::2], shares), options.window) / options.window
-        else:
-            padded[..., ::2] -= np.einsum("fpc,p->fc", padded[..., ::2], shares)[:, None]
-    rows = padded * np.sqrt(shares)[:, None]
-    squares = _boxed(np.einsum("fpc,fpc->f", rows[..., ::2], rows[..., ::2]), options.window)
-    energies = squares - options.window * np.einsum("nc,nc->n", centres, centres)
-    columns = np.ascontiguousarray(rows.transpose(1, 2, 0))
-    return CostPoints(np.ascontiguousarray(rows), columns, energies, centres)
+        middle = np.einsum("p,pcf->cf", shares, ground)
+        ground -= middle if window == 1 else middle.mean(axis=1, keepdims=True)
+        if window > 1:
+            centres = _boxed(middle - middle.mean(axis=1, keepdims=True), window) / window
+    columns *= np.sqrt(shares)[:, None, None]
+    squares = np.einsum("pcf,pcf->f", ground, ground)
+    energies = _boxed(squares, window) - window * np.einsum("cn,cn->n", centres, centres)
+    return CostPoints(np.ascontiguousarray(columns.transpose(2, 0, 1)), columns, energies, centres.T.copy())
 
 
 def costs_between(a: CostPoints, b: CostPoints, options: CostOptions) -> Floats:
@@ -126,7 +126,5 @@ def _shares(weights: ArrayLike | None, count: int) -> Floats:
 
 
 def _boxed(values: Floats, window: int) -> Floats:
-    """Sums over each run of `window` values along the first axis."""
-    if window == 1:
-        return values
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(values, window, axis=0).sum(axis=-1))
+    """Sums over each run of `window` values along the last axis."""
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(values, window, axis=-1).sum(axis=-1))

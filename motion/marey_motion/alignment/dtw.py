@@ -65,6 +65,7 @@ def least_total(costs: Floats, *, max_run: int | None = None) -> float:
     """The total of `align` alone, infinite where no way keeps the limit; costs as `frame_costs` makes them."""
     from marey_motion.alignment import dtw_kernels as kernels
 
+    costs = np.ascontiguousarray(costs)
     return float(kernels.total(costs) if max_run is None else kernels.total_limited(costs, max_run))
 
 

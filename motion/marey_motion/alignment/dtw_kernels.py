@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-# Steps by which a cell was reached; of equal costs the lowest wins.
+# Steps by which a cell is reached; of equal costs the lowest wins.
 BOTH, FIRST, SECOND = 0, 1, 2
+LANES = 4
 
 _compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
 
@@ -15,43 +16,65 @@ _compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
 def align(costs, path):  # type: ignore[no-untyped-def]
     """Fill `path` backwards from the end; the least total and the number of cells."""
     n, m = costs.shape
-    steps = np.zeros((n, m), np.uint8)
-    totals = np.empty(m)
-    totals[0] = costs[0, 0]
-    for j in range(1, m):
-        totals[j] = totals[j - 1] + costs[0, j]
-        steps[0, j] = SECOND
-    for i in range(1, n):
-        diagonal = totals[0]
-        left = totals[0] + costs[i, 0]
-        totals[0] = left
-        steps[i, 0] = FIRST
-        for j in range(1, m):
-            above = totals[j]
-            best, step = diagonal, BOTH
-            if above < best:
-                best, step = above, FIRST
-            if left < best:
-                best, step = left, SECOND
-            left = best + costs[i, j]
-            totals[j] = left
-            steps[i, j] = step
-            diagonal = above
-    return totals[m - 1], _walk_back(steps, path)
+    totals = np.empty((n + 1, m + 1))  # with a border that no way comes from, but into the first cell
+    totals[0, :] = np.inf
+    totals[:, 0] = np.inf
+    totals[0, 0] = 0.0
+    whole = n - n % LANES if m >= LANES else 0
+    for i in range(0, whole, LANES):
+        _four_rows(costs, i, totals)
+    for i in range(whole, n):
+        _cells(costs, i, 0, m, totals)
+    return totals[n, m], _walk_back(totals, path)
 
 
 @_compiled
-def _walk_back(steps, path):  # type: ignore[no-untyped-def]
-    i, j, length = steps.shape[0] - 1, steps.shape[1] - 1, 0
+def _cells(costs, i, start, stop, totals):  # type: ignore[no-untyped-def]
+    """Totals of row i in columns [start, stop)."""
+    for j in range(start, stop):
+        totals[i + 1, j + 1] = min(totals[i, j], totals[i, j + 1], totals[i + 1, j]) + costs[i, j]
+
+
+@_compiled
+def _four_rows(costs, i, totals):  # type: ignore[no-untyped-def]
+    """Totals of rows i to i + 3: each cell waits for the one on its left, but four rows, each a column behind the one
+    above it, do not wait for each other."""
+    m = costs.shape[1]
+    for lane in range(LANES - 1):
+        _cells(costs, i + lane, 0, LANES - 1 - lane, totals)
+    left_0, left_1 = totals[i + 1, LANES - 1], totals[i + 2, LANES - 2]
+    left_2, left_3 = totals[i + 3, LANES - 3], totals[i + 4, LANES - 4]
+    past_0, past_1, past_2 = totals[i + 1, LANES - 2], totals[i + 2, LANES - 3], totals[i + 3, LANES - 4]
+    for j in range(LANES - 1, m):
+        now_0 = min(totals[i, j], totals[i, j + 1], left_0) + costs[i, j]
+        now_1 = min(past_0, left_0, left_1) + costs[i + 1, j - 1]
+        now_2 = min(past_1, left_1, left_2) + costs[i + 2, j - 2]
+        now_3 = min(past_2, left_2, left_3) + costs[i + 3, j - 3]
+        totals[i + 1, j + 1] = now_0
+        totals[i + 2, j] = now_1
+        totals[i + 3, j - 1] = now_2
+        totals[i + 4, j - 2] = now_3
+        past_0, past_1, past_2 = left_0, left_1, left_2
+        left_0, left_1, left_2, left_3 = now_0, now_1, now_2, now_3
+    for lane in range(1, LANES):
+        _cells(costs, i + lane, m - lane, m, totals)
+
+
+@_compiled
+def _walk_back(totals, path):  # type: ignore[no-untyped-def]
+    """Fill `path` backwards from totals (n + 1, m + 1)."""
+    i, j, length = totals.shape[0] - 1, totals.shape[1] - 1, 0
     while True:
-        path[length, 0], path[length, 1] = i, j
+        path[length, 0], path[length, 1] = i - 1, j - 1
         length += 1
-        if i == 0 and j == 0:
+        if i == 1 and j == 1:
             return length
-        step = steps[i, j]
-        if step != SECOND:
+        both, first, second = totals[i - 1, j - 1], totals[i - 1, j], totals[i, j - 1]
+        if both <= first and both <= second:
+            i, j = i - 1, j - 1
+        elif first <= second:
             i -= 1
-        if step != FIRST:
+        else:
             j -= 1
 
 
