@@ -323,9 +323,50 @@ def test_limits_are_never_left(body: Skeleton, solver: Callable[..., SolvedPoses
             assert np.all(np.linalg.norm(across / halves, axis=1) <= 1.0 + 1e-9)
         else:
             assert np.abs(across).max() < 1e-9
+    assert solved.residual_after.mean() < 0.1 * solved.residual_before.mean()
+
+
+@pytest.mark.parametrize("solver", ITERATIVE)
+def test_a_hinge_reaches_what_its_angle_allows(body: Skeleton, solver: Callable[..., SolvedPoses]) -> None:
+    rest = Motion(body.offsets[:1].copy(), body.rest_rotations[None].copy(), np.zeros((1, 0, 3)), ())
+    elbow, wrist = body.index_of("LeftForeArm"), body.index_of("LeftHand")
+    limit = JointLimit.hinge(JointAxes((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), -2.0, 0.0)
+    at_elbow = rest.positions(body)[0, elbow]
+    freedom = Freedom((elbow,), limits={elbow: limit})
+    for angle, allowed in ((-1.2, -1.2), (-2.6, -2.0), (0.7, 0.0)):
+        target = at_elbow + 0.26 * np.array([np.cos(angle), 0.0, -np.sin(angle)])
+        solved = solver(body, rest, [PositionTarget(wrist, target)], freedom=freedom)
+        _, twist = _swing_and_twist(limit, solved.motion.rotations[:, elbow])
+        assert twist[0] == pytest.approx(allowed, abs=1e-3)
+
+
+def test_a_stiff_joint_turns_less(body: Skeleton) -> None:
+    motion = _moved(body, frames=8)
+    wrist, shoulder = body.index_of("LeftHand"), body.index_of("LeftArm")
+    target = [PositionTarget(wrist, motion.positions(body)[:, wrist] + (0.0, 0.12, 0.1))]
+    for solver in ITERATIVE:
+        turned = []
+        for stiffness in ({}, {shoulder: 0.95}):
+            solved = solver(body, motion, target, freedom=Freedom(stiffness=stiffness))
+            assert solved.reached.all()
+            angle = quaternions.angle_between(motion.rotations[:, shoulder], solved.motion.rotations[:, shoulder])
+            turned.append(angle)
+        assert np.all(turned[1] < 0.5 * turned[0])
+
+
+@pytest.mark.parametrize("standard", ["left_wrist", "right_wrist", "left_ankle", "right_ankle"])
+def test_two_bones_meet_every_place_they_can_reach(skeleton: Skeleton, standard: str) -> None:
+    motion = _moved(skeleton, frames=200)
+    end = _joint(skeleton, standard)
+    limb = limb_ending_at(skeleton, map_joints(skeleton), end, guess_axes(skeleton, map_joints(skeleton)))
+    assert limb is not None
+    places = motion.positions(skeleton)
+    bones = ((limb.start, limb.middle), (limb.middle, end))
+    lengths = [np.linalg.norm(places[:, a] - places[:, b], axis=1) for a, b in bones]
+    first, second = (length[:, None] for length in lengths)
     random = np.random.default_rng(4)
     ways = random.normal(size=(200, 3))
-    ways *= random.uniform(abs(first - second), first + second, (200, 1)) / np.linalg.norm(ways, axis=1, keepdims=True)
+    ways *= random.uniform(np.abs(first - second), first + second) / np.linalg.norm(ways, axis=1, keepdims=True)
     target = places[:, limb.start] + ways
     solved = solve_two_bone(skeleton, motion, limb, PositionTarget(end, target))
     assert np.abs(solved.motion.positions(skeleton)[:, end] - target).max() < 1e-9
