@@ -98,7 +98,7 @@ def test_a_model_tells_how_good_it_is_and_what_it_was_made_of(lab: ProjectHandle
     assert {one["name"] for one in document["training"]["examples"]} == {
         f"walks/walk {index:02}" for index in range(EXAMPLES)
     }
-    (listed,) = [model for model in lab.models.list(filters={"skeleton": document["skeleton"]["item"]})]
+    (listed,) = lab.models.list(filters={"skeleton": document["skeleton"]["item"]})
     assert listed.id == walk.id
 
 
@@ -108,7 +108,7 @@ def test_the_same_clips_options_and_seed_make_the_same_model(lab: ProjectHandle,
 
 
 def test_clips_that_were_not_aligned_together_are_refused_by_name(lab: ProjectHandle) -> None:
-    with pytest.raises(JobUnsuccessful, match="walk .*not aligned together"):
+    with pytest.raises(JobUnsuccessful, match=r"walk .*not aligned together"):
         lab.model(lab.train_model(("aligned", "others"), name="mixed"))
 
 

@@ -15,8 +15,8 @@ from marey_motion.modelling.splines import SplineBasis
 Floats = NDArray[np.float64]
 InnerProduct = Literal["coefficients", "l2"]
 
-SMALLEST_RELATIVE_DEVIATION = 1e-9
-"""Singular values below this share of the largest one are rounding; the Gram matrix holds their squares."""
+SMALLEST_RELATIVE_DEVIATION = 2e-7
+"""Singular values below this share of the largest one are rounding: the Gram matrix holds their squares."""
 
 SMALLEST_RELATIVE_SPREAD = 1e-11
 """Examples that differ from their mean by less than this share of their size are copies of one example."""

@@ -21,6 +21,8 @@ Refusal = Literal["", "small-component", "held-out"]
 LEAST_EXAMPLES_PER_COMPONENT = 5
 LEAST_FOLDS = 2
 SEEDS = 2**32
+TOLERANCE = 1e-3
+"""Of the mean log-likelihood of an example, from one iteration to the next; it has no unit."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,8 @@ def fit_mixture(latents: Floats, options: MixtureOptions | None = None, *, seed:
     unit = float(np.sqrt(latents.var(axis=0).mean()))
     if not unit > 0.0:
         raise ModelError("latent vectors that do not vary have no dimensions", where="latents")
-    mixture, candidates, held_out = _Fitting(latents / unit, wanted, seed).choose()
+    with one_thread():
+        mixture, candidates, held_out = _Fitting(latents / unit, wanted, seed).choose()
     shift = dimensions * float(np.log(unit))
     return FittedMixture(
         mixture=LatentMixture(mixture.weights, mixture.means * unit, mixture.covariances * unit**2),
@@ -206,7 +209,7 @@ def _fitted(latents: Floats, count: int, options: MixtureOptions, seed: int) -> 
         reg_covar=options.regularisation,
         n_init=options.starts,
         max_iter=options.iterations,
-        tol=1e-5,
+        tol=TOLERANCE,
         random_state=seed % SEEDS,
     )
     if count > examples:

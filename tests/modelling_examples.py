@@ -1,0 +1,73 @@
+"""Aligned examples that are known to the last number, for tests of models."""
+
+import numpy as np
+
+from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Placement
+from marey_motion.gait import generate_gait
+from marey_motion.modelling.splines import SplineBasis
+from marey_motion.motion import Motion
+from marey_motion.skeleton import EndSite, Skeleton
+
+HZ = 60.0
+
+
+def chain(joints=4):
+    """A straight chain of bones of 30 cm that stands on its root, with a tip at its end."""
+    offsets = np.zeros((joints, 3))
+    offsets[1:, 1] = 0.3
+    parents = np.arange(-1, joints - 1, dtype=np.int32)
+    at_rest = np.tile([1.0, 0.0, 0.0, 0.0], (joints, 1))
+    names = tuple(f"bone_{index}" for index in range(joints))
+    return Skeleton(names, parents, offsets, at_rest, (EndSite(joints - 1, np.array([0.0, 0.3, 0.0])),))
+
+
+def unit_poses(poses):
+    """Poses (..., 3 + 4·J) with quaternions of unit length."""
+    rotations = poses[..., 3:].reshape(*poses.shape[:-1], -1, 4)
+    rotations = rotations / np.linalg.norm(rotations, axis=-1, keepdims=True)
+    return np.concatenate((poses[..., :3], rotations.reshape(*poses.shape[:-1], -1)), axis=-1)
+
+
+def as_motion(poses):
+    frames = len(poses)
+    return Motion(poses[:, :3].copy(), poses[:, 3:].reshape(frames, -1, 4).copy(), np.zeros((frames, 0, 3)), ())
+
+
+def aligned_set(skeleton, poses, time_functions=None, keyframes=None):
+    """A set of examples with poses (m, N, 3 + 4·J) and time functions (m, N), by default the identity."""
+    clips = []
+    for index, one in enumerate(poses):
+        times = np.arange(len(one), dtype=float) if time_functions is None else time_functions[index]
+        uid = f"clip_{index:03}@1"
+        place = Placement(0.0, 0.0, 0.0)
+        clips.append(AlignedClip(uid, f"clip {index}", as_motion(one), times, place, 1e-4, round(times[-1]) + 1))
+    return AlignedSet(skeleton, HZ, tuple(clips), "clip_000@1", keyframes or {})
+
+
+def warps(count, frames, seed=0):
+    """Time functions (count, N) whose slopes rise and fall, each in its own way."""
+    random = np.random.default_rng(seed)
+    phase = np.linspace(0.0, np.pi, frames - 1)
+    slopes = np.exp(
+        0.15 * random.standard_normal((count, 1)) + 0.2 * random.standard_normal((count, 1)) * np.sin(phase)
+    )
+    return np.concatenate((np.zeros((count, 1)), np.cumsum(slopes, axis=1)), axis=1)
+
+
+def bending_chains(count=20, frames=30, seed=0, joints=4):
+    """Chains that sway: a few random smooth functions in every channel."""
+    random = np.random.default_rng(seed)
+    skeleton = chain(joints)
+    basis = SplineBasis.clamped(frames, 7)
+    rest = np.concatenate((np.zeros(3), np.tile([1.0, 0.0, 0.0, 0.0], joints)))
+    modes = 0.1 * random.standard_normal((3, 7, 3 + 4 * joints))
+    coefficients = rest + np.tensordot(random.standard_normal((count, 3)), modes, axes=1)
+    return aligned_set(skeleton, unit_poses(basis.at_frames @ coefficients), warps(count, frames, seed))
+
+
+def walks(count=16, frames=40, seed=0):
+    """Generated walks of many speeds and turn rates, which begin in the same phase."""
+    random = np.random.default_rng(seed)
+    clips = [generate_gait(0.9 + 0.7 * random.random(), 0.3 * random.standard_normal(), 1.0) for _ in range(count)]
+    poses = np.stack([Motion.of(clip).at_frames(np.arange(frames)).poses for clip in clips])
+    return aligned_set(clips[0].skeleton, poses, warps(count, frames, seed), {"contact": frames // 2})

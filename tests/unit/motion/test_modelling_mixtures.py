@@ -1,0 +1,184 @@
+"""Mixtures of normal distributions: their densities, their samples, and how many components are chosen."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+
+from marey_motion.errors import MotionError
+from marey_motion.modelling.mixture import LatentMixture
+from marey_motion.modelling.mixture_fitting import MixtureOptions, fit_mixture, one_thread
+
+
+def two_kinds(examples=200, dimensions=3, apart=8.0, seed=0):
+    """Examples of two well separated kinds, 3 to 2."""
+    random = np.random.default_rng(seed)
+    kinds = random.random(examples) < 0.6
+    return random.standard_normal((examples, dimensions)) + apart * np.where(kinds, 0.5, -0.5)[:, None]
+
+
+def some_mixture(components=3, dimensions=4, seed=0):
+    random = np.random.default_rng(seed)
+    spread = random.standard_normal((components, dimensions, dimensions))
+    covariances = spread @ spread.transpose(0, 2, 1) + 0.1 * np.eye(dimensions)
+    weights = random.uniform(0.2, 1.0, components)
+    return LatentMixture(weights / weights.sum(), random.standard_normal((components, dimensions)), covariances)
+
+
+@given(st.integers(0, 1000), st.integers(1, 5), st.integers(1, 6))
+def test_densities_are_those_of_an_independent_library(seed, components, dimensions):
+    mixture = some_mixture(components, dimensions, seed)
+    points = np.random.default_rng(seed).standard_normal((7, dimensions))
+    each = [
+        np.log(weight) + np.atleast_1d(multivariate_normal(mean, covariance).logpdf(points))
+        for weight, mean, covariance in zip(mixture.weights, mixture.means, mixture.covariances, strict=True)
+    ]
+    np.testing.assert_allclose(mixture.component_log_densities(points), np.stack(each, axis=1), rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(mixture.log_density(points), logsumexp(each, axis=0), rtol=1e-8, atol=1e-8)
+
+
+def test_samples_have_the_means_and_covariances_of_the_mixture():
+    mixture = some_mixture(2, 3, 5)
+    drawn = mixture.sample(200_000, 1)
+    mean = mixture.weights @ mixture.means
+    away = mixture.means - mean
+    covariance = np.einsum("k,kij->ij", mixture.weights, mixture.covariances + away[:, :, None] * away[:, None, :])
+    np.testing.assert_allclose(drawn.mean(axis=0), mean, atol=0.05)
+    np.testing.assert_allclose(np.cov(drawn.T), covariance, rtol=0.05, atol=0.05)
+
+
+@given(st.integers(0, 2**63 - 1), st.integers(1, 30), st.integers(1, 30))
+def test_samples_are_the_same_for_the_same_seed_and_begin_alike(seed, few, many):
+    mixture = some_mixture()
+    shared = min(few, many)
+    assert np.array_equal(mixture.sample(few, seed)[:shared], mixture.sample(many, seed)[:shared])
+    assert not np.array_equal(mixture.sample(few, seed, 1), mixture.sample(few, seed))
+
+
+def test_a_mixture_of_nothing_gives_samples_of_nothing():
+    point = fit_mixture(np.empty((6, 0)))
+    assert point.method == "point"
+    assert point.mixture.sample(3, 0).shape == (3, 0)
+    np.testing.assert_array_equal(point.mixture.log_density(np.empty((2, 0))), 0.0)
+
+
+def test_what_is_no_mixture_is_refused():
+    for weights, covariances in (((0.5, 0.6), np.eye(2)), ((1.0,), np.eye(2)), ((0.5, 0.5), np.eye(3))):
+        with pytest.raises(MotionError):
+            LatentMixture(np.array(weights), np.zeros((2, 2)), np.stack([covariances] * 2))
+    flat = LatentMixture(np.ones(1), np.zeros((1, 2)), np.zeros((1, 2, 2)))
+    with pytest.raises(MotionError, match="positive definite"):
+        flat.log_density(np.zeros((1, 2)))
+
+
+# -- fitting -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_number_of_kinds_is_found():
+    fitted = fit_mixture(two_kinds())
+    assert len(fitted.mixture.weights) == 2
+    assert fitted.mixture.weights[0] == pytest.approx(0.6, abs=0.08)
+    assert [one.components for one in fitted.candidates] == list(range(1, 11))
+    best = min(fitted.candidates, key=lambda one: one.bic)
+    assert best.components == 2
+
+
+def test_one_kind_in_many_dimensions_is_one_component():
+    """The published choice, by Akaike's criterion up to 40 components, finds 24 in such data."""
+    one_kind = np.random.default_rng(2).standard_normal((89, 12)) * np.linspace(3.0, 0.3, 12)
+    assert len(fit_mixture(one_kind).mixture.weights) == 1
+
+
+def test_identical_examples_give_identical_mixtures_every_time():
+    """Without a seed, the number of components was another one in every run."""
+    random = np.random.default_rng(4)
+    examples = np.concatenate([random.standard_normal((25, 2)) + 3.0 * random.standard_normal(2) for _ in range(4)])
+    first, second = (fit_mixture(examples, seed=3) for _ in range(2))
+    assert np.array_equal(first.mixture.means, second.mixture.means)
+    assert np.array_equal(first.mixture.covariances, second.mixture.covariances)
+    assert first.candidates == second.candidates
+
+
+@settings(max_examples=4, deadline=None)
+@given(st.sampled_from([1e-4, 0.03, 7.0, 1e4]), st.integers(0, 50))
+def test_the_choice_does_not_depend_on_the_unit(unit, seed):
+    examples = two_kinds(80, 2, 5.0, seed)
+    plain, scaled = fit_mixture(examples), fit_mixture(examples * unit)
+    assert len(plain.mixture.weights) == len(scaled.mixture.weights)
+    np.testing.assert_allclose(scaled.mixture.means, plain.mixture.means * unit, rtol=1e-6, atol=1e-6 * unit)
+    shift = 2 * 80 * np.log(unit)
+    for one, other in zip(plain.candidates, scaled.candidates, strict=True):
+        assert other.log_likelihood == pytest.approx(one.log_likelihood - shift, abs=1e-4)
+    densities = scaled.mixture.log_density(examples * unit)
+    assert scaled.candidates[len(scaled.mixture.weights) - 1].log_likelihood == pytest.approx(densities.sum())
+
+
+def test_few_examples_get_one_shrunk_component():
+    examples = np.random.default_rng(1).standard_normal((6, 8))
+    fitted = fit_mixture(examples)
+    assert fitted.method == "shrunk"
+    assert len(fitted.mixture.weights) == 1
+    assert np.linalg.eigvalsh(fitted.mixture.covariances[0])[0] > 1e-3
+    np.testing.assert_allclose(fitted.mixture.means[0], examples.mean(axis=0))
+
+
+def test_the_heaviest_component_comes_first():
+    fitted = fit_mixture(two_kinds(seed=9))
+    assert (np.diff(fitted.mixture.weights) <= 0.0).all()
+    assert fitted.mixture.means[0].mean() > 0.0
+
+
+def test_a_component_of_a_few_stray_examples_is_not_taken():
+    examples = two_kinds(60, 2, 0.0)
+    examples[:2] += 60.0
+    fitted = fit_mixture(examples)
+    assert {one.refusal for one in fitted.candidates if one.components > 1} >= {"small-component"}
+    assert fitted.mixture.weights.min() * 60 >= 5 or len(fitted.mixture.weights) == 1
+
+
+def test_a_mixture_that_fits_its_own_examples_alone_is_not_taken():
+    random = np.random.default_rng(11)
+    refused = []
+    for _ in range(20):
+        fitted = fit_mixture(random.standard_t(4, (26, 6)), MixtureOptions(criterion="aic"))
+        refused += [one.refusal for one in fitted.candidates]
+        if len(fitted.mixture.weights) > 1:
+            single = fit_mixture(random.standard_t(4, (26, 6)), MixtureOptions(components=1))
+            assert fitted.held_out is not None
+            assert single.held_out is not None
+    assert "held-out" in refused
+
+
+def test_held_out_likelihoods_are_those_of_mixtures_that_lack_the_example():
+    examples = two_kinds(100)
+    fitted = fit_mixture(examples)
+    assert fitted.held_out is not None
+    assert fitted.held_out.shape == (100,)
+    assert fitted.held_out.mean() < fitted.mixture.log_density(examples).mean()
+    stray = np.concatenate((examples, [[80.0, 0.0, 0.0]]))
+    held_out = fit_mixture(stray).held_out
+    assert held_out is not None
+    assert held_out.argmin() == 100
+    assert fit_mixture(examples, MixtureOptions(folds=0)).held_out is None
+
+
+def test_the_choice_can_be_made_by_hand():
+    assert len(fit_mixture(two_kinds(), MixtureOptions(components=3)).mixture.weights) == 3
+    with pytest.raises(MotionError, match="9 components for 8 examples"):
+        fit_mixture(two_kinds(8), MixtureOptions(components=9))
+
+
+def test_numbers_that_are_none_are_refused():
+    with pytest.raises(MotionError, match="finite"):
+        fit_mixture(np.full((5, 2), np.nan))
+    with pytest.raises(MotionError, match="do not vary"):
+        fit_mixture(np.ones((5, 2)))
+
+
+def test_libraries_keep_to_one_thread():
+    from threadpoolctl import threadpool_info
+
+    with one_thread():
+        assert {library["num_threads"] for library in threadpool_info()} == {1}
