@@ -12,6 +12,7 @@ from marey_schemas.documents import Check, OutputRef, SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, Refusal, skeleton_output
 from marey_schemas.jobs import ImportParams, StagedOutput
 from marey_schemas.kinds import Kind
+from marey_schemas.originals import original_of, with_original
 from marey_worker.context import Context, JobRefused, NoSuchThing
 
 SKELETON_COLLECTION = "skeletons"
@@ -61,6 +62,9 @@ class _Importing:
             return self._refused(planned, Refusal(code=error.code, detail=str(error), **place))
         except NoSuchThing as error:
             return self._refused(planned, Refusal(code="blob-missing", detail=str(error)))
+        if found.modelled is not None and found.modelled.graph is not None:
+            detail = "a graph names models of the project; import it after them, in a request with few files"
+            return self._refused(planned, Refusal(code="graph-alone", detail=detail))
         self._stage(planned, found)
         return ImportEntry(
             name=planned.name,
@@ -128,8 +132,30 @@ class _Importing:
                 )
             )
             self._ready_bytes += motion["poses"].nbytes
+        if found.modelled is not None and found.modelled.model is not None:
+            self._stage_model(planned, found, found.modelled.model)
         if self._ready_bytes > BYTES_PER_STAGE or len(self._ready) >= 128:
             self._flush()
+
+    def _stage_model(self, planned: PlannedFile, found: ImportedDocuments, model: dict[str, Any]) -> None:
+        """The model under its name. Its tree names the digest of the stored model, which is not known yet."""
+        assert found.modelled is not None
+        if found.modelled.tree is not None:
+            self._context.log(f"{planned.companion}: left out; import the tree with its model in a small request")
+        if found.hierarchy is not None:
+            model = {**model, "skeleton": OutputRef(output=skeleton_output(planned.name)).model_dump()}
+        original = original_of("model", model, planned.name, self._digests[planned.name])
+        self._ready.append(
+            StagedOutput(
+                name=planned.name,
+                kind=Kind.MODEL,
+                item_name=found.modelled.name,
+                collection="/".join(part for part in (self._params.collection, planned.folder) if part),
+                tags=self._params.tags,
+                parts={"model": with_original(model, original=original)},
+            )
+        )
+        self._ready_bytes += sum(part.nbytes for part in model["spatial"].values() if hasattr(part, "nbytes"))
 
     def _flush(self) -> None:
         if self._ready:

@@ -1,0 +1,46 @@
+"""Files that models, trees and graphs were imported from: given back as they came while nothing has changed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import Field
+
+from marey_schemas.base import Request
+from marey_schemas.canonical import document_digest
+from marey_schemas.names import Digest
+
+CONTENT = {
+    "model": (
+        "name", "joints", "frame_rate_hz", "spatial", "temporal", "temporal_weight", "mixture", "keyframes",
+    ),
+    "tree": ("samples", "sizes", "children"),
+    "graph": ("actions", "start"),
+}  # fmt: skip
+"""Members of a part that come from its file."""
+
+
+class StoredOriginal(Request):
+    """The file that something was imported from, and the digest of what it became then."""
+
+    name: str = Field("", max_length=1024, description="Of the file, without its folders.")
+    blob: Digest
+    content: Digest
+
+
+def content_digest(part: str, document: Mapping[str, Any]) -> str:
+    """Digest of what a part says that comes from its file; arrays may be references to what is stored."""
+    return document_digest({name: document.get(name) for name in CONTENT[part]})
+
+
+def original_of(part: str, document: Mapping[str, Any], file: str, digest: str) -> dict[str, Any]:
+    """What to keep of the file that a part was imported from."""
+    name = file.replace("\\", "/").rpartition("/")[2]
+    return StoredOriginal(name=name, blob=digest, content=content_digest(part, document)).model_dump()
+
+
+def with_original(model: Mapping[str, Any], **originals: Mapping[str, Any]) -> dict[str, Any]:
+    """Part `model` that was imported, with what to keep of its file (`original`) and of that of its tree (`tree`)."""
+    provenance = {**model["provenance"]["predecessor"], **originals}
+    return {**model, "provenance": {**model["provenance"], "predecessor": provenance}}
