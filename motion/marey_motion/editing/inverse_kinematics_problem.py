@@ -173,47 +173,45 @@ def pose_problem(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], 
             raise EditError(f"joint {target.joint} of {skeleton.joint_count}", where=f"targets[{number}]")
     if not targets:
         raise EditError("at least one target is needed", where="targets")
-    paths = [skeleton.path_to_root(target.joint) for target in targets]
-    joints = np.array(sorted(set().union(*paths)), dtype=np.int64)
-    carries = np.array([[joint in path for path in paths] for joint in joints.tolist()], dtype=np.bool_)
+    paths = [set(skeleton.path_to_root(target.joint)) for target in targets]
+    joints = sorted(set[int]().union(*paths))
+    carries = np.array([[joint in path for path in paths] for joint in joints], dtype=np.bool_)
     body = _body(skeleton, motion, joints, carries, freedom)
     packed = _targets(joints, targets, motion.frame_count)
     roots, rotations = (
         np.array(one, dtype=np.float64, order="C") for one in (motion.root_translations, motion.rotations[:, joints])
     )
-    return Problem(joints, body, packed, roots, rotations)
+    return Problem(np.array(joints, dtype=np.int64), body, packed, roots, rotations)
 
 
-def _body(skeleton: Skeleton, motion: Motion, joints: Ints, carries: Flags, freedom: Freedom) -> Body:
+def _body(skeleton: Skeleton, motion: Motion, joints: list[int], carries: Flags, freedom: Freedom) -> Body:
     count = len(joints)
-    may_turn = joints.tolist() if freedom.joints is None else freedom.joints
-    movable = np.isin(joints, may_turn)
+    may_turn = set(joints if freedom.joints is None else freedom.joints)
+    movable = np.array([joint in may_turn for joint in joints], dtype=np.bool_)
     if not movable.any() and not freedom.root_moves:
         raise EditError("none of the joints that may move carries a target", code="chain-invalid", where="joints")
     limits, limited, stiffness = np.zeros((count, 14)), np.zeros(count, np.bool_), np.zeros(count)
-    for k, joint in enumerate(joints.tolist()):
+    for k, joint in enumerate(joints):
         stiffness[k] = freedom.stiffness.get(joint, 0.0)
         if joint in freedom.limits:
             limited[k], limits[k] = True, freedom.limits[joint].row
-    parents = np.searchsorted(joints, skeleton.parents[joints]).astype(np.int64)
-    parents[0] = -1
-    offsets = skeleton.offsets[joints][None]
-    moving = np.isin(motion.translated_joints, joints)
-    if moving.any():
+    places = {joint: k for k, joint in enumerate(joints)}
+    parents = np.array([places.get(parent, -1) for parent in skeleton.parents[joints].tolist()], dtype=np.int64)
+    offsets = np.array(skeleton.offsets[joints][None], dtype=np.float64, order="C")
+    moving = [number for number, joint in enumerate(motion.translated_joints) if joint in places]
+    if moving:
         offsets = np.repeat(offsets, motion.frame_count, axis=0)
-        places = np.searchsorted(joints, np.array(motion.translated_joints)[moving])
-        offsets[:, places] = motion.translations[:, moving]
-    offsets = np.ascontiguousarray(offsets, dtype=np.float64)
+        offsets[:, [places[motion.translated_joints[number]] for number in moving]] = motion.translations[:, moving]
     return Body(parents, offsets, movable, stiffness, limited, limits, carries, bool(freedom.root_moves))
 
 
-def _targets(joints: Ints, targets: Sequence[Target], frames: int) -> Targets:
+def _targets(joints: list[int], targets: Sequence[Target], frames: int) -> Targets:
     count = len(targets)
     values = [_checked_values(target, number, frames) for number, target in enumerate(targets)]
     rows = max(len(value) for value in values)
     packed = Targets(
         np.array([_KINDS[type(target)] for target in targets], dtype=np.int64),
-        np.searchsorted(joints, [target.joint for target in targets]).astype(np.int64),
+        np.array([joints.index(target.joint) for target in targets], dtype=np.int64),
         np.zeros((rows, count, 4)),
         *(np.zeros((count, 3)) for _ in range(3)),
         np.zeros(count),
