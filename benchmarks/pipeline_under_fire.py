@@ -1,0 +1,244 @@
+"""A pipeline whose worker is killed at random moments must end in the same bytes as one that is left alone.
+
+`python -m benchmarks.pipeline_under_fire [TAKES [KILLS [SEED]]]` brings 200 generated takes from files to a model, with
+one worker, with two, and with one that is killed ten times, and prints what that took.
+"""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from benchmarks.local_server import LocalServer, clean_environment, running
+from marey_client import Marey
+from marey_client.imports import find_files
+from marey_client.model_building import plan_model
+from marey_client.pipelines import PipelineRun
+from marey_client.project import ProjectHandle
+from marey_motion.clip import Clip
+from marey_motion.formats import write_motion
+from marey_motion.gait import game_skeleton, generate_gait
+from marey_schemas.access import ProjectCreate
+from marey_schemas.canonical import array_digest
+from marey_schemas.kinds import Kind
+from marey_schemas.model_pipelines import model_pipeline
+
+TAKES, KILLS, SEED = 200, 10, 7
+SECONDS, RATE_HZ = 1.2, 60.0
+PATIENCE_S = 1800.0
+LONGEST_PAUSE_S = 1.0
+QUICK_LEASES = {"MAREY_LEASE_TTL_S": "3", "MAREY_HEARTBEAT_S": "0.5", "MAREY_CANCEL_GRACE_S": "2"}
+PARTS = {Kind.PROCESSED: ("motion", "info"), Kind.MODEL: ("model", "tree")}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a pipeline: how long it took, when workers were killed, and digests of its arrays."""
+
+    seconds: float
+    attempts: int
+    lost: int
+    digests: Mapping[str, str]
+    moments: Sequence[str]
+
+
+def write_takes(folder: Path, count: int, seconds: float = SECONDS) -> Path:
+    """Walks of different speeds and turns as BVH files, and beside their folder a skeleton to carry them over to."""
+    takes = folder / "takes"
+    takes.mkdir(parents=True)
+    chance = random.Random(count)
+    for number in range(count):
+        clip = generate_gait(0.9 + 0.8 * number / count, chance.gauss(0.0, 0.2), seconds, RATE_HZ)
+        (takes / f"walk-{number:03d}.bvh").write_bytes(write_motion(clip, "bvh"))
+    skeleton = game_skeleton()
+    at_rest = np.concatenate([skeleton.offsets[0], skeleton.rest_rotations.ravel()]).astype(np.float32)
+    rig = Clip(skeleton, RATE_HZ, np.tile(at_rest, (5, 1)), None, ())
+    (folder / "game.bvh").write_bytes(write_motion(rig, "bvh"))
+    return takes
+
+
+def run_pipeline(
+    material: Path,
+    data: Path,
+    *,
+    workers: int = 1,
+    kills: int = 0,
+    chance: random.Random | None = None,
+    settings: Mapping[str, str] = MappingProxyType({}),
+    **choices: Any,
+) -> Outcome:
+    """Bring the takes of a folder from files to a model on a server of its own; `choices` are those of the plan.
+
+    So many times, a moment after a worker has begun some work, all workers are killed and started anew.
+    """
+    data.parent.mkdir(parents=True, exist_ok=True)
+    with running(data, **QUICK_LEASES, **settings) as server, server.client() as marey:
+        lab = marey.create_project(ProjectCreate(name="lab"))
+        wanted = _plan(lab, material, choices)
+        started = time.monotonic()
+        with at_work(server, workers) as shift:
+            run = lab.pipeline(wanted)
+            fire = _Fire(marey, run, shift, chance or random.Random())
+            moments = [fire.shoot() for _ in range(kills)]
+            run.wait(timeout_s=PATIENCE_S)
+        tries = list(_attempts(marey, lab))
+        return Outcome(time.monotonic() - started, len(tries), tries.count("lost"), digests(lab), moments)
+
+
+def _plan(lab: ProjectHandle, material: Path, choices: Mapping[str, Any]) -> Any:
+    [rig] = lab.imports.upload(find_files([material / "game.bvh"]).files)
+    files = find_files([material / "takes"]).files
+    plan = plan_model(lab, files, name="walk", skeleton={"item": rig.skeleton}, **choices)
+    # A job may be unlucky more often than three times when ten kills fall on it.
+    return model_pipeline(plan, seed=SEED, max_attempts=20)
+
+
+def _attempts(marey: Marey, lab: ProjectHandle) -> Iterator[str | None]:
+    for job in list(lab.jobs()):
+        for one in (job, *marey.jobs.list(lab.name, filters={"parent": job.id})):
+            yield from (attempt.outcome for attempt in marey.jobs.attempts(one.id))
+
+
+def digests(lab: ProjectHandle) -> dict[str, str]:
+    """Digest of every array of every aligned clip and model, by the place of the item and in its documents."""
+    found: dict[str, str] = {}
+    for kind, parts in PARTS.items():
+        for one in lab.items(kind).list():
+            for part in parts:
+                for path, array in _arrays(one.part(part)):
+                    found[f"{one.path}/{part}{path}"] = array_digest(array)
+    return found
+
+
+def _arrays(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(tree, np.ndarray):
+        yield path, tree
+    elif isinstance(tree, Mapping):
+        for name, value in tree.items():
+            yield from _arrays(value, f"{path}/{name}")
+    elif isinstance(tree, list | tuple):
+        for index, value in enumerate(tree):
+            yield from _arrays(value, f"{path}/{index}")
+
+
+# -- workers ----------------------------------------------------------------------------------------------------------
+
+
+class Shift:
+    """Workers of a server, which can be killed together and started anew."""
+
+    def __init__(self, server: LocalServer, count: int) -> None:
+        self._server = server
+        self._count = count
+        self._processes: list[subprocess.Popen[bytes]] = []
+
+    def start(self) -> None:
+        """Start every worker."""
+        self._processes = [self._worker(number) for number in range(self._count)]
+
+    def kill(self) -> None:
+        """End every worker as a power cut would."""
+        for process in self._processes:
+            process.kill()
+            process.wait()
+
+    def _worker(self, number: int) -> subprocess.Popen[bytes]:
+        folder = self._server.data.parent
+        arguments = ["--attached", "--server", self._server.url, "--name", f"w{number}"]
+        arguments += ["--cache", str(folder / f"cache-{number}")]
+        with (folder / "workers.log").open("ab") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "marey_worker", *arguments],
+                env=clean_environment(), stdin=subprocess.PIPE, stdout=log, stderr=log,
+            )  # fmt: skip
+        assert process.stdin is not None
+        process.stdin.write(f"{self._server.token}\n".encode())
+        process.stdin.flush()
+        return process
+
+
+@contextmanager
+def at_work(server: LocalServer, count: int) -> Iterator[Shift]:
+    """So many workers, while the block runs."""
+    shift = Shift(server, count)
+    with ExitStack() as stack:
+        stack.callback(shift.kill)
+        shift.start()
+        yield shift
+
+
+class _Fire:
+    """Kills workers under a pipeline."""
+
+    def __init__(self, marey: Marey, run: PipelineRun, shift: Shift, chance: random.Random) -> None:
+        self._marey = marey
+        self._run = run
+        self._shift = shift
+        self._chance = chance
+        self._seen: set[tuple[str, int]] = set()
+
+    def shoot(self) -> str:
+        """Kill every worker at most a second after one has begun something; what it had begun."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not (begun := self._begun()):
+            if self._run.ended or time.monotonic() > deadline:
+                raise RuntimeError(f"there was nobody left to kill: {self._run}; use more takes")
+            time.sleep(0.05)
+        pause_s = self._chance.uniform(0.0, LONGEST_PAUSE_S)
+        time.sleep(pause_s)
+        self._shift.kill()
+        self._shift.start()
+        return f"{pause_s:.2f} s after {' and '.join(sorted(begun))} had begun"
+
+    def _begun(self) -> list[str]:
+        """Steps of which a worker has begun something that was not begun before."""
+        begun = []
+        for name, job in self._run.refresh().items():
+            if job.state != "running":
+                continue
+            tasks = self._marey.jobs.list(job.project, filters={"parent": job.id, "state": "running"})
+            leases = {(one.id, one.fence) for one in ([job] if job.size is None else tasks)}
+            if leases - self._seen:
+                begun.append(name)
+            self._seen |= leases
+        return begun
+
+
+# -- the comparison ---------------------------------------------------------------------------------------------------
+
+
+def main(takes: int = TAKES, kills: int = KILLS, seed: int = SEED) -> None:
+    """Run the pipeline three times, print figures, and fail where the results are not the same."""
+    with tempfile.TemporaryDirectory(prefix="marey-fire-") as folder:
+        material = Path(folder, "material")
+        write_takes(material, takes)
+        alone = run_pipeline(material, Path(folder, "one", "data"))
+        _tell("one worker", alone)
+        double = run_pipeline(material, Path(folder, "two", "data"), workers=2)
+        _tell("two workers", double)
+        fired = run_pipeline(material, Path(folder, "fire", "data"), kills=kills, chance=random.Random(seed))
+        _tell(f"one worker, killed {kills} times", fired)
+        for moment in fired.moments:
+            print(f"    {moment}")
+    if not alone.digests == double.digests == fired.digests:
+        sys.exit("the results are not the same")
+    print(f"all {len(alone.digests)} arrays are the same in every run")
+
+
+def _tell(what: str, outcome: Outcome) -> None:
+    print(f"{what}: {outcome.seconds:.1f} s, {outcome.attempts} attempts, {outcome.lost} of them lost", flush=True)
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))
