@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, is_dataclass
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.result import EvaluationOptions, Provenance
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
+from marey_motion.version import code_version
 
 
 def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials: Sequence[Trial]) -> Provenance:
@@ -30,7 +30,7 @@ def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials
         normaliser=database.normaliser.digest,
         options=_digest({"database": database.options, "controller": options.controller, "window": options.window}),
         scenarios=_digest(list(trials)),
-        code_version=_code_version(),
+        code_version=code_version(),
     )
 
 
@@ -92,10 +92,3 @@ def _canonical(value: Any) -> Any:
 
 def _short(digest: str) -> str:
     return digest[: len("sha256:") + 12]
-
-
-def _code_version() -> str:
-    try:
-        return f"marey@{version('marey')}"
-    except PackageNotFoundError:  # run from a source tree that is not installed
-        return "marey@unknown"

@@ -5,14 +5,13 @@ import io
 import json
 import subprocess
 import sys
-import xml.etree.ElementTree as ElementTree
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.image import imread
 
+from drawn_figures import is_sound, rows_of
 from evaluation_results import SMALL, evaluated, made_up, some_coverage, wandering
 from marey_motion.drawing.paper import nice_levels, shortened, without_shared_folder
 from marey_motion.errors import MotionError
@@ -36,23 +35,6 @@ def result():
 @pytest.fixture(scope="module")
 def other():
     return made_up(seed=5, clips=9, sway_m=0.05)
-
-
-def is_sound(figure):
-    """Both pictures can be read, all columns of a table are of one length, and there is something to say."""
-    assert imread(io.BytesIO(figure.png)).shape[0] > 100
-    assert ElementTree.fromstring(figure.svg).tag.endswith("svg")
-    assert figure.caption.endswith(".")
-    assert "nan" not in figure.caption
-    for columns in figure.data["tables"].values():
-        assert len({len(values) for values in columns.values()}) == 1
-    json.dumps(figure.data, allow_nan=False)
-    return figure
-
-
-def rows_of(figure, table):
-    columns = figure.data["tables"][table]
-    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 @pytest.mark.parametrize("name", FIGURES)

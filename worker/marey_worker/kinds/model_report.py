@@ -9,7 +9,6 @@ from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.modelling.figures import ModelSubject, draw_alignment_figures, draw_model_figures
 from marey_motion.modelling.report import render_model_report
 from marey_motion.modelling.training import TrainedPrimitive
-from marey_schemas.job_kinds import find_kind
 from marey_schemas.reports import ModelReport
 from marey_worker.context import Context
 from marey_worker.kinds.stored_reports import store_report
@@ -27,7 +26,5 @@ def write_model_report(
     title = trained.primitive.name
     subject = ModelSubject(trained.primitive, aligned, trained.report, context.seed)
     figures = {**draw_alignment_figures(aligned), **draw_model_figures(subject)}
-    page = render_model_report(
-        trained, subject, figures, title=title, origin=origin, code_version=find_kind("model").code_version
-    )
+    page = render_model_report(trained, subject, figures, title=title, origin=origin)
     return store_report(context, ModelReport, title, page, ((None, figure) for figure in figures.values()))

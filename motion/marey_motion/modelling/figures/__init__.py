@@ -54,7 +54,7 @@ def draw_alignment_figures(aligned: AlignedSet) -> dict[str, DrawnFigure]:
 def draw_model_figures(subject: ModelSubject) -> dict[str, DrawnFigure]:
     """Every figure of a model, by name; the components one by one, as `component-1` and so on."""
     swept = {
-        f"component-{number + 1}": (f"Component {number + 1}", partial(draw_component, subject, number))
+        f"component-{number + 1}": (f"Component {number + 1} of the poses", partial(draw_component, subject, number))
         for number in range(min(SWEPT_COMPONENTS, subject.primitive.spatial.count))
     }
     return _drawn(swept | {name: (title, partial(draw, subject)) for name, (title, draw) in MODEL_FIGURES.items()})

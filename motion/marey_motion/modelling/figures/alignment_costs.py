@@ -44,6 +44,15 @@ class CostView(NamedTuple):
     costs_cm: Floats
     frames: tuple[NDArray[np.int64], NDArray[np.int64]]
 
+    @property
+    def along_way_cm(self) -> Floats:
+        """(N,) at each canonical frame, where the way goes."""
+        wanted = (np.arange(len(self.clip.time_function)), np.rint(self.clip.time_function))
+        cells = [
+            np.abs(frames - each[:, None]).argmin(axis=1) for frames, each in zip(self.frames, wanted, strict=True)
+        ]
+        return np.asarray(self.costs_cm[cells[0], cells[1]], dtype=np.float64)
+
 
 def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None) -> Sketch | None:
     """The clip of middling cost and the one of the highest; None where there is only the reference."""
@@ -84,6 +93,7 @@ def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None
         "clip": [view.clip.uid for view in views for _ in range(aligned.frame_count)],
         "reference_frame": np.tile(np.arange(aligned.frame_count), len(views)),
         "clip_frame": np.concatenate([view.clip.time_function for view in views]),
+        "distance_cm": np.concatenate([view.along_way_cm for view in views]),
     }
     return Sketch(figure, {"ways": table}, caption)
 

@@ -26,8 +26,8 @@ def draw_mean(subject: ModelSubject) -> Sketch:
     row = StripRow("mean", f"{duration_s:.2f} s", points[None], _ways(subject, subject.mean_poses[None]))
     figure = draw_strips(subject.body, [row], moments, subject.seen_from_rad, cell_in=(CELL_IN[0], 1.9))
     caption = (
-        f"The mean motion of the model, {duration_s:.2f} s, at {len(frames)} moments of canonical time, seen from its "
-        "front right. The line on the floor is where the root goes."
+        f"What the model makes when nothing varies: {duration_s:.2f} s, at {len(frames)} moments of canonical time, "
+        "seen from its front right. The line on the floor is where the root goes."
     )
     return Sketch(figure, {"positions": position_table(subject, frames, [("mean", points)])}, caption)
 
@@ -49,7 +49,7 @@ def draw_component(subject: ModelSubject, component: int) -> Sketch:
     share = float(np.diff(subject.primitive.spatial.energy, prepend=0.0)[component])
     joint, moved_cm = most_moved(subject, points)
     caption = (
-        f"What spatial component {component + 1} changes ({100 * share:.0f} % of the variance): from two standard "
+        f"What it changes ({100 * share:.0f} % of the variance): from two standard "
         f"deviations of the examples below the mean to two above it. Most of all it moves {joint}, by up to "
         f"{moved_cm:.0f} cm from end to end."
     )

@@ -46,7 +46,7 @@ def draw_latent_space(subject: ModelSubject) -> Sketch | None:
     if not pairs:
         return None
     samples = primitive.sample(SCATTERED_SAMPLES, subject.seed)
-    figure = new_figure(0.3 + len(pairs) * (SIDE + 0.75), SIDE + 1.35)
+    figure = new_figure(max(0.3 + len(pairs) * (SIDE + 0.75), 5.6), SIDE + 1.35)
     for place, pair in enumerate(pairs):
         names = [_axis(primitive.spatial.count, dimension) for dimension in pair]
         panel = add_panel(figure, Place(0.75 + place * (SIDE + 0.75), 0.65, SIDE, SIDE), x=names[0], y=names[1])
@@ -133,9 +133,9 @@ def draw_likelihood(subject: ModelSubject) -> Sketch:
     order = sorted(range(len(examples)), key=lambda place: (_judged(examples[place]), examples[place].uid))
     below = _deviations(np.array([_judged(example) for example in examples]))
     shown = order[:MOST_ROWS]
-    figure = new_figure(8.4, ROW * len(shown) + 0.95)
+    figure = new_figure(8.8, ROW * len(shown) + 0.95)
     label = "how much likelier or less likely than the middle example (robust deviations)"
-    panel = add_panel(figure, Place(2.6, 0.65, 5.6, ROW * len(shown)), x=label)
+    panel = add_panel(figure, Place(3.0, 0.65, 5.6, ROW * len(shown)), x=label)
     values, rows = below[shown], np.arange(len(shown))
     drawn = np.maximum(values, -FARTHEST)
     odd = np.array([examples[place].outlier for place in shown], dtype=bool)
@@ -187,4 +187,4 @@ def _likelihood_caption(subject: ModelSubject, odd: list[int], hidden: int) -> s
         return f"{start} None is."
     named = ", ".join(subject.names[place] for place in odd[:NAMED])
     more = f" and {len(odd) - NAMED} more" if len(odd) > NAMED else ""
-    return f"{start} Look at {named}{more}: do they show the same action as the others?"
+    return f"{start} Look whether the action of the others is what these show: {named}{more}."

@@ -119,7 +119,7 @@ def draw_paths(subject: ModelSubject) -> Sketch:
     ways = np.concatenate([points.transpose(0, 2, 1, 3).reshape(-1, 3) for points in sets.values()])
     table |= {f"{axis}_m": ways[:, place] for place, axis in enumerate("xyz")}
     caption = (
-        f"Where {_listed(list(joints))} go, in metres from where the root begins, which faces forward: "
+        f"The ways of {_listed(list(joints))}, in metres from where the root begins, the body facing forward: "
         f"{amount(len(chosen), 'training example')} on the left, as many samples of the model on the right; from the "
         "side above, from above below. Samples should fill the space of the examples, and not leave it."
     )

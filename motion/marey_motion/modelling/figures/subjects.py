@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from marey_motion import kinematics
 from marey_motion.alignment.aligned import AlignedSet
-from marey_motion.drawing.paper import told_apart
+from marey_motion.drawing.paper import shortened, told_apart
 from marey_motion.drawing.stick_figures import Body, body_of
 from marey_motion.drawing.strips import Moments
 from marey_motion.modelling.primitive import MotionPrimitive
@@ -23,6 +23,7 @@ Floats = NDArray[np.float64]
 
 MOMENTS = 7
 SAMPLES = 16
+LONGEST_LABEL = 18
 
 FROM_ASIDE_RAD, FROM_AHEAD_RAD = float(np.radians(-50.0)), float(np.radians(-25.0))
 """Where canonical motions, which begin facing +z, are seen from: their front right, so that walks go to the right."""
@@ -115,7 +116,7 @@ def choose_moments(subject: ModelSubject, count: int) -> tuple[NDArray[np.int64]
         places = [place for place in free if ends.get(place, frame) == frame]
         if places:
             place = min(places, key=lambda place: abs(int(frames[place]) - frame))
-            frames[place], labels[place] = frame, label
+            frames[place], labels[place] = frame, shortened(label, LONGEST_LABEL)
     order = np.argsort(frames, kind="stable")
     frames, labels = frames[order], [labels[place] for place in order]
     middles = subject.points(subject.mean_poses[frames])[:, subject.body.pelvis][:, [0, 2]]

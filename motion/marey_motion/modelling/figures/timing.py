@@ -104,7 +104,7 @@ def draw_durations(subject: ModelSubject) -> Sketch:
     shares = [np.histogram(values, edges)[0] / len(values) for values in (examples, samples)]
     table = {"from_s": edges[:-1], "to_s": edges[1:], "examples_share": shares[0], "samples_share": shares[1]}
     caption = (
-        f"How long motions last: the examples {examples.min():.2f} to {examples.max():.2f} s, nine of ten samples "
+        f"Examples last {examples.min():.2f} to {examples.max():.2f} s, nine of ten samples "
         f"{np.quantile(samples, 0.05):.2f} to {np.quantile(samples, 0.95):.2f} s."
     )
     return Sketch(figure, {"durations": table}, caption)

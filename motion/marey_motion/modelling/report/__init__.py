@@ -22,6 +22,7 @@ from marey_motion.modelling.report.definitions import definitions
 from marey_motion.modelling.report.provenance import provenance
 from marey_motion.modelling.training import TrainedPrimitive
 from marey_motion.modelling.verdict import verdict_of
+from marey_motion.version import code_version
 
 __all__ = ["render_model_report"]
 
@@ -33,7 +34,6 @@ def render_model_report(
     *,
     title: str,
     origin: Mapping[str, Any],
-    code_version: str,
 ) -> str:
     """The report of a model as an HTML document.
 
@@ -53,7 +53,7 @@ def render_model_report(
         making_chapter(subject, figures),
         numbers_chapter(figures),
         Section("definitions", "What the words and numbers mean", definitions()),
-        Section("provenance", "Where this comes from", provenance(trained, origin, code_version)),
+        Section("provenance", "Where this comes from", provenance(trained, origin)),
     ]
     lead = element("p", verdict_of(trained), class_="verdict"), headline(trained)
-    return page(title, lead, sections, f"Written by Marey {code_version}.")
+    return page(title, lead, sections, f"Written by Marey {code_version()}.")

@@ -19,7 +19,7 @@ from marey_motion.modelling.training_report import ExampleReport
 
 Figures = Mapping[str, DrawnFigure]
 
-MOST_ROWS = 20
+MOST_ROWS = 30
 CM_PER_M = 100.0
 
 
@@ -27,14 +27,14 @@ def headline(trained: TrainedPrimitive) -> Html:
     """The numbers that answer most questions."""
     primitive, report = trained.primitive, trained.report
     durations, drawn = report.training_durations, report.sample_durations
-    lasting = "" if drawn is None else f"samples {drawn.least_s:.2f} to {drawn.most_s:.2f} s"
+    lasting = "" if drawn is None else f"samples {drawn.least_s:.1f}–{drawn.most_s:.1f} s"
     odd = sum(example.outlier for example in report.examples)
     kinds = amount(len(primitive.mixture.weights), "kind")
     return facts(
         (
             ("examples", str(len(report.examples)), f"{odd} odd" if odd else "none of them odd"),
             ("an unseen example is off by", *_unseen(trained)),
-            ("how long it lasts", f"{durations.least_s:.2f} to {durations.most_s:.2f} s", lasting),
+            ("how long it lasts", f"{durations.least_s:.1f}–{durations.most_s:.1f} s", lasting),
             ("numbers that make a motion", str(primitive.dimensions),
              f"{primitive.spatial.count} of poses, {primitive.temporal.count} of time; {kinds}"),
             ("feet of samples slide at", *_sliding(report.sample_feet, report.training_feet)),

@@ -8,16 +8,17 @@ from typing import Any
 from marey_motion.drawing.markup import Html, element, joined
 from marey_motion.drawing.tables import folded, table
 from marey_motion.modelling.training import TrainedPrimitive
+from marey_motion.version import code_version
 
 _ORIGINS = {"set": "aligned set", "reference": "reference", "seed": "seed"}
 
 
-def provenance(trained: TrainedPrimitive, origin: Mapping[str, Any], code_version: str) -> Html:
+def provenance(trained: TrainedPrimitive, origin: Mapping[str, Any]) -> Html:
     """What the model was made of, by which options and which code."""
     known = [
         (label, element("code", str(origin[name]))) for name, label in _ORIGINS.items() if origin.get(name) is not None
     ]
-    known.append(("version of the code", element("code", code_version)))
+    known.append(("version of the code", element("code", code_version())))
     options = [(name, _written(value)) for name, value in trained.options.as_tree().items()]
     clips = [
         (element("code", f"{clip['item']}@{clip['revision']}"), str(clip["name"])) for clip in origin.get("aligned", ())

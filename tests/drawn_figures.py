@@ -1,0 +1,46 @@
+"""Figures taken apart: can they be read, do their tables hold together, is anything cut off?"""
+
+import io
+import json
+import xml.etree.ElementTree as ElementTree
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.image import imread
+from matplotlib.text import Text
+
+
+def is_sound(figure):
+    """Both pictures can be read, all columns of a table are of one length, and there is something to say."""
+    assert imread(io.BytesIO(figure.png)).shape[0] > 100
+    assert ElementTree.fromstring(figure.svg).tag.endswith("svg")
+    assert figure.caption.endswith(".")
+    assert "nan" not in figure.caption
+    for columns in figure.data["tables"].values():
+        assert len({len(values) for values in columns.values()}) == 1
+    json.dumps(figure.data, allow_nan=False)
+    return figure
+
+
+def rows_of(figure, table):
+    columns = figure.data["tables"][table]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def cut_off(figure):
+    """The texts of a page of matplotlib that reach over its borders."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    page = figure.bbox.padded(1.0)
+    hidden = {id(label) for axes in figure.axes for label in _labels_beyond(axes)}
+    texts = [text for text in figure.findobj(Text) if text.get_visible() and text.get_text().strip()]
+    boxes = [(text, text.get_window_extent(canvas.get_renderer())) for text in texts if id(text) not in hidden]
+    return [text.get_text() for text, box in boxes if not (page.contains(*box.min) and page.contains(*box.max))]
+
+
+def _labels_beyond(axes):
+    """Those of ticks outside the limits of their axis, which are not drawn."""
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = sorted(axis.get_view_interval())
+        for tick in axis.get_major_ticks():
+            if not (axes.axison and low <= tick.get_loc() <= high):
+                yield from (tick.label1, tick.label2)

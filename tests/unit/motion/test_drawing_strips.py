@@ -1,0 +1,84 @@
+"""Strips of small figures: where bodies stand on the page, and what is drawn of them."""
+
+import numpy as np
+import pytest
+from matplotlib.patches import Circle, PathPatch
+
+from drawn_figures import cut_off
+from marey_motion import kinematics
+from marey_motion.drawing.paper import COLOURS, INK, REFERENCE
+from marey_motion.drawing.stick_figures import body_of, runs_of
+from marey_motion.drawing.strips import Moments, StripRow, draw_strips
+from marey_motion.gait import generate_gait
+
+
+@pytest.fixture(scope="module")
+def walk():
+    clip = generate_gait(1.2, 0.0, 1.0)
+    return clip.skeleton, kinematics.global_positions(clip, end_sites=True).astype(np.float64)
+
+
+def strip(walk, *, shift=(0.0, 0.0, 0.0), ghost=False, copies=1):
+    skeleton, points = walk
+    body = body_of(skeleton)
+    shown = points[[0, 30, 59]]
+    middles = shown[:, body.pelvis][:, [0, 2]]
+    row = StripRow(
+        "a walk", "", np.stack([shown + shift] * copies), points[None, :, body.pelvis], shown if ghost else None
+    )
+    return draw_strips(body, [row], Moments(middles, ["0 %", "50 %", "100 %"], ["", "", ""]), 0.0, cell_in=(1.2, 1.5))
+
+
+def coloured(figure, colour):
+    return [patch for patch in figure.axes[0].get_children() if isinstance(patch, PathPatch) and same(patch, colour)]
+
+
+def same(patch, colour):
+    from matplotlib.colors import to_rgb
+
+    return np.allclose(patch.get_edgecolor()[:3], to_rgb(colour))
+
+
+def test_each_cell_has_a_body_with_a_left_a_right_and_a_middle(walk):
+    figure = strip(walk)
+    for colour in (COLOURS[0], COLOURS[1], INK):
+        assert len(coloured(figure, colour)) == 3
+    assert sum(isinstance(patch, Circle) for patch in figure.axes[0].get_children()) == 3
+    assert not cut_off(figure)
+
+
+def test_seen_from_ahead_the_left_side_is_on_the_right(walk):
+    figure = strip(walk)
+    left, right = (np.mean([patch.get_path().vertices[:, 0].mean() for patch in coloured(figure, colour)])
+                   for colour in COLOURS[:2])  # fmt: skip
+    assert left > right
+
+
+def test_a_motion_that_is_elsewhere_stands_beside_the_ghost_of_the_other(walk):
+    moved = strip(walk, shift=(0.2, 0.0, 0.0), ghost=True)
+    ghosts, lefts = coloured(moved, REFERENCE), coloured(moved, COLOURS[0])
+    assert len(ghosts) == 9
+    still = coloured(strip(walk, ghost=True), COLOURS[0])
+    away = lefts[0].get_path().vertices[:, 0].mean() - still[0].get_path().vertices[:, 0].mean()
+    assert away > 0.05  # inches: to the viewer's right is the body's left
+
+
+def test_feet_stand_on_the_line_of_the_floor(walk):
+    figure = strip(walk)
+    floors = [line.get_ydata()[0] for line in figure.axes[0].lines if len(set(line.get_ydata())) == 1]
+    lowest = min(patch.get_path().vertices[:, 1].min() for patch in coloured(figure, COLOURS[0]))
+    assert lowest == pytest.approx(min(floors), abs=0.1)
+
+
+def test_many_bodies_on_top_of_each_other_are_pale(walk):
+    one, many = coloured(strip(walk), COLOURS[0]), coloured(strip(walk, copies=9), COLOURS[0])
+    assert len(many) == 9 * len(one)
+    assert many[0].get_alpha() < one[0].get_alpha()
+
+
+def test_bones_are_joined_to_runs_that_hold_each_bone_once():
+    bones = np.array([[3, 2], [2, 1], [1, 0], [5, 4], [4, 1]])
+    runs = runs_of(bones)
+    drawn = [tuple(pair) for run in runs for pair in zip(run[:-1].tolist(), run[1:].tolist(), strict=True)]
+    assert sorted(drawn) == sorted(map(tuple, bones.tolist()))
+    assert len(runs) == 2

@@ -1,0 +1,111 @@
+"""Reports of models: one sound HTML file that says what was learned, whatever clips are called."""
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from marey_motion.modelling.figures import ModelSubject, draw_alignment_figures, draw_model_figures
+from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.report import render_model_report
+from marey_motion.modelling.training import train_primitive
+from marey_motion.modelling.training_warnings import Warned
+from marey_motion.modelling.verdict import verdict_of
+from model_examples import walks
+from report_pages import HOSTILE, is_sound
+
+ORIGIN = {
+    "aligned": [{"item": "item_1", "revision": 2, "name": "lab/aligned/walk 00"}],
+    "set": "sha256:abc",
+    "reference": "walk000",
+    "seed": 7,
+}
+
+
+QUICK = ModelOptions(report_samples=20, starts=1)
+
+
+def made(aligned, options=QUICK):
+    trained = train_primitive(aligned, options, name="walk")
+    return trained, ModelSubject(trained.primitive, aligned, trained.report)
+
+
+def rendered(trained, subject, figures=None, **options):
+    return render_model_report(trained, subject, figures or {}, **{"title": "Walk", "origin": ORIGIN, **options})
+
+
+@pytest.fixture(scope="module")
+def model():
+    return made(walks())
+
+
+@pytest.fixture(scope="module")
+def figures(model):
+    return {**draw_alignment_figures(model[1].examples), **draw_model_figures(model[1])}
+
+
+@pytest.fixture(scope="module")
+def page(model, figures):
+    return is_sound(rendered(*model, figures))
+
+
+def test_a_report_is_one_sound_file_that_shows_every_figure(page, figures):
+    assert page.tags["svg"] == page.tags["figcaption"] == len(figures)
+    assert page.tags["h1"] == 1
+    for figure in figures.values():
+        assert figure.caption in page.text
+
+
+def test_the_page_opens_with_the_verdict(page, model):
+    assert page.text.startswith("Walk Walk " + verdict_of(model[0]))
+
+
+def test_the_same_model_gives_the_same_page(model, figures):
+    assert rendered(*model, figures) == rendered(*model, figures)
+
+
+def test_the_page_may_load_nothing(model):
+    assert "default-src &#x27;none&#x27;" in rendered(*model)
+    assert not re.search(r"(?:href|src)=\"(?!#|data:)", rendered(*model))
+
+
+def test_the_numbers_of_every_example_are_listed(page, model):
+    for example in model[0].report.examples:
+        assert f"{example.duration_s:.2f}" in page.text
+        assert f"{example.left_out_error_cm:.1f}" in page.text
+
+
+def test_warnings_are_told_first_and_with_their_codes(model):
+    trained, subject = model
+    warned = replace(trained, warnings=(Warned("odd-durations", "half of the samples <last> longer"),))
+    text = is_sound(rendered(warned, subject)).text
+    assert "Half of the samples <last> longer. odd-durations" in text
+    assert "Nothing stands out." in is_sound(rendered(replace(trained, warnings=()), subject)).text
+
+
+def test_it_says_what_the_model_was_made_of(page):
+    assert "item_1@2" in page.text
+    assert "lab/aligned/walk 00" in page.text
+    assert "left foot down" in page.text
+    assert "jacobian" in page.text
+
+
+def test_names_and_titles_are_shown_and_never_run():
+    trained, subject = made(walks(6, names=(*HOSTILE, "plain")))
+    drawn = {**draw_alignment_figures(subject.examples), **draw_model_figures(subject)}
+    page = is_sound(rendered(trained, subject, drawn, title=HOSTILE[1]))
+    assert HOSTILE[0] in page.text
+    assert "alert" not in "".join(page.scripts)
+
+
+@pytest.mark.parametrize("odd", ["copies", "bare"])
+def test_models_of_little_are_reported(odd):
+    aligned = walks(3)
+    if odd == "copies":
+        first = aligned.clips[0]
+        aligned = replace(aligned, clips=tuple(replace(first, uid=f"walk00{n}") for n in range(3)), keyframes={})
+    options = ModelOptions(leave_one_out=False, folds=0, report_samples=0, starts=1)
+    trained, subject = made(aligned, options)
+    page = is_sound(rendered(trained, subject, draw_model_figures(subject), origin={}))
+    assert "not measured" in page.text
+    assert ("Nothing: all examples are the same motion" in page.text) is (odd == "copies")
