@@ -54,13 +54,13 @@ def warps(count, frames, seed=0):
     return np.concatenate((np.zeros((count, 1)), np.cumsum(slopes, axis=1)), axis=1)
 
 
-def bending_chains(count=20, frames=30, seed=0, joints=4):
+def bending_chains(count=20, frames=30, seed=0, joints=4, size=0.1):
     """Chains that sway: a few random smooth functions in every channel."""
     random = np.random.default_rng(seed)
     skeleton = chain(joints)
     basis = SplineBasis.clamped(frames, 7)
     rest = np.concatenate((np.zeros(3), np.tile([1.0, 0.0, 0.0, 0.0], joints)))
-    modes = 0.1 * random.standard_normal((3, 7, 3 + 4 * joints))
+    modes = size * random.standard_normal((3, 7, 3 + 4 * joints))
     coefficients = rest + np.tensordot(random.standard_normal((count, 3)), modes, axes=1)
     return aligned_set(skeleton, unit_poses(basis.at_frames @ coefficients), warps(count, frames, seed))
 

@@ -25,6 +25,7 @@ OUTLIER_DEVIATIONS = 5.0
 """Robust standard deviations below the median from which on an example's likelihood stands out."""
 
 DEVIATION_OF_MEDIAN = 1.4826
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,7 @@ def _at(errors: ReconstructionErrors, components: int) -> int:
 
 
 def _durations(durations: Floats, span: tuple[float, float]) -> Durations:
-    outside = (durations < span[0]) | (durations > span[1])
+    outside = (durations < span[0] * (1.0 - ROUNDING)) | (durations > span[1] * (1.0 + ROUNDING))
     return Durations(float(durations.min()), float(durations.mean()), float(durations.max()), float(outside.mean()))
 
 

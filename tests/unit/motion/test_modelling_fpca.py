@@ -126,9 +126,8 @@ def test_signs_of_components_do_not_depend_on_the_order_of_the_examples():
     coefficients = some(9, 8)
     one, other = all_of(coefficients), all_of(coefficients[::-1])
     np.testing.assert_allclose(one.functions.directions, other.functions.directions, atol=1e-9)
-    assert (np.take_along_axis(
-        one.functions.directions.reshape(8, -1), np.abs(one.functions.directions.reshape(8, -1)).argmax(axis=1)[:, None], 1
-    ) > 0).all()  # fmt: skip
+    flat = one.functions.directions.reshape(8, -1)
+    assert (flat[np.arange(8), np.abs(flat).argmax(axis=1)] > 0.0).all()
 
 
 # -- signs of quaternions ----------------------------------------------------------------------------------------------

@@ -1,0 +1,112 @@
+"""Models as documents: every number comes back as it was, whatever they travel as."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from marey_motion.errors import MotionError
+from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.primitive_documents import (
+    primitive_from_tree,
+    primitive_to_tree,
+    report_from_tree,
+    trained_to_tree,
+)
+from marey_motion.modelling.training import train_primitive
+from marey_motion.skeleton import Skeleton
+from marey_schemas.canonical import document_digest
+from marey_schemas.codecs import MEDIA_TYPES, decode_tree, encode_tree
+from marey_schemas.modelling import ModelParams, MotionPrimitiveDocument
+from modelling_examples import bending_chains, chain, walks
+
+SKELETON = {"item": "skel_1", "revision": 2}
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return train_primitive(walks(12, 30), name="walk", seed=4)
+
+
+@pytest.mark.parametrize("media_type", MEDIA_TYPES)
+def test_a_model_comes_back_bit_by_bit(trained, media_type):
+    tree = trained_to_tree(trained, SKELETON, {"seed": 4})
+    read = decode_tree(encode_tree(tree, media_type), media_type)
+    assert document_digest(read) == document_digest(tree)
+    MotionPrimitiveDocument.model_validate(read)
+    primitive = primitive_from_tree(read, trained.primitive.skeleton)
+    assert document_digest(primitive_to_tree(primitive, SKELETON)) == document_digest(
+        primitive_to_tree(trained.primitive, SKELETON)
+    )
+    drawn = primitive.sample(3, 9)
+    assert np.array_equal(drawn, trained.primitive.sample(3, 9))
+    assert np.array_equal(primitive.poses(drawn), trained.primitive.poses(drawn))
+
+
+def test_a_report_comes_back_with_its_model(trained):
+    read = report_from_tree(trained_to_tree(trained, SKELETON, {}))
+    assert read.examples == trained.report.examples
+    assert read.candidates == trained.report.candidates
+    assert read.sample_feet == trained.report.sample_feet
+    assert np.array_equal(read.reconstruction.left_out_each_cm, trained.report.reconstruction.left_out_each_cm)
+    assert report_from_tree(primitive_to_tree(trained.primitive, SKELETON)) is None
+
+
+def test_a_model_without_components_travels_too():
+    single = train_primitive(bending_chains(1))
+    tree = trained_to_tree(single, SKELETON, {})
+    for media_type in MEDIA_TYPES:
+        read = decode_tree(encode_tree(tree, media_type), media_type)
+        MotionPrimitiveDocument.model_validate(read)
+        primitive = primitive_from_tree(read, chain())
+        assert np.array_equal(primitive.poses(np.empty((1, 0))), single.primitive.poses(np.empty((1, 0))))
+
+
+def test_joints_may_stand_in_another_order():
+    model = train_primitive(bending_chains()).primitive
+    tree = primitive_to_tree(model, SKELETON)
+    order = [0, 1, 2, 3]
+    branched = Skeleton(
+        ("bone_0", "bone_2", "bone_1", "bone_3"), np.array([-1, 0, 0, 0]), chain().offsets, chain().rest_rotations
+    )
+    read = primitive_from_tree(tree, branched)
+    latents = model.sample(2, 0)
+    here, there = (one.poses(latents)[..., 3:].reshape(2, -1, 4, 4) for one in (read, model))
+    np.testing.assert_array_equal(here, there[:, :, [0, 2, 1, 3]])
+
+
+def test_a_model_of_other_joints_is_refused():
+    tree = primitive_to_tree(train_primitive(bending_chains()).primitive, SKELETON)
+    with pytest.raises(MotionError, match="not the skeleton's: bone_4"):
+        primitive_from_tree(tree, chain(5))
+    with pytest.raises(MotionError, match="marey/motion@1"):
+        primitive_from_tree({**tree, "schema": "marey/motion@1"}, chain())
+
+
+@pytest.mark.parametrize(
+    ("place", "told"),
+    [
+        (("joints",), "19 channels, but the joints need 15"),
+        (("spatial", "knots"), "knots"),
+        (("spatial", "projections"), "projections"),
+        (("temporal", "variances"), "variances"),
+        (("mixture", "means"), "dimensions for"),
+        (("mixture", "weights"), "weights"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(place, told):
+    tree = primitive_to_tree(train_primitive(bending_chains()).primitive, SKELETON)
+    holder = tree
+    for name in place[:-1]:
+        holder = holder[name]
+    value = holder[place[-1]]
+    holder[place[-1]] = value[..., :-1] if isinstance(value, np.ndarray) else value[:-1]
+    if place == ("mixture", "means"):
+        tree["mixture"]["covariances"] = tree["mixture"]["covariances"][:, :-1, :-1]
+    with pytest.raises(ValidationError, match=told):
+        MotionPrimitiveDocument.model_validate(tree)
+
+
+def test_what_can_be_asked_for_are_the_options_of_training():
+    asked = ModelParams()
+    options = ModelOptions(**asked.model_dump(exclude={"name", "tags", "report"}))
+    assert options == ModelOptions()

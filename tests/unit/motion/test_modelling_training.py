@@ -1,0 +1,284 @@
+"""Motion primitives: what training makes of aligned examples, and what it says about it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from marey_motion.alignment.aligned import AlignedClip
+from marey_motion.errors import MotionError
+from marey_motion.kinematics import forward_kinematics
+from marey_motion.modelling import reconstruction_kernels
+from marey_motion.modelling.fpca import Keep, find_components
+from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.primitive_documents import trained_to_tree
+from marey_motion.modelling.reconstruction import comparison_frames, reconstruction_errors
+from marey_motion.modelling.splines import SplineBasis
+from marey_motion.modelling.training import fit_examples, train_primitive
+from marey_motion.modelling.verdict import headline_of, verdict_of
+from marey_schemas.codecs import MSGPACK, encode_tree
+from modelling_examples import aligned_set, bending_chains, chain, unit_poses, walks, warps
+
+SCALINGS = ["jacobian", "root_max", "sfpca", "none"]
+QUICK = ModelOptions(leave_one_out=False, folds=0, report_samples=0)
+
+
+def as_bytes(trained):
+    return encode_tree(trained_to_tree(trained, {"item": "skeleton", "revision": 1}, {}), MSGPACK)
+
+
+# -- the model ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scaling", SCALINGS)
+def test_examples_come_back_from_their_latent_vectors(scaling):
+    aligned = bending_chains(size=0.02)
+    options = dataclasses.replace(QUICK, scaling=scaling, spatial_components=20, temporal_share=1.0)
+    primitive = train_primitive(aligned, options).primitive
+    latents = primitive.latents_of(aligned.poses, aligned.time_functions)
+    poses = primitive.poses(latents)
+    reached = [forward_kinematics(aligned.skeleton, one) for one in poses]
+    wanted = [forward_kinematics(aligned.skeleton, one) for one in aligned.poses]
+    np.testing.assert_allclose(reached, wanted, atol=5e-3)
+    np.testing.assert_allclose(primitive.latents_of(poses, primitive.time_functions(latents)), latents, atol=0.02)
+
+
+@pytest.mark.parametrize("copies", [1, 5])
+def test_copies_of_one_clip_give_that_clip(copies):
+    poses = np.repeat(bending_chains(1).poses, copies, axis=0)
+    times = np.repeat(warps(1, 30), copies, axis=0)
+    trained = train_primitive(aligned_set(chain(), poses, times))
+    primitive = trained.primitive
+    assert (primitive.spatial.count, primitive.temporal.count) == (0, 0)
+    drawn = primitive.sample(3, 1)
+    np.testing.assert_allclose(primitive.poses(drawn), np.repeat(poses[:1], 3, axis=0), atol=2e-3)
+    np.testing.assert_allclose(primitive.durations_s(drawn), times[0, -1] / 60.0, rtol=1e-9)
+    assert [warning.code for warning in trained.warnings] == ["no-variation"]
+
+
+def test_every_sampled_quaternion_has_unit_length():
+    primitive = train_primitive(walks(), QUICK).primitive
+    poses = primitive.poses(primitive.sample(50, 2))
+    lengths = np.linalg.norm(poses[..., 3:].reshape(*poses.shape[:2], -1, 4), axis=-1)
+    np.testing.assert_allclose(lengths, 1.0, atol=1e-12)
+    for motion in primitive.motions(primitive.sample(3, 2)):
+        np.testing.assert_allclose(np.linalg.norm(motion.rotations, axis=2), 1.0, atol=1e-12)
+
+
+def test_whatever_is_drawn_time_runs_forward():
+    primitive = train_primitive(bending_chains(), QUICK).primitive
+    extreme = 6.0 * primitive.mixture.sample(200, 0)
+    assert (np.diff(primitive.time_functions(extreme), axis=1) > 0.0).all()
+
+
+def test_samples_last_no_longer_or_shorter_than_the_examples_by_more_than_a_fifth():
+    aligned = bending_chains(30)
+    primitive = train_primitive(aligned, QUICK).primitive
+    durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
+    free = dataclasses.replace(primitive, duration_range_s=None)
+    drawn = primitive.durations_s(primitive.sample(2000, 3))
+    assert durations.min() * 0.8 <= drawn.min()
+    assert drawn.max() <= durations.max() * 1.2
+    assert free.durations_s(free.sample(2000, 3)).max() > durations.max() * 1.2
+    np.testing.assert_array_equal(primitive.sample(20, 3), primitive.sample(2000, 3)[:20])
+
+
+def test_motions_last_as_long_as_their_latent_vectors_say():
+    primitive = train_primitive(walks(), QUICK).primitive
+    latents = primitive.sample(6, 0)
+    for motion, seconds in zip(primitive.motions(latents), primitive.durations_s(latents), strict=True):
+        assert (motion.frame_count - 1) / primitive.frame_rate_hz == pytest.approx(seconds, abs=0.5 / 60.0)
+
+
+def test_a_mixture_of_a_known_latent_space_is_recovered():
+    """Two kinds of motion in a space of three functions."""
+    random = np.random.default_rng(0)
+    skeleton, basis, examples = chain(), SplineBasis.clamped(40, 8), 120
+    modes = np.zeros((3, 8, 19))
+    modes[0, :, 0], modes[1, :, 1], modes[2, :, 2] = random.standard_normal((3, 8))
+    kind = random.random(examples) < 0.5
+    hidden = random.standard_normal((examples, 3)) * (0.3, 0.2, 0.1) + np.where(kind, 1.0, -1.0)[:, None]
+    rest = np.concatenate((np.zeros(3), np.tile([1.0, 0.0, 0.0, 0.0], 4)))
+    poses = basis.at_frames @ (rest + np.tensordot(hidden, modes, axes=1))
+    trained = train_primitive(aligned_set(skeleton, poses), ModelOptions(spatial_share=0.9999))
+    primitive = trained.primitive
+    assert (primitive.spatial.count, primitive.temporal.count) == (3, 0)
+    mixture = primitive.mixture
+    assert len(mixture.weights) == 2
+    drawn = primitive.sample(50, 1)
+    expected = np.log(sum(
+        weight * multivariate_normal(mean, covariance).pdf(drawn)
+        for weight, mean, covariance in zip(mixture.weights, mixture.means, mixture.covariances, strict=True)
+    ))  # fmt: skip
+    np.testing.assert_allclose(primitive.log_density(drawn), expected, rtol=1e-9)
+
+
+def test_signs_of_quaternions_do_not_matter():
+    aligned = walks()
+    flips = np.where(np.random.default_rng(0).random((16, 1, aligned.skeleton.joint_count)) < 0.5, -1.0, 1.0)
+    poses = aligned.poses
+    poses[..., 3:] *= np.repeat(flips, 4, axis=2)
+    poses[0] = aligned.poses[0]
+    turned = aligned_set(aligned.skeleton, poses, aligned.time_functions)
+    one, other = train_primitive(aligned, QUICK).primitive, train_primitive(turned, QUICK).primitive
+    np.testing.assert_allclose(one.spatial.mean, other.spatial.mean, atol=1e-12)
+    np.testing.assert_allclose(one.spatial.variances, other.spatial.variances, rtol=1e-9)
+
+
+@pytest.mark.parametrize("scaling", SCALINGS)
+def test_training_gives_the_same_bytes_every_time_and_on_any_number_of_threads(scaling):
+    aligned, options = walks(12, 30), ModelOptions(scaling=scaling)
+    first = as_bytes(train_primitive(aligned, options, seed=3))
+    assert as_bytes(train_primitive(aligned, options, seed=3)) == first
+    assert as_bytes(train_primitive(aligned, options, seed=3, threads=2)) == first
+
+
+# -- the report --------------------------------------------------------------------------------------------------------
+
+
+def test_what_a_left_out_example_loses_is_what_a_model_without_it_loses():
+    aligned = bending_chains(8)
+    options = dataclasses.replace(QUICK, spatial_share=1.0)
+    fitted = fit_examples(aligned, options)
+    found = reconstruction_errors(aligned.skeleton, fitted.spatial, fitted.poses, 5)
+    basis = fitted.spatial.functions.basis
+    frames = comparison_frames(basis)
+    coefficients = basis.fit(fitted.poses)
+    for left_out in range(8):
+        others = np.delete(coefficients, left_out, axis=0)
+        for count in range(6):
+            functions = find_components(basis, others, fitted.weights, Keep(count=count)).functions
+            made = functions.coefficients(functions.scores(coefficients[left_out][None]))[0]
+            reached = forward_kinematics(aligned.skeleton, unit_poses(basis.at_frames @ made)[frames])
+            wanted = forward_kinematics(aligned.skeleton, fitted.poses[left_out, frames])
+            error = 100.0 * np.linalg.norm(reached - wanted, axis=2).mean()
+            assert found.left_out_each_cm[left_out, count] == pytest.approx(error, abs=1e-6)
+    assert found.left_out_cm == pytest.approx(found.left_out_each_cm.mean(axis=0))
+
+
+def test_more_components_lose_less_and_unseen_examples_lose_more():
+    report = train_primitive(walks(24), ModelOptions(scaling="sfpca")).report
+    errors = report.reconstruction
+    assert (np.diff(errors.training_cm) < 0.05).all()
+    assert (errors.left_out_cm >= errors.training_cm - 1e-9).all()
+    assert errors.training_cm[-1] < 0.2 * errors.training_cm[0]
+    assert report.spatial_energy[-1] == pytest.approx(1.0)
+
+
+def test_the_gradient_of_distances_of_joints_is_right():
+    random = np.random.default_rng(3)
+    skeleton = walks(1).skeleton
+    poses = walks(1).poses[0, :3] + 0.2 * random.standard_normal((3, 3 + 4 * skeleton.joint_count))
+    targets = forward_kinematics(skeleton, unit_poses(poses)) + 0.1 * random.standard_normal(
+        (3, skeleton.joint_count, 3)
+    )
+
+    def error(at):
+        gradient = np.empty_like(at)
+        arguments = (at, skeleton.parents, skeleton.offsets, targets, gradient)
+        return reconstruction_kernels.squared_error_gradient(*arguments), gradient
+
+    total, gradient = error(poses)
+    assert total == pytest.approx(((forward_kinematics(skeleton, unit_poses(poses)) - targets) ** 2).sum())
+    for column in range(0, poses.shape[1], 5):
+        change = np.zeros_like(poses)
+        change[1, column] = 1e-6
+        slope = (error(poses + change)[0] - error(poses - change)[0]) / 2e-6
+        assert gradient[1, column] == pytest.approx(slope, rel=1e-5, abs=1e-6)
+
+
+def test_an_example_unlike_the_others_is_named():
+    aligned = bending_chains(30)
+    poses = aligned.poses
+    poses[7, :, 0] += np.linspace(0.0, 3.0, 30)
+    trained = train_primitive(aligned_set(aligned.skeleton, poses, aligned.time_functions))
+    assert [one.name for one in trained.report.examples if one.outlier] == ["clip 7"]
+    (told,) = [warning for warning in trained.warnings if warning.code == "outliers"]
+    assert "clip 7" in told.message
+
+
+def test_the_report_tells_of_feet_durations_and_likelihoods():
+    aligned = walks(24)
+    trained = train_primitive(aligned, seed=1)
+    report = trained.report
+    assert report.training_feet.below_floor_share == 0.0
+    assert 0.0 < report.sample_feet.slide_m_s < 1.0
+    assert report.training_feet.slide_m_s < report.sample_feet.slide_m_s
+    durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
+    assert report.training_durations.most_s == pytest.approx(durations.max())
+    assert report.held_out_log_likelihood < report.log_likelihood
+    assert np.mean([one.log_likelihood for one in report.examples]) == pytest.approx(report.log_likelihood)
+    assert report.candidates[0].components == 1
+    assert report.time_error_frames < 1.0
+    assert trained.primitive.keyframes == {"contact": 20}
+    assert verdict_of(trained).startswith("24 examples in ")
+    assert headline_of(trained)["examples"] == 24
+
+
+def test_feet_below_the_floor_are_told():
+    aligned = walks(16)
+    poses = aligned.poses
+    poses[..., 1] -= 0.1
+    trained = train_primitive(aligned_set(aligned.skeleton, poses, aligned.time_functions))
+    assert trained.report.sample_feet.below_floor_share > 0.9
+    assert "feet-below-floor" in [warning.code for warning in trained.warnings]
+
+
+def test_few_examples_are_a_warning():
+    codes = [warning.code for warning in train_primitive(walks(5)).warnings]
+    assert "too-few-examples" in codes
+
+
+def test_a_skeleton_without_feet_has_no_feet_to_report():
+    report = train_primitive(bending_chains()).report
+    assert report.training_feet is None
+    assert report.sample_feet is None
+
+
+def test_examples_of_a_set_without_its_reference_can_be_trained_on():
+    aligned = dataclasses.replace(bending_chains(), reference="gone@1")
+    assert train_primitive(aligned, QUICK).primitive.dimensions > 0
+
+
+# -- what is refused ---------------------------------------------------------------------------------------------------
+
+
+def changed(aligned, index, **members):
+    clips = list(aligned.clips)
+    clips[index] = dataclasses.replace(clips[index], **members)
+    return dataclasses.replace(aligned, clips=tuple(clips))
+
+
+def test_examples_that_make_no_model_are_refused_by_name():
+    aligned = bending_chains(4)
+    odd: AlignedClip = aligned.clips[2]
+    holes = odd.motion._replace(root_translations=np.full((30, 3), np.nan))
+    loose = odd.motion._replace(translations=np.zeros((30, 1, 3)), translated_joints=(1,))
+    back = odd.time_function.copy()
+    back[5] = back[6]
+    for members, told in (
+        ({"motion": holes}, "not finite"),
+        ({"motion": loose}, "bone_1 moves against its parent"),
+        ({"motion": odd.motion.at_frames(np.arange(20))}, "20 frames"),
+        ({"time_function": back}, "does not rise"),
+    ):
+        with pytest.raises(MotionError, match=f"clip 2: .*{told}"):
+            train_primitive(changed(aligned, 2, **members))
+    with pytest.raises(MotionError, match="at least 5"):
+        train_primitive(aligned_set(chain(), aligned.poses[:, :4]))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("scaling", "unit"),
+        ("spatial_share", 1.5),
+        ("temporal_coefficients", 3),
+        ("folds", -1),
+        ("temporal_weight", np.inf),
+    ],
+)
+def test_options_out_of_range_are_refused_by_name(name, value):
+    with pytest.raises(MotionError, match=name):
+        ModelOptions(**{name: value})
