@@ -261,12 +261,13 @@ def download(
 
 
 def _clips_at(marey: Marey, address: Address) -> tuple[list[ItemHandle], str]:
-    """What an address means to a download, and the folder that paths are told from: a clip, a folder, or a skeleton."""
+    """What an address means to a download, and the folder that paths are told from: a clip, a folder, or another item."""
     from marey_schemas.kinds import Kind
 
     clip = find_item(marey, address, [Kind.CLIP])
     below = [] if clip else list(marey.project(address.project).clips.list(collection=address.path))
-    single = clip or (None if below else find_item(marey, address, [Kind.SKELETON]))
+    others = [Kind.SKELETON, Kind.MODEL, Kind.GRAPH, Kind.ANNOTATION]
+    single = clip or (None if below else find_item(marey, address, others))
     if single is not None:
         return [single], single.item.collection
     if not below:
