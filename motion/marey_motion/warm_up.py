@@ -75,6 +75,7 @@ def compile_kernels() -> None:
     _edit(clip)
     _align(clip)
     _measure(clip)
+    _model(clip)
     _search(clip)
 
 
@@ -148,6 +149,22 @@ def _measure(clip: Clip) -> None:
     online = OnlineCoverage(clip.frame_rate_hz)
     online.add_frames(MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton)), clip)
     online.end_take()
+
+
+def _model(clip: Clip) -> None:
+    """Find what two motions have in common, and how well that rebuilds them."""
+    from marey_motion.modelling.fpca import Keep, find_components
+    from marey_motion.modelling.reconstruction import reconstruction_errors
+    from marey_motion.modelling.scaled_fpca import optimised_weights
+    from marey_motion.modelling.splines import SplineBasis
+    from marey_motion.motion import Motion
+
+    poses = np.stack([Motion.of(clip).poses, Motion.of(clip).poses])
+    poses[1, :, :3] *= 1.1
+    basis = SplineBasis.clamped(poses.shape[1], 7)
+    coefficients = basis.fit(poses)
+    weights, keep = optimised_weights(clip.skeleton, basis, coefficients, (np.ones(poses.shape[2]),), Keep())
+    reconstruction_errors(clip.skeleton, find_components(basis, coefficients, weights, keep), poses, 1)
 
 
 def _search(clip: Clip) -> None:

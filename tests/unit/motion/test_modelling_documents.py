@@ -64,7 +64,6 @@ def test_a_model_without_components_travels_too():
 def test_joints_may_stand_in_another_order():
     model = train_primitive(bending_chains()).primitive
     tree = primitive_to_tree(model, SKELETON)
-    order = [0, 1, 2, 3]
     branched = Skeleton(
         ("bone_0", "bone_2", "bone_1", "bone_3"), np.array([-1, 0, 0, 0]), chain().offsets, chain().rest_rotations
     )
