@@ -17,6 +17,8 @@ from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, mapping_to_document, skeleton_to_document
 from marey_motion.errors import FormatError, MappingError
 from marey_motion.formats import pair_companions, read_motion
+from marey_motion.formats.predecessor_documents import pair_trees, read_document
+from marey_motion.formats.predecessor_graph import PredecessorGraph
 from marey_motion.rigs import JointAxes, JointMapping, guess_axes, map_joints
 from marey_motion.skeleton import Skeleton
 from marey_motion.source import ImportedMotion, ImportOptions
@@ -80,8 +82,28 @@ class FileDigests:
 
 
 @dataclass(frozen=True)
+class ModelledDocuments:
+    """What a file of the predecessor says that is no motion: a model, with a tree over its samples; or a graph.
+
+    Parameters
+    ----------
+    name : what it is called
+    model : part `model`, of which the skeleton may be called `SKELETON_OUTPUT`
+    tree : part `tree` without the digest of its model
+    """
+
+    name: str
+    model: Tree | None = None
+    tree: Tree | None = None
+    graph: PredecessorGraph | None = None
+
+
+@dataclass(frozen=True)
 class ImportedDocuments:
-    """The documents of one file: a skeleton, and a clip unless it holds none. A clip may use a skeleton given to it."""
+    """The documents of one file: a skeleton, and a clip or a model unless it holds none.
+
+    Clips and models may use a skeleton that was given.
+    """
 
     skeleton_name: str
     hierarchy: Tree | None
@@ -89,6 +111,7 @@ class ImportedDocuments:
     motion: Tree | None
     info: Tree | None
     checks: tuple[Tree, ...]
+    modelled: ModelledDocuments | None = None
 
 
 def import_options(given: Mapping[str, Any]) -> ImportOptions:
@@ -102,7 +125,8 @@ def import_options(given: Mapping[str, Any]) -> ImportOptions:
 def plan_imports(names: Sequence[str]) -> list[PlannedFile]:
     """What becomes of each file of a batch, in the order given. Folders in names become folders below the target."""
     companions = {pairing.motion: pairing for pairing in pair_companions(names)}
-    needed = {pairing.skeleton for pairing in companions.values() if pairing.skeleton is not None}
+    trees = pair_trees(names)
+    needed = {*trees.values(), *(one.skeleton for one in companions.values() if one.skeleton is not None)}
     taken: set[tuple[str, str]] = set()
     seen: set[str] = set()
     planned = []
@@ -115,8 +139,8 @@ def plan_imports(names: Sequence[str]) -> list[PlannedFile]:
             one = replace(one, role="companion")
         elif one.role == "motion" and pairing is not None and pairing.skeleton is None:
             one = replace(one, role="refused", code="asf-missing", reason=pairing.reason or "")
-        elif one.role == "motion" and pairing is not None:
-            one = replace(one, companion=pairing.skeleton)
+        elif one.role == "motion" and (pairing is not None or name in trees):
+            one = replace(one, companion=pairing.skeleton if pairing is not None else trees[name])
         if one.role == "motion":
             taken.add((one.folder, one.item_name))
         seen.add(name)
@@ -147,6 +171,11 @@ def import_file(
     ------
     MotionError    with code, file, line and joint where they are known
     """
+    subject = read_document(bytes(data), planned.name)
+    if subject is not None:
+        from marey_motion.importing_models import import_modelled
+
+        return import_modelled(planned, *subject, request, None if companion is None else bytes(companion))
     imported = read_motion(
         data,
         planned.name,
@@ -159,15 +188,15 @@ def import_file(
     if request.skeleton is not None and imported.clip is not None:
         clip = _on_skeleton(imported.clip, request.skeleton, planned.name)
         motion = clip_to_document(clip, dict(request.skeleton_ref or {}))  # type: ignore[arg-type]
-        return ImportedDocuments("", None, None, _tree(motion), info, checks)
+        return ImportedDocuments("", None, None, as_tree(motion), info, checks)
     mapping, axes = _anatomy(imported)
     motion_tree = None
     if imported.clip is not None:
-        motion_tree = _tree(clip_to_document(imported.clip, {"output": SKELETON_OUTPUT}))  # type: ignore[arg-type]
+        motion_tree = as_tree(clip_to_document(imported.clip, {"output": SKELETON_OUTPUT}))  # type: ignore[arg-type]
     return ImportedDocuments(
         mapping.rig or "skeleton",
-        _tree(skeleton_to_document(imported.skeleton)),
-        _tree(mapping_to_document(mapping, axes)),
+        as_tree(skeleton_to_document(imported.skeleton)),
+        as_tree(mapping_to_document(mapping, axes)),
         motion_tree,
         info,
         checks,
@@ -175,15 +204,20 @@ def import_file(
 
 
 def _anatomy(imported: ImportedMotion) -> tuple[JointMapping, dict[str, JointAxes]]:
+    return anatomy_of(imported.skeleton, imported.clip)
+
+
+def anatomy_of(skeleton: Skeleton, clip: Clip | None) -> tuple[JointMapping, dict[str, JointAxes]]:
     """Mapping and axes; without axes, and with a note, where too little of a body is recognised to tell them."""
-    mapping = map_joints(imported.skeleton)
+    mapping = map_joints(skeleton)
     try:
-        return mapping, guess_axes(imported.skeleton, mapping, imported.clip)
+        return mapping, guess_axes(skeleton, mapping, clip)
     except MappingError as error:
         return replace(mapping, notes=(*mapping.notes, f"no axes: {error.message}")), {}
 
 
-def _tree(document: Any) -> Tree:
+def as_tree(document: Any) -> Tree:
+    """The document as plain values and arrays."""
     tree: Tree = document.model_dump(by_alias=True, exclude_none=True)
     return tree
 

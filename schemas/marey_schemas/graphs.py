@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, StringConstraints, model_validator
 
 from marey_schemas.base import Request
-from marey_schemas.names import Digest
+from marey_schemas.originals import StoredOriginal
 from marey_schemas.references import OutputRef, RevisionRef
 
 MOST_PRIMITIVES = 10_000
@@ -40,13 +40,6 @@ class GraphAction(Request):
     """An action, such as walk, made of primitives, such as leftStance."""
 
     primitives: dict[NodeName, GraphPrimitive] = Field(min_length=1, max_length=MOST_PRIMITIVES)
-
-
-class StoredOriginal(Request):
-    """The file that something was imported from, and the digest of what it became then."""
-
-    blob: Digest
-    content: Digest
 
 
 class ModelGraph(Request):

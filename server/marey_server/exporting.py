@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from marey_schemas import codecs
-from marey_schemas.documents import Annotation, Motion, SkeletonHierarchy
+from marey_schemas.documents import Motion, SkeletonHierarchy
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_server.errors import Invalid, NotFound
+from marey_server.predecessor_exports import PredecessorOptions, unchanged_original, write_predecessor
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
 
@@ -20,16 +21,8 @@ ExportFormat = Literal["original", "bvh", "npz", "predecessor", "json"]
 
 
 @dataclass(frozen=True, slots=True)
-class ExportOptions:
-    """How a format that leaves things open is written: annotations of the predecessor."""
-
-    end_index: Literal["inclusive", "exclusive"] = "inclusive"
-    form: Literal["labels", "list", "frames"] = "labels"
-
-
-@dataclass(frozen=True, slots=True)
 class ExportSource:
-    """An item's documents at one revision; for those with motion also the hierarchy of their skeleton."""
+    """An item's documents at one revision; for motions and models also the hierarchy of their skeleton."""
 
     item: Item
     revision: int
@@ -48,7 +41,7 @@ class ExportedFile:
 
 @dataclass(frozen=True, slots=True)
 class OriginalFile:
-    """The file that a clip was imported from, as it came."""
+    """The file that an item was imported from, as it came."""
 
     name: str
     digest: str
@@ -61,14 +54,35 @@ def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revisio
     held = items.read_revision(tx, project, kind, item_id, number).parts
     parts = {part: items.read_part(tx, project, kind, item_id, part, revision=number).tree for part in sorted(held)}
     hierarchy = None
-    if kind in WITH_MOTION:
-        ref = parts["motion"]["skeleton"]
+    if kind in WITH_MOTION or kind is Kind.MODEL:
+        ref = parts["model" if kind is Kind.MODEL else "motion"]["skeleton"]
         hierarchy = items.read_part(tx, project, Kind.SKELETON, ref["item"], "hierarchy", revision=ref["revision"]).tree
     return ExportSource(found, number, parts, hierarchy)
 
 
+def find_unchanged_original(
+    tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None, options: PredecessorOptions
+) -> OriginalFile | None:
+    """The file that a model, a tree or a graph was imported from, if that still says the same. Raises `NotFound`."""
+    if kind not in (Kind.MODEL, Kind.GRAPH):
+        return None
+    found = items.read_item(tx, project, kind, item_id)
+    number = found.revision if revision is None else revision
+    held = items.read_revision(tx, project, kind, item_id, number).parts
+    wanted = [part for part in held if part in ("model", "graph", options.part)]
+    parts = {
+        part: items.read_part(tx, project, kind, item_id, part, revision=number, arrays="none").tree for part in wanted
+    }
+    original = unchanged_original(kind, parts, options)
+    return None if original is None else OriginalFile(original.name or found.name, original.blob)
+
+
 def find_original(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> OriginalFile:
     """The file that an item was imported from. Raises `NotFound` where it was made otherwise."""
+    if kind in (Kind.MODEL, Kind.GRAPH):
+        unchanged = find_unchanged_original(tx, project, kind, item_id, revision, PredecessorOptions())
+        if unchanged is not None:
+            return unchanged
     if kind is Kind.CLIP:
         info = items.read_part(tx, project, kind, item_id, "info", revision=revision, arrays="none").tree
         source = info.get("source", {})
@@ -78,10 +92,12 @@ def find_original(tx: Transaction, project: str, kind: Kind, item_id: str, revis
     raise NotFound("It was not made from a file; ask for another format, such as bvh.", code="no-original")
 
 
-def write_file(source: ExportSource, file_format: ExportFormat, unit: str, options: ExportOptions) -> ExportedFile:
+def write_file(source: ExportSource, file_format: ExportFormat, unit: str, options: PredecessorOptions) -> ExportedFile:
     """The file of an item. Raises `Invalid` where the format cannot hold it."""
-    if file_format == "predecessor" and source.item.kind is Kind.ANNOTATION:
-        return _write_annotation(source, options)
+    beside = source.item.kind is Kind.PROCESSED and options.part == "alignment"
+    if file_format == "predecessor" and (beside or source.item.kind not in WITH_MOTION):
+        name, data = write_predecessor(source.item.kind, source.item.name, source.parts, source.hierarchy, options)
+        return ExportedFile(name, codecs.JSON, data)
     if file_format == "json":
         return ExportedFile(f"{source.item.name}.json", codecs.JSON, codecs.encode_tree(_as_tree(source), codecs.JSON))
     if source.item.kind not in WITH_MOTION or source.hierarchy is None:
@@ -97,17 +113,6 @@ def write_file(source: ExportSource, file_format: ExportFormat, unit: str, optio
     except MotionError as error:
         raise Invalid(str(error), code="cannot-be-exported") from error
     return ExportedFile(source.item.name + written.suffix, written.media_type, written.data)
-
-
-def _write_annotation(source: ExportSource, options: ExportOptions) -> ExportedFile:
-    from marey_motion.documents import layer_from_document
-    from marey_motion.formats.predecessor_annotation import write_predecessor_annotation
-
-    annotation = Annotation.model_validate(source.parts["annotation"])
-    ends = [segment.end for segment in annotation.segments] + [one.frame + 1 for one in annotation.keyframes]
-    layer = layer_from_document(annotation, max(ends, default=1))
-    data = write_predecessor_annotation(layer, form=options.form, end_index=options.end_index)
-    return ExportedFile(f"{source.item.name}_sections.json", codecs.JSON, data)
 
 
 def _as_tree(source: ExportSource) -> dict[str, Any]:

@@ -261,7 +261,7 @@ def download(
 
 
 def _clips_at(marey: Marey, address: Address) -> tuple[list[ItemHandle], str]:
-    """What an address means to a download, and the folder that paths are told from: a clip, a folder, or another item."""
+    """What an address means to a download, and the folder that paths are told from: a clip, a folder, another item."""
     from marey_schemas.kinds import Kind
 
     clip = find_item(marey, address, [Kind.CLIP])

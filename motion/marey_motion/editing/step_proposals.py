@@ -154,7 +154,7 @@ class _Travel(NamedTuple):
     def of(cls, clip: Clip, body: MatchingBody) -> _Travel:
         positions = kinematics.global_positions(clip).astype(np.float64)
         directions = kinematics.forward_directions(positions, body.lefts, body.rights)
-        ground = kinematics.ground_projection(positions)
+        ground = np.asarray(kinematics.ground_projection(positions), dtype=np.float64)
         heading = kinematics.headings(directions)
         return cls(ground[:, body.hips], ground[:, list(body.feet)], heading, clip.frame_rate_hz)
 

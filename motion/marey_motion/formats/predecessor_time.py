@@ -88,9 +88,9 @@ def components_of(basis: SplineBasis, mean: Floats, directions: Floats, variance
     How much of the variance of the examples was left out is not known: the energy is that of what is kept.
     """
     flat = directions.reshape(len(directions), mean.size)
-    projections = np.linalg.pinv(flat).T.reshape(directions.shape) if len(flat) else directions
+    projections = np.asarray(np.linalg.pinv(flat).T.reshape(directions.shape) if len(flat) else directions)
     total = float(variances.sum())
-    energy = np.cumsum(variances) / total if total > 0 else np.ones(len(variances))
+    energy = np.asarray(np.cumsum(variances) / total if total > 0 else np.ones(len(variances)))
     return FunctionalComponents(basis, mean, directions, projections, variances, energy)
 
 

@@ -8,13 +8,14 @@ from pydantic import Field
 
 from marey_schemas.base import Request
 from marey_server import exporting
-from marey_server.exporting import ExportFormat, ExportOptions
+from marey_server.exporting import ExportFormat
 from marey_server.handlers.declarations import Access, Bytes, reads
 from marey_server.handlers.items import kind_of
 from marey_server.handlers.queries import MAX_INTEGER
 from marey_server.handlers.reply import Rendered, Reply
 from marey_server.handlers.resource import Resource
 from marey_server.handlers.streaming import BlobSender, attachment
+from marey_server.predecessor_exports import PredecessorOptions
 
 
 class ExportQuery(Request):
@@ -27,6 +28,14 @@ class ExportQuery(Request):
     )
     form: Literal["labels", "list", "frames"] = Field(
         "labels", description="Of an annotation of the predecessor: sections by label, a list, or frames by label."
+    )
+    part: Literal["model", "tree", "alignment"] | None = Field(
+        None,
+        description="For the predecessor: the tree of a model, or what is kept beside an aligned clip: its time "
+        "function and sections. Absent: the model, or the clip.",
+    )
+    layout: Literal["2", "3"] | None = Field(
+        None, description="Of a model of the predecessor; absent: as it was imported, else 3."
     )
     revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Absent: the newest.")
 
@@ -52,13 +61,22 @@ class Export(BlobSender):
         headers=("Range", "If-Range"),
     )
     async def get(self, project: str, kind: str, item: str, query: ExportQuery) -> Rendered | Reply | None:
-        """An item as a file: clips and aligned clips as bvh, npz, predecessor, json or the original; others as json."""
+        """An item as a file, or the original where it was imported from one.
+
+        Clips and aligned clips are bvh, npz, predecessor or json; annotations, models with their trees, and graphs are
+        predecessor or json; others json. What was imported from a file of the predecessor and has not changed since is
+        given back as it came.
+        """
         place = (project, kind_of(kind), item, query.revision)
         if query.format == "original":
             original = await self.look_up(exporting.find_original, *place)
             return await self.send_blob(original.digest, disposition=attachment(original.name))
+        options = PredecessorOptions(query.end_index, query.form, query.part, query.layout)
+        if query.format == "predecessor":
+            unchanged = await self.look_up(exporting.find_unchanged_original, *place, options)
+            if unchanged is not None:
+                return await self.send_blob(unchanged.digest, disposition=attachment(unchanged.name))
         source = await self.look_up(exporting.read_source, *place)
-        options = ExportOptions(query.end_index, query.form)
         file = await self.compute(exporting.write_file, source, query.format, query.unit, options)
         headers = {"Content-Disposition": attachment(file.name), "Cache-Control": "private, no-cache"}
         return Reply(file.data, media_type=file.media_type, headers=headers)

@@ -67,7 +67,10 @@ def run(context: Context, params: AnnotateParams) -> dict[str, Any]:
             empty.append(place)
             continue
         labels.update(segment.label for segment in layer.segments)
-        sources = {"clips": (_input(pin),), **({"rigs": (_input(edited),)} if edited else {})}
+        sources: dict[str, tuple[ItemInput, ...]] = {
+            "clips": (_input(pin),),
+            **({"rigs": (_input(edited),)} if edited else {}),
+        }
         ready.append(_output(pin, layer, layer_name, params, sources))
         if len(ready) == OUTPUTS_PER_STAGE:
             context.stage(ready)

@@ -162,7 +162,7 @@ class _Cutting:
         return ClipInfo.model_validate(stored).model_copy(update={"checks": ()})
 
     def _sources(self, one: _Annotated) -> dict[str, tuple[ItemInput, ...]]:
-        sources = {"annotations": (_input(one.pin),)}
+        sources: dict[str, tuple[ItemInput, ...]] = {"annotations": (_input(one.pin),)}
         if clip := self._clip_pins.get((one.clip.item, one.clip.revision)):
             sources["clips"] = (_input(clip),)
         return sources

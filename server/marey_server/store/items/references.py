@@ -78,6 +78,8 @@ class ReferenceCheck:
             self._require_joints(bodies["model"], "/model")
         elif kind is Kind.ANNOTATION:
             self._require_frames(bodies["annotation"])
+        elif kind is Kind.GRAPH:
+            self._require_models(bodies["graph"])
 
     def _require_joints(self, motion: Tree, pointer: str) -> None:
         hierarchy = self._referred(motion["skeleton"], Kind.SKELETON, "hierarchy", f"{pointer}/skeleton")
@@ -97,6 +99,12 @@ class ReferenceCheck:
         ends += [keyframe["frame"] + 1 for keyframe in annotation.get("keyframes", ())]
         if max(ends, default=0) > frames:
             raise _invalid("/annotation", "beyond-end", f"The clip has {frames} frames; the annotation {max(ends)}.")
+
+    def _require_models(self, graph: Tree) -> None:
+        for action, group in graph["actions"].items():
+            for name, node in group["primitives"].items():
+                pointer = "/".join(("/graph/actions", _escaped(action), "primitives", _escaped(name), "model"))
+                self._referred(node["model"], Kind.MODEL, "model", pointer)
 
     def _referred(self, ref: Tree, kind: Kind, part: str, pointer: str) -> Tree:
         """Body of a part of the revision that `ref` names."""
@@ -127,6 +135,11 @@ class ReferenceCheck:
         )
         body: Tree | None = self._tx.execute(statement).scalar()
         return body
+
+
+def _escaped(name: str) -> str:
+    """A name as a part of a JSON Pointer."""
+    return name.replace("~", "~0").replace("/", "~1")
 
 
 def _invalid(pointer: str, code: str, detail: str) -> Invalid:
