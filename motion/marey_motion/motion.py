@@ -69,6 +69,14 @@ class Motion(NamedTuple):
             translations=self.translations[frames],
         )
 
+    def sliced(self, start: int, stop: int) -> Motion:
+        """The frames [start, stop), in the same memory."""
+        return self._replace(
+            root_translations=self.root_translations[start:stop],
+            rotations=self.rotations[start:stop],
+            translations=self.translations[start:stop],
+        )
+
 
 def _unit_and_continuous(rotations: Floats) -> Floats:
     """Rotations (F, J, 4) of nearly unit length, changed in place: sums of four as one product, which is what costs."""

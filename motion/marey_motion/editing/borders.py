@@ -36,6 +36,8 @@ def smooth_step(places: Floats) -> Floats:
 
 def blended(a: Floats, b: Floats, shares: Floats) -> Floats:
     """Rotations (n, J, 4) from `a` at share 0 of (n,) to `b` at share 1, both of which are taken as they are."""
+    if np.all(shares == 1.0):
+        return b
     result = np.where((shares == 1.0)[:, None, None], b, a)
     between = (shares > 0.0) & (shares < 1.0)
     result[between] = quaternions.slerp(a[between], b[between], shares[between, None])

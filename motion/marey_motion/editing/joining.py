@@ -116,5 +116,5 @@ def _faded_over(first: Motion, second: Motion, overlap: int) -> Motion:
         translations=first.translations[end]
         + share[:, None, None] * (second.translations[start] - first.translations[end]),
     )
-    kept = first.at_frames(np.arange(first.frame_count - overlap))
-    return _in_a_row(_in_a_row(kept, middle), second.at_frames(np.arange(overlap, second.frame_count)))
+    kept = first.sliced(0, first.frame_count - overlap)
+    return _in_a_row(_in_a_row(kept, middle), second.sliced(overlap, second.frame_count))

@@ -58,9 +58,9 @@ def _in_place(motion: Motion, places: Floats, seam: LoopSeam) -> Motion:
 def _closed(motion: Motion, seam: LoopSeam, life: float, velocity_life: float) -> Motion:
     """The difference at the seam, half of it at either end."""
     frames = motion.frame_count
-    following = moved_over(motion.at_frames(np.array([0, 1])), seam)
+    following = moved_over(motion.sliced(0, 2), seam)
     arrival = step_of(motion, frames - 2)
-    going_on = add_offset(motion.at_frames(np.array([frames - 1])), np.array([0]), arrival)
+    going_on = add_offset(motion.sliced(frames - 1, frames), np.array([0]), arrival)
     difference = offset_to(following, 0, going_on, 0).times(0.5)
     velocity = arrival.minus(step_of(following, 0)).times(0.5)
     touched = np.arange(min(frames, int(np.ceil(life))))

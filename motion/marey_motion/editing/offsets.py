@@ -77,7 +77,9 @@ def seam_offset(before: Motion, after: Motion) -> tuple[PoseOffset, PoseOffset]:
     """
     arrival, departure = step_of(before, max(0, before.frame_count - 2)), step_of(after, 0)
     velocity = arrival.minus(departure).times(0.5)
-    going_on = add_offset(before.at_frames(np.array([-1])), np.array([0]), arrival.minus(velocity))
+    going_on = add_offset(
+        before.sliced(before.frame_count - 1, before.frame_count), np.array([0]), arrival.minus(velocity)
+    )
     return offset_to(after, 0, going_on, 0), velocity
 
 

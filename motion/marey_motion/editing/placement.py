@@ -113,7 +113,7 @@ def body_track(take: Take, start: int, stop: int) -> tuple[Floats, Floats]:
 
 def _positions(take: Take, start: int, stop: int) -> Floats:
     first, last = take.frames((start, stop))
-    return take.motion.at_frames(np.arange(first, last)).positions(take.skeleton)
+    return take.motion.sliced(first, last).positions(take.skeleton)
 
 
 def _direction(axis: str) -> Floats:

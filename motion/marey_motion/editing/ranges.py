@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
-import numpy as np
-
 from marey_motion.editing.take import Take
 from marey_motion.errors import EditError
 
@@ -15,7 +13,7 @@ from marey_motion.errors import EditError
 def trim(take: Take, *, start: int = 0, stop: int | None = None) -> Take:
     """Keep the frames [start, stop); without `stop`, up to the end. Raises `EditError` where they are not there."""
     first, last = take.frames((start, stop))
-    return take.moved(take.motion.at_frames(np.arange(first, last)))
+    return take.moved(take.motion.sliced(first, last))
 
 
 def split(take: Take, *, at: Sequence[int]) -> tuple[Take, ...]:
@@ -33,6 +31,6 @@ def split(take: Take, *, at: Sequence[int]) -> tuple[Take, ...]:
                 where="at",
             )
     return tuple(
-        replace(take.moved(take.motion.at_frames(np.arange(start, stop))), pieces=(*take.pieces, number))
+        replace(take.moved(take.motion.sliced(start, stop)), pieces=(*take.pieces, number))
         for number, (start, stop) in enumerate(pairwise(bounds), start=1)
     )

@@ -26,10 +26,11 @@ from marey_motion.editing.placement import face, flip_axes, move_to_origin, rota
 from marey_motion.editing.ranges import split, trim
 from marey_motion.editing.smoothing import smooth
 from marey_motion.editing.symmetry import mirror
-from marey_motion.editing.take import MOST_NUMBERS, EditedBody, Finding, Take, motion_of, settled
+from marey_motion.editing.take import MOST_NUMBERS, EditedBody, Finding, Take, motion_of, require_finite, settled
 from marey_motion.editing.timing import resample, retime
 from marey_motion.editing.turning_joints import rotate_joint
 from marey_motion.errors import EditError, MotionError
+from marey_motion.motion import Motion
 
 Command = Callable[..., Take | tuple[Take, ...]]
 NamedCommand = tuple[str, Mapping[str, Any]]
@@ -137,13 +138,14 @@ def apply_command(take: Take, name: str, parameters: Mapping[str, Any]) -> tuple
     except TypeError as error:
         raise EditError(f"{error}", code="command-invalid") from None
     made = command(take, **parameters)
-    return tuple(map(_checked, made if isinstance(made, tuple) else (made,)))
+    return tuple(_settled(one, take.motion) for one in (made if isinstance(made, tuple) else (made,)))
 
 
-def _checked(take: Take) -> Take:
+def _settled(take: Take, before: Motion) -> Take:
+    """The take with rotations of unit length and of continuous sign; what the command left alone is so already."""
     motion = take.motion
-    for numbers in (motion.root_translations, motion.rotations, motion.translations):
-        finite = np.isfinite(numbers).all(axis=tuple(range(1, numbers.ndim)))
-        if not finite.all():
-            raise EditError(f"frame {int(np.argmin(finite))} gets a number that is not finite", code="edit-not-finite")
-    return take.moved(settled(motion))
+    if motion.root_translations is not before.root_translations:
+        require_finite(motion.root_translations)
+    if motion.translations is not before.translations:
+        require_finite(motion.translations)
+    return take if motion.rotations is before.rotations else take.moved(settled(motion))

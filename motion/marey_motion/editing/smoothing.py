@@ -51,13 +51,15 @@ def smooth(
     """
     motion = take.motion
     span, shares = range_weights(take, frames, border_s)
-    chosen = list(range(take.skeleton.joint_count)) if joints is None else sorted({take.joint(one) for one in joints})
+    every = range(take.skeleton.joint_count)
+    chosen = list(every) if joints is None else sorted({take.joint(one) for one in joints})
+    columns = slice(None) if joints is None else chosen
     weights = _weights(take, method, window_s, order)
     root, rotations, translations = motion.root_translations.copy(), motion.rotations.copy(), motion.translations.copy()
     if root_translation:
         root[span] += shares[:, None] * (_smooth_positions(root, weights) - root)[span]
-    smoothed = _smooth_rotations(take, rotations[:, chosen], weights, chosen)[span]
-    rotations[span, chosen] = blended(rotations[span, chosen], smoothed, shares)
+    smoothed = _smooth_rotations(take, rotations[:, columns], weights, chosen)[span]
+    rotations[span, columns] = blended(rotations[span, columns], smoothed, shares)
     carriers = take.skeleton.path_to_root(take.body.pelvis) if motion.translated_joints else ()
     moved = [root_translation if joint in carriers else joint in chosen for joint in motion.translated_joints]
     steps = _smooth_positions(translations[:, moved], weights) - translations[:, moved]

@@ -171,10 +171,11 @@ def motion_of(clip: Clip) -> Motion:
 def settled(motion: Motion) -> Motion:
     """The motion with rotations of unit length and of continuous sign.
 
-    What is of unit length in single precision stays as it is.
+    What is of unit length in single precision stays as it is. Raises `EditError` for rotations that are not finite.
     """
     rotations = motion.rotations
     squares = np.einsum("fjc,fjc->fj", rotations, rotations)
+    require_finite(squares)
     off = np.abs(squares - 1.0) > UNIT_IN_SINGLE
     turned_over = np.einsum("fjc,fjc->fj", rotations[1:], rotations[:-1]) < 0.0
     if not (off.any() or turned_over.any()):
@@ -183,3 +184,10 @@ def settled(motion: Motion) -> Motion:
     rotations[off] /= np.sqrt(squares[off])[:, None]
     rotations[1:][np.cumsum(turned_over, axis=0) % 2 == 1] *= -1.0
     return motion._replace(rotations=rotations)
+
+
+def require_finite(numbers: Floats) -> None:
+    """Refuse frames (F, ...) with a number that is not finite. Raises `EditError`."""
+    if not np.isfinite(numbers).all():
+        frame = int(np.argmin(np.isfinite(numbers.reshape(len(numbers), -1)).all(axis=1)))
+        raise EditError(f"frame {frame} gets a number that is not finite", code="edit-not-finite")

@@ -1,0 +1,106 @@
+"""Edits of 10,000 frames: each command by itself, and beside what scipy offers for the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation, Slerp
+
+from benchmarks.timing import Row, time_in_turn
+from marey_motion.clip import Clip
+from marey_motion.editing.registry import NamedCommand, edit_clip
+from marey_motion.gait import generate_gait
+
+FRAMES, RATE_HZ = 10_000, 60.0
+MOST_MS = 500
+"""What a person who drags a slider still takes for an answer, for nearly three minutes of motion."""
+
+ARM = ("LeftArm", "LeftForeArm", "LeftHand")
+COMMANDS: tuple[NamedCommand, ...] = (
+    ("trim", {"start": 100}),
+    ("split", {"at": [2500, 5000, 7500]}),
+    ("concatenate", {"source": "run"}),
+    ("resample", {"frame_rate_hz": 45.0}),
+    ("retime", {"speed": 0.9}),
+    ("close_loop", {}),
+    ("translate", {"shift_m": (1.0, 0.0, 0.0)}),
+    ("rotate", {"angle_rad": 0.5}),
+    ("face", {}),
+    ("move_to_origin", {}),
+    ("scale", {"factor": 1.1}),
+    ("flip_axes", {"up": "+z", "forward": "-y"}),
+    ("fix_drift", {"shift_m": (0.3, 0.0, 0.1), "turn_rad": 0.2}),
+    ("move_to_ground", {}),
+    ("find_contacts", {}),
+    ("mirror", {}),
+    ("smooth", {}),
+    ("smooth", {"method": "gaussian"}),
+    ("rotate_joint", {"joint": "LeftArm", "axis": (0.0, 1.0, 0.0), "angle_rad": 0.3, "space": "world"}),
+    ("paste", {"source": "run", "joints": ARM}),
+)
+
+
+def run() -> list[Row]:
+    """Every command as users get it: from a clip in single precision to one, checked before and after."""
+    walk = generate_gait(1.3, 0.1, FRAMES / RATE_HZ, RATE_HZ)
+    run_clip = generate_gait(3.0, -0.2, 20.0, RATE_HZ)
+    rows = [_alone(walk, run_clip, command) for command in COMMANDS]
+    return [*rows, *(_beside(walk, *peer) for peer in _peers(walk))]
+
+
+def _edit(walk: Clip, *commands: NamedCommand, **sources: Clip) -> Clip:
+    return edit_clip(walk, commands, sources=sources)[0].clip
+
+
+def _alone(walk: Clip, run_clip: Clip, command: NamedCommand) -> Row:
+    (ours,) = time_in_turn(lambda: _edit(walk, command, run=run_clip), repeats=5)
+    name, given = command
+    told = f"{name} ({given['method']})" if "method" in given else name
+    return Row(
+        f"edit: {told}",
+        f"{walk.frame_count:,} frames x {walk.skeleton.joint_count} joints",
+        ours.shown(1e3, "ms"),
+        goal=f"≤ {MOST_MS} ms",
+        met=ours.median_s * 1e3 <= MOST_MS,
+    )
+
+
+def _beside(walk: Clip, name: str, peer: str, command: NamedCommand, theirs: Callable[[], Any]) -> Row:
+    ours, other = time_in_turn(lambda: _edit(walk, command), theirs, repeats=5)
+    ratio = other.median_s / ours.median_s
+    return Row(
+        f"edit: {name}",
+        f"{walk.frame_count:,} frames x {walk.skeleton.joint_count} joints",
+        ours.shown(1e3, "ms"),
+        f"{peer} {other.shown(1e3, 'ms')}",
+        ratio,
+    )
+
+
+def _peers(walk: Clip) -> list[tuple[str, str, NamedCommand, Callable[[], Any]]]:
+    """The same by scipy's means, from and to single precision; what scipy has no word for is left out.
+
+    Its filter smooths components: it neither minds where a quaternion changes its sign nor keeps the ends.
+    """
+
+    def slerped() -> list[NDArray[np.float32]]:
+        rotations = walk.rotations.astype(np.float64)
+        places = np.arange(0.0, walk.frame_count - 1, RATE_HZ / 45.0)
+        frames = np.arange(walk.frame_count, dtype=np.float64)
+        joints = (Rotation.from_quat(rotations[:, joint], scalar_first=True) for joint in range(rotations.shape[1]))
+        return [Slerp(frames, one)(places).as_quat(scalar_first=True).astype(np.float32) for one in joints]
+
+    def filtered() -> NDArray[np.float32]:
+        means = savgol_filter(walk.poses.astype(np.float64), 15, 3, axis=0)
+        rotations = means[:, 3:].reshape(walk.frame_count, -1, 4)
+        rotations /= np.linalg.norm(rotations, axis=-1, keepdims=True)
+        return means.astype(np.float32)
+
+    return [
+        ("resample, cubic beside slerp", "scipy Slerp", ("resample", {"frame_rate_hz": 45.0}), slerped),
+        ("smooth", "scipy savgol_filter, normalised", ("smooth", {}), filtered),
+    ]
