@@ -118,7 +118,7 @@ class Objective:
             self.rows, points, turns, times, point_slopes, turn_slopes, time_slopes, residuals, slopes
         )
         scaled, steep = residuals * self._scales[:, None], slopes * self._scales[:, None, None]
-        return Linearised(points, point_slopes, scaled.ravel(), steep.reshape(-1, width))
+        return Linearised(points, point_slopes, scaled.ravel(), steep.reshape(scaled.size, width))
 
     @cached_property
     def _scales(self) -> Floats:

@@ -22,7 +22,8 @@ Floats = NDArray[np.float64]
 
 MOST_ITERATIONS = 50
 FIRST_DAMPING = 1e-3
-MOST_DAMPING = 1e12
+LEAST_DAMPING, MOST_DAMPING = 1e-12, 1e12
+EASING, TIGHTENING = 10.0, 4.0
 LEAST_GAIN = 1e-12
 
 
@@ -104,13 +105,13 @@ def refine(problem: Problem, start: Floats, options: RefineOptions = DEFAULT_REF
         if new_cost < cost:
             gained = cost - new_cost
             here, (residuals, slopes), cost = there, tried, new_cost
-            damping = max(damping / 5.0, 1e-12)
+            damping = max(damping / EASING, LEAST_DAMPING)
             if gained <= LEAST_GAIN * max(cost, 1.0):
                 break
         else:
             if _is_still(step, here):
                 break
-            damping *= 4.0
+            damping *= TIGHTENING
     return Refined(here, cost, start_cost, iterations, evaluations)
 
 

@@ -19,7 +19,7 @@ from marey_motion.errors import MotionError
 from marey_motion.modelling import slope_kernels
 from marey_motion.modelling.constraints import Constraint, ConstraintError
 from marey_motion.modelling.mixture import LatentMixture
-from marey_motion.modelling.objective import Linearised, Objective, as_row, build_objective
+from marey_motion.modelling.objective import AT_ORIGIN, Linearised, Objective, as_row, build_objective
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.tracking import Chains, Tracked, facing, standing, track_points
 
@@ -127,7 +127,9 @@ class SeveralSteps:
     transitions: TransitionOptions
 
     @classmethod
-    def of(cls, steps: Sequence[Step], start: Placement, transitions: TransitionOptions) -> SeveralSteps:
+    def of(
+        cls, steps: Sequence[Step], start: Placement = AT_ORIGIN, transitions: TransitionOptions = DEFAULT_TRANSITIONS
+    ) -> SeveralSteps:
         """Prepare steps. Raises `ConstraintError`, naming step and constraint."""
         if not 1 <= len(steps) <= MOST_STEPS:
             raise ConstraintError(f"{len(steps)} steps are not within 1 to {MOST_STEPS}", where="steps")
@@ -157,7 +159,7 @@ class SeveralSteps:
         """Errors of all constraints and all jumps, in tolerances, and their derivatives."""
         walked = list(self._walk(stacked, len(self.links)))
         residuals = [part for one in walked for part in (one.found.residuals, self._scale * one.jumps.ravel())]
-        jumps = [self._scale * one.jump_slopes.reshape(-1, len(stacked)) for one in walked]
+        jumps = [self._scale * one.jump_slopes.reshape(one.jumps.size, len(stacked)) for one in walked]
         slopes = [part for one, jump in zip(walked, jumps, strict=True) for part in (one.found.slopes, jump)]
         return np.concatenate(residuals), np.concatenate(slopes)
 

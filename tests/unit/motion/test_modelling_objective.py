@@ -1,0 +1,225 @@
+"""Constraints and Equation 1, against forward kinematics of whole motions and formulas written out."""
+
+import numpy as np
+import pytest
+
+from marey_motion import quaternions
+from marey_motion.alignment.aligned import Placement
+from marey_motion.errors import MotionError
+from marey_motion.kinematics import as_global_rotations, forward_directions, forward_kinematics, headings
+from marey_motion.modelling.constraints import (
+    ConstraintError,
+    JointOrientation,
+    JointPosition,
+    KeyframeTime,
+    LookDirection,
+    RootHeading,
+    RootPosition,
+)
+from marey_motion.modelling.objective import MOST_CONSTRAINTS, build_objective
+from marey_motion.modelling.steps import SeveralSteps, Step
+from search_primitives import FRAMES, sliding, standard_joints, walking
+
+PLACEMENT = Placement(0.7, 0.4, -0.3)
+EVERY_KIND = (
+    JointPosition("left_wrist", "middle", (0.2, None, 0.3), 0.02, 2.0),
+    JointPosition("head", 4.25, (None, 1.5, None)),
+    JointOrientation("head", 3.5, (1.0, 0.1, 0.2, 0.3)),
+    LookDirection("head", "end", direction=(0.1, -0.3, 1.0)),
+    LookDirection("right_elbow", 7.75, point_m=(0.0, 1.0, 3.0), axis=(1.0, 0.5, 0.0)),
+    RootPosition("end", (0.1, 1.0)),
+    RootPosition("start", (None, 0.2), 0.05),
+    RootHeading("end", 2.9),
+    KeyframeTime(10.5, 0.4),
+    KeyframeTime("end", 1.1, 0.01, 3.0),
+)
+
+
+def world(primitive, latents, frame):
+    """Positions (n, J, 3) and rotations (n, J, 4) at a canonical frame, in the world."""
+    poses = primitive.poses(latents, [frame])[:, 0]
+    turn = quaternions.from_axis_angle((0.0, 1.0, 0.0), PLACEMENT.heading_rad)
+    positions = quaternions.rotate_vectors(turn, forward_kinematics(primitive.skeleton, poses))
+    rotations = as_global_rotations(primitive.skeleton, poses[:, 3:].reshape(len(poses), -1, 4))
+    origin = np.array((PLACEMENT.x, 0.0, PLACEMENT.z))
+    return positions + origin, quaternions.multiply(turn, rotations)
+
+
+def angle_between(a, b):
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
+
+
+def frame_of(primitive, at):
+    moments = {"start": 0, "end": FRAMES - 1, **primitive.keyframes}
+    return float(moments.get(at, at))
+
+
+def plain_error(primitive, joints, latents, constraint):
+    """The error of one constraint, from whole poses."""
+    frame = frame_of(primitive, constraint.at)
+    positions, rotations = world(primitive, latents, frame)
+    match constraint:
+        case JointPosition():
+            target = np.array([np.nan if value is None else value for value in constraint.target_m])
+            return np.sqrt(np.nansum((positions[:, joints[constraint.joint]] - target) ** 2, axis=1))
+        case RootPosition():
+            target = np.array([np.nan if value is None else value for value in constraint.target_m])
+            return np.sqrt(np.nansum((positions[:, joints["pelvis"]][:, [0, 2]] - target) ** 2, axis=1))
+        case JointOrientation():
+            wanted = quaternions.normalise(constraint.rotation)
+            missing = quaternions.multiply(quaternions.conjugate(wanted), rotations[:, joints[constraint.joint]])
+            return 2 * np.arccos(np.clip(np.abs(missing[:, 0]), 0, 1))
+        case LookDirection():
+            axis = np.asarray(constraint.axis) / np.linalg.norm(constraint.axis)
+            pointing = quaternions.rotate_vectors(rotations[:, joints[constraint.joint]], axis)
+            wanted = constraint.direction
+            if wanted is None:
+                wanted = np.asarray(constraint.point_m) - positions[:, joints[constraint.joint]]
+            return angle_between(pointing, np.broadcast_to(wanted, pointing.shape))
+        case RootHeading():
+            lefts, rights = ([joints[f"{side}_{part}"] for part in ("hip", "shoulder")] for side in ("left", "right"))
+            found = [headings(forward_directions(one[None], lefts, rights))[0] for one in positions]
+            return np.abs((np.array(found) - constraint.heading_rad + np.pi) % (2 * np.pi) - np.pi)
+        case KeyframeTime():
+            passed = primitive.time_functions(latents)
+            reached = [np.interp(frame, np.arange(FRAMES), one) for one in passed]
+            return np.abs(np.array(reached) / primitive.frame_rate_hz - constraint.seconds)
+
+
+def test_errors_are_those_of_the_whole_motions():
+    primitive, _ = walking()
+    latents = primitive.sample(50, 1)
+    objective = build_objective(primitive, EVERY_KIND, standard_joints(), placement=PLACEMENT)
+    found = objective.errors(latents)
+    for column, constraint in zip(found.T, EVERY_KIND, strict=True):
+        np.testing.assert_allclose(
+            column, plain_error(primitive, standard_joints(), latents, constraint), atol=1e-9, err_msg=str(constraint)
+        )
+
+
+def test_the_objective_is_the_sum_of_weighted_errors_in_their_tolerances():
+    primitive, _ = walking()
+    latents = primitive.sample(20, 2)
+    objective = build_objective(primitive, EVERY_KIND, standard_joints(), placement=PLACEMENT)
+    errors = objective.errors(latents)
+    tolerances = [0.02, 0.01, np.radians(5), np.radians(5), np.radians(5), 0.01, 0.05, np.radians(5), 0.05, 0.01]
+    weights = [2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 3.0]
+    np.testing.assert_allclose(objective.costs(latents), errors @ (np.array(weights) / tolerances), rtol=1e-12)
+
+
+def test_what_comes_out_for_one_does_not_depend_on_the_others():
+    primitive, _ = walking()
+    latents = primitive.sample(40, 3)
+    objective = build_objective(primitive, EVERY_KIND, standard_joints())
+    together = objective.costs(latents)
+    assert np.array_equal(together, np.concatenate([objective.costs(one[None]) for one in latents]))
+
+
+def test_a_quarter_turn_about_any_axis_is_an_error_of_a_quarter_turn():
+    primitive, _ = walking()
+    latents = primitive.sample(1, 4)
+    poses = primitive.poses(latents, [0.0])[:, 0]
+    head = as_global_rotations(primitive.skeleton, poses[:, 3:].reshape(1, -1, 4))[0, standard_joints()["head"]]
+    for axis in np.eye(3):
+        target = quaternions.multiply(head, quaternions.from_axis_angle(axis, np.pi / 2))
+        objective = build_objective(primitive, [JointOrientation("head", 0, tuple(target))], standard_joints())
+        np.testing.assert_allclose(objective.errors(latents), np.pi / 2, atol=1e-12)
+
+
+def test_a_heading_is_missed_by_the_shorter_way_round():
+    primitive, _ = walking()
+    latents = primitive.sample(5, 5)
+    for turns in (-3, 0, 2):
+        wanted = [RootHeading("start", 0.1 + 2 * np.pi * turns)]
+        assert build_objective(primitive, wanted, standard_joints()).errors(latents).max() < 0.5
+
+
+def test_looking_the_opposite_way_is_half_a_turn_off():
+    primitive = sliding()
+    latents = primitive.sample(1, 0)
+    for direction, angle in (((0, 0, 1), 0.0), ((0, 0, -1), np.pi), ((0, 2, 0), np.pi / 2)):
+        objective = build_objective(primitive, [LookDirection("root", 0, direction=direction)], {})
+        np.testing.assert_allclose(objective.errors(latents), angle, atol=1e-12)
+
+
+@pytest.mark.parametrize("constraint", EVERY_KIND, ids=lambda one: f"{type(one).__name__} {one.at}")
+def test_derivatives_are_those_of_finite_differences(constraint):
+    primitive, _ = walking()
+    problem = SeveralSteps.of([Step(primitive, (constraint,), standard_joints())], PLACEMENT)
+    for latent in primitive.sample(5, 6):
+        assert_derivatives(problem, latent)
+
+
+def test_derivatives_of_steps_that_hang_together_are_those_of_finite_differences():
+    primitive, _ = walking()
+    steps = [Step(primitive, EVERY_KIND[:7], standard_joints()), Step(primitive, EVERY_KIND, standard_joints())] * 2
+    problem = SeveralSteps.of(steps, PLACEMENT)
+    assert_derivatives(problem, primitive.sample(len(steps), 7).ravel())
+
+
+def assert_derivatives(problem, stacked):
+    _, slopes = problem.linearise(stacked)
+    step = 1e-5
+    for column, direction in enumerate(np.eye(len(stacked))):
+        ahead, behind = (problem.linearise(stacked + sign * step * direction)[0] for sign in (1, -1))
+        measured = (ahead - behind) / (2 * step)
+        np.testing.assert_allclose(slopes[:, column], measured, atol=1e-6 * max(1.0, np.abs(slopes).max()))
+
+
+@pytest.mark.parametrize(
+    ("make", "where"),
+    [
+        (lambda: JointPosition("head", 0, (None, None, None)), "target_m"),
+        (lambda: JointPosition("head", 0, (np.nan, 0.0, 0.0)), "target_m"),
+        (lambda: JointPosition("head", 0, (0.0, 0.0, 0.0), tolerance_m=0.0), "tolerance_m"),
+        (lambda: JointOrientation("head", 0, (0.0, 0.0, 0.0, 0.0)), "rotation"),
+        (lambda: LookDirection("head", 0), "direction"),
+        (lambda: LookDirection("head", 0, direction=(0, 0, 1), point_m=(0, 0, 1)), "direction"),
+        (lambda: LookDirection("head", 0, direction=(0, 0, 1), axis=(0, 0, 0)), "axis"),
+        (lambda: RootPosition(0, (None, None)), "target_m"),
+        (lambda: RootHeading(0, np.inf), "heading_rad"),
+        (lambda: KeyframeTime(0, -1.0), "seconds"),
+        (lambda: KeyframeTime(0, 1.0, weight=-1.0), "weight"),
+    ],
+)
+def test_a_constraint_that_makes_no_sense_is_refused_by_its_field(make, where):
+    with pytest.raises(ConstraintError) as caught:
+        make()
+    assert caught.value.where == where
+
+
+@pytest.mark.parametrize(
+    ("constraint", "message"),
+    [
+        (JointPosition("tail", 0, (0.0, 0.0, 0.0)), "no joint is called 'tail'"),
+        (JointPosition("head", "contact", (0.0, 0.0, 0.0)), "no keyframe 'contact'; it has start, end, middle"),
+        (JointPosition("head", -1.0, (0.0, 0.0, 0.0)), "not within 0 to 30"),
+        (RootPosition(FRAMES, (0.0, 0.0)), "not within 0 to 30"),
+    ],
+)
+def test_what_the_model_has_not_is_refused_by_the_place_of_the_constraint(constraint, message):
+    primitive, _ = walking()
+    with pytest.raises(MotionError, match=message) as caught:
+        build_objective(primitive, [RootPosition(0, (0.0, 0.0)), constraint], standard_joints())
+    assert caught.value.where.startswith("constraints[1]")
+
+
+def test_a_heading_needs_hips_and_shoulders():
+    with pytest.raises(MotionError, match="left_hip"):
+        build_objective(sliding(), [RootHeading(0, 0.0)], {})
+
+
+def test_too_many_constraints_are_refused():
+    with pytest.raises(ConstraintError, match="more than"):
+        build_objective(sliding(), [RootPosition(0, (0.0, 0.0))] * (MOST_CONSTRAINTS + 1), {})
+
+
+def test_a_joint_may_be_named_as_the_skeleton_names_it():
+    primitive, _ = walking()
+    name = primitive.skeleton.joint_names[standard_joints()["left_wrist"]]
+    latents = primitive.sample(3, 8)
+    own, standard = (
+        build_objective(primitive, [JointPosition(one, 0, (0.0, 0.0, 0.0))], standard_joints()).errors(latents)
+        for one in (name, "left_wrist")
+    )
+    assert np.array_equal(own, standard)

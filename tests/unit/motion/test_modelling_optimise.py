@@ -1,0 +1,145 @@
+"""Refinement: closed forms where there are some, what must hold everywhere else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from marey_motion.errors import MotionError
+from marey_motion.kinematics import forward_kinematics
+from marey_motion.modelling.constraints import JointPosition, KeyframeTime, RootHeading, RootPosition
+from marey_motion.modelling.mixture import LatentMixture
+from marey_motion.modelling.objective import build_objective
+from marey_motion.modelling.optimise import RefineOptions, refine
+from marey_motion.modelling.search import search_tree
+from marey_motion.modelling.steps import SeveralSteps, Step
+from marey_motion.modelling.tree import TreeOptions, build_tree
+from search_primitives import FRAMES, sliding, standard_joints, walking
+
+WRIST = (JointPosition("left_wrist", "middle", (0.35, 1.0, 0.6)),)
+
+
+def on_walks(constraints, mixtures=2):
+    return SeveralSteps.of([Step(walking(mixtures=mixtures)[0], tuple(constraints), standard_joints())])
+
+
+def objective_of(primitive, constraints, joints):
+    return build_objective(primitive, constraints, joints)
+
+
+def posterior(primitive, constraints, joints, weight):
+    """½ Σ w (e / σ)² - λ ln p, from errors alone."""
+    objective = objective_of(primitive, constraints, joints)
+    scales = np.array(
+        [one.weight / tolerance**2 for one, tolerance in zip(constraints, tolerances(constraints), strict=True)]
+    )
+
+    def cost(latent):
+        errors = objective.errors(latent[None])[0]
+        return 0.5 * float(scales @ errors**2) - weight * float(primitive.log_density(latent[None])[0])
+
+    return cost
+
+
+def tolerances(constraints):
+    return [next(value for name, value in vars(one).items() if name.startswith("tolerance")) for one in constraints]
+
+
+@pytest.mark.parametrize("weight", [1.0, 0.01, 25.0])
+def test_with_one_gaussian_and_linear_constraints_the_result_is_that_of_ridge_regression(weight):
+    primitive = sliding(2)
+    constraints = (RootPosition("middle", (0.25, None), 0.02, 3.0),)
+    problem = SeveralSteps.of([Step(primitive, constraints, {})])
+    found = refine(problem, np.array([2.0, -3.0]), RefineOptions(weight))
+    # The root's x is 0.1 times the first score.
+    slope = np.array([[0.1, 0.0]]) * np.sqrt(3.0) / 0.02
+    precision = weight * np.linalg.inv(primitive.mixture.covariances[0])
+    mean = primitive.mixture.means[0]
+    right = slope.T @ (np.sqrt(3.0) / 0.02 * np.array([0.25])) + precision @ mean
+    np.testing.assert_allclose(found.latents, np.linalg.solve(slope.T @ slope + precision, right), rtol=1e-7)
+
+
+def test_without_constraints_the_result_is_the_mean():
+    primitive = sliding(2)
+    found = refine(SeveralSteps.of([Step(primitive, (), {})]), np.array([5.0, 5.0]))
+    np.testing.assert_allclose(found.latents, primitive.mixture.means[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("weight", [1.0, 0.05])
+def test_where_it_ends_nothing_nearby_is_better(weight):
+    primitive, _ = walking(mixtures=1)
+    constraints = (*WRIST, RootHeading("end", 0.2), KeyframeTime("end", 0.9))
+    cost = posterior(primitive, constraints, standard_joints(), weight)
+    found = refine(on_walks(constraints, mixtures=1), primitive.mixture.means[0], RefineOptions(weight))
+    np.testing.assert_allclose(found.cost, cost(found.latents), rtol=1e-9)
+    gradient = [
+        (cost(found.latents + 1e-5 * one) - cost(found.latents - 1e-5 * one)) / 2e-5
+        for one in np.eye(len(found.latents))
+    ]
+    np.testing.assert_allclose(gradient, 0.0, atol=1e-3 * max(1.0, found.start_cost))
+
+
+def test_the_result_is_never_worse_than_the_start():
+    primitive, _ = walking(mixtures=3)
+    cost = posterior(primitive, WRIST, standard_joints(), 1.0)
+    for start in primitive.sample(40, 9) * 2.0:
+        found = refine(on_walks(WRIST, mixtures=3), start)
+        np.testing.assert_allclose((found.start_cost, found.cost), (cost(start), cost(found.latents)), rtol=1e-9)
+        assert found.cost <= found.start_cost
+
+
+def test_no_iterations_return_the_start():
+    start = walking()[0].sample(1, 1)[0]
+    found = refine(on_walks(WRIST), start, RefineOptions(iterations=0))
+    assert np.array_equal(found.latents, start)
+
+
+def test_what_a_motion_does_already_is_met_within_a_millimetre():
+    primitive, latents = walking()
+    tree = build_tree(primitive, 1, TreeOptions(3000, features="latent"))
+    for example in latents[::8]:
+        pose = primitive.poses(example[None], [float(FRAMES // 2)])[:, 0]
+        place = forward_kinematics(primitive.skeleton, pose)[0, standard_joints()["left_wrist"]]
+        wanted = (JointPosition("left_wrist", "middle", tuple(place.tolist())),)
+        objective = objective_of(primitive, wanted, standard_joints())
+        sample = search_tree(objective, tree, candidates=8)
+        assert sample.costs[0] < 3.0
+        refined = refine(on_walks(wanted), sample.latents[0], RefineOptions(0.01))
+        assert objective.errors(refined.latents[None])[0, 0] < 1e-3
+        assert primitive.log_density(refined.latents[None])[0] > primitive.log_density(latents).min()
+
+
+def test_out_of_reach_a_smaller_weight_comes_nearer_and_a_larger_one_stays_likelier():
+    primitive, _ = walking(mixtures=1)
+    wanted = (JointPosition("left_wrist", "middle", (1.5, 2.0, 0.0), 0.1),)
+    objective = objective_of(primitive, wanted, standard_joints())
+    errors, densities = [], []
+    for weight in (100.0, 10.0, 1.0, 0.1, 0.01):
+        found = refine(on_walks(wanted, mixtures=1), primitive.mixture.means[0], RefineOptions(weight, 200)).latents[
+            None
+        ]
+        errors.append(objective.errors(found)[0, 0])
+        densities.append(primitive.log_density(found)[0])
+    assert (np.diff(errors) < 0).all()
+    assert (np.diff(densities) < 0).all()
+
+
+def test_the_component_of_the_mixture_is_picked_anew_on_the_way():
+    primitive = sliding(1)
+    two = LatentMixture(np.array([0.5, 0.5]), np.array([[-2.0], [2.0]]), np.full((2, 1, 1), 0.25))
+    problem = SeveralSteps.of([Step(replace(primitive, mixture=two), (RootPosition("middle", (0.2, None)),), {})])
+    found = refine(problem, np.array([-2.0]))
+    # At 2 both the target and the second component are met.
+    np.testing.assert_allclose(found.latents, 2.0, atol=1e-3)
+
+
+def test_a_model_that_never_varies_stays_as_it_is():
+    found = refine(SeveralSteps.of([Step(sliding(0), (RootPosition(0, (1.0, 0.0)),), {})]), np.zeros(0))
+    assert found.latents.shape == (0,)
+    assert found.cost == found.start_cost
+
+
+@pytest.mark.parametrize("options", [{"likelihood_weight": -1.0}, {"likelihood_weight": np.nan}, {"iterations": -1}])
+def test_options_out_of_range_are_refused(options):
+    with pytest.raises(MotionError):
+        RefineOptions(**options)

@@ -1,0 +1,145 @@
+"""Searching trees, against going through them in plain Python and through all samples."""
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from marey_motion.errors import MotionError
+from marey_motion.modelling.constraints import JointPosition, RootPosition
+from marey_motion.modelling.objective import build_objective
+from marey_motion.modelling.search import search_all, search_tree
+from marey_motion.modelling.tree import SampleTree, TreeOptions, build_tree
+from search_primitives import sliding, standard_joints, walking
+
+EVERYTHING = 10**6
+
+
+@cache
+def grown(leaf_size=1, samples=2000):
+    return build_tree(walking()[0], 2, TreeOptions(samples, leaf_size=leaf_size, features="latent"))
+
+
+def wrist_at(x, y, z):
+    return build_objective(walking()[0], [JointPosition("left_wrist", "middle", (x, y, z))], standard_joints())
+
+
+TARGETS = st.tuples(st.floats(-0.5, 0.8), st.floats(0.5, 1.5), st.floats(0.0, 1.5))
+
+
+def plain_beam(objective, tree, candidates):
+    """The best sample by a beam, one node at a time."""
+
+    def cost(latent):
+        return float(objective.costs(np.asarray(latent, dtype=np.float64)[None])[0])
+
+    frontier, found = [0], []
+    while frontier:
+        following = []
+        for node in frontier:
+            if not tree.children[node]:
+                rows = range(tree.starts[node], tree.starts[node] + tree.sizes[node])
+                found += [(cost(tree.samples[row]), row) for row in rows]
+            for child in range(tree.first_children[node], tree.first_children[node] + tree.children[node]):
+                if tree.sizes[child] == 1:
+                    found.append((cost(tree.samples[tree.starts[child]]), int(tree.starts[child])))
+                else:
+                    following.append((cost(tree.means[child]), child))
+        frontier = [node for _, node in sorted(following)[:candidates]]
+    return min(found)
+
+
+@settings(max_examples=25, deadline=None)
+@given(target=TARGETS, candidates=st.integers(1, 20), leaf_size=st.sampled_from((1, 5, 30)))
+def test_the_beam_keeps_the_true_best_of_each_level(target, candidates, leaf_size):
+    objective, tree = wrist_at(*target), grown(leaf_size)
+    found = search_tree(objective, tree, candidates=candidates)
+    cost, row = plain_beam(objective, tree, candidates)
+    assert (found.costs[0], found.samples[0]) == (cost, row)
+
+
+@settings(max_examples=25, deadline=None)
+@given(target=TARGETS, leaf_size=st.sampled_from((1, 5, 30)), top=st.integers(1, 50))
+def test_a_beam_of_all_nodes_is_an_exhaustive_search(target, leaf_size, top):
+    objective, tree = wrist_at(*target), grown(leaf_size)
+    beam, everything = (
+        search_tree(objective, tree, candidates=EVERYTHING, top=top),
+        search_all(objective, tree, top=top),
+    )
+    assert np.array_equal(beam.samples, everything.samples)
+    assert np.array_equal(beam.costs, everything.costs)
+    assert np.array_equal(beam.latents, everything.latents)
+
+
+def test_all_samples_are_those_with_the_lowest_costs_in_order():
+    objective, tree = wrist_at(0.3, 1.0, 0.4), grown()
+    found = search_all(objective, tree, top=30)
+    costs = objective.costs(tree.samples.astype(np.float64))
+    assert np.array_equal(found.costs, np.sort(costs)[:30])
+    assert np.array_equal(costs[found.samples], found.costs)
+    assert found.evaluations == len(costs)
+
+
+def test_few_of_many_samples_are_looked_at():
+    found = search_tree(wrist_at(0.3, 1.0, 0.4), grown(), candidates=4)
+    assert found.evaluations < 150
+
+
+def test_what_is_found_is_a_sample_and_never_a_mean():
+    tree = grown()
+    found = search_tree(wrist_at(0.3, 1.0, 0.4), tree, candidates=1)
+    assert (tree.samples == found.latents[0].astype(np.float32)).all(axis=1).any()
+
+
+def test_where_everything_costs_the_same_the_first_in_the_tree_are_found():
+    tree = grown()
+    free = build_objective(walking()[0], [], standard_joints())
+    assert search_all(free, tree, top=3).samples.tolist() == [0, 1, 2]
+    first = search_tree(free, tree, candidates=4)
+    assert first.costs.tolist() == [0.0]
+
+
+def test_a_root_that_is_a_leaf_is_searched():
+    tree = build_tree(walking()[0], 2, TreeOptions(50, leaf_size=50, features="latent"))
+    objective = wrist_at(0.3, 1.0, 0.4)
+    assert search_tree(objective, tree).costs == search_all(objective, tree).costs
+
+
+def test_the_target_that_is_a_samples_own_is_found():
+    tree, primitive = grown(), walking()[0]
+    wanted = primitive.poses(tree.samples[777:778].astype(np.float64), [0.0])[0, 0, :3]
+    objective = build_objective(primitive, [JointPosition("pelvis", 0, tuple(wanted))], {"pelvis": 0})
+    assert search_all(objective, tree).costs[0] < 1e-6
+
+
+def test_threads_find_the_same():
+    tree = grown()
+    tree.means  # noqa: B018
+
+    def found(_number):
+        one = search_tree(wrist_at(0.2, 1.1, 0.5), tree, candidates=6, top=10)
+        return one.latents.tobytes() + one.costs.tobytes()
+
+    with ThreadPoolExecutor(2) as pool:
+        assert len(set(pool.map(found, range(8)))) == 1
+
+
+def test_a_tree_of_another_model_is_refused():
+    with pytest.raises(MotionError, match="the model needs") as caught:
+        search_tree(build_objective(sliding(), [RootPosition(0, (0.0, 0.0))], {}), grown())
+    assert caught.value.code == "tree-of-another"
+
+
+def test_a_beam_is_at_least_one_wide():
+    with pytest.raises(MotionError):
+        search_tree(wrist_at(0.0, 0.0, 0.0), grown(), candidates=0)
+
+
+def test_a_model_that_never_varies_has_one_motion_to_find():
+    primitive = sliding(0)
+    tree = SampleTree(np.zeros((1, 0), np.float32), np.array([1], np.int32), np.array([0], np.int32))
+    found = search_tree(build_objective(primitive, [RootPosition(0, (0.5, None))], {}), tree)
+    np.testing.assert_allclose(found.costs, 50.0)

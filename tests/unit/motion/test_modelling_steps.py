@@ -1,0 +1,183 @@
+"""Several motions in a row: that they hang together, and do what was asked, in the world and in real time."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from marey_motion.alignment.aligned import Placement
+from marey_motion.errors import MotionError
+from marey_motion.kinematics import forward_directions, headings
+from marey_motion.modelling.constraints import (
+    ConstraintError,
+    JointOrientation,
+    JointPosition,
+    LookDirection,
+    RootHeading,
+    RootPosition,
+)
+from marey_motion.modelling.finishing import finish_motion
+from marey_motion.modelling.found_motions import found_motion
+from marey_motion.modelling.optimise import RefineOptions
+from marey_motion.modelling.step_search import search_steps
+from marey_motion.modelling.steps import MOST_STEPS, Step, TransitionOptions
+from marey_motion.modelling.tree import TreeOptions, build_tree
+from marey_motion.rigs import map_joints
+from search_primitives import sliding, standard_joints, walking
+
+START = Placement(0.5, 1.0, -2.0)
+
+
+def tree():
+    return build_tree(walking()[0], 1, TreeOptions(2000, features="latent"))
+
+
+def walk_to(*places):
+    """Steps of a second that end near places on the ground."""
+    return [Step(walking()[0], (RootPosition("end", place, 0.05),), standard_joints()) for place in places]
+
+
+THREE = walk_to((1.6, -0.9), (2.3, 0.2), (3.1, 1.2))
+
+
+def found_three(**options):
+    sequel = search_steps(THREE, [tree()] * 3, start=START, **options)
+    return sequel, found_motion(THREE, sequel)
+
+
+def heading_at(positions):
+    joints = standard_joints()
+    lefts, rights = ([joints[f"{side}_{part}"] for part in ("hip", "shoulder")] for side in ("left", "right"))
+    return headings(forward_directions(positions, lefts, rights))
+
+
+@pytest.mark.parametrize("refining", [None, RefineOptions()])
+def test_the_body_goes_on_where_and_as_it_stood(refining):
+    sequel, found = found_three(refining=refining)
+    ends = [found.frame_of(step, walking()[0], "end") for step in range(3)]
+    for number, (step, latent) in enumerate(zip(THREE, sequel.latents, strict=True)):
+        if not number:
+            continue
+        # The first pose of a step, which stands in for the last one of the step before.
+        motion = step.primitive.motions(latent[None])[0]
+        positions = motion.positions(found.skeleton)[:1]
+        placement = sequel.measured.placements[number]
+        before = found.motion.positions(found.skeleton)[[ends[number - 1]]]
+        turned = rotated(positions, placement)
+        pelvis = standard_joints()["pelvis"]
+        np.testing.assert_allclose(turned[0, pelvis, [0, 2]], before[0, pelvis, [0, 2]], atol=1e-9)
+        np.testing.assert_allclose(heading_at(turned), heading_at(before), atol=1e-9)
+
+
+def rotated(positions, placement):
+    cos, sin = np.cos(placement.heading_rad), np.sin(placement.heading_rad)
+    x, y, z = np.moveaxis(positions, -1, 0)
+    return np.stack((cos * x + sin * z + placement.x, y, cos * z - sin * x + placement.z), axis=-1)
+
+
+def test_refining_brings_hands_and_feet_together_at_the_seams():
+    sampled, _ = found_three(refining=None)
+    refined, _ = found_three(refining=RefineOptions(0.1))
+    for before, after in zip(sampled.measured.jumps_m, refined.measured.jumps_m, strict=True):
+        assert after.sum() < 0.7 * before.sum()
+    assert max(jumps[1:].max() for jumps in refined.measured.jumps_m) < 0.12
+
+
+def test_steps_end_where_they_were_asked_to():
+    sequel, found = found_three(transitions=TransitionOptions(tolerance_m=0.3))
+    positions = found.motion.positions(found.skeleton)[:, standard_joints()["pelvis"]]
+    for number, step in enumerate(THREE):
+        target = step.constraints[0].target_m
+        place = positions[found.frame_of(number, step.primitive, "end"), [0, 2]]
+        reached = np.linalg.norm(place - target)
+        np.testing.assert_allclose(reached, sequel.measured.errors[number][0], atol=5e-3)
+        assert reached < 0.1
+
+
+def test_the_motion_begins_where_it_was_put():
+    _, found = found_three()
+    positions = found.motion.positions(found.skeleton)[:1]
+    np.testing.assert_allclose(positions[0, standard_joints()["pelvis"], [0, 2]], (START.x, START.z), atol=0.05)
+    np.testing.assert_allclose(heading_at(positions), START.heading_rad, atol=0.3)
+
+
+def test_a_row_of_motions_has_the_frames_of_all_of_them_and_the_seams_once():
+    sequel, found = found_three()
+    lasting = [float(walking()[0].durations_s(one[None])[0]) * found.frame_rate_hz for one in sequel.latents]
+    assert found.motion.frame_count == sum(map(round, lasting)) + 1
+    assert found.starts == (0, round(lasting[0]), round(lasting[0]) + round(lasting[1]))
+    jumps = np.einsum("fjc,fjc->fj", found.motion.rotations[1:], found.motion.rotations[:-1])
+    assert jumps.min() > 0.0
+
+
+def test_a_tolerance_that_is_larger_lets_joints_jump_more():
+    tight, loose = (
+        search_steps(THREE, [tree()] * 3, start=START, transitions=TransitionOptions(tolerance_m=size))
+        for size in (0.005, 0.5)
+    )
+    assert sum(map(np.sum, tight.measured.jumps_m)) < sum(map(np.sum, loose.measured.jumps_m))
+
+
+def test_one_step_needs_no_hips_and_shoulders():
+    primitive = sliding(2)
+    step = Step(primitive, (RootPosition("end", (0.3, None)),), {})
+    one = build_tree(primitive, 0, TreeOptions(500, features="latent"))
+    sequel = search_steps([step], [one], start=Placement(0.0, 0.1, 0.0), refining=RefineOptions(1e-4))
+    assert sequel.measured.errors[0][0] < 1e-3
+    with pytest.raises(MotionError, match="left_hip"):
+        search_steps([step, step], [one, one])
+
+
+def test_a_constraint_that_is_wrong_is_told_by_step_and_place():
+    steps = [THREE[0], Step(walking()[0], (RootHeading("end", 0.0), RootHeading("never", 0.0)), standard_joints())]
+    with pytest.raises(ConstraintError, match="no keyframe 'never'") as caught:
+        search_steps(steps, [tree()] * 2)
+    assert caught.value.where == "steps[1].constraints[1].at"
+
+
+@pytest.mark.parametrize("count", [0, MOST_STEPS + 1])
+def test_the_number_of_steps_is_limited(count):
+    with pytest.raises(ConstraintError, match="steps"):
+        search_steps(THREE[:1] * count, [tree()] * count)
+
+
+def test_steps_of_different_skeletons_make_no_motion():
+    sequel = search_steps(THREE[:1], [tree()])
+    primitive = sliding(2)
+    other = Step(primitive, (), {})
+    wrong = search_steps([other], [build_tree(primitive, 0, TreeOptions(10, features="latent"))])
+    with pytest.raises(ConstraintError, match="different skeletons") as caught:
+        found_motion([THREE[0], other], joined(sequel, wrong))
+    assert caught.value.where == "steps[1]"
+
+
+def joined(first, second):
+    measured = first.measured._replace(placements=first.measured.placements + second.measured.placements)
+    return replace(first, latents=first.latents + second.latents, measured=measured)
+
+
+def test_inverse_kinematics_removes_what_is_left():
+    wanted = (
+        JointPosition("left_wrist", "middle", (1.6, 1.1, -1.3)),
+        JointOrientation("head", "end", (1.0, 0.0, 0.3, 0.0)),
+        LookDirection("head", 4.0, direction=(0.3, 0.0, 1.0)),
+        RootHeading("end", 0.5),
+    )
+    step = Step(walking()[0], wanted, standard_joints())
+    sequel = search_steps([step], [tree()], start=START)
+    found = found_motion([step], sequel)
+    assert sequel.measured.errors[0][0] > 0.01
+    finished = finish_motion([step], found, map_joints(found.skeleton))
+    assert set(finished.errors) == {(0, 0), (0, 1), (0, 2)}
+    assert max(finished.errors.values()) < 2e-3
+    wrist = finished.found.motion.positions(found.skeleton)[found.frame_of(0, step.primitive, "middle")]
+    np.testing.assert_allclose(wrist[standard_joints()["left_wrist"]], wanted[0].target_m, atol=1e-3)
+    pelvis = standard_joints()["pelvis"]
+    before, after = (one.motion.positions(found.skeleton)[:, pelvis] for one in (found, finished.found))
+    np.testing.assert_allclose(after, before, atol=1e-9)
+
+
+def test_where_nothing_can_be_finished_the_motion_stays():
+    step = THREE[0]
+    found = found_motion([step], search_steps([step], [tree()], start=START))
+    assert finish_motion([step], found, map_joints(found.skeleton)).found is found

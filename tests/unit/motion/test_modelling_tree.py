@@ -1,0 +1,176 @@
+"""Trees over samples: what they hold, how they are grown, and that they come out the same."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from marey_motion.errors import MotionError
+from marey_motion.modelling.mixture import LatentMixture
+from marey_motion.modelling.sample_tree_documents import sample_tree_from_tree, sample_tree_to_tree
+from marey_motion.modelling.tree import END_EFFECTORS, SampleTree, TreeOptions, build_tree
+from marey_schemas.codecs import MEDIA_TYPES, decode_tree, encode_tree
+from marey_schemas.sample_trees import SampleTreeDocument
+from search_primitives import sliding, standard_joints, walking
+
+LATENT = TreeOptions(samples=600, features="latent")
+
+
+def members(tree, node):
+    return tree.samples[tree.starts[node] : tree.starts[node] + tree.sizes[node]]
+
+
+def children(tree, node):
+    first = tree.first_children[node]
+    return range(first, first + tree.children[node])
+
+
+def test_a_tree_holds_each_sample_of_the_model_once():
+    primitive, _ = walking()
+    tree = build_tree(primitive, 7, LATENT)
+    drawn = primitive.sample(600, 7).astype(np.float32)
+    assert sorted(map(bytes, tree.samples)) == sorted(map(bytes, drawn))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**63 - 1),
+    samples=st.integers(1, 300),
+    branching=st.integers(2, 7),
+    leaf_size=st.integers(1, 40),
+    depth=st.integers(1, 9),
+)
+def test_children_share_the_samples_of_their_parent(seed, samples, branching, leaf_size, depth):
+    primitive, _ = walking()
+    tree = build_tree(primitive, seed, TreeOptions(samples, branching, leaf_size, depth, "latent"))
+    levels = np.zeros(len(tree.sizes), dtype=int)
+    for node in range(len(tree.sizes)):
+        below = children(tree, node)
+        assert len(below) != 1
+        assert len(below) <= branching
+        if len(below):
+            assert tree.sizes[node] > leaf_size
+            assert np.array_equal(np.concatenate([members(tree, child) for child in below]), members(tree, node))
+            levels[list(below)] = levels[node] + 1
+        else:
+            assert tree.sizes[node] <= leaf_size or levels[node] == depth or same(members(tree, node))
+        np.testing.assert_allclose(tree.means[node], members(tree, node).mean(axis=0, dtype=np.float64), atol=1e-12)
+    assert levels.max() <= depth
+
+
+def same(rows):
+    return (rows == rows[0]).all()
+
+
+def test_a_node_of_one_sample_has_it_as_its_mean_to_the_last_bit():
+    tree = build_tree(walking()[0], 1, LATENT)
+    alone = np.flatnonzero(tree.sizes == 1)
+    assert alone.size > 500
+    assert np.array_equal(tree.means[alone], tree.samples[tree.starts[alone]].astype(np.float64))
+
+
+def test_splitting_brings_samples_together():
+    primitive, _ = walking()
+    tree = build_tree(primitive, 3, LATENT)
+    spatial = primitive.spatial.count
+    around = [((members(tree, node)[:, :spatial] - tree.means[node, :spatial]) ** 2).sum() for node in range(5)]
+    assert sum(around[1:]) < 0.8 * around[0]
+
+
+def test_two_clear_groups_are_told_apart():
+    primitive = sliding(1)
+    far = LatentMixture(np.array([0.3, 0.7]), np.array([[-50.0], [50.0]]), np.full((2, 1, 1), 1.0))
+    object.__setattr__(primitive, "mixture", far)
+    tree = build_tree(primitive, 4, TreeOptions(200, branching=2, features="latent"))
+    left, right = (members(tree, node) for node in children(tree, 0))
+    assert (np.sign(left) != np.sign(right[0])).all()
+    assert same(np.sign(right))
+
+
+def test_threads_and_repetitions_make_the_same_bytes():
+    primitive, _ = walking()
+    wanted = [standard_joints()[name] for name in END_EFFECTORS]
+
+    def built(_number):
+        tree = build_tree(primitive, 11, TreeOptions(1500), end_effectors=wanted)
+        return tree.samples.tobytes() + tree.sizes.tobytes() + tree.children.tobytes()
+
+    alone = {built(0), built(1)}
+    with ThreadPoolExecutor(2) as pool:
+        together = set(pool.map(built, range(4)))
+    assert len(alone | together) == 1
+
+
+def test_another_seed_makes_another_tree():
+    primitive, _ = walking()
+    one, other = (build_tree(primitive, seed, LATENT) for seed in (1, 2))
+    assert not np.array_equal(one.samples, other.samples)
+
+
+def test_equal_samples_are_one_leaf_and_a_model_without_components_one_sample():
+    primitive, _ = walking()
+    still = LatentMixture(np.ones(1), np.zeros((1, primitive.dimensions)), 1e-120 * np.eye(primitive.dimensions)[None])
+    frozen = build_tree(with_mixture(primitive, still), 0, LATENT)
+    assert (frozen.sizes.tolist(), frozen.children.tolist()) == ([600], [0])
+    nothing = build_tree(sliding(0), 0, LATENT)
+    assert nothing.samples.shape == (1, 0)
+
+
+def with_mixture(primitive, mixture):
+    return replace(primitive, mixture=mixture)
+
+
+def test_a_tree_of_ten_thousand_samples_is_stored_in_less_than_two_megabytes():
+    primitive, _ = walking()
+    tree = build_tree(primitive, 0, end_effectors=[standard_joints()[name] for name in END_EFFECTORS])
+    document = document_of(tree)
+    assert len(encode_tree(document, "application/msgpack", arrays="blocks")) < 2_000_000
+
+
+def document_of(tree):
+    return sample_tree_to_tree(tree, model_digest="sha256:" + "0" * 64, seed=0, options=TreeOptions())
+
+
+@pytest.mark.parametrize("media_type", MEDIA_TYPES)
+def test_a_tree_comes_back_from_its_document_bit_by_bit(media_type):
+    tree = build_tree(walking()[0], 5, LATENT)
+    read = decode_tree(encode_tree(document_of(tree), media_type), media_type)
+    SampleTreeDocument.model_validate(read)
+    again = sample_tree_from_tree(read)
+    for name in ("samples", "sizes", "children", "starts", "means"):
+        assert np.array_equal(getattr(again, name), getattr(tree, name)), name
+
+
+@pytest.mark.parametrize(
+    ("sizes", "children"),
+    [
+        ([3], [1]),
+        ([3, 1, 1], [2, 0, 0]),
+        ([3, 2, 1], [0, 2, 0]),
+        ([4, 2, 1], [2, 0, 0]),
+        ([3, 3], [1, -1]),
+        ([3, 0, 3], [2, 0, 0]),
+        ([], []),
+        ([3, 2, 1, 1], [2, 0, 0, 0]),
+    ],
+)
+def test_nodes_that_make_no_tree_are_refused(sizes, children):
+    with pytest.raises(MotionError, match="tree"):
+        SampleTree(np.zeros((3, 2), np.float32), np.array(sizes, np.int32), np.array(children, np.int32))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("samples", 0), ("branching", 1), ("leaf_size", 0), ("depth", 0), ("samples", 10**8)]
+)
+def test_options_out_of_range_are_refused_by_name(field, value):
+    with pytest.raises(MotionError, match=str(value)) as caught:
+        TreeOptions(**{field: value})
+    assert caught.value.where == field
+
+
+def test_end_effectors_are_needed_to_group_by_them():
+    with pytest.raises(MotionError, match="neither hands"):
+        build_tree(sliding(), 0)
