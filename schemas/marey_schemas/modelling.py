@@ -62,6 +62,9 @@ class ModelParams(Request):
     folds: int = Field(5, ge=0, le=100, description="Parts held out in turn for likelihoods; 0: none.")
     report_samples: int = Field(200, ge=0, le=10_000, description="Drawn to measure feet and durations.")
     report: bool = Field(True, description="Write the report and its figures.")
+    search_check: bool = Field(
+        True, description="For the report: search for places that examples reached, by a model without them."
+    )
 
 
 class FunctionalComponentsDocument(Request):

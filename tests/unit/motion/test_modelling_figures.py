@@ -22,6 +22,7 @@ from marey_motion.modelling.figures.components import draw_component
 from marey_motion.modelling.figures.latent_space import ellipse
 from marey_motion.modelling.figures.samples import reach_of
 from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.search_check import SearchCheck
 from marey_motion.modelling.training import train_primitive
 from marey_motion.skeleton import Skeleton
 from model_examples import FRAMES, walks
@@ -45,7 +46,7 @@ def figures(subject):
 
 
 def test_every_figure_is_sound(figures):
-    assert set(ALIGNMENT_FIGURES) | set(MODEL_FIGURES) | {"component-1"} <= set(figures)
+    assert (set(ALIGNMENT_FIGURES) | set(MODEL_FIGURES) | {"component-1"}) - set(figures) == {"search-errors"}
     for figure in figures.values():
         is_sound(figure)
 
@@ -312,3 +313,10 @@ def test_two_hundred_examples_are_drawn_as_twenty_are():
 
 def test_the_figures_of_no_samples_of_the_search_say_so():
     assert draw_search_errors(np.zeros(0), np.zeros(0)).caption == "No target was searched for."
+
+
+def test_the_check_of_searches_is_drawn_where_there_is_one(subject):
+    found = SearchCheck(("walk001", "walk001"), ("left_wrist", "right_wrist"), (5, 9), np.array([2.0, 3.0]), np.ones(2))
+    figure = draw_model_figures(replace(subject, check=found))["search-errors"]
+    assert [row["joint"] for row in rows_of(figure, "errors")] == ["left_wrist", "right_wrist"]
+    assert "hands and feet of 1 example were" in figure.caption

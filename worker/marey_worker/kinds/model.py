@@ -23,7 +23,7 @@ from marey_worker.context import Context, JobRefused
 from marey_worker.kinds.matching_clips import place_of, refusing_motion_errors
 from marey_worker.kinds.model_report import write_model_report
 
-NOT_OPTIONS = {"name", "tags", "report"}
+NOT_OPTIONS = {"name", "tags", "report", "search_check"}
 
 
 def run(context: Context, params: ModelParams) -> dict[str, Any]:
@@ -50,7 +50,7 @@ def run(context: Context, params: ModelParams) -> dict[str, Any]:
     parts = {"model": tree}
     if params.report:
         context.progress(0, None, "writing the report")
-        parts["report"] = write_model_report(context, trained, aligned, origin)
+        parts["report"] = write_model_report(context, trained, aligned, origin, params)
     context.stage(
         [StagedOutput(name=params.name, kind=Kind.MODEL, item_name=params.name, tags=params.tags, parts=parts)]
     )

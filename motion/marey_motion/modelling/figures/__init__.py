@@ -14,7 +14,7 @@ from marey_motion.modelling.figures.alignment_costs import draw_alignment_costs
 from marey_motion.modelling.figures.components import draw_component, draw_mean
 from marey_motion.modelling.figures.latent_space import draw_latent_space, draw_likelihood
 from marey_motion.modelling.figures.samples import draw_paths, draw_samples
-from marey_motion.modelling.figures.search_errors import draw_search_errors
+from marey_motion.modelling.figures.search_errors import draw_search_check, draw_search_errors
 from marey_motion.modelling.figures.spectrum import draw_criterion, draw_reconstruction, draw_variance
 from marey_motion.modelling.figures.subjects import ModelSubject
 from marey_motion.modelling.figures.time_warps import draw_time_warps
@@ -32,6 +32,7 @@ MODEL_FIGURES: dict[str, tuple[str, Callable[[ModelSubject], Sketch | None]]] = 
     "mean": ("The mean motion", draw_mean),
     "samples": ("Examples and samples", draw_samples),
     "paths": ("Where hands and feet go", draw_paths),
+    "search-errors": ("How near it comes to what is asked", draw_search_check),
     "durations": ("How long motions last", draw_durations),
     "time-components": ("What varies in time", draw_time_components),
     "variance": ("What the components hold", draw_variance),

@@ -10,10 +10,23 @@ from numpy.typing import NDArray
 from marey_motion.drawing.drawn import Sketch
 from marey_motion.drawing.paper import COLOURS, REFERENCE, Place, add_keys, add_panel, new_figure
 from marey_motion.drawing.words import amount
+from marey_motion.modelling.figures.subjects import ModelSubject
 
 Floats = NDArray[np.float64]
 
 BINS = 30
+
+
+def draw_search_check(subject: ModelSubject) -> Sketch | None:
+    """Errors of searches for what examples reached; None where they were not measured."""
+    check = subject.check
+    if check is None:
+        return None
+    examples = amount(len(set(check.examples)), "example")
+    about = f"where hands and feet of {examples} were, by a model made without them"
+    sketch = draw_search_errors(check.searched_cm, check.refined_cm, about=about)
+    whose = {"example": check.examples, "joint": check.joints, "canonical_frame": check.frames}
+    return sketch._replace(tables={"errors": {**whose, **sketch.tables["errors"]}})
 
 
 def draw_search_errors(searched_cm: Floats, refined_cm: Floats, *, about: str = "") -> Sketch:

@@ -15,6 +15,7 @@ from marey_motion.drawing.paper import shortened, told_apart
 from marey_motion.drawing.stick_figures import Body, body_of
 from marey_motion.drawing.strips import Moments
 from marey_motion.modelling.primitive import MotionPrimitive
+from marey_motion.modelling.search_check import SearchCheck
 from marey_motion.modelling.signs import consistent_poses
 from marey_motion.modelling.training_report import TrainingReport
 from marey_motion.skeleton import Skeleton
@@ -40,12 +41,14 @@ class ModelSubject:
     primitive : the model
     examples : that it was trained on
     report : how good it is
+    check : how near searches come, if that was measured
     seed : of the samples that are drawn
     """
 
     primitive: MotionPrimitive
     examples: AlignedSet
     report: TrainingReport
+    check: SearchCheck | None = None
     seed: int = 0
 
     @cached_property

@@ -92,7 +92,7 @@ def motion_chapter(subject: ModelSubject, figures: Figures) -> Section:
         sortable=False,
     )
     pictures = shown(figures, "samples", "mean", "paths")
-    return Section("motions", "What it makes", (text, pictures, listing, shown(figures, "durations")))
+    return Section("motions", "What it makes", (text, pictures, listing, shown(figures, "search-errors", "durations")))
 
 
 def _reach_row(reach: Reach) -> list[Cell]:
@@ -172,5 +172,5 @@ def making_chapter(subject: ModelSubject, figures: Figures) -> Section:
 
 def numbers_chapter(figures: Figures) -> Section:
     """How much the model keeps, and what it costs."""
-    pictures = shown(figures, "variance", "reconstruction", "latent-space", "mixture", "search-errors")
+    pictures = shown(figures, "variance", "reconstruction", "latent-space", "mixture")
     return Section("numbers", "How much it keeps", pictures)

@@ -1,0 +1,69 @@
+"""Checks of searches: what they look for was reached by examples that the model has not seen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from marey_motion.kinematics import forward_kinematics
+from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.search_check import check_search
+from marey_motion.rigs import map_joints
+from model_examples import walks
+
+OPTIONS = ModelOptions(starts=1)
+
+
+def standard_joints(aligned):
+    return {name: aligned.skeleton.index_of(joint) for name, joint in map_joints(aligned.skeleton).joints.items()}
+
+
+@pytest.fixture(scope="module")
+def aligned():
+    return walks(16)
+
+
+@pytest.fixture(scope="module")
+def check(aligned):
+    return check_search(aligned, standard_joints(aligned), OPTIONS, seed=1)
+
+
+def test_every_fifth_example_but_never_the_reference_is_looked_for(aligned, check):
+    assert sorted(set(check.examples)) == ["walk001", "walk006", "walk011"]
+    assert set(check.joints) == {"left_wrist", "right_wrist", "left_ankle", "right_ankle"}
+    assert len(check.searched_cm) == len(check.refined_cm) == len(check.frames) == 12
+
+
+def test_refining_comes_nearer_than_the_samples_of_the_tree(check):
+    assert np.median(check.refined_cm) < np.median(check.searched_cm)
+    assert np.median(check.refined_cm) < 1.0
+    assert (check.searched_cm >= 0.0).all()
+
+
+def test_the_same_seed_finds_the_same(aligned, check):
+    again = check_search(aligned, standard_joints(aligned), OPTIONS, seed=1)
+    assert np.array_equal(again.searched_cm, check.searched_cm)
+    assert np.array_equal(again.refined_cm, check.refined_cm)
+
+
+def test_places_where_the_other_examples_never_go_are_missed(aligned):
+    """The example that is left out stands far away: nothing of the others comes near."""
+    odd = aligned.clips[1]
+    away = odd.motion._replace(root_translations=np.add(odd.motion.root_translations, (5.0, 0.0, 0.0)))
+    clips = (aligned.clips[0], replace(odd, motion=away), *aligned.clips[2:])
+    missed = check_search(replace(aligned, clips=clips), standard_joints(aligned), OPTIONS, seed=1)
+    of_odd = [error for uid, error in zip(missed.examples, missed.refined_cm, strict=True) if uid == odd.uid]
+    assert min(of_odd) > 5.0
+
+
+def test_targets_are_looked_for_where_examples_differ_most(aligned, check):
+    poses = aligned.poses
+    points = np.stack([forward_kinematics(aligned.skeleton, each) for each in poses])
+    wrist = points[:, :, standard_joints(aligned)["left_wrist"]]
+    widest = int(wrist.var(axis=0).sum(axis=-1).argmax())
+    assert check.frames[check.joints.index("left_wrist")] == widest
+
+
+def test_few_examples_and_unknown_joints_are_not_checked(aligned):
+    assert check_search(walks(9), standard_joints(aligned), OPTIONS, seed=0) is None
+    assert check_search(aligned, {}, OPTIONS, seed=0) is None
