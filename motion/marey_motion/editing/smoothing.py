@@ -100,7 +100,7 @@ def _smooth_rotations(take: Take, rotations: Floats, weights: Floats, joints: Se
     before = _reflected(rotations[0], rotations[reach:0:-1])
     after = _reflected(rotations[-1], rotations[-2 : -reach - 2 : -1])
     means = _averaged(np.concatenate((before, rotations, after)), weights)
-    lengths = np.linalg.norm(means, axis=-1)
+    lengths = np.sqrt(np.einsum("fjc,fjc->fj", means, means))
     if lengths.size and lengths.min() < LEAST_LENGTH:
         frame, joint = np.unravel_index(int(np.argmin(lengths)), lengths.shape)
         raise EditError(
@@ -108,7 +108,8 @@ def _smooth_rotations(take: Take, rotations: Floats, weights: Floats, joints: Se
             code="window-too-long",
             where=f"joint {take.skeleton.joint_names[joints[int(joint)]]}",
         )
-    return np.asarray(means / lengths[..., None], dtype=np.float64)
+    means /= lengths[..., None]
+    return means
 
 
 def _reflected(end: Floats, rotations: Floats) -> Floats:
