@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -43,13 +44,18 @@ class PrincipalExamples:
     functions : to be kept
     energy : (r,) cumulative share of the variance, of all r components that the examples have
     scores : (m, r) of the examples on all of them, centred
-    directions : (r, n, D) of all of them
+    deviations : (m, n, D) of the examples' coefficients from their mean
     """
 
     functions: FunctionalComponents
     energy: Floats
     scores: Floats
-    directions: Floats
+    deviations: Floats
+
+    @cached_property
+    def directions(self) -> Floats:
+        """(r, n, D) of all components: what one unit of each score adds to the coefficients."""
+        return np.tensordot((self.scores / (self.scores**2).sum(axis=0)).T, self.deviations, axes=1)
 
 
 def find_components(
@@ -70,49 +76,52 @@ def find_components(
 
     Notes
     -----
-    Fewer examples than coefficients: the eigenvectors of the (m, m) Gram matrix are those of the covariance, at a
-    fraction of the cost. The share of variance is of all components. Signs are such that the largest entry of each
-    scaled direction is positive.
+    Fewer examples than coefficients: the eigenvectors u of the (m, m) matrix of the examples' inner products are those
+    of the covariance, at a fraction of the cost. A direction is the sum of the deviations weighted by u, whatever the
+    inner product; the product enters with what takes the scores off again. The share of variance is of all
+    components. The largest entry of each direction is positive.
     """
     examples = len(coefficients)
     if coefficients.shape[1] != basis.count or weights.shape != coefficients.shape[2:]:
         raise MotionError(
-            f"coefficients {coefficients.shape} do not fit {basis.count} splines, weights {weights.shape}"
+            f"coefficients {coefficients.shape} do not fit {basis.count} splines, {weights.shape} weights"
         )
     mean = coefficients.mean(axis=0)
-    root = root_of_products(basis, inner_product)
-    scaled = (root.T @ (coefficients - mean)) * weights
-    flat = scaled.reshape(examples, -1)
-    size = np.linalg.norm((root.T @ coefficients) * weights)
-    deviations, left = _decompose(flat, float(size))
-    vectors = (left.T @ flat) / deviations[:, None]
-    largest = np.take_along_axis(vectors, np.abs(vectors).argmax(axis=1)[:, None], axis=1)
-    signs = np.where(largest < 0.0, -1.0, 1.0)
-    vectors, left = vectors * signs, left * signs.T
-    shaped = vectors.reshape(-1, *mean.shape)
-    directions = np.linalg.solve(root.T, shaped) / weights
-    projections = (root @ shaped) * weights
-    energy = np.cumsum(deviations**2) / max(float((deviations**2).sum()), np.finfo(np.float64).tiny)
+    deviations = coefficients - mean
+    duals = dual_coefficients(basis, deviations, inner_product) * weights**2
+    size = float(np.linalg.norm(coefficients * weights))
+    lengths, left = _decompose(deviations.reshape(examples, -1) @ duals.reshape(examples, -1).T, size)
+    energy = np.cumsum(lengths**2) / max(float((lengths**2).sum()), np.finfo(np.float64).tiny)
     kept = _kept_count(energy, keep)
+    shares = (left[:, :kept] / lengths[:kept]).T
+    directions = np.tensordot(shares, deviations, axes=1)
+    flat = directions.reshape(kept, mean.size)
+    signs = np.where(flat[np.arange(kept), np.abs(flat).argmax(axis=1)] < 0.0, -1.0, 1.0)
     functions = FunctionalComponents(
         basis=basis,
         mean=mean,
-        directions=directions[:kept],
-        projections=projections[:kept],
-        variances=deviations[:kept] ** 2 / max(examples - 1, 1),
+        directions=directions * signs[:, None, None],
+        projections=np.tensordot(shares, duals, axes=1) * signs[:, None, None],
+        variances=lengths[:kept] ** 2 / max(examples - 1, 1),
         energy=energy[:kept],
     )
-    return PrincipalExamples(functions, energy, left * deviations, directions)
+    scores = left * lengths
+    scores[:, :kept] *= signs
+    return PrincipalExamples(functions, energy, scores, deviations)
 
 
-def _decompose(flat: Floats, size: float) -> tuple[Floats, Floats]:
-    """Singular values (r,), falling, and left singular vectors (m, r) of centred examples (m, P)."""
-    squares, vectors = np.linalg.eigh(flat @ flat.T)
-    squares, vectors = squares[::-1], vectors[:, ::-1]
-    deviations = np.sqrt(np.maximum(squares, 0.0))
-    floor = max(SMALLEST_RELATIVE_DEVIATION * float(deviations[0]), SMALLEST_RELATIVE_SPREAD * size)
-    rank = min(int((deviations > floor).sum()), len(flat) - 1)
-    return deviations[:rank], vectors[:, :rank]
+def dual_coefficients(basis: SplineBasis, coefficients: Floats, inner_product: InnerProduct) -> Floats:
+    """What coefficients (..., n, D) are multiplied with, one by one, to give inner products with their functions."""
+    return coefficients if inner_product == "coefficients" else np.asarray(basis.products @ coefficients)
+
+
+def _decompose(products: Floats, size: float) -> tuple[Floats, Floats]:
+    """Singular values (r,), falling, and left singular vectors (m, r) of examples with inner products (m, m)."""
+    squares, vectors = np.linalg.eigh(0.5 * (products + products.T))
+    lengths = np.sqrt(np.maximum(squares[::-1], 0.0))
+    floor = max(SMALLEST_RELATIVE_DEVIATION * float(lengths[0]), SMALLEST_RELATIVE_SPREAD * size)
+    rank = min(int((lengths > floor).sum()), len(products) - 1)
+    return lengths[:rank], vectors[:, ::-1][:, :rank]
 
 
 def _kept_count(energy: Floats, keep: Keep) -> int:
@@ -120,10 +129,3 @@ def _kept_count(energy: Floats, keep: Keep) -> int:
         return min(keep.count, len(energy))
     enough = int(np.searchsorted(energy, keep.share - 1e-12)) + 1
     return min(enough, len(energy), len(energy) if keep.most is None else keep.most)
-
-
-def root_of_products(basis: SplineBasis, inner_product: InnerProduct) -> Floats:
-    """(n, n) lower triangular L with L Lᵀ the inner products of the basis functions."""
-    if inner_product == "coefficients":
-        return np.eye(basis.count)
-    return np.asarray(np.linalg.cholesky(basis.products), dtype=np.float64)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import kinematics
-from marey_motion.modelling.fpca import InnerProduct, Keep, find_components, root_of_products
+from marey_motion.modelling.fpca import InnerProduct, Keep, dual_coefficients, find_components
 from marey_motion.modelling.reconstruction import comparison_frames
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.skeleton import Skeleton
@@ -103,9 +103,8 @@ class _Problem:
     @cached_property
     def grams(self) -> Floats:
         """(3 + J, m, m) inner products of the examples in each group of channels."""
-        root = root_of_products(self.basis, self.inner_product)
-        shaped = root.T @ self.deviations
-        each = np.einsum("anc,bnc->cab", shaped, shaped, optimize=True)
+        duals = dual_coefficients(self.basis, self.deviations, self.inner_product)
+        each = self.deviations.transpose(2, 0, 1) @ duals.transpose(2, 1, 0)
         joints = each[3:].reshape(-1, 4, *each.shape[1:]).sum(axis=1)
         return np.concatenate((each[:3], joints))
 

@@ -107,5 +107,6 @@ def test_arrays_that_do_not_fit_are_refused(place, told):
 
 def test_what_can_be_asked_for_are_the_options_of_training():
     asked = ModelParams()
-    options = ModelOptions(**asked.model_dump(exclude={"name", "tags", "report"}))
+    options = ModelOptions(**asked.model_dump(include=set(ModelOptions().as_tree())))
     assert options == ModelOptions()
+    assert set(ModelOptions().as_tree()) <= set(ModelParams.model_fields)
