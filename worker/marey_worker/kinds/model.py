@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from marey_motion import documents
 from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.alignment.aligned_documents import StoredExample, set_from_examples, uid_of
-from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.options import DEFAULT_OPTIONS, ModelOptions
 from marey_motion.modelling.primitive_documents import trained_to_tree
 from marey_motion.modelling.training import train_primitive
 from marey_schemas.alignment import AlignmentInfo
@@ -23,7 +23,7 @@ from marey_worker.context import Context, JobRefused
 from marey_worker.kinds.matching_clips import place_of, refusing_motion_errors
 from marey_worker.kinds.model_report import write_model_report
 
-NOT_OPTIONS = {"name", "tags", "report", "search_check"}
+OPTIONS = set(DEFAULT_OPTIONS.as_tree())
 
 
 def run(context: Context, params: ModelParams) -> dict[str, Any]:
@@ -39,7 +39,7 @@ def run(context: Context, params: ModelParams) -> dict[str, Any]:
         aligned = _aligned(context, pins, skeleton, motions, infos)
         trained = train_primitive(
             aligned,
-            ModelOptions(**params.model_dump(exclude=NOT_OPTIONS)),
+            ModelOptions(**params.model_dump(include=OPTIONS)),
             name=params.name,
             seed=context.seed,
             threads=context.threads,
