@@ -182,7 +182,7 @@ class _Cluster:
         sets, which = np.unique(active, axis=1, return_inverse=True)
         for number, chosen in enumerate(sets.T):
             here = np.flatnonzero(which.reshape(-1) == number)
-            asked = [constraints[i] for i in np.flatnonzero(chosen)]
+            asked = [one for one, counts in zip(constraints, chosen, strict=True) if counts]
             solved = self._solve(given.at_frames(here), frames[here], asked)
             rotations[here], roots[here] = solved.rotations, solved.root_translations
         changed = given._replace(rotations=rotations, root_translations=roots)

@@ -132,8 +132,8 @@ def plant_feet(
     planted = motion._replace(root_translations=motion.root_translations - lowering[:, None] * (0.0, 1.0, 0.0))
     for foot, plan in zip(feet, plans, strict=True):
         planted = _with_leg(skeleton, planted, motion, foot, plan, lowering, options.knee_damping_rad)
-    slides = [_slide(points, feet, contacts) for points in (positions, planted.positions(skeleton))]
-    return PlantedMotion(planted, tuple(contacts), *slides, float(lowering.max(initial=0.0)))
+    before, after = (_slide(points, feet, contacts) for points in (positions, planted.positions(skeleton)))
+    return PlantedMotion(planted, tuple(contacts), before, after, float(lowering.max(initial=0.0)))
 
 
 def find_contacts(positions: Floats, foot: Foot, frame_rate_hz: float, options: PlantOptions) -> FootContacts:

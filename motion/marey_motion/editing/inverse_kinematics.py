@@ -127,8 +127,9 @@ def solve(
     ----------
     motion : F frames, which stay as they are
     freedom : what may turn
-    limb : a limb that may turn instead. "auto" takes the two-bone solver where there is one, all targets are the
-        position (in all axes) and the orientation of its end, and no limits are asked for; else least squares.
+    limb : a limb that is to turn. "auto" takes the two-bone solver where there is one, all targets are the position (in
+        all axes) and the orientation of its end, and no limits are asked for; else, and where the limb is too short in
+        any of the frames and more may turn, least squares.
 
     Raises
     ------
@@ -143,7 +144,10 @@ def solve(
                 where="solver",
             )
         position, orientation = asked
-        return solve_two_bone(skeleton, motion, limb, position, orientation=orientation, options=options)
+        exact = solve_two_bone(skeleton, motion, limb, position, orientation=orientation, options=options)
+        others = set(freedom.joints or ()) - set(limb.joints)
+        if solver == "two_bone" or exact.reached.all() or not (others or freedom.root_moves):
+            return exact
     if limb is not None and all(isinstance(one, OrientationTarget) and one.joint == limb.end for one in targets):
         freedom = replace(freedom, joints=(limb.end,))  # an orientation alone does not move the limb
     elif limb is not None and freedom.joints is None:
@@ -241,8 +245,11 @@ def solve_two_bone(
     found = problem.found
     _measure(problem, options, found.before, found)
     before = problem.rotations.copy()
+    start, middle, end = np.searchsorted(problem.joints, (limb.start, limb.middle, limb.end)).tolist()
     kernel_limb = _LimbKernel(
-        *(int(np.searchsorted(problem.joints, joint)) for joint in (limb.start, limb.middle, limb.end)),
+        start,
+        middle,
+        end,
         problem.targets.offsets[0],
         np.array(limb.hinge or (0.0, 0.0, 0.0)),
         float(damping_zone_rad),

@@ -129,7 +129,8 @@ class Problem(NamedTuple):
     @property
     def placing(self) -> Placing:
         """Room for cyclic coordinate descent."""
-        return Placing(*self._pose_room(), np.zeros((3, 3)), np.zeros((4, 4)), np.zeros((4, 4)))
+        room = self._pose_room()
+        return Placing(**room, matrix=np.zeros((3, 3)), form=np.zeros((4, 4)), vectors=np.zeros((4, 4)))
 
     def stepping(self, regularisation_m: float) -> Stepping:
         """Room for least squares."""
@@ -138,21 +139,29 @@ class Problem(NamedTuple):
         holding = np.full(unknowns, regularisation_m**2)
         holding[:-3] /= np.repeat((1.0 - self.body.stiffness[self.body.movable]) ** 2, 3)
         return Stepping(
-            *self._pose_room(),
-            *(np.zeros(shape) for shape in ((joints, 4), 3, (joints, 4), 3)),
-            holding,
-            *(np.zeros(unknowns) for _ in range(4)),
-            *(np.zeros((errors, unknowns)) for _ in range(2)),
-            *(np.zeros(errors) for _ in range(2)),
-            np.zeros((errors, errors)),
-            np.zeros(movable, np.int64),
-            np.zeros((movable, 3)),
+            **self._pose_room(),
+            first=np.zeros((joints, 4)),
+            first_root=np.zeros(3),
+            trial=np.zeros((joints, 4)),
+            trial_root=np.zeros(3),
+            holding=holding,
+            displacement=np.zeros(unknowns),
+            gradient=np.zeros(unknowns),
+            step=np.zeros(unknowns),
+            softness=np.zeros(unknowns),
+            jacobian=np.zeros((errors, unknowns)),
+            softened=np.zeros((errors, unknowns)),
+            scaled_errors=np.zeros(errors),
+            right=np.zeros(errors),
+            matrix=np.zeros((errors, errors)),
+            blocked=np.zeros(movable, np.int64),
+            outward=np.zeros((movable, 3)),
         )
 
-    def _pose_room(self) -> tuple[Floats, ...]:
+    def _pose_room(self) -> dict[str, Floats]:
         joints, count = len(self.joints), len(self.targets.kinds)
-        shapes = ((joints, 4), (joints, 3), (count, 3), (count, 4), (count, 3))
-        return tuple(np.zeros(shape) for shape in shapes)
+        shapes = {"spins": (joints, 4), "places": (joints, 3), "tips": (count, 3), "turns": (count, 4)}
+        return {name: np.zeros(shape) for name, shape in (shapes | {"errors": (count, 3)}).items()}
 
     def put_back(self, motion: Motion) -> Motion:
         """The motion with the poses of this problem."""
@@ -213,7 +222,9 @@ def _targets(joints: list[int], targets: Sequence[Target], frames: int) -> Targe
         np.array([_KINDS[type(target)] for target in targets], dtype=np.int64),
         np.array([joints.index(target.joint) for target in targets], dtype=np.int64),
         np.zeros((rows, count, 4)),
-        *(np.zeros((count, 3)) for _ in range(3)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3)),
         np.zeros(count),
     )
     for number, (target, value) in enumerate(zip(targets, values, strict=True)):

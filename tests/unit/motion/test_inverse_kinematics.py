@@ -503,6 +503,10 @@ def test_the_solver_that_fits_is_chosen(body: Skeleton) -> None:
     assert exact.residual_after[0, 0] < 1e-12
     with pytest.raises(EditError, match="two bones reach one position"):
         solve(body, motion, [PositionTarget(limb.end, near, axes="xy")], limb=limb, solver="two_bone")
+    far = motion.positions(body)[0, limb.start] + np.array([0.5, 0.25, 0.1])
+    chain = Freedom(chain_of(body, limb.end, body.index_of("Spine")))
+    assert not solve(body, motion, [PositionTarget(limb.end, far)], limb=limb).reached[0]
+    assert solve(body, motion, [PositionTarget(limb.end, far)], limb=limb, freedom=chain).reached[0]
     several = [PositionTarget(limb.end, near), LookAtTarget(body.index_of("Head"), near, axis=(0, 0, 1))]
     assert solve(body, motion, several).reached.all()
 
