@@ -23,8 +23,8 @@ from marey_motion.rigs import map_joints
 
 Floats = NDArray[np.float64]
 
-# Frames of both motions, points, repeats.
-SIZES = ((200, 205, 20, 15), (200, 205, 78, 15), (1000, 1000, 63, 5))
+# Frames of both motions, points, repeats, calls in each: a call by itself takes as long as finding its code again.
+SIZES = ((200, 205, 20, 9, 20), (200, 205, 78, 9, 20), (1000, 1000, 63, 5, 2))
 GOAL_RATIO = 3
 GOAL_MS = 5
 RANDOM_MATRICES = 100
@@ -76,7 +76,7 @@ def _clouds(frames: int, points: int, seed: int) -> Floats:
     return np.asarray(random.normal(size=(points, 3)) + random.normal(size=(frames, points, 3)).cumsum(axis=0) * 0.03)
 
 
-def _pair(frames: int, others: int, points: int, repeats: int) -> list[Row]:
+def _pair(frames: int, others: int, points: int, repeats: int, calls: int) -> list[Row]:
     a, b = _clouds(frames, points, 1), _clouds(others, points, 2)
     size = f"{frames} x {others}, {points} points"
     plain = CostOptions("plain")
@@ -88,8 +88,8 @@ def _pair(frames: int, others: int, points: int, repeats: int) -> list[Row]:
         found = theirs() / points
         assert abs(found - total) <= 1e-9 * total, f"{name} finds {found}, we find {total}"
     return [
-        _against("DTW given the costs", size, lambda: align(costs), given, repeats, GOAL_RATIO),
-        _against("plain costs and DTW", size, lambda: align(frame_costs(a, b, plain)), of_points, repeats),
+        _against("DTW given the costs", size, lambda: align(costs), given, repeats, calls, GOAL_RATIO),
+        _against("plain costs and DTW", size, lambda: align(frame_costs(a, b, plain)), of_points, repeats, calls),
     ]
 
 
@@ -99,10 +99,11 @@ def _against(
     ours: Callable[[], object],
     peers: dict[str, Callable[[], float]],
     repeats: int,
+    calls: int,
     goal: float | None = None,
 ) -> Row:
     """Beside each of the peers; the ratio is that with librosa, the quickest of them."""
-    own, *theirs = time_in_turn(ours, *peers.values(), repeats=repeats)
+    own, *theirs = _each(calls, repeats, ours, *peers.values())
     by_name = dict(zip(peers, theirs, strict=True))
     ratio = by_name["librosa"].median_s / own.median_s
     shown = ", ".join(f"{name} {timing.median_s * 1e3:.2f}" for name, timing in by_name.items())
@@ -111,9 +112,23 @@ def _against(
     return Row(job, size, _ms(own), shown, ratio, f"≥ {goal:g}x librosa", ratio >= goal)
 
 
+def _each(calls: int, repeats: int, *contenders: Callable[[], object]) -> list[Timing]:
+    """Seconds of one of so many calls."""
+
+    def many(call: Callable[[], object]) -> Callable[[], None]:
+        def run() -> None:
+            for _ in range(calls):
+                call()
+
+        return run
+
+    timings = time_in_turn(*map(many, contenders), repeats=repeats)
+    return [Timing(one.best_s / calls, one.median_s / calls) for one in timings]
+
+
 def _published_pair() -> Row:
     a, b = _clouds(200, 78, 3), _clouds(205, 78, 4)
-    (ours,) = time_in_turn(lambda: align(frame_costs(a, b), max_run=3), repeats=15)
+    (ours,) = _each(10, 9, lambda: align(frame_costs(a, b), max_run=3))
     return Row(
         "turned costs and DTW with slope limit",
         "200 x 205, 78 points",

@@ -16,65 +16,70 @@ _compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
 def align(costs, path):  # type: ignore[no-untyped-def]
     """Fill `path` backwards from the end; the least total and the number of cells."""
     n, m = costs.shape
-    totals = np.empty((n + 1, m + 1))  # with a border that no way comes from, but into the first cell
-    totals[0, :] = np.inf
-    totals[:, 0] = np.inf
+    steps = np.empty((n, m), np.uint8)
+    # The row before a block and those of the block, with a border that no way comes from, but into the first cell.
+    totals = np.full((LANES + 1, m + 1), np.inf)
     totals[0, 0] = 0.0
     whole = n - n % LANES if m >= LANES else 0
     for i in range(0, whole, LANES):
-        _four_rows(costs, i, totals)
+        _four_rows(costs[i : i + LANES], totals, steps[i : i + LANES])
+        totals[0] = totals[LANES]
     for i in range(whole, n):
-        _cells(costs, i, 0, m, totals)
-    return totals[n, m], _walk_back(totals, path)
+        _cells(costs[i], totals[0], totals[1], steps[i], 0, m)
+        totals[0] = totals[1]
+    return totals[0, m], _walk_back(steps, path)
 
 
 @_compiled
-def _cells(costs, i, start, stop, totals):  # type: ignore[no-untyped-def]
-    """Totals of row i in columns [start, stop)."""
+def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
+    """The least of three totals and the step that has it, without branches, which could not be foreseen."""
+    least = min(both, first, second)
+    alone = least < both
+    return least, np.uint8(alone) + np.uint8(alone & (least < first))
+
+
+@_compiled
+def _cells(costs, before, totals, steps, start, stop):  # type: ignore[no-untyped-def]
+    """Columns [start, stop) of one row; totals stand one column further than costs and steps."""
     for j in range(start, stop):
-        totals[i + 1, j + 1] = min(totals[i, j], totals[i, j + 1], totals[i + 1, j]) + costs[i, j]
+        least, steps[j] = _cheapest(before[j], before[j + 1], totals[j])
+        totals[j + 1] = least + costs[j]
 
 
 @_compiled
-def _four_rows(costs, i, totals):  # type: ignore[no-untyped-def]
-    """Totals of rows i to i + 3: each cell waits for the one on its left, but four rows, each a column behind the one
-    above it, do not wait for each other."""
+def _four_rows(costs, totals, steps):  # type: ignore[no-untyped-def]
+    """Each cell waits for the one on its left. Rows that go a column behind the one above them do not wait for it."""
     m = costs.shape[1]
-    for lane in range(LANES - 1):
-        _cells(costs, i + lane, 0, LANES - 1 - lane, totals)
-    left_0, left_1 = totals[i + 1, LANES - 1], totals[i + 2, LANES - 2]
-    left_2, left_3 = totals[i + 3, LANES - 3], totals[i + 4, LANES - 4]
-    past_0, past_1, past_2 = totals[i + 1, LANES - 2], totals[i + 2, LANES - 3], totals[i + 3, LANES - 4]
+    for row in range(LANES - 1):
+        _cells(costs[row], totals[row], totals[row + 1], steps[row], 0, LANES - 1 - row)
+    left_0, left_1, left_2, left_3 = totals[1, 3], totals[2, 2], totals[3, 1], totals[4, 0]
+    past_0, past_1, past_2 = totals[1, 2], totals[2, 1], totals[3, 0]
     for j in range(LANES - 1, m):
-        now_0 = min(totals[i, j], totals[i, j + 1], left_0) + costs[i, j]
-        now_1 = min(past_0, left_0, left_1) + costs[i + 1, j - 1]
-        now_2 = min(past_1, left_1, left_2) + costs[i + 2, j - 2]
-        now_3 = min(past_2, left_2, left_3) + costs[i + 3, j - 3]
-        totals[i + 1, j + 1] = now_0
-        totals[i + 2, j] = now_1
-        totals[i + 3, j - 1] = now_2
-        totals[i + 4, j - 2] = now_3
+        least_0, steps[0, j] = _cheapest(totals[0, j], totals[0, j + 1], left_0)
+        least_1, steps[1, j - 1] = _cheapest(past_0, left_0, left_1)
+        least_2, steps[2, j - 2] = _cheapest(past_1, left_1, left_2)
+        least_3, steps[3, j - 3] = _cheapest(past_2, left_2, left_3)
         past_0, past_1, past_2 = left_0, left_1, left_2
-        left_0, left_1, left_2, left_3 = now_0, now_1, now_2, now_3
-    for lane in range(1, LANES):
-        _cells(costs, i + lane, m - lane, m, totals)
+        left_0, left_1 = least_0 + costs[0, j], least_1 + costs[1, j - 1]
+        left_2, left_3 = least_2 + costs[2, j - 2], least_3 + costs[3, j - 3]
+        totals[1, j + 1], totals[2, j], totals[3, j - 1], totals[4, j - 2] = left_0, left_1, left_2, left_3
+    for row in range(1, LANES):
+        _cells(costs[row], totals[row], totals[row + 1], steps[row], m - row, m)
 
 
 @_compiled
-def _walk_back(totals, path):  # type: ignore[no-untyped-def]
-    """Fill `path` backwards from totals (n + 1, m + 1)."""
-    i, j, length = totals.shape[0] - 1, totals.shape[1] - 1, 0
+def _walk_back(steps, path):  # type: ignore[no-untyped-def]
+    """Fill `path` backwards from the end; the number of cells."""
+    i, j, length = steps.shape[0] - 1, steps.shape[1] - 1, 0
     while True:
-        path[length, 0], path[length, 1] = i - 1, j - 1
+        path[length, 0], path[length, 1] = i, j
         length += 1
-        if i == 1 and j == 1:
+        if i == 0 and j == 0:
             return length
-        both, first, second = totals[i - 1, j - 1], totals[i - 1, j], totals[i, j - 1]
-        if both <= first and both <= second:
-            i, j = i - 1, j - 1
-        elif first <= second:
+        step = steps[i, j]
+        if step != SECOND:
             i -= 1
-        else:
+        if step != FIRST:
             j -= 1
 
 
