@@ -43,7 +43,7 @@ class Constraint:
     ----------
     target : its values are for all of these frames, or one for each
     joints : indices of the joints that may turn for it
-    limb : the limb that these are, where they are one
+    limb : the limb among these that ends at the target, where there is one: it is tried alone before the others turn
     """
 
     target: Target

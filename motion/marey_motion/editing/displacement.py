@@ -167,6 +167,8 @@ def _rotation_vectors(before: Floats, after: Floats) -> Floats:
 def _continued(values: Floats, joints: int) -> Floats:
     """Values (n, 3·joints + 3) whose rotation vectors go on beyond half a turn where their neighbours' do."""
     vectors = values[:, : 3 * joints].reshape(len(values), joints, 3)
+    if np.linalg.norm(vectors, axis=-1).max(initial=0.0) < 0.5 * np.pi:
+        return values
     for n in range(1, len(values)):
         angle = np.linalg.norm(vectors[n], axis=-1, keepdims=True)
         other = vectors[n] * (1.0 - 2.0 * np.pi / np.maximum(angle, 1e-12))

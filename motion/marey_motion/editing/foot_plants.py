@@ -165,7 +165,9 @@ def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, 
     for start, stop in runs(contacts.toe):
         places[start:stop] = np.median(toe[start:stop], axis=0)
     shift = _blended(contacts.toe, places - toe, blend)
-    firm_toe = np.clip(_blended(contacts.toe, np.ones((len(toe), 1)), blend), 0.0, 1.0)
+    firm_toe, firm_heel = (
+        np.clip(_blended(one, np.ones((len(toe), 1)), blend), 0.0, 1.0) for one in (contacts.toe, contacts.heel)
+    )
     led, length = ankle + shift, np.linalg.norm(ankle - toe, axis=1, keepdims=True)
     own = led.copy()
     for start, stop in _heel_runs(contacts):
@@ -177,9 +179,8 @@ def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, 
     target = led + _blended(contacts.heel, own - led, blend)
     target += firm_toe * (_at_distance(target, toe + shift, length) - target)
     turn = _turn_between(toe - ankle, toe + shift - target)
-    firm = np.maximum(firm_toe, np.clip(_blended(contacts.heel, np.ones((len(toe), 1)), blend), 0.0, 1.0))
     rotation = quaternions.multiply(turn, spins[:, foot.leg.end])
-    return _Plan(target, np.asarray(rotation, dtype=np.float64), firm[:, 0])
+    return _Plan(target, np.asarray(rotation, dtype=np.float64), np.maximum(firm_toe, firm_heel)[:, 0])
 
 
 def _heel_runs(contacts: FootContacts) -> list[Run]:

@@ -245,16 +245,7 @@ def solve_two_bone(
     found = problem.found
     _measure(problem, options, found.before, found)
     before = problem.rotations.copy()
-    start, middle, end = np.searchsorted(problem.joints, (limb.start, limb.middle, limb.end)).tolist()
-    kernel_limb = _LimbKernel(
-        start,
-        middle,
-        end,
-        problem.targets.offsets[0],
-        np.array(limb.hinge or (0.0, 0.0, 0.0)),
-        float(damping_zone_rad),
-        two_bone_kernels.GIVEN if orientation else {"carried": 0, "held": 1}[ending],
-    )
+    kernel_limb = _kernel_limb(problem, limb, "given" if orientation else ending, damping_zone_rad)
     two_bone_kernels.reach_frames(
         kernel_limb,
         problem.body,
@@ -267,6 +258,22 @@ def solve_two_bone(
     _measure(problem, options, found.after, found)
     _keep_better(problem, before, found)
     return _solved(motion, problem, found)
+
+
+def _kernel_limb(
+    problem: Problem, limb: Limb, ending: Literal["carried", "held", "given"], damping_zone_rad: float
+) -> _LimbKernel:
+    from marey_motion.editing import two_bone_kernels
+
+    start, middle, end = np.searchsorted(problem.joints, (limb.start, limb.middle, limb.end)).tolist()
+    endings = {
+        "carried": two_bone_kernels.CARRIED,
+        "held": two_bone_kernels.HELD,
+        "given": two_bone_kernels.GIVEN,
+    }
+    hinge = np.array(limb.hinge or (0.0, 0.0, 0.0))
+    offset = problem.targets.offsets[0]
+    return _LimbKernel(start, middle, end, offset, hinge, float(damping_zone_rad), endings[ending])
 
 
 def _keep_better(problem: Problem, before: Floats, found: Found) -> None:
