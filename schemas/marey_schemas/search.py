@@ -130,6 +130,9 @@ class SearchRequest(Request):
     )
     start: StartPlacement = StartPlacement()
     candidates: int = Field(8, ge=1, le=MOST_CANDIDATES, description="Nodes that are followed down the tree.")
+    passes: int = Field(
+        2, ge=1, le=4, description="1: the tree's samples alone; each further one looks closer around the best so far."
+    )
     refine: bool = Field(True, description="Improve what the tree has by numerical optimisation.")
     likelihood_weight: float = Field(
         1.0,
@@ -173,7 +176,7 @@ class ConstraintError(Answer):
     error_cm: float | None = None
     error_deg: float | None = None
     error_s: float | None = None
-    sampled_error: float = Field(description="Of the sample that the tree gave, in the same unit.")
+    searched_error: float = Field(description="After the search of the tree, in the same unit.")
     finished_error: float | None = Field(None, description="After inverse kinematics, in the same unit.")
     reached: bool = Field(description="Within its tolerance, at the end.")
 

@@ -70,6 +70,7 @@ def search(searchables: Sequence[Searchable], request: SearchRequest) -> SearchR
             [one.tree for one in searchables],
             start=placement_of(request.start),
             candidates=request.candidates,
+            passes=request.passes,
             refining=RefineOptions(request.likelihood_weight, request.iterations) if request.refine else None,
             transitions=TransitionOptions(tolerance_m=request.transition_tolerance_cm * CM),
         )
@@ -158,7 +159,7 @@ def _errors(result: SearchResult, request: SearchRequest) -> tuple[ConstraintErr
                     constraint=place,
                     type=constraint.type,
                     joint=getattr(constraint, "joint", None),
-                    sampled_error=_in_unit(float(sampled[place]), unit),
+                    searched_error=_in_unit(float(sampled[place]), unit),
                     finished_error=None if finished is None else left,
                     reached=left <= getattr(constraint, f"tolerance_{unit}"),
                     **{f"error_{unit}": error},

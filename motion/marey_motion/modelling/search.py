@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,12 @@ from marey_motion.modelling.tree import SampleTree
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-CANDIDATES = 4
+CANDIDATES = 8
+"""Four are the published number; eight come a sixth nearer in a millisecond."""
+
+PASSES = 2
+NARROWING = 0.25
+"""By how much the samples are drawn together for each further pass."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +29,7 @@ class Found:
 
     Parameters
     ----------
-    samples : (t,) their places in the tree
+    samples : (t,) their places in the tree; -1 for what a further pass found between them
     latents : (t, L)
     costs : (t,) Equation 1
     evaluations : motions that were evaluated
@@ -48,6 +54,32 @@ def search_tree(objective: Objective, tree: SampleTree, *, candidates: int = CAN
     top : samples to return
     """
     _check(objective, tree, candidates, top)
+    return _descend(objective, tree, candidates, top, lambda latents: latents)
+
+
+def search_closely(
+    objective: Objective, tree: SampleTree, *, candidates: int = CANDIDATES, passes: int = PASSES
+) -> Found:
+    """The best sample, and then what is better close to it: as `search_tree`, several times.
+
+    Each further pass goes down the same tree once more, with all samples drawn together about the best motion so far,
+    so that they are a quarter as far apart as in the pass before. What is found there is about as likely as a sample.
+    """
+    best = search_tree(objective, tree, candidates=candidates)
+    middle = tree.means[0]
+    for number in range(1, passes):
+        share, centre = NARROWING**number, best.latents[0]
+        found = _descend(objective, tree, candidates, 1, lambda latents: centre + share * (latents - middle))  # noqa: B023
+        evaluations = best.evaluations + found.evaluations
+        better = replace(found, samples=np.full(1, -1)) if found.costs[0] < best.costs[0] else best
+        best = replace(better, evaluations=evaluations)
+    return best
+
+
+def _descend(
+    objective: Objective, tree: SampleTree, candidates: int, top: int, drawn: Callable[[Floats], Floats]
+) -> Found:
+    """Go down a tree whose latent vectors are where `drawn` puts them."""
     frontier = np.zeros(1, dtype=np.intp)
     seen, costs, evaluations = [], [], 0
     while frontier.size:
@@ -56,12 +88,13 @@ def search_tree(objective: Objective, tree: SampleTree, *, candidates: int = CAN
         alone = tree.sizes[nodes] == 1
         samples = np.concatenate((_ranges(tree.starts[leaves], tree.sizes[leaves]), tree.starts[nodes[alone]]))
         nodes = nodes[~alone]
-        found = objective.costs(np.concatenate((tree.means[nodes], tree.samples[samples])))
+        found = objective.costs(drawn(np.concatenate((tree.means[nodes], tree.samples[samples]))))
         seen.append(samples)
         costs.append(found[len(nodes) :])
         evaluations += len(found)
         frontier = nodes[_smallest(found[: len(nodes)], nodes, candidates)]
-    return _best(tree, np.concatenate(seen), np.concatenate(costs), top, evaluations)
+    best = _best(tree, np.concatenate(seen), np.concatenate(costs), top, evaluations)
+    return replace(best, latents=drawn(best.latents))
 
 
 def search_all(objective: Objective, tree: SampleTree, *, top: int = 1) -> Found:

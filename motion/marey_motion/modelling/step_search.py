@@ -12,7 +12,7 @@ from marey_motion.alignment.aligned import Placement
 from marey_motion.modelling.constraints import START, JointPosition
 from marey_motion.modelling.objective import AT_ORIGIN, build_objective
 from marey_motion.modelling.optimise import DEFAULT_REFINING, Refined, RefineOptions, refine
-from marey_motion.modelling.search import CANDIDATES, Found, search_tree
+from marey_motion.modelling.search import CANDIDATES, PASSES, Found, search_closely
 from marey_motion.modelling.steps import DEFAULT_TRANSITIONS, CarriedOn, Measured, SeveralSteps, Step, TransitionOptions
 from marey_motion.modelling.tree import SampleTree
 
@@ -29,7 +29,7 @@ class Sequel:
     measured : where they take place, and what they miss
     joints : standard names of the transition joints, whose jumps were measured after that of the pelvis
     searched : what the search of each tree came upon
-    sampled : what the best samples alone come to
+    sampled : what comes of the searches alone
     refined : how refining them ended, None where it was not asked for
     """
 
@@ -47,6 +47,7 @@ def search_steps(
     *,
     start: Placement = AT_ORIGIN,
     candidates: int = CANDIDATES,
+    passes: int = PASSES,
     refining: RefineOptions | None = DEFAULT_REFINING,
     transitions: TransitionOptions = DEFAULT_TRANSITIONS,
 ) -> Sequel:
@@ -56,6 +57,7 @@ def search_steps(
     ----------
     trees : over samples of each step's primitive
     start : of the first step's canonical frame
+    candidates, passes : see `search_closely`
     refining : None to keep the samples that were found
 
     Raises
@@ -66,7 +68,7 @@ def search_steps(
     searched: list[Found] = []
     for step, tree in zip(steps, trees, strict=True):
         begun = problem.carried_on([one.latents[0] for one in searched])
-        searched.append(_search_step(step, tree, begun, candidates, transitions))
+        searched.append(_search_step(step, tree, begun, candidates, passes, transitions))
     stacked = np.concatenate([one.latents[0] for one in searched])
     measured = sampled = problem.measure(stacked)
     refined = None if refining is None else refine(problem, stacked, refining)
@@ -77,13 +79,13 @@ def search_steps(
 
 
 def _search_step(
-    step: Step, tree: SampleTree, begun: CarriedOn, candidates: int, transitions: TransitionOptions
+    step: Step, tree: SampleTree, begun: CarriedOn, candidates: int, passes: int, transitions: TransitionOptions
 ) -> Found:
-    """The best sample for a step that goes on where another ended."""
+    """The best motion of a tree for a step that goes on where another ended."""
     going_on = tuple(
         JointPosition(name, START, (x, y, z), transitions.tolerance_m, transitions.weight)
         for name, (x, y, z) in ((name, point.tolist()) for name, point in begun.joints.items())
     )
     constraints = (*step.constraints, *going_on)
     objective = build_objective(step.primitive, constraints, step.standard_joints, placement=begun.placement)
-    return search_tree(objective, tree, candidates=candidates)
+    return search_closely(objective, tree, candidates=candidates, passes=passes)

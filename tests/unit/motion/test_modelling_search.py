@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from marey_motion.errors import MotionError
 from marey_motion.modelling.constraints import JointPosition, RootPosition
 from marey_motion.modelling.objective import build_objective
-from marey_motion.modelling.search import search_all, search_tree
+from marey_motion.modelling.search import search_all, search_closely, search_tree
 from marey_motion.modelling.tree import SampleTree, TreeOptions, build_tree
 from search_primitives import sliding, standard_joints, walking
 
@@ -143,3 +143,27 @@ def test_a_model_that_never_varies_has_one_motion_to_find():
     tree = SampleTree(np.zeros((1, 0), np.float32), np.array([1], np.int32), np.array([0], np.int32))
     found = search_tree(build_objective(primitive, [RootPosition(0, (0.5, None))], {}), tree)
     np.testing.assert_allclose(found.costs, 50.0)
+
+
+def test_looking_closer_comes_nearer_and_stays_as_likely():
+    primitive, tree = walking()[0], grown()
+    once, twice = [], []
+    for target in primitive.sample(25, 31):
+        place = primitive.poses(target[None], [0.0])[0, 0, :3]
+        wanted = [JointPosition("pelvis", 0, tuple(place)), RootPosition("end", (0.05, 1.1))]
+        objective = build_objective(primitive, wanted, standard_joints())
+        once.append(search_tree(objective, tree, candidates=4))
+        twice.append(search_closely(objective, tree, candidates=4, passes=2))
+    costs = np.array([[one.costs[0], other.costs[0]] for one, other in zip(once, twice, strict=True)])
+    assert (costs[:, 1] <= costs[:, 0]).all()
+    assert np.median(costs[:, 1]) < 0.7 * np.median(costs[:, 0])
+    densities = primitive.log_density(np.concatenate([one.latents for one in twice]))
+    assert np.median(densities) > np.percentile(primitive.log_density(tree.samples.astype(float)), 10)
+
+
+def test_what_lies_between_samples_is_told_from_samples_and_costs_what_it_says():
+    objective, tree = wrist_at(0.3, 1.0, 0.4), grown()
+    found = search_closely(objective, tree)
+    assert found.samples.tolist() == [-1]
+    assert np.array_equal(objective.costs(found.latents), found.costs)
+    assert search_closely(objective, tree, passes=1).samples[0] >= 0
