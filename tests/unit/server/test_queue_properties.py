@@ -14,7 +14,7 @@ from sqlalchemy import Connection, delete, func, select
 from marey_schemas.jobs import Lease
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import Conflict, LeaseLost
-from marey_server.store import job_layout, tables
+from marey_server.store import job_layout, retrying, tables
 from marey_server.store.reaper import share_waiting
 from marey_server.store.transaction import Transaction
 from queue_desk import Desk
@@ -116,6 +116,26 @@ class QueueMachine(RuleBasedStateMachine):
         unfinished = [job.id for job in self.model.jobs.values() if job.state not in TERMINAL]
         inputs = {"things": {"collection": "raw"}}
         self.desk.submit("survey", inputs=inputs, params={"number": tasks}, into=into, after=unfinished[:1] * wait)
+
+    @rule(data=st.data(), kind=st.sampled_from(["square", "survey"]), into=st.sampled_from(["x", "y"]))
+    def submit_for_what_others_make(self, data: st.DataObject, kind: str, into: str) -> None:
+        self._tick()
+        chained = sorted(row.id for row in self._rows() if row.kind in CHAINED and row.parent_id is None)
+        if chained:
+            makers = data.draw(st.lists(st.sampled_from(chained), min_size=1, max_size=2, unique=True))
+            inputs = {"things": [{"job": maker} for maker in makers]}
+            self.desk.submit(kind, inputs=inputs, params={"number": 2}, into=into)
+
+    @rule(data=st.data())
+    def try_again(self, data: st.DataObject) -> None:
+        """Chained jobs alone: the model of errands knows no tries."""
+        self._tick()
+        lost = {row.id for row in self._rows() if row.kind in CHAINED and row.state in ("failed", "cancelled")}
+        again = sorted(job for job in lost if self._is_head(job) and not self._needs_an_errand(job))
+        if again:
+            job_id = data.draw(st.sampled_from(again))
+            made = self.desk.database.write(self.desk.user, retrying.retry_job, job_id)
+            assert made.retry_of == job_id
 
     # -- working -------------------------------------------------------------------------------------------------------
 
@@ -264,6 +284,14 @@ class QueueMachine(RuleBasedStateMachine):
                     assert left == 0
 
     @invariant()
+    def a_job_that_goes_on_has_its_inputs(self) -> None:
+        for row in self._rows():
+            late = any("job" in entry for entries in row.inputs.values() for entry in entries)
+            assert row.unbound == late
+            assert not late or row.state in ("waiting", "failed", "cancelled")
+            assert not late or row.size is None
+
+    @invariant()
     def only_leased_jobs_run(self) -> None:
         for row in self._rows():
             has_tasks_at_work = row.size is not None and row.dependencies_left > 0
@@ -278,6 +306,7 @@ class QueueMachine(RuleBasedStateMachine):
                 pass
             leases = self.desk.claim_many()
             for lease in leases:
+                self.desk.stage(lease, "r")
                 self.desk.complete(lease)
             if not leases and all(row.state in TERMINAL for row in self._rows()):
                 break
@@ -297,6 +326,14 @@ class QueueMachine(RuleBasedStateMachine):
         if lease.kind in ERRANDS:
             return self.model.holds(lease.job, lease.fence)
         return any(row.id == lease.job and row.state == "running" and row.fence == lease.fence for row in self._rows())
+
+    def _is_head(self, job_id: str) -> bool:
+        return any(row.id == job_id and row.parent_id is None for row in self._rows())
+
+    def _needs_an_errand(self, job_id: str) -> bool:
+        """Whether it came after an errand, or after a job that did, or its tries did."""
+        after = self.desk.job(job_id).after
+        return any(other in self.model.jobs or self._needs_an_errand(other) for other in after)
 
     def _rows(self) -> list[Any]:
         return self.desk.database.read(SYSTEM, _all_jobs)
@@ -320,7 +357,8 @@ def run_machine(desk: Desk, monkeypatch: pytest.MonkeyPatch, *, examples: int = 
     """Run the machine on a desk whose clock stands still and whose ids are numbers, so that runs can be repeated."""
     clock = StillClock()
     numbers = itertools.count(1)
-    monkeypatch.setattr(job_layout, "new_id", lambda prefix: f"{prefix}_{next(numbers):08}")
+    for module in (job_layout, retrying):
+        monkeypatch.setattr(module, "new_id", lambda prefix: f"{prefix}_{next(numbers):08}")
     desk.database.clock = clock
     desk.things(4)
     run_state_machine_as_test(

@@ -1,0 +1,189 @@
+"""From takes to a model as its users walk it: command line and SDK, a real server, a real worker."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from benchmarks.pipeline_under_fire import write_takes
+
+from marey_client import Marey
+from marey_client.errors import NoAnnotations
+from marey_client.imports import find_files
+from marey_client.project import ProjectHandle
+from marey_motion.formats import write_motion
+from marey_motion.gait import generate_gait
+from marey_schemas.access import ProjectCreate
+from marey_schemas.imports import ImportOptions
+from marey_schemas.kinds import Kind
+from server_process import ServerProcess
+
+pytestmark = pytest.mark.timeout(600)
+
+TAKES = 20
+"""More than one task of a retargeting takes."""
+
+QUICK = ("model.leave_one_out=false", "model.folds=0", "model.report_samples=20", "tree.samples=500")
+QUICK_FLAGS = tuple(flag for choice in QUICK for flag in ("--set", choice))
+CHANGED = "walk-003"
+
+
+@pytest.fixture
+def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
+    process = ServerProcess(tmp_path, database_url)
+    process.start(workers=1)
+    yield process
+    process.stop()
+
+
+@pytest.fixture
+def marey(server: ServerProcess) -> Iterator[Marey]:
+    with server.client() as client:
+        yield client
+
+
+@pytest.fixture
+def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
+    """A project with a skeleton that came with a clip, and beside it a folder of takes that are not there yet."""
+    project = marey.create_project(ProjectCreate(name="lab"))
+    write_takes(tmp_path, TAKES)
+    project.imports.upload(find_files([tmp_path / "game.bvh"]).files, ImportOptions(collection="rigs"))
+    return project
+
+
+@pytest.fixture
+def command(server: ServerProcess, tmp_path: Path) -> dict[str, Any]:
+    """How the command line is run against the server, in a folder of its own."""
+    surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
+    known = {"MAREY_URL": server.url, "MAREY_DATA": str(server.data), "HOME": str(tmp_path)}
+    return {"env": {**surroundings, **known, "XDG_CONFIG_HOME": str(tmp_path)}, "cwd": tmp_path, "text": True}
+
+
+@pytest.fixture
+def run(command: dict[str, Any]) -> Callable[..., subprocess.CompletedProcess[str]]:
+    def run(*arguments: object, status: int = 0, **more: Any) -> subprocess.CompletedProcess[str]:
+        told = [sys.executable, "-m", "marey_client.cli", *map(str, arguments)]
+        done = subprocess.run(told, capture_output=True, timeout=400, **command, **more)
+        assert done.returncode == status, done.stdout + done.stderr
+        return done
+
+    return run
+
+
+def skeleton_path(lab: ProjectHandle) -> str:
+    (rig,) = lab.skeletons.list()
+    return f"lab/{rig.path}"
+
+
+def attempts(marey: Marey, jobs: dict[str, Any]) -> dict[str, int]:
+    """How often somebody worked on each step, its tasks counted."""
+    counts = {}
+    for name, job in jobs.items():
+        tasks = [one.id for one in marey.jobs.list("lab", filters={"parent": job["id"]})]
+        counts[name] = sum(len(list(marey.jobs.attempts(one))) for one in (job["id"], *tasks))
+    return counts
+
+
+def test_after_one_take_has_changed_the_model_is_stale_and_only_what_depends_on_that_take_is_computed_again(
+    marey: Marey, lab: ProjectHandle, run: Callable[..., Any], tmp_path: Path
+) -> None:
+    line = ("build-model", "takes", "--project", "lab", "--to", skeleton_path(lab), "--name", "walk", *QUICK_FLAGS)
+    first = json.loads(run(*line, "--json").stdout)["jobs"]
+    assert list(first) == ["import", "retarget", "align", "model", "tree"]
+    assert attempts(marey, first) == {"import": 1, "retarget": 2, "align": 1, "model": 1, "tree": 1}
+    (model,) = lab.items(Kind.MODEL).list()
+    assert (model.path, {"model", "tree"} <= model.item.parts.keys()) == ("walk/walk", True)
+    assert len(list(lab.items(Kind.PROCESSED).list(collection="walk/aligned"))) == TAKES
+    assert "stale" not in run("show", "lab/walk/walk").stdout
+
+    again = json.loads(run(*line, "--json").stdout)["jobs"]
+    assert set(attempts(marey, again).values()) == {0}
+    assert lab.items(Kind.MODEL).get(model.id).item.revision == model.item.revision
+
+    changed = tmp_path / "takes" / f"{CHANGED}.bvh"
+    changed.write_bytes(write_motion(generate_gait(1.4, 0.3, 1.2, 60.0), "bvh"))
+    lab.imports.upload(find_files([changed]).files, ImportOptions(collection="walk/takes"))
+    shown = dict(line.split(maxsplit=1) for line in run("show", "lab/walk/walk").stdout.splitlines())
+    assert shown["stale"] == f"clip {CHANGED} has newer revisions than 1"
+    because = lab.items(Kind.MODEL).get(model.id).staleness().because
+    assert {(edge.kind, edge.name) for edge in because} == {("clip", CHANGED)}
+
+    third = json.loads(run(*line, "--json").stdout)["jobs"]
+    assert attempts(marey, third) == {"import": 1, "retarget": 1, "align": 1, "model": 1, "tree": 1}
+    now = lab.items(Kind.MODEL).get(model.id)
+    assert now.item.revision > model.item.revision
+    assert not now.staleness().stale
+    revisions = {clip.name: clip.item.revision for clip in lab.clips.list(collection="walk/retargeted")}
+    assert {name for name, revision in revisions.items() if revision > 1} == {CHANGED}
+
+
+def test_clips_that_are_there_become_a_model_from_python_too(lab: ProjectHandle, tmp_path: Path) -> None:
+    lab.imports.upload(find_files([tmp_path / "takes"]).files, ImportOptions(collection="raw"))
+    seen: list[set[str]] = []
+    pipeline = lab.build_model(
+        "raw", name="walk", into="models", annotate={"proposal": {"method": "steps"}}, cut={}, align={"rate_hz": 30},
+        model={"leave_one_out": False, "folds": 0, "report_samples": 0}, tree=None, priority=5,
+    )  # fmt: skip
+    ended = pipeline.wait(
+        timeout_s=300, on_progress=lambda steps: seen.append({job.state.value for job in steps.values()})
+    )
+    assert list(ended) == ["annotate", "cut", "align", "model"]
+    assert {job.priority for job in ended.values()} == {5}
+    assert "waiting" in seen[0]
+    (made,) = pipeline.outputs("model")
+    assert lab.items(Kind.MODEL).get(made.item).path == "models/walk"
+    pieces = {clip.item.collection for clip in lab.clips.list(collection="models/pieces")}
+    assert pieces == {"models/pieces/raw"}
+    with pytest.raises(NoAnnotations, match="nobody"):
+        lab.build_model("raw", name="other", layer="nobody", cut={})
+
+
+def test_a_graph_of_jobs_comes_from_a_file_or_from_standard_input(
+    lab: ProjectHandle, run: Callable[..., Any], tmp_path: Path
+) -> None:
+    lab.imports.upload(find_files([tmp_path / "takes" / f"{CHANGED}.bvh"]).files, ImportOptions(collection="raw"))
+    (rig, *_) = lab.skeletons.list(sort="id")
+    skeleton = {"item": rig.id}
+    steps: dict[str, Any] = {
+        "once": {"kind": "retarget", "inputs": {"clips": {"collection": "raw"}, "skeleton": skeleton}, "into": "once"},
+        "twice": {"kind": "retarget", "inputs": {"clips": {"step": "once"}, "skeleton": skeleton}, "into": "twice"},
+    }
+    (tmp_path / "graph.json").write_text(json.dumps({"steps": steps}))
+    told = run("pipeline", "graph.json", "--project", "lab").stdout
+    assert told.count("succeeded") == 2
+    assert next(lab.clips.list(collection="twice")).path == f"twice/raw/{CHANGED}"
+    again = json.loads(run("pipeline", "-", "--project", "lab", "--json", input=json.dumps({"steps": steps})).stdout)
+    assert {job["cached_from"] is not None for job in again["jobs"].values()} == {True}
+
+    steps["once"]["inputs"]["clips"] = {"step": "twice"}
+    refused = run("pipeline", "-", "--project", "lab", input=json.dumps({"steps": steps}), status=1).stderr
+    assert "/steps/twice/inputs/clips/step: These steps wait for each other: once -> twice -> once" in refused
+    assert "JSON" in run("pipeline", "-", "--project", "lab", input="steps: {}", status=2).stderr
+
+
+def test_who_stops_waiting_leaves_the_jobs_running_and_is_told_so(
+    lab: ProjectHandle, command: dict[str, Any], marey: Marey
+) -> None:
+    line = ["build-model", "takes", "--project", "lab", "--to", skeleton_path(lab), "--name", "walk", *QUICK_FLAGS]
+    waiting = subprocess.Popen(
+        [sys.executable, "-m", "marey_client.cli", *line], stdout=subprocess.PIPE, stderr=subprocess.PIPE, **command
+    )
+    deadline = time.monotonic() + 60
+    while not list(lab.jobs()):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    time.sleep(0.5)
+    waiting.send_signal(signal.SIGINT)
+    _, told = waiting.communicate(timeout=60)
+    assert waiting.returncode == 130, told
+    assert "go on without you" in told
+    for job in list(lab.jobs()):
+        assert marey.jobs.wait(job.id, timeout_s=300).state == "succeeded"
