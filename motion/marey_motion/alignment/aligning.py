@@ -42,6 +42,8 @@ LEAST_CLIPS = 2
 LEAST_FRAMES = 4
 MOST_FRAMES = 4000
 """Of one example: the costs of two such take 128 MB."""
+MOST_JOINT_FRAMES = 30_000_000
+"""Of all examples together, joints times frames: these take about 3 GB."""
 SAME_OFFSET_M = 1e-3
 """By which bones of one skeleton may differ between files."""
 MIRRORED = "~mirrored"
@@ -156,6 +158,7 @@ class _Aligning:
     def align(self, clips: Sequence[SourceExample]) -> AlignedSet:
         self._require_options(clips)
         rate_hz = self._rate_of(clips)
+        self._require_size(clips, rate_hz)
         self._tell(0, None, f"reading {len(clips)} clips")
         prepared = self._kept(clips, [self._attempt(self._prepare, one, rate_hz) for one in clips])
         common = self._common_labels(prepared)
@@ -187,6 +190,17 @@ class _Aligning:
         rate = self._options.rate_hz
         if rate is not None and not (np.isfinite(rate) and rate > 0):
             raise MotionError(f"the rate is {rate}, a positive number is needed", where="rate_hz")
+
+    def _require_size(self, clips: Sequence[SourceExample], rate_hz: float) -> None:
+        frames = sum(one.clip.frame_count / one.clip.frame_rate_hz * rate_hz for one in clips)
+        size = frames * self._body.skeleton.joint_count
+        if size > MOST_JOINT_FRAMES:
+            raise MotionError(
+                f"{len(clips)} clips with {frames:,.0f} frames of {self._body.skeleton.joint_count} joints at "
+                f"{rate_hz:g} Hz are too much to align at once, {size / MOST_JOINT_FRAMES:.1f} times what is possible; "
+                "take fewer clips or a lower rate",
+                code="too-much",
+            )
 
     def _attempt(self, work: Callable[..., Any], *arguments: Any) -> Any:
         """What the work makes, or the `MotionError` that it raises."""

@@ -45,9 +45,9 @@ def turned_windows(a, b, window, costs):  # type: ignore[no-untyped-def]
     n, m = costs.shape
     width = m + window - 1
     sums = np.zeros((3, m))
-    history = np.empty((window + 1, 3, width))
+    history = np.empty((window, 3, width))
     for row in range(n + window - 1):
-        slot = row % (window + 1)
+        slot = row % window
         _products(a.rows[row], b.columns, history[slot, 0], history[slot, 1], history[slot, 2])
         i = row - window + 1
         if i < 0:
@@ -67,7 +67,7 @@ def _slide(history, row, window, sums):  # type: ignore[no-untyped-def]
     """Fill sums (c, m) with those over the window of rows that ends at `row`, along diagonals."""
     sums[:] = 0.0
     for step in range(window):
-        past = history[(row - window + 1 + step) % (window + 1)]
+        past = history[(row - window + 1 + step) % window]
         for channel in range(sums.shape[0]):
             values, total = past[channel], sums[channel]
             for j in range(total.shape[0]):
@@ -97,9 +97,9 @@ def plain_windows(rows, columns, window, costs):  # type: ignore[no-untyped-def]
     """As `plain`, the mean over windows."""
     n, m = costs.shape
     sums = np.zeros((1, m))
-    history = np.empty((window + 1, 1, m + window - 1))
+    history = np.empty((window, 1, m + window - 1))
     for row in range(n + window - 1):
-        _squares(rows[row], columns, history[row % (window + 1), 0])
+        _squares(rows[row], columns, history[row % window, 0])
         if row >= window - 1:
             _slide(history, row, window, sums)
             costs[row - window + 1] = sums[0] / window

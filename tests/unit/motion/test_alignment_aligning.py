@@ -266,3 +266,10 @@ def test_a_reference_that_does_not_fit_is_not_left_out_silently():
     examples, _ = warped_walks(3)
     with pytest.raises(MotionError, match="short: it has 3 frames"):
         align_clips([*examples, short(3)], BODY, AlignOptions(reference="short@1"), on_refusal=lambda *_: None)
+
+
+def test_more_than_fits_into_memory_is_refused_before_anything_is_computed():
+    examples, _ = warped_walks(3)
+    error = raised(examples, AlignOptions(rate_hz=1e6))
+    assert error.code == "too-much"
+    assert "a lower rate" in str(error)
