@@ -186,7 +186,10 @@ def _target(rig: _Rig, joint: int, tree: Tree, start: int, stop: int) -> Target:
 
 def _looking_axis(rig: _Rig, joint: int) -> NDArray[np.float64]:
     """The front of head and trunk, the direction of other bones, in the joint's frame."""
-    axes = rig.axes_of(joint)
+    try:
+        axes = rig.axes_of(joint)
+    except MappingError as error:
+        raise MappingError(f"{error.message}; or say which axis looks", where="axis") from error
     mapping = rig.take.body.mapping.joints
     name = rig.take.skeleton.joint_names[joint]
     looks = any(mapping.get(standard) == name for standard in _LOOKING)

@@ -1,6 +1,7 @@
 """The commands `constrain` and `plant_feet`, from JSON to poses."""
 
 import json
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from marey_motion.gait import game_skeleton, generate_gait
 from marey_motion.motion import Motion
 from marey_motion.retargeting import plan_retarget, retarget
 from marey_motion.rigs import guess_axes, map_joints
+from marey_motion.skeleton import Skeleton
 from marey_schemas.editing import EditDocument
 
 
@@ -170,6 +172,22 @@ def test_feet_are_planted_where_contacts_are_given_or_found(walk: Clip) -> None:
     toes = _places(given.clip, "left_toe")
     assert np.ptp(toes[66:86], axis=0).max() < 1e-3
     assert given.clip.poses[:59].tobytes() == clip.poses[:59].tobytes()
+
+
+def test_what_is_no_body_can_be_constrained_but_has_no_front_and_no_feet(tumbling: Callable[..., Clip]) -> None:
+    names = tuple(f"part{number}" for number in range(8))
+    crane = Skeleton(names, np.arange(-1, 7, dtype=np.int32), np.tile((0.0, 0.3, 0.0), (8, 1)), quaternions.identity(8))
+    clip = tumbling(crane, 40)
+    moved = _edited(
+        clip, _constrain({"kind": "position", "joint": "part7", "frames": [10, 20], "shift_m": [0, 0.02, 0]})
+    )
+    assert moved.findings[0].values["constraints"][0]["frames_reached"] >= 9
+    look = {"kind": "look_at", "joint": "part7", "frames": [10, 20], "point_m": [0, 1, 0]}
+    with pytest.raises(MotionError, match="say which axis looks"):
+        _edited(clip, _constrain(look))
+    assert _edited(clip, _constrain({**look, "axis": [0, 1, 0]})).findings
+    with pytest.raises(MotionError, match="plant_feet"):
+        _edited(clip, {"command": "plant_feet"})
 
 
 @pytest.mark.parametrize(
