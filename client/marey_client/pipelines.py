@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from types import MappingProxyType
 
-from marey_client.errors import JobUnsuccessful, WaitedTooLong
+from marey_client.errors import Conflict, JobUnsuccessful, WaitedTooLong
 from marey_client.jobs import Jobs
 from marey_client.transport import Transport
 from marey_schemas.jobs import FailureReason, Job, JobOutput, JobState
@@ -40,9 +41,9 @@ class PipelineRun:
         """Whether every job has ended."""
         return all(job.state.terminal for job in self._steps.values())
 
-    def refresh(self) -> Mapping[str, Job]:
+    def refresh(self) -> dict[str, Job]:
         """How the jobs stand now."""
-        return self._look(wait_s=0.0)
+        return dict(self._look(wait_s=0.0))
 
     def wait(self, *, timeout_s: float | None = None, on_progress: OnProgress | None = None) -> Mapping[str, Job]:
         """Wait until every job has ended; `on_progress` sees all of them about once a second.
@@ -70,10 +71,11 @@ class PipelineRun:
         return self._jobs.outputs(self._steps[step].id)
 
     def cancel(self) -> Mapping[str, Job]:
-        """Ask every job that has not ended to stop."""
-        for job in self.refresh().values():
+        """Ask every job that has not ended to stop, the last ones first: so none fails because another was stopped."""
+        for job in reversed(self.refresh().values()):
             if not job.state.terminal:
-                self._jobs.cancel(job.id)
+                with suppress(Conflict):  # it has ended since
+                    self._jobs.cancel(job.id)
         return self.refresh()
 
     def _look(self, wait_s: float) -> Mapping[str, Job]:

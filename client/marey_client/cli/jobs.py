@@ -269,7 +269,7 @@ def retry_job(
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Submit a job that failed or was cancelled again, as a new job."""
+    """Submit a job that failed or was cancelled again, with those it needs and those that failed because of it."""
     with connect(context) as marey:
         again = marey.jobs.retry(job_id)
         if not wait:

@@ -101,6 +101,7 @@ class ProjectJobs(Resource):
     async def post(self, project: str, body: JobCreate) -> Rendered | Reply:
         """Submit a job. Inputs are pinned to the revisions they have now; many of them are spread over many tasks.
 
+        An input `{"job": id}` is everything of the input's kind that another job makes; this one waits for it.
         `Prefer: wait=n` answers when the job has ended, at the latest after n seconds.
         """
         submitted = await self.answer_with(lambda made: _accepted(made[0]), submission.submit, project, (body,))
@@ -273,7 +274,11 @@ class JobRetry(Resource):
 
     @writes(access=Access.CONTRIBUTOR, scope="jobs", answer=Job, status=202, idempotency="key")
     async def post(self, job: str) -> Rendered:
-        """Submit a failed or cancelled job again, with the inputs it had; the answer is the new job."""
+        """Submit a failed or cancelled job again, with the inputs it had; the answer is the new job.
+
+        Jobs it needs that did not succeed are tried again before it, and those that ended only because it did not
+        succeed, after it: the rest of a pipeline goes on.
+        """
         return await self.answer_with(_accepted, retrying.retry_job, job)
 
 

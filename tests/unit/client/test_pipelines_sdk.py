@@ -96,6 +96,16 @@ def test_cancelling_asks_every_job_that_has_not_ended(script):
     ]
 
 
+def test_the_last_jobs_are_cancelled_first_and_one_that_ended_meanwhile_is_no_error(script, make_problem):
+    run = submitted(script, a="running", b="waiting")
+    gone = make_problem(409, "job-ended")
+    script.answers = [answer(job("a", state="running")), answer(job("b", state="waiting")), gone]
+    script.answers += [answer(job("a", state="cancelled"))] * 2 + [answer(job("b", state="cancelled"))]
+    run.cancel()
+    stopped = [request.url.path for request in script.requests if request.url.path.endswith("/cancel")]
+    assert stopped == ["/api/v1/jobs/job_b/cancel", "/api/v1/jobs/job_a/cancel"]
+
+
 def test_why_a_job_waits_is_told_with_those_it_waits_for(script):
     waiting = Job.model_validate(
         job("b", state="waiting", after=["job_a", "job_c"], inputs={"clips": [{"job": "job_a"}]})
