@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from marey_motion.editing.inverse_kinematics_targets import (
     chain_of,
 )
 from marey_motion.errors import EditError, MotionError
+from marey_motion.formats import read_motion
 from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
 from marey_motion.motion import Motion
 from marey_motion.rigs import JointAxes, guess_axes, map_joints
@@ -556,3 +558,26 @@ def test_walking_people_reach_with_either_hand() -> None:
         freedom = Freedom(chain_of(clip.skeleton, wrist, top))
         for solver in ITERATIVE:
             assert solver(clip.skeleton, motion, [PositionTarget(wrist, target)], freedom=freedom).reached.all()
+
+
+@pytest.mark.parametrize("name", ["cmu-amc/07/07_01-walk.amc", "bandai-namco-2/*raise-up*right-hand*_normal_001.bvh"])
+def test_captured_people_reach_with_either_hand(mocap: Path, name: str) -> None:
+    path = sorted(mocap.glob(name))[0]
+    companion = next(path.parent.glob("*.asf")).read_bytes() if path.suffix == ".amc" else None
+    clip = read_motion(path.read_bytes(), path.name, companion=companion).clip
+    assert clip is not None
+    skeleton, mapping = clip.skeleton, map_joints(clip.skeleton)
+    motion = Motion.of(clip).at_frames(np.arange(0, clip.frame_count, 5))
+    for side in ("left", "right"):
+        wrist = _joint(skeleton, f"{side}_wrist")
+        shift = np.random.default_rng(0).normal(0.0, 0.05, (motion.frame_count, 3))
+        target = [PositionTarget(wrist, motion.positions(skeleton)[:, wrist] + shift)]
+        freedom = Freedom(chain_of(skeleton, wrist, _joint(skeleton, "spine")))
+        for solver in ITERATIVE:
+            assert solver(skeleton, motion, target, freedom=freedom).reached.mean() > 0.97
+        limb = limb_ending_at(skeleton, mapping, wrist, guess_axes(skeleton, mapping, clip))
+        assert limb is not None
+        exact = solve(skeleton, motion, target, limb=limb, solver="two_bone")
+        assert exact.reached.mean() > 0.3
+        assert exact.residual_after[exact.reached].max() < 1e-9
+        assert np.all(exact.residual_after <= exact.residual_before + 1e-9)
