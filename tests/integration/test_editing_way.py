@@ -175,3 +175,71 @@ def test_a_preview_shows_what_the_job_makes_and_stores_nothing(marey: Marey, lab
     assert np.array_equal(walk.preview(edit, frames=slice(20, 50)).motion.poses, shown.motion.poses)  # type: ignore[union-attr]
     with pytest.raises(RequestFailed, match=r"commands\[0\] \(trim\)"):
         walk.preview([{"command": "trim", "start": 100_000}])
+
+
+@pytest.fixture
+def run(server: ServerProcess, tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs the command line against the server, in a folder of its own."""
+
+    def run(*arguments: object, status: int = 0, stdin: str = "") -> subprocess.CompletedProcess[str]:
+        surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
+        known = {"MAREY_URL": server.url, "MAREY_DATA": str(server.data), "HOME": str(tmp_path)}
+        done = subprocess.run(
+            [sys.executable, "-m", "marey_client.cli", *map(str, arguments)],
+            env={**surroundings, **known, "XDG_CONFIG_HOME": str(tmp_path)},
+            capture_output=True, text=True, input=stdin, cwd=tmp_path, timeout=240,
+        )  # fmt: skip
+        assert done.returncode == status, done.stdout + done.stderr
+        return done
+
+    return run
+
+
+def test_an_animator_edits_from_the_command_line(lab: ProjectHandle, run: Callable[..., Any], tmp_path: Path) -> None:
+    walk = "lab/walks/walk 0"
+    told = run("edit", "preview", walk, "--do", "trim start=10 stop=100", "--do", "find_ground").stdout
+    assert "0:90 of 90" in told
+    assert "find_ground: height_m 0.02" in told
+    shown = json.loads(run("edit", "preview", walk, "--do", "mirror", "--frames", "5:7", "--json").stdout)
+    assert (shown["frames"], len(shown["motion"]["poses"]["data"])) == ([5, 7], 2)
+
+    given = ("--do", "smooth joints=Head,Neck frames=10:90", "--do", "concatenate source='lab/walks/walk 30'")
+    run("edit", "save", "lab/edits/longer", "--title", "Longer", *given)
+    listed = run("edit", "show", "lab/edits/longer").stdout
+    assert listed.startswith("Longer\n  0  smooth")
+    assert clips_of(lab, "walks")["walk 30"].id in listed
+    (tmp_path / "edit.json").write_text(run("edit", "show", "lab/edits/longer", "--json").stdout)
+    assert "revision 1" in run("edit", "save", "lab/edits/longer", "--file", "edit.json").stdout
+
+    told = run("edit", "apply", "lab/walks", "--with", "lab/edits/longer", "--into", "longer", "--tag", "long").stdout
+    assert "3 clips" in told
+    assert "0 refused" in told
+    assert {clip.item.tags for clip in lab.clips.list(collection="longer")} == {("long",)}
+    piped = run("edit", "apply", walk, "--file", "-", "--suffix", "-short", stdin='[{"command": "trim", "stop": 9}]')
+    assert "1 clips" in piped.stdout
+    assert clips_of(lab, "walks")["walk 0-short"].item.summary["frames"] == 9
+
+
+WRONG: tuple[tuple[tuple[str, ...], int, str], ...] = (
+    (("edit", "apply", "lab/walks", "--do", "mirror"), 2, "say where the results go"),
+    (("edit", "apply", "lab/walks", "--into", "x"), 2, "give commands by --do, or by --file"),
+    (("edit", "apply", "lab/walks", "--do", "wobble", "--into", "x"), 2, "there is no command 'wobble'"),
+    (("edit", "apply", "lab/walks", "--do", "trim start=9 stop=3", "--into", "x"), 2, "must lie after"),
+    (("edit", "preview", "lab/walks/walk 0", "--do", "trim start=9999"), 1, "commands[0] (trim)"),
+    (("edit", "preview", "lab/walks/none", "--do", "mirror"), 2, "there is no clip at lab/walks/none"),
+    (
+        ("edit", "preview", "lab/walks/walk 0", "--do", "paste joints=Head source=lab/walks/x"),
+        2,
+        "there is no clip",
+    ),
+    (("edit", "show", "lab/edits/none"), 2, "there is no edit at"),
+    (("edit", "apply", "lab/walks", "--do", "trim stop=99999", "--into", "x"), 1, "the frames 0:99999"),
+)
+
+
+def test_what_went_wrong_is_told_in_a_line(lab: ProjectHandle, run: Callable[..., Any]) -> None:
+    for arguments, status, told in WRONG:
+        done = run(*arguments, status=status)
+        assert told in done.stderr
+        assert "Traceback" not in done.stderr
+    assert {clip.item.collection for clip in lab.clips.list()} == {"walks"}
