@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
@@ -117,6 +118,13 @@ def name_ticks(axes: Axes, places: Sequence[float], names: Sequence[str]) -> Non
     """Names, as clips have, down the vertical axis."""
     axes.set_yticks(list(places), [plain(shortened(name)) for name in without_shared_folder(names)], parse_math=False)
     axes.tick_params(axis="y", length=0, labelcolor=INK)
+
+
+def tick_whole_numbers(axis: Axis) -> None:
+    """Ticks at whole numbers only, of what is counted."""
+    from matplotlib.ticker import MaxNLocator
+
+    axis.set_major_locator(MaxNLocator(nbins="auto", integer=True, steps=[1, 2, 5, 10]))
 
 
 def plain(text: str) -> str:

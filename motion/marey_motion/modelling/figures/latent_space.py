@@ -149,7 +149,7 @@ def draw_likelihood(subject: ModelSubject) -> Sketch:
     for row in np.flatnonzero(values < -FARTHEST):
         write(panel, (drawn[row] + 0.4, rows[row] - 0.02), f"{values[row]:.0f}", color=QUIET, va="bottom")
     panel.axvline(-OUTLIER_DEVIATIONS, color=QUIET, lw=0.9, ls=(0, (4, 3)))
-    name_ticks(panel, rows, [subject.names[place] for place in shown])
+    name_ticks(panel, rows.tolist(), [subject.names[place] for place in shown])
     panel.set(xlim=(-FARTHEST - 1.0, max(2.5, 1.1 * float(drawn.max()))), ylim=(len(shown) - 0.4, -0.6))
     tables: Tables = {
         "examples": {

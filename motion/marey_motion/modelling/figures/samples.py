@@ -103,8 +103,8 @@ def draw_paths(subject: ModelSubject) -> Sketch:
         for row, (axis, label) in enumerate(((1, "height (m)"), (0, "to the left (m)"))):
             bottom = 0.95 + (heights[1] + 0.45 if row == 0 else 0.0)
             place = Place(0.7 + column * (width + 0.55), bottom, width, heights[row])
-            labels = {"title": f"{len(points)} {name}"} if row == 0 else {"x": "forward (m)"}
-            panel = add_panel(figure, place, y=label if column == 0 else "", **labels)
+            title, below = (f"{len(points)} {name}", "") if row == 0 else ("", "forward (m)")
+            panel = add_panel(figure, place, title=title, x=below, y=label if column == 0 else "")
             _draw_paths(panel, points, list(joints), axis)
             wide, high = 0.5 * width / scale, 0.5 * heights[row] / scale
             panel.set(xlim=(middle[2] - wide, middle[2] + wide), ylim=(middle[axis] - high, middle[axis] + high))

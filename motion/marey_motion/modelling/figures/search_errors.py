@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.drawing.drawn import Sketch
-from marey_motion.drawing.paper import COLOURS, REFERENCE, Place, add_keys, add_panel, new_figure
+from marey_motion.drawing.paper import COLOURS, REFERENCE, Place, add_keys, add_panel, new_figure, tick_whole_numbers
 from marey_motion.drawing.words import amount
 from marey_motion.modelling.figures.subjects import ModelSubject
 
@@ -46,9 +46,9 @@ def draw_search_errors(searched_cm: Floats, refined_cm: Floats, *, about: str = 
         ("after refinement", refined_cm, COLOURS[0], {"histtype": "step", "lw": 1.6}),
     )
     for label, values, colour, look in drawn:
-        panel.hist(values, edges, color=colour, label=label, **look)
+        panel.hist(values, edges.tolist(), color=colour, label=label, **look)
     panel.set_xlim(0.0, ceiling)
-    panel.yaxis.get_major_locator().set_params(integer=True)
+    tick_whole_numbers(panel.yaxis)
     add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
     table = {"target": np.arange(len(searched_cm)), "searched_cm": searched_cm, "refined_cm": refined_cm}
     return Sketch(figure, {"errors": table}, _caption(searched_cm, refined_cm, about))

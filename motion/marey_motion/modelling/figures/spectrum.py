@@ -8,7 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.drawing.drawn import Sketch, Tables
-from marey_motion.drawing.paper import COLOURS, INK, QUIET, REFERENCE, Place, add_keys, add_panel, new_figure, write
+from marey_motion.drawing.paper import (
+    COLOURS,
+    INK,
+    QUIET,
+    REFERENCE,
+    Place,
+    add_keys,
+    add_panel,
+    new_figure,
+    tick_whole_numbers,
+    write,
+)
 from marey_motion.drawing.words import amount
 from marey_motion.modelling.figures.subjects import ModelSubject
 
@@ -52,7 +63,7 @@ def _draw_bars(panel: Axes, energy: Floats, kept: int) -> None:
     for chosen, colour, alpha in ((numbers <= kept, COLOURS[0], 1.0), (numbers > kept, REFERENCE, 0.35)):
         panel.bar(numbers[chosen], 100.0 * shown[chosen], width=0.8, color=colour, alpha=alpha)
     panel.set(xlim=(0.3, max(len(shown), 4) + 0.7), ylim=(0.0, 109.0))
-    panel.xaxis.get_major_locator().set_params(integer=True)
+    tick_whole_numbers(panel.xaxis)
     if kept:
         write(panel, (kept, 100.0 * shown[min(kept, len(shown)) - 1] + 1.0), f"{100.0 * energy[kept - 1]:.0f} %",
               ha="center", va="bottom", color=INK)  # fmt: skip
@@ -89,7 +100,7 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
     top = 1.15 * max(float(curve.max()) for curve in (high, errors.left_out_cm, errors.training_cm)) or 1.0
     panel.set(xlim=(-0.4, max(float(errors.components[-1]), 1.0) + 0.4), ylim=(0.0, top))
     write(panel, (kept, top), f" kept: {kept}", color=QUIET, va="top")
-    panel.xaxis.get_major_locator().set_params(integer=True)
+    tick_whole_numbers(panel.xaxis)
     add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
     at = min(kept, len(errors.components) - 1)
     caption = (
@@ -132,7 +143,7 @@ def draw_criterion(subject: ModelSubject) -> Sketch | None:
     taken = next((each for each in candidates if each.components == chosen), None)
     if taken is not None:
         panel.plot([chosen], [taken.bic], ls="", marker="o", ms=11, mfc="none", mec=INK, label=f"taken: {chosen}")
-    panel.xaxis.get_major_locator().set_params(integer=True)
+    tick_whole_numbers(panel.xaxis)
     panel.set_xlim(counts[0] - 0.5, counts[-1] + 0.5)
     add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
     tables: Tables = {

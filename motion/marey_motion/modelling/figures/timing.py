@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -93,12 +95,13 @@ def draw_durations(subject: ModelSubject) -> Sketch:
     edges = np.linspace(low - margin, high + margin, 31)
     figure = new_figure(8.2, 3.0)
     panel = add_panel(figure, Place(0.75, 0.65, 5.4, 1.95), x="duration (s)", y="share of motions (%)")
-    for values, colour, label, look in (
+    drawn: tuple[tuple[Floats, str, str, dict[str, Any]], ...] = (
         (examples, REFERENCE, f"{len(examples)} examples", {"histtype": "stepfilled", "alpha": 0.55}),
         (samples, COLOURS[0], f"{len(samples):,} samples", {"histtype": "step", "lw": 1.6}),
-    ):
+    )
+    for values, colour, label, look in drawn:
         weights = np.full(len(values), 100.0 / len(values))
-        panel.hist(values, edges, weights=weights, color=colour, label=label, **look)
+        panel.hist(values, edges.tolist(), weights=weights, color=colour, label=label, **look)
     panel.set_xlim(edges[0], edges[-1])
     add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
     shares = [np.histogram(values, edges)[0] / len(values) for values in (examples, samples)]
