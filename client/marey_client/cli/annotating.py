@@ -82,7 +82,9 @@ def show(context: typer.Context, place: Place, as_json: AsJson = False) -> None:
         ]
     )
     rate_hz = clip.item.summary["frame_rate_hz"]
-    rows = [(one.label, one.start, one.end, f"{(one.end - one.start) / rate_hz:.3f}") for one in document.segments]
+    rows: list[tuple[object, ...]] = [
+        (one.label, one.start, one.end, f"{(one.end - one.start) / rate_hz:.3f}") for one in document.segments
+    ]
     rows += [(one.label, one.frame, "", "") for one in document.keyframes]
     return print_table(("label", "frame", "end", "s"), rows, right=("frame", "end", "s"))
 
@@ -100,13 +102,16 @@ def create(
     """Make an annotation of a clip, with segments and keyframes or without any."""
     from marey_schemas.kinds import Kind
 
-    segments = [dict(zip(("label", "start", "end"), _segment(text), strict=True)) for text in segment or ()]
-    keyframes = [dict(zip(("label", "frame"), _keyframe(text), strict=True)) for text in keyframe or ()]
+    segments = sorted((_segment(text) for text in segment or ()), key=lambda one: one[1:])
+    keyframes = sorted((_keyframe(text) for text in keyframe or ()), key=lambda one: (one[1], one[0]))
     with connect(context) as marey:
         found = require_item(marey, Address.parse(clip), [Kind.CLIP])
-        segments.sort(key=lambda one: one["start"])
-        keyframes.sort(key=lambda one: (one["frame"], one["label"]))
-        made = found.annotate(layer, name=name, segments=segments, keyframes=keyframes)
+        made = found.annotate(
+            layer,
+            name=name,
+            segments=[dict(zip(("label", "start", "end"), one, strict=True)) for one in segments],
+            keyframes=[dict(zip(("label", "frame"), one, strict=True)) for one in keyframes],
+        )
     return print_json(made.item) if as_json else typer.echo(f"{made.project}/{made.path}")
 
 
@@ -299,7 +304,7 @@ def cut(
         "shortest_s": shortest, "tags": tuple(tag or ()), **{key: one for key, one in given.items() if one is not None},
     }  # fmt: skip
     with connect(context) as marey:
-        places = [
+        places: list[Any] = [
             find_item(marey, address, [Kind.ANNOTATION]) or CollectionInput(collection=address.path)
             for address in addresses
         ]
