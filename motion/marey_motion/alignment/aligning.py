@@ -31,6 +31,7 @@ from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
 from marey_motion.mirroring import mirror_clip
+from marey_motion.modelling.signs import consistent_signs
 from marey_motion.motion import Motion
 from marey_motion.resampling import resample_motion
 from marey_motion.skeleton import Skeleton, same_hierarchy
@@ -315,11 +316,7 @@ def body_weights(body: MatchingBody) -> Floats:
 
 def _with_signs_of(motion: Motion, reference: Motion) -> Motion:
     """The motion with each joint's quaternions, over the whole clip, on the reference's side."""
-    rotations = motion.rotations.copy()
-    dots = np.einsum("fjc,fjc->fj", rotations[1:], rotations[:-1])
-    signs = np.cumprod(np.concatenate((np.ones((1, dots.shape[1])), np.where(dots < 0.0, -1.0, 1.0))), axis=0)
-    signs *= np.where(np.einsum("fjc,fjc,fj->j", rotations, reference.rotations, signs) < 0.0, -1.0, 1.0)
-    return motion._replace(rotations=rotations * signs[..., None])
+    return motion._replace(rotations=consistent_signs(motion.rotations[None], reference.rotations)[0])
 
 
 def restore(clip: AlignedClip, skeleton: Skeleton) -> Motion:
