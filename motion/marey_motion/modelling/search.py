@@ -126,4 +126,5 @@ def _smallest(costs: Floats, places: Indices, count: int) -> Indices:
 def _ranges(starts: NDArray[np.int32], counts: NDArray[np.int32]) -> Indices:
     """The numbers from each start on, as many as its count, one range after the other."""
     ends = np.cumsum(counts)
-    return np.arange(ends[-1] if ends.size else 0, dtype=np.intp) + np.repeat(starts - (ends - counts), counts)
+    firsts: Indices = np.repeat(starts - (ends - counts), counts)
+    return firsts + np.arange(len(firsts), dtype=np.intp)
