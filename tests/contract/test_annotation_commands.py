@@ -1,0 +1,16 @@
+"""The commands of annotations as they travel are those that are carried out."""
+
+import inspect
+from typing import get_args
+
+from marey_motion.editing.annotations import COMMANDS
+from marey_schemas.annotations import AnnotationCommand
+
+
+def test_each_command_that_travels_says_what_the_function_of_its_name_takes():
+    models = get_args(get_args(AnnotationCommand)[0])
+    travelling = {get_args(model.model_fields["command"].annotation)[0]: model for model in models}
+    assert travelling.keys() == COMMANDS.keys()
+    for name, model in travelling.items():
+        wanted = set(inspect.signature(COMMANDS[name]).parameters) - {"layer"}
+        assert set(model.model_fields) - {"command"} == wanted
