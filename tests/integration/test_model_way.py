@@ -105,11 +105,37 @@ def test_a_model_tells_how_good_it_is_and_what_it_was_made_of(lab: ProjectHandle
 def test_the_same_clips_options_and_seed_make_the_same_model(lab: ProjectHandle, walk: ModelHandle) -> None:
     again = lab.model(lab.train_model("aligned", name="walk", into="again", seed=5, cache="off"))
     assert again.item.parts["model"].document == walk.item.parts["model"].document
+    assert again.item.parts["report"].document == walk.item.parts["report"].document
 
 
 def test_clips_that_were_not_aligned_together_are_refused_by_name(lab: ProjectHandle) -> None:
     with pytest.raises(JobUnsuccessful, match=r"walk .*not aligned together"):
         lab.model(lab.train_model(("aligned", "others"), name="mixed"))
+
+
+def test_a_model_has_a_report_with_its_figures(walk: ModelHandle, tmp_path: Path) -> None:
+    page = walk.report().decode()
+    assert page.startswith("<!DOCTYPE html>")
+    assert walk.verdict.split(".")[0] in page
+    figures = {figure.name: figure for figure in walk.figures()}
+    assert {"time-warps", "alignment-costs", "mean", "samples", "component-1", "likelihood"} <= set(figures)
+    assert all(figure.caption for figure in figures.values())
+    assert walk.figure("samples").startswith(b"\x89PNG")
+    assert b"<svg" in walk.figure("samples", "svg")
+    rows = walk.figure("time-warps", "csv", table="clips").decode().splitlines()
+    assert len(rows) == 1 + EXAMPLES
+    saved = walk.save_figures(tmp_path / "figures")
+    assert "samples.png" in {file.name for file in saved}
+
+
+def test_the_report_is_a_page_that_may_load_nothing(walk: ModelHandle) -> None:
+    answer = walk.transport.send("GET", f"{walk.url}/report", headers={"Accept": "text/html"})
+    policy = answer.headers["Content-Security-Policy"].split("; ")
+    assert "default-src 'none'" in policy
+    assert "sandbox allow-scripts" in policy
+    assert any(rule.startswith("script-src 'sha256-") for rule in policy)
+    figure = walk.transport.send("GET", f"{walk.url}/figures/mean", params={"format": "svg"}, headers={"Accept": "*/*"})
+    assert figure.headers["Content-Security-Policy"].endswith("; sandbox")
 
 
 def test_samples_are_the_same_for_the_same_seed_and_begin_alike(walk: ModelHandle) -> None:
@@ -209,4 +235,8 @@ def test_from_the_command_line(lab: ProjectHandle, run: Callable[..., Any], tmp_
     shown = run("show", "lab/models/cli").stdout
     assert "verdict" in shown
     assert "left_out_error_cm" in shown
+    assert "no part" in run("report", "lab/models/cli", status=1).stderr
+    assert run("report", "lab/models/walk", "--out", "walk.html", "--figures", "drawn").stdout == "walk.html\n"
+    assert (tmp_path / "walk.html").read_bytes().startswith(b"<!DOCTYPE html>")
+    assert (tmp_path / "drawn" / "component-1.svg").is_file()
     assert "no format" in run("sample", "lab/models/cli", "--format", "fbx", status=2).stderr

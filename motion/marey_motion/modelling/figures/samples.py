@@ -111,19 +111,26 @@ def draw_paths(subject: ModelSubject) -> Sketch:
             if (row, column) == (1, 0):
                 add_keys(panel, loc="upper left", bbox_to_anchor=(-0.02, -0.48 / heights[1]), ncols=4)
     names = [*(subject.examples.clips[index].uid for index in chosen), *(f"sample {n}" for n in range(len(chosen)))]
-    table = {
-        "motion": np.repeat(names, len(joints) * len(frames)).tolist(),
-        "joint": np.tile(np.repeat(list(joints), len(frames)), len(names)).tolist(),
-        "canonical_frame": np.tile(frames, len(names) * len(joints)),
-    }
-    ways = np.concatenate([points.transpose(0, 2, 1, 3).reshape(-1, 3) for points in sets.values()])
-    table |= {f"{axis}_m": ways[:, place] for place, axis in enumerate("xyz")}
+    table = _path_table(names, list(joints), frames, np.concatenate(list(sets.values())))
     caption = (
         f"The ways of {_listed(list(joints))}, in metres from where the root begins, the body facing forward: "
         f"{amount(len(chosen), 'training example')} on the left, as many samples of the model on the right; from the "
         "side above, from above below. Samples should fill the space of the examples, and not leave it."
     )
     return Sketch(figure, {"paths": table}, caption)
+
+
+def _path_table(names: list[str], joints: list[str], frames: NDArray[np.int64], points: Floats) -> dict[str, object]:
+    """Ways of points (motions, T, joints, 3) as columns of a table."""
+    ways = points.transpose(0, 2, 1, 3).reshape(-1, 3)
+    return {
+        "motion": np.repeat(names, len(joints) * len(frames)).tolist(),
+        "joint": np.tile(np.repeat(joints, len(frames)), len(names)).tolist(),
+        "canonical_frame": np.tile(frames, len(names) * len(joints)),
+        "x_m": ways[:, 0],
+        "y_m": ways[:, 1],
+        "z_m": ways[:, 2],
+    }
 
 
 def _followed(subject: ModelSubject) -> dict[str, int]:
