@@ -267,7 +267,7 @@ CUT = KindDeclaration(
             kind=Kind.CLIP,
             many=True,
             required=False,
-            description="The clips of the annotations at those revisions, so that the history of the pieces names them.",
+            description="The annotated clips at those revisions, so that the history of the pieces names them.",
         ),
     },
     outputs={"clips": Kind.CLIP, "annotations": Kind.ANNOTATION},

@@ -1,4 +1,4 @@
-"""Motion primitives and their training reports to and from trees of plain values and arrays that travel and are kept."""
+"""Motion primitives and their training reports, to and from trees of plain values and arrays that are kept."""
 
 from __future__ import annotations
 
