@@ -179,15 +179,16 @@ def _search(clip: Clip) -> None:
     from marey_motion.motion import Motion
     from marey_motion.rigs import map_joints
 
-    poses = Motion.of(clip).poses
-    functions = []
-    for values in (poses, np.zeros((len(poses) - 1, 1))):
+    def alone(values: NDArray[np.float64]) -> FunctionalComponents:
         basis = SplineBasis.clamped(len(values), 7)
         mean = basis.fit(values)
         directions = np.ones((1, *mean.shape)) / mean.size
-        functions.append(FunctionalComponents(basis, mean, directions, directions, np.ones(1), np.ones(1)))
+        return FunctionalComponents(basis, mean, directions, directions, np.ones(1), np.ones(1))
+
+    poses = Motion.of(clip).poses
     mixture = LatentMixture(np.ones(1), np.zeros((1, 2)), 1e-4 * np.eye(2)[None])
-    primitive = MotionPrimitive("walk", clip.skeleton, clip.frame_rate_hz, *functions, 1.0, mixture)
+    space, time = alone(poses), alone(np.zeros((len(poses) - 1, 1)))
+    primitive = MotionPrimitive("walk", clip.skeleton, clip.frame_rate_hz, space, time, 1.0, mixture)
     joints = {name: clip.skeleton.index_of(joint) for name, joint in map_joints(clip.skeleton).joints.items()}
     tree = build_tree(primitive, 0, TreeOptions(64), end_effectors=[joints[name] for name in END_EFFECTORS])
     step = Step(primitive, (RootPosition("end", (0.0, None)),), joints)
