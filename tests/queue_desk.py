@@ -137,8 +137,7 @@ class Desk:
     def things(self, count: int, collection: str = "raw") -> list[str]:
         """Make things to work on; their item ids."""
         drafts = [
-            Draft(f"thing{n}", Kind.STUDY, f"thing{n}", {"study": document(number=n)}, collection)
-            for n in range(count)
+            Draft(f"thing{n}", Kind.STUDY, f"thing{n}", {"study": document(number=n)}, collection) for n in range(count)
         ]
         return [one.item for one in self.publish(*drafts)]
 

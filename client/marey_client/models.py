@@ -111,7 +111,7 @@ class ModelHandle(SearchableHandle):
             details = {"model": tree["model"], "seed": seed, "place": place}
             info = ClipInfo(action=self.name, source=Source(format="sampled", details=details))
             parts = {"motion": motion, "info": info.model_dump(mode="json", by_alias=True, exclude_none=True)}
-            name = f"{names or self.name} {seed} {place:04d}"
+            name = f"{names or self.name}_{seed}_{place:04d}"
             made.append(clips.create(name, parts, collection=into, tags=tags))
         return made
 

@@ -97,7 +97,7 @@ class CutParams(Request):
         None, description="Longer segments are left out."
     )
     name: str = Field(
-        "{clip} {label} {number:2}",
+        "{clip}_{label}_{number:2}",
         min_length=1,
         max_length=MAX_NAME_LENGTH,
         description="Names of the pieces; {number:2} counts the segments of a label in a clip from 1, in two digits.",

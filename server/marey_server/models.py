@@ -162,13 +162,13 @@ def sample_file(
         files = [write_clip_file(clip, file_format, unit=unit) for clip in clips]
     except MotionError as error:
         raise Invalid(str(error), code="cannot-be-exported") from error
-    stem = f"{found.name} {seed}"
+    stem = f"{found.name}_{seed}"
     if count == 1:
         return SampleFile(stem + files[0].suffix, files[0].media_type, files[0].data)
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
         for place, file in enumerate(files, start=1):
-            archive.writestr(_entry(f"{stem} {place:04d}{file.suffix}"), file.data, compresslevel=6)
+            archive.writestr(_entry(f"{stem}_{place:04d}{file.suffix}"), file.data, compresslevel=6)
     return SampleFile(f"{stem}.zip", "application/zip", packed.getvalue())
 
 

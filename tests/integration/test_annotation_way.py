@@ -85,7 +85,7 @@ def test_walks_become_steps_of_each_foot_with_their_keyframes(lab: ProjectHandle
     assert len(steps) == made["labels"]["step_left"] == told["segments"]["step_left"]
     assert list(lab.clips.list(collection="steps/walks/step_right"))
 
-    step = next(one for one in steps if one.name == "walk 1.5 0 step_left 01")
+    step = next(one for one in steps if one.name == "walk 1.5 0_step_left_01")
     (source,) = lab.clips.list(path="walks/walk 1.5 0")
     frames = step.info().source.details["frames"]
     np.testing.assert_array_equal(step.motion().poses, source.motion(frames=slice(*frames)).poses)

@@ -163,7 +163,7 @@ def test_samples_become_files_that_read_back(walk: ModelHandle, tmp_path: Path) 
             assert clip.frame_count == len(motion.poses)
             np.testing.assert_allclose(clip.root_translations, motion.root_translations, atol=1e-5)
     (single,) = walk.save_samples(tmp_path / "one", "bvh", seed=7)
-    assert single.read_bytes() == (tmp_path / "bvh" / "walk 7 0001.bvh").read_bytes()
+    assert single.read_bytes() == (tmp_path / "bvh" / "walk_7_0001.bvh").read_bytes()
     for file in walk.save_samples(tmp_path / "predecessor", "predecessor", n=2, seed=7):
         assert file.read_bytes().startswith(b"BZh")
     (document,) = walk.save_samples(tmp_path / "json", "json", n=2)
@@ -184,7 +184,7 @@ def test_an_archive_of_samples_is_the_same_bytes_every_time(walk: ModelHandle) -
 
 def test_samples_become_clips_on_the_models_skeleton(lab: ProjectHandle, walk: ModelHandle) -> None:
     made = walk.add_samples(2, 3, into="drawn")
-    assert [clip.path for clip in made] == ["drawn/walk 3 0001", "drawn/walk 3 0002"]
+    assert [clip.path for clip in made] == ["drawn/walk_3_0001", "drawn/walk_3_0002"]
     for clip, motion in zip(made, walk.sample(2, 3).motions, strict=True):
         assert np.array_equal(clip.motion().poses, motion.poses)
         source = clip.info().source
@@ -228,10 +228,10 @@ def test_from_the_command_line(lab: ProjectHandle, run: Callable[..., Any], tmp_
     assert told.startswith(f"{EXAMPLES} examples in ")
     assert "left out, cm" in told
     files = run("sample", "lab/models/cli", "-n", "2", "--seed", "1", "--out", "samples").stdout.split("\n")
-    assert [Path(file).name for file in files if file] == ["cli 1 0001.bvh", "cli 1 0002.bvh"]
-    assert (tmp_path / "samples" / "cli 1 0002.bvh").read_bytes().startswith(b"HIERARCHY")
+    assert [Path(file).name for file in files if file] == ["cli_1_0001.bvh", "cli_1_0002.bvh"]
+    assert (tmp_path / "samples" / "cli_1_0002.bvh").read_bytes().startswith(b"HIERARCHY")
     clips = json.loads(run("sample", "lab/models/cli", "--into", "from-cli", "--json").stdout)
-    assert clips == {"clips": ["lab/from-cli/cli 0 0001"]}
+    assert clips == {"clips": ["lab/from-cli/cli_0_0001"]}
     shown = run("show", "lab/models/cli").stdout
     assert "verdict" in shown
     assert "left_out_error_cm" in shown

@@ -287,7 +287,7 @@ def cut(
     after: Annotated[float, typer.Option(min=0, help="Seconds after each segment that are taken along.")] = 0.0,
     shortest: Annotated[float, typer.Option(min=0, help="Leave shorter segments out, seconds.")] = 0.0,
     longest: Annotated[float | None, typer.Option(min=0, help="Leave longer segments out, seconds.")] = None,
-    name: Annotated[str | None, typer.Option(help="Names of the pieces; default {clip} {label} {number:2}.")] = None,
+    name: Annotated[str | None, typer.Option(help="Names of the pieces; default {clip}_{label}_{number:2}.")] = None,
     tag: Annotated[list[str] | None, typer.Option(help="Tag of the pieces; may be repeated.")] = None,
     priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = True,
