@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.clip import Clip
-from marey_motion.editing.annotations import Keyframe, Layer, Segment
+from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import ClipError, MappingError
 from marey_motion.rigs import STANDARD_JOINTS, JointAxes, JointMapping
 from marey_motion.skeleton import EndSite, Skeleton

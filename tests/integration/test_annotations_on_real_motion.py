@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from marey_motion.editing.annotations import Layer
-from marey_motion.editing.speed_proposals import ReachOptions, propose_reaches
-from marey_motion.editing.step_proposals import propose_steps
+from marey_motion.editing.annotations.layers import Layer
+from marey_motion.editing.annotations.speed_proposals import ReachOptions, propose_reaches
+from marey_motion.editing.annotations.step_proposals import propose_steps
 from marey_motion.formats import pair_companions, read_motion
 from marey_motion.matching.body import MatchingBody
 from marey_motion.rigs import map_joints

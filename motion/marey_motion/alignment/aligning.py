@@ -26,12 +26,12 @@ from marey_motion.alignment.segments import (
     require_labels,
     sections_of,
 )
+from marey_motion.alignment.signs import consistent_signs
 from marey_motion.alignment.warp import inverse, warped
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
 from marey_motion.mirroring import mirror_clip
-from marey_motion.modelling.signs import consistent_signs
 from marey_motion.motion import Motion
 from marey_motion.resampling import resample_motion
 from marey_motion.skeleton import Skeleton, same_hierarchy

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from marey_motion import kinematics, quaternions
 from marey_motion.editing.displacement import displace, windows_around
-from marey_motion.editing.inverse_kinematics import Limb, Solver, measure_residuals, solve
-from marey_motion.editing.inverse_kinematics_targets import (
+from marey_motion.editing.inverse_kinematics.solving import Limb, Solver, measure_residuals, solve
+from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     LookAtTarget,
     OrientationTarget,

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from marey_motion.editing.constraining import Constraint, constrain_motion, current_values
 from marey_motion.editing.foot_plants import Foot, FootContacts, PlantOptions, find_contacts
 from marey_motion.editing.foot_plants import plant_feet as plant
-from marey_motion.editing.inverse_kinematics import Solver, limb_ending_at
-from marey_motion.editing.inverse_kinematics_targets import (
+from marey_motion.editing.inverse_kinematics.solving import Solver, limb_ending_at
+from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     JointLimit,
     LookAtTarget,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.editing.constraining import Constraint, constrain_motion
-from marey_motion.editing.inverse_kinematics_targets import Freedom, PositionTarget, SolverOptions
+from marey_motion.editing.inverse_kinematics.targets import Freedom, PositionTarget, SolverOptions
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve1d, maximum_filter1d
 
 from marey_motion import kinematics, quaternions
-from marey_motion.editing.contacts import runs
+from marey_motion.editing.annotations.contacts import runs
 from marey_motion.editing.displacement import spread_displacements, windows_around
-from marey_motion.editing.inverse_kinematics import Limb, solve_two_bone
-from marey_motion.editing.inverse_kinematics_targets import OrientationTarget, PositionTarget
+from marey_motion.editing.inverse_kinematics.solving import Limb, solve_two_bone
+from marey_motion.editing.inverse_kinematics.targets import OrientationTarget, PositionTarget
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
@@ -222,7 +222,7 @@ def _turn_between(before: Floats, after: Floats) -> Floats:
 
 def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], zone: float, blend: int) -> Floats:
     """How far the root must come down (F,), metres, so that standing feet are in reach without stretching knees."""
-    from marey_motion.editing import two_bone_kernels
+    from marey_motion.editing.inverse_kinematics import two_bone_kernels
 
     wanted = np.zeros(len(positions))
     for foot, plan in zip(feet, plans, strict=True):

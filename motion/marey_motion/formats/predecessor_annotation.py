@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from marey_motion.editing.annotations import Keyframe, Layer, Segment
+from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import AnnotationError, FormatError
 from marey_motion.formats.document_fields import field_of, number_array
 from marey_motion.formats.predecessor_encoding import decode_document, encode_document

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from marey_motion.editing.constraining import Constraint as Constrained
 from marey_motion.editing.finish import finish
-from marey_motion.editing.inverse_kinematics import limb_ending_at
-from marey_motion.editing.inverse_kinematics_targets import LookAtTarget, OrientationTarget, PositionTarget, Target
+from marey_motion.editing.inverse_kinematics.solving import limb_ending_at
+from marey_motion.editing.inverse_kinematics.targets import LookAtTarget, OrientationTarget, PositionTarget, Target
 from marey_motion.modelling.constraints import (
     Constraint,
     JointOrientation,

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import AlignedSet
+from marey_motion.alignment.signs import consistent_poses
 from marey_motion.errors import ModelError
 from marey_motion.modelling.fpca import Keep, PrincipalExamples, find_components
 from marey_motion.modelling.mixture_fitting import FittedMixture, MixtureOptions, fit_mixture, one_thread
@@ -16,7 +17,6 @@ from marey_motion.modelling.options import DEFAULT_OPTIONS, ModelOptions
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.scaled_fpca import optimised_weights
 from marey_motion.modelling.scaling import jacobian_weights, root_max_weights
-from marey_motion.modelling.signs import consistent_poses
 from marey_motion.modelling.splines import SplineBasis, coefficient_count
 from marey_motion.modelling.time_model import equalising_weight, fit_log_slopes
 from marey_motion.modelling.training_report import TrainingReport, report_on

@@ -17,7 +17,7 @@ from marey_motion.alignment.segments import (
     require_labels,
     sections_of,
 )
-from marey_motion.editing.annotations import Keyframe, Layer, Segment
+from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import AnnotationError
 
 

@@ -9,8 +9,8 @@ from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
 from marey_motion.editing.constraining import Constraint, constrain_motion
 from marey_motion.editing.finish import finish
-from marey_motion.editing.inverse_kinematics import Limb, limb_ending_at
-from marey_motion.editing.inverse_kinematics_targets import (
+from marey_motion.editing.inverse_kinematics.solving import Limb, limb_ending_at
+from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     JointLimit,
     LookAtTarget,

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marey_motion.editing import annotations
-from marey_motion.editing.annotations import COMMANDS, Keyframe, Layer, Segment, piece_of
+from marey_motion.editing.annotations import layers as annotations
+from marey_motion.editing.annotations.layers import COMMANDS, Keyframe, Layer, Segment, piece_of
 from marey_motion.errors import AnnotationError
 
 FRAMES = 30

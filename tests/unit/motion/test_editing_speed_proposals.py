@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from marey_motion import kinematics, quaternions
-from marey_motion.editing.annotations import Layer
-from marey_motion.editing.speed_proposals import PauseOptions, ReachOptions, propose_pauses, propose_reaches
+from marey_motion.editing.annotations.layers import Layer
+from marey_motion.editing.annotations.speed_proposals import PauseOptions, ReachOptions, propose_pauses, propose_reaches
 from marey_motion.errors import MappingError, MotionError
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody

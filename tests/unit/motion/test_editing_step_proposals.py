@@ -8,8 +8,8 @@ from math import radians
 import numpy as np
 import pytest
 
-from marey_motion.editing.contacts import ContactOptions, find_stances
-from marey_motion.editing.step_proposals import StepOptions, propose_steps
+from marey_motion.editing.annotations.contacts import ContactOptions, find_stances
+from marey_motion.editing.annotations.step_proposals import StepOptions, propose_steps
 from marey_motion.errors import MotionError
 from marey_motion.gait import foot_motions, generate_along, generate_gait, start_and_stop, straight_or_arc
 from marey_motion.matching.body import MatchingBody

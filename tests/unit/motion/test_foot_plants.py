@@ -7,7 +7,7 @@ import pytest
 
 from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
-from marey_motion.editing.contacts import runs
+from marey_motion.editing.annotations.contacts import runs
 from marey_motion.editing.foot_plants import (
     Foot,
     FootContacts,
@@ -17,7 +17,7 @@ from marey_motion.editing.foot_plants import (
     foot_slide_m,
     plant_feet,
 )
-from marey_motion.editing.inverse_kinematics import limb_ending_at
+from marey_motion.editing.inverse_kinematics.solving import limb_ending_at
 from marey_motion.errors import EditError
 from marey_motion.formats import read_motion
 from marey_motion.gait import generate_gait

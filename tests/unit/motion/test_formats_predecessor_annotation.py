@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marey_motion.editing.annotations import Keyframe, Layer, Segment
+from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import FormatError
 from marey_motion.formats.predecessor_annotation import read_predecessor_annotation, write_predecessor_annotation
 

@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
-from marey_motion.editing.inverse_kinematics import (
+from marey_motion.editing.inverse_kinematics.solving import (
     Limb,
     SolvedPoses,
     constraint_jacobian,
@@ -21,7 +21,7 @@ from marey_motion.editing.inverse_kinematics import (
     solve_least_squares,
     solve_two_bone,
 )
-from marey_motion.editing.inverse_kinematics_targets import (
+from marey_motion.editing.inverse_kinematics.targets import (
     ANGLE_LENGTH_M,
     Freedom,
     JointLimit,

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from sklearn.decomposition import PCA
 
 from marey_motion import quaternions
+from marey_motion.alignment.signs import consistent_signs
 from marey_motion.modelling.fpca import Keep, find_components
 from marey_motion.modelling.scaled_fpca import SMALLEST_WEIGHT, _logarithms, _Problem, optimised_weights
 from marey_motion.modelling.scaling import LEAST_WEIGHT_M, jacobian_weights, root_max_weights
-from marey_motion.modelling.signs import consistent_signs
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.skeleton import Skeleton
 from modelling_examples import bending_chains, chain, unit_poses, walks

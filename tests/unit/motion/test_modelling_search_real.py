@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from marey_motion.alignment.aligning import SourceExample, align_clips
+from marey_motion.alignment.signs import consistent_poses
 from marey_motion.formats import read_motion
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.matching.body import MatchingBody
@@ -12,7 +13,6 @@ from marey_motion.modelling.constraints import JointPosition
 from marey_motion.modelling.objective import build_objective
 from marey_motion.modelling.optimise import RefineOptions
 from marey_motion.modelling.options import ModelOptions
-from marey_motion.modelling.signs import consistent_poses
 from marey_motion.modelling.step_search import search_steps
 from marey_motion.modelling.steps import Step
 from marey_motion.modelling.training import train_primitive

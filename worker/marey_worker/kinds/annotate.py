@@ -10,10 +10,10 @@ from pydantic import ValidationError
 
 from marey_motion import documents
 from marey_motion.clip import Clip
-from marey_motion.editing.annotations import Layer
-from marey_motion.editing.contacts import ContactOptions
-from marey_motion.editing.speed_proposals import PauseOptions, ReachOptions, propose_pauses, propose_reaches
-from marey_motion.editing.step_proposals import StepOptions, propose_steps
+from marey_motion.editing.annotations.contacts import ContactOptions
+from marey_motion.editing.annotations.layers import Layer
+from marey_motion.editing.annotations.speed_proposals import PauseOptions, ReachOptions, propose_pauses, propose_reaches
+from marey_motion.editing.annotations.step_proposals import StepOptions, propose_steps
 from marey_motion.errors import AnnotationError, MotionError, UnknownJoint
 from marey_motion.matching.body import MatchingBody
 from marey_schemas.annotations import (

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from marey_motion import documents
-from marey_motion.editing.annotations import Segment, piece_of
+from marey_motion.editing.annotations.layers import Segment, piece_of
 from marey_motion.errors import MotionError
 from marey_schemas.annotations import MAX_NAME_LENGTH, CutParams
 from marey_schemas.documents import Annotation, ClipInfo, Motion, OutputRef, RevisionRef, Source

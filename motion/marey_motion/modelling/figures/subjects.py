@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from marey_motion import kinematics
 from marey_motion.alignment.aligned import AlignedSet
+from marey_motion.alignment.signs import consistent_poses
 from marey_motion.drawing.paper import shortened, told_apart
 from marey_motion.drawing.stick_figures import Body, body_of
 from marey_motion.drawing.strips import Moments
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search_check import SearchCheck
-from marey_motion.modelling.signs import consistent_poses
 from marey_motion.modelling.training_report import TrainingReport
 from marey_motion.skeleton import Skeleton
 

@@ -25,7 +25,7 @@ def apply_commands(
     `expected_rev` any more.
     """
     from marey_motion import documents
-    from marey_motion.editing.annotations import COMMANDS
+    from marey_motion.editing.annotations.layers import COMMANDS
     from marey_motion.errors import MotionError
 
     found = read_part(tx, project, Kind.ANNOTATION, item_id, "annotation")

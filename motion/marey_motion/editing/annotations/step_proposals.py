@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from marey_motion import kinematics
 from marey_motion.clip import Clip
-from marey_motion.editing.annotations import Keyframe, Layer, Segment
-from marey_motion.editing.contacts import ContactOptions, Stance, find_stances
+from marey_motion.editing.annotations.contacts import ContactOptions, Stance, find_stances
+from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import SIDES, MatchingBody
 

@@ -14,8 +14,8 @@ from scipy.signal import find_peaks
 
 from marey_motion import kinematics
 from marey_motion.clip import Clip
-from marey_motion.editing.annotations import Keyframe, Layer, Segment
-from marey_motion.editing.contacts import runs
+from marey_motion.editing.annotations.contacts import runs
+from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import MappingError, MotionError
 from marey_motion.matching.body import SIDES, MatchingBody
 

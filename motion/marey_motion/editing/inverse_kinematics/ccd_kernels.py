@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from marey_motion.editing.pose_kernels import (
+from marey_motion.editing.inverse_kinematics.pose_kernels import (
     ORIENTATION,
     POSITION,
     SWING_RANGE,
@@ -15,7 +15,7 @@ from marey_motion.editing.pose_kernels import (
     store_residuals,
     within_limits,
 )
-from marey_motion.editing.rotation_kernels import (
+from marey_motion.editing.inverse_kinematics.rotation_kernels import (
     about,
     between,
     compiled,

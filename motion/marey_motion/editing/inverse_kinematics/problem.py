@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.editing.inverse_kinematics_targets import (
+from marey_motion.editing.inverse_kinematics.targets import (
     ANGLE_LENGTH_M,
     Freedom,
     LookAtTarget,

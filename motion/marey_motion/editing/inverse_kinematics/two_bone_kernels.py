@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from marey_motion.editing.pose_kernels import place_joints
-from marey_motion.editing.rotation_kernels import (
+from marey_motion.editing.inverse_kinematics.pose_kernels import place_joints
+from marey_motion.editing.inverse_kinematics.rotation_kernels import (
     between,
     compiled,
     cross,

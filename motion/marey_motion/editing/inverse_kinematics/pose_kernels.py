@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from marey_motion.editing.rotation_kernels import (
+from marey_motion.editing.inverse_kinematics.rotation_kernels import (
     TINY,
     about,
     compiled,

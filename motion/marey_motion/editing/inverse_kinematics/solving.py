@@ -14,8 +14,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.editing.inverse_kinematics_problem import Found, Problem, pose_problem
-from marey_motion.editing.inverse_kinematics_targets import (
+from marey_motion.editing.inverse_kinematics.problem import Found, Problem, pose_problem
+from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     OrientationTarget,
     PositionTarget,
@@ -172,7 +172,7 @@ def solve_ccd(
 
     Raises `EditError` naming the target that cannot be asked for.
     """
-    from marey_motion.editing import ccd_kernels
+    from marey_motion.editing.inverse_kinematics import ccd_kernels
 
     if freedom.root_moves:
         raise EditError("cyclic coordinate descent cannot shift the root", code="solver-unfit", where="root_moves")
@@ -198,7 +198,7 @@ def solve_least_squares(
 
     Raises `EditError` naming the target that cannot be asked for.
     """
-    from marey_motion.editing import least_squares_kernels
+    from marey_motion.editing.inverse_kinematics import least_squares_kernels
 
     problem = pose_problem(skeleton, motion, targets, freedom)
     found, room = problem.found, problem.stepping(options.regularisation_m)
@@ -233,7 +233,7 @@ def solve_two_bone(
 
     Raises `EditError` where the joints are no limb or the targets are not of its end.
     """
-    from marey_motion.editing import two_bone_kernels
+    from marey_motion.editing.inverse_kinematics import two_bone_kernels
 
     targets: tuple[Target, ...] = (position,) if orientation is None else (position, orientation)
     if _limb_targets(targets, limb) is None:
@@ -263,7 +263,7 @@ def solve_two_bone(
 def _kernel_limb(
     problem: Problem, limb: Limb, ending: Literal["carried", "held", "given"], damping_zone_rad: float
 ) -> _LimbKernel:
-    from marey_motion.editing import two_bone_kernels
+    from marey_motion.editing.inverse_kinematics import two_bone_kernels
 
     start, middle, end = np.searchsorted(problem.joints, (limb.start, limb.middle, limb.end)).tolist()
     endings = {
@@ -286,7 +286,7 @@ def _keep_better(problem: Problem, before: Floats, found: Found) -> None:
 
 
 def _measure(problem: Problem, options: SolverOptions, residuals: Floats, found: Found) -> None:
-    from marey_motion.editing import pose_kernels
+    from marey_motion.editing.inverse_kinematics import pose_kernels
 
     pose_kernels.measure_frames(
         problem.body,
@@ -316,7 +316,7 @@ def constraint_jacobian(
     Columns are displacements of local rotations, q·exp(d), joint by joint in the order returned, then the root's
     translation, which is left out (zeros) where the root does not move.
     """
-    from marey_motion.editing import least_squares_kernels
+    from marey_motion.editing.inverse_kinematics import least_squares_kernels
 
     problem = pose_problem(skeleton, motion, targets, freedom)
     room = problem.stepping(0.0)

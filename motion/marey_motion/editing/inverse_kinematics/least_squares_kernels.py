@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 
-from marey_motion.editing.pose_kernels import (
+from marey_motion.editing.inverse_kinematics.pose_kernels import (
     ORIENTATION,
     POSITION,
     measure,
     store_residuals,
     within_limits,
 )
-from marey_motion.editing.rotation_kernels import (
+from marey_motion.editing.inverse_kinematics.rotation_kernels import (
     TINY,
     compiled,
     cross,
