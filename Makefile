@@ -18,12 +18,12 @@ $(BIN)/python:
 
 $(VENV)/.installed-all: pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) install -c constraints.txt -e '.[all]'
-	$(BIN)/python -m marey_motion.warm_up
+	$(BIN)/python -m marey_motion.warm_up --processes 2
 	@touch $@
 
 $(VENV)/.installed-dev: pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) install -c constraints.txt -e '.[dev]'
-	$(BIN)/python -m marey_motion.warm_up
+	$(BIN)/python -m marey_motion.warm_up --processes 2
 	@touch $@ $(VENV)/.installed-all
 
 demo: $(VENV)/.installed-all ## From takes to an evaluated, reported dataset; DATA=folder for your own motion

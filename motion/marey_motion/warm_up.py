@@ -5,6 +5,10 @@ The compiled code is kept on disk; later processes load it in a fraction of a se
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -52,16 +56,33 @@ def discard_outdated_kernels() -> None:
             compiled.unlink(missing_ok=True)
 
 
-def compile_kernels() -> None:
-    """Read, check, retarget, write and match a second of generated walking in every way that uses a kernel."""
+def compile_kernels(stages: Sequence[str], processes: int = 1) -> None:
+    """Go through stages of `STAGES`, the first one before the others, which run side by side in so many processes."""
+    first, *others = stages
+    _compile(first)
+    if processes < 2 or len(others) < 2:
+        for stage in others:
+            _compile(stage)
+        return
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        list(pool.map(_compile, others))
+
+
+def _compile(stage: str) -> None:
+    from marey_motion.gait import generate_gait
+
+    STAGES[stage](generate_gait(1.3, 0.2, 1.0))
+
+
+def _read(clip: Clip) -> None:
+    """Read, check, write and retarget a walk."""
     from marey_motion.formats import ImportOptions, read_motion, write_motion
-    from marey_motion.gait import game_skeleton, generate_gait
+    from marey_motion.gait import game_skeleton
     from marey_motion.kinematics import global_rotations
     from marey_motion.retargeting import plan_retarget, retarget
     from marey_motion.rigs import guess_axes, map_joints
 
     read_motion(_AMC, "walk.amc", companion=_ASF, options=ImportOptions(unit_scale_m=0.05644, up_axis="y"))
-    clip = generate_gait(1.3, 0.2, 1.0)
     read = read_motion(write_motion(clip, "bvh"), "walk.bvh").clip
     assert read is not None
     target = game_skeleton()
@@ -71,12 +92,6 @@ def compile_kernels() -> None:
         rigs.append((skeleton, mapping, guess_axes(skeleton, mapping)))
     result = retarget(read, plan_retarget(*rigs[0], *rigs[1]))
     global_rotations(result)
-    _match(clip)
-    _edit(clip)
-    _align(clip)
-    _measure(clip)
-    _model(clip)
-    _search(clip)
 
 
 def _edit(clip: Clip) -> None:
@@ -195,6 +210,29 @@ def _search(clip: Clip) -> None:
     search_steps([step, step], [tree, tree])
 
 
-if __name__ == "__main__":
+STAGES: Mapping[str, Callable[[Clip], None]] = {
+    "files": _read,
+    "editing": _edit,
+    "matching": _match,
+    "searches": _search,
+    "models": _model,
+    "alignment": _align,
+    "coverage": _measure,
+}
+"""What uses kernels, by name; the longest first after that which the others need."""
+
+
+def main() -> None:
+    """Compile everything, or the stages that are named."""
+    parser = argparse.ArgumentParser(prog="python -m marey_motion.warm_up", description=__doc__)
+    parser.add_argument("stages", nargs="*", metavar="stage", help=f"of {', '.join(STAGES)}; all when absent")
+    parser.add_argument("--processes", type=int, default=1, help="that compile side by side; default 1")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.stages) - set(STAGES):
+        parser.error(f"no stage {', '.join(sorted(unknown))}; there are {', '.join(STAGES)}")
     discard_outdated_kernels()
-    compile_kernels()
+    compile_kernels(arguments.stages or tuple(STAGES), arguments.processes)
+
+
+if __name__ == "__main__":
+    main()

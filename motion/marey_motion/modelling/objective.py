@@ -198,6 +198,7 @@ def _row(
 
     match constraint:
         case KeyframeTime():
+            _require_possible(primitive, constraint)
             return _Row(kernels.TIME, moments.setdefault(frame, len(moments)), (constraint.seconds,))
         case RootHeading():
             return _Row(kernels.HEADING, place(facing(frame, standard_joints)), (constraint.heading_rad,))
@@ -217,6 +218,13 @@ def _row(
         case LookDirection(point_m=point):
             assert point is not None
             return _Row(kernels.POINT, joint, point, _unit(constraint.axis))
+
+
+def _require_possible(primitive: MotionPrimitive, constraint: KeyframeTime) -> None:
+    """Raise `ConstraintError` for a time that no motion of the primitive reaches."""
+    if primitive.duration_range_s is not None and constraint.seconds > primitive.duration_range_s[1]:
+        least, most = primitive.duration_range_s
+        raise ConstraintError(f"motions of {primitive.name} last {least:.2f} to {most:.2f} s", where="seconds")
 
 
 def _position_row(item: int, target: tuple[float | None, ...]) -> _Row:

@@ -17,6 +17,12 @@ from marey_motion.skeleton import Skeleton
 
 Floats = NDArray[np.float64]
 
+MOST_FRAMES = 100_000
+"""Of one motion."""
+
+MOST_LOG_SLOPE = 100.0
+"""Beyond it nothing is a motion, but still a number."""
+
 MOST_ATTEMPTS = 100
 """To draw a motion that lasts neither too short nor too long."""
 
@@ -82,7 +88,7 @@ class MotionPrimitive:
     temporal_weight : positive
     mixture : of latent vectors
     keyframes : canonical frame by label
-    duration_range_s : within which samples last, or None; normal distributions of logarithms have long tails
+    duration_range_s : within which motions last, or None; normal distributions of logarithms have long tails
     """
 
     name: str
@@ -128,7 +134,7 @@ class MotionPrimitive:
             return latents
         least, most = self.duration_range_s
         for attempt in range(1, MOST_ATTEMPTS):
-            durations = self.durations_s(latents)
+            durations = self._passed(latents)[:, -1] / self.frame_rate_hz
             odd = (durations < least) | (durations > most)
             if not odd.any():
                 break
@@ -147,11 +153,21 @@ class MotionPrimitive:
         return np.asarray(poses, dtype=np.float64)
 
     def time_functions(self, latents: Floats) -> Floats:
-        """Frames of real time (m, N), at `frame_rate_hz`, that have passed at each canonical frame; the first is 0."""
+        """Frames of real time (m, N), at `frame_rate_hz`, that have passed at each canonical frame; the first is 0.
+
+        A motion that would last longer or shorter than `duration_range_s` allows is played faster or slower as a whole.
+        """
+        passed = self._passed(latents)
+        if self.duration_range_s is not None:
+            least, most = (seconds * self.frame_rate_hz for seconds in self.duration_range_s)
+            passed *= np.clip(passed[:, -1:], least, most) / passed[:, -1:]
+        return passed
+
+    def _passed(self, latents: Floats) -> Floats:
         scores = latents[:, self.spatial.count :] / self.temporal_weight
         log_slopes = (self.temporal.basis.at_frames @ self.temporal.coefficients(scores))[..., 0]
         passed = np.zeros((len(latents), self.frame_count))
-        np.cumsum(np.exp(log_slopes), axis=1, out=passed[:, 1:])
+        np.cumsum(np.exp(np.clip(log_slopes, -MOST_LOG_SLOPE, MOST_LOG_SLOPE)), axis=1, out=passed[:, 1:])
         return passed
 
     def durations_s(self, latents: Floats) -> Floats:
@@ -159,10 +175,18 @@ class MotionPrimitive:
         return np.asarray(self.time_functions(latents)[:, -1] / self.frame_rate_hz)
 
     def motions(self, latents: Floats) -> list[Motion]:
-        """Motions in real time at `frame_rate_hz`; each lasts a whole number of frames, at most half a frame off."""
+        """Motions in real time at `frame_rate_hz`; each lasts a whole number of frames, at most half a frame off.
+
+        Raises `MotionError` for latent vectors so odd that a motion would have more than `MOST_FRAMES` frames.
+        """
         made = []
         for latent in latents:
             passed = self.time_functions(latent[None])[0]
+            if passed[-1] > MOST_FRAMES:
+                raise MotionError(
+                    f"the motion would last {passed[-1] / self.frame_rate_hz:.3g} s, far out of what the model knows",
+                    code="motion-too-long",
+                )
             steps = max(1, round(float(passed[-1])))
             times = np.interp(np.linspace(0.0, passed[-1], steps + 1), passed, np.arange(self.frame_count))
             made.append(_as_motion(self.poses(latent[None], times)[0]))

@@ -15,7 +15,7 @@ read_motion(write_motion(generate_gait(1.0, 0.0, 0.5), "bvh"), "walk.bvh")
 
 def test_a_first_file_finds_the_kernels_compiled(tmp_path: Path) -> None:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    subprocess.run([sys.executable, "-m", "marey_motion.warm_up"], env=environment, check=True)
+    subprocess.run([sys.executable, "-m", "marey_motion.warm_up", "files"], env=environment, check=True)
     before = {file.name for file in tmp_path.rglob("*.nbi")}
     subprocess.run([sys.executable, "-c", READ_A_WALK], env=environment, check=True)
     assert before

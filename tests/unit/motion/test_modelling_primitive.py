@@ -1,0 +1,49 @@
+"""How long motions of a model last, whatever latent vector is asked for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from marey_motion.errors import MotionError
+from marey_motion.modelling.constraints import ConstraintError, KeyframeTime
+from marey_motion.modelling.objective import build_objective
+from search_primitives import walking
+
+FAR = 1e3
+
+
+def bounded():
+    primitive, joints = walking()
+    usual = float(primitive.durations_s(np.zeros((1, primitive.dimensions)))[0])
+    return replace(primitive, duration_range_s=(0.8 * usual, 1.2 * usual)), joints
+
+
+def test_a_motion_lasts_no_longer_than_the_model_allows_and_within_that_as_its_latents_say():
+    primitive, _ = bounded()
+    free = replace(primitive, duration_range_s=None)
+    odd = np.zeros((2, primitive.dimensions))
+    odd[0, primitive.spatial.count], odd[1, primitive.spatial.count] = FAR, -FAR
+    assert sorted(primitive.durations_s(odd)) == pytest.approx(primitive.duration_range_s)
+    usual = np.zeros((1, primitive.dimensions))
+    assert np.array_equal(primitive.time_functions(usual), free.time_functions(usual))
+
+
+def test_a_motion_of_millions_of_frames_is_refused():
+    free, _ = walking()
+    latent = np.zeros((1, free.dimensions))
+    latent[0, free.spatial.count] = FAR if free.durations_s(_moved(free, FAR)) > free.durations_s(latent) else -FAR
+    with pytest.raises(MotionError, match="far out of what the model knows"):
+        free.motions(latent)
+
+
+def _moved(primitive, amount):
+    latent = np.zeros((1, primitive.dimensions))
+    latent[0, primitive.spatial.count] = amount
+    return latent
+
+
+def test_a_time_that_no_motion_of_the_model_reaches_is_refused():
+    primitive, joints = bounded()
+    with pytest.raises(ConstraintError, match="last"):
+        build_objective(primitive, [KeyframeTime("end", 3.0 * primitive.duration_range_s[1])], joints)
