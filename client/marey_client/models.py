@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,6 @@ from marey_schemas.documents import ClipInfo, Source
 from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.modelling import ModelParams
-
-if TYPE_CHECKING:
-    pass
 
 AlignedPlace = str | CollectionInput | ItemInput | ProcessedHandle
 """A folder of aligned clips by its path, an aligned clip, or either as an input of jobs."""
