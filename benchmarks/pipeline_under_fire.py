@@ -38,6 +38,7 @@ TAKES, KILLS, SEED = 200, 10, 7
 SECONDS, RATE_HZ = 1.2, 60.0
 PATIENCE_S = 1800.0
 LONGEST_PAUSE_S = 2.0
+SPARED = 0.4
 QUICK_LEASES = {"MAREY_LEASE_TTL_S": "3", "MAREY_HEARTBEAT_S": "0.5", "MAREY_CANCEL_GRACE_S": "2"}
 PARTS = {Kind.PROCESSED: ("motion", "info"), Kind.MODEL: ("model", "tree")}
 
@@ -75,12 +76,14 @@ def run_pipeline(
     workers: int = 1,
     kills: int = 0,
     chance: random.Random | None = None,
+    spared: float = 0.0,
     settings: Mapping[str, str] = MappingProxyType({}),
     **choices: Any,
 ) -> Outcome:
     """Bring the takes of a folder from files to a model on a server of its own; `choices` are those of the plan.
 
-    So many times, a moment after a worker has begun some work, all workers are killed and started anew.
+    So many times, a moment after a worker has begun some work, all workers are killed and started anew; the share
+    `spared` of such beginnings is let go.
     """
     data.parent.mkdir(parents=True, exist_ok=True)
     with running(data, **QUICK_LEASES, **settings) as server, server.client() as marey:
@@ -89,7 +92,7 @@ def run_pipeline(
         started = time.monotonic()
         with at_work(server, workers) as shift:
             run = lab.pipeline(wanted)
-            fire = _Fire(marey, run, shift, chance or random.Random())
+            fire = _Fire(marey, run, shift, chance or random.Random(), spared)
             moments = [fire.shoot() for _ in range(kills)]
             run.wait(timeout_s=PATIENCE_S)
         tries = list(_attempts(marey, lab))
@@ -181,17 +184,18 @@ def at_work(server: LocalServer, count: int) -> Iterator[Shift]:
 class _Fire:
     """Kills workers under a pipeline."""
 
-    def __init__(self, marey: Marey, run: PipelineRun, shift: Shift, chance: random.Random) -> None:
+    def __init__(self, marey: Marey, run: PipelineRun, shift: Shift, chance: random.Random, spared: float) -> None:
         self._marey = marey
         self._run = run
         self._shift = shift
         self._chance = chance
+        self._spared = spared
         self._seen: set[tuple[str, int]] = set()
 
     def shoot(self) -> str:
         """Kill every worker a moment after one has begun something; what it had begun."""
         deadline = time.monotonic() + PATIENCE_S
-        while not (begun := self._begun()):
+        while not (begun := self._begun()) or self._chance.random() < self._spared:
             if self._run.ended or time.monotonic() > deadline:
                 raise RuntimeError(f"there was nobody left to kill: {self._run}; use more takes")
             time.sleep(0.05)
@@ -227,7 +231,9 @@ def main(takes: int = TAKES, kills: int = KILLS, seed: int = SEED) -> None:
         _tell("one worker", alone)
         double = run_pipeline(material, Path(folder, "two", "data"), workers=2)
         _tell("two workers", double)
-        fired = run_pipeline(material, Path(folder, "fire", "data"), kills=kills, chance=random.Random(seed))
+        fired = run_pipeline(
+            material, Path(folder, "fire", "data"), kills=kills, chance=random.Random(seed), spared=SPARED
+        )
         _tell(f"one worker, killed {kills} times", fired)
         for moment in fired.moments:
             print(f"    {moment}")

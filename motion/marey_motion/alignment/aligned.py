@@ -42,8 +42,8 @@ class AlignedClip:
 
     Parameters
     ----------
-    uid : unique among the clips; ties are broken by it
-    name : for people
+    uid : unique among the clips
+    name : for people; ties are broken by it, then by the uid, which is another one wherever the clips are stored anew
     motion : N canonical frames, in the canonical frame: the body begins at x = z = 0 and faces +z. Joints between a
         static root and the one that carries the body are not translated.
     time_function : (N,) fractional frame of the source (at the set's rate) at each canonical frame; strictly
@@ -70,7 +70,7 @@ class AlignedSet:
     ----------
     skeleton : of all of them
     frame_rate_hz : of canonical frames, that of the reference
-    clips : ordered by uid
+    clips : ordered by name, then uid
     reference : uid of the clip whose time is the canonical time
     keyframes : canonical frame by label
     """

@@ -76,14 +76,14 @@ def example_to_tree(
 
 
 def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
-    """The set that stored examples make up, ordered by uid. It may lack some that were aligned with them.
+    """The set that stored examples make up, ordered by name and uid. It may lack some that were aligned with them.
 
     Raises `MotionError` where there are none, and naming the first example that was aligned with others than those
     before it, that moves another skeleton, or stands twice.
     """
     if not examples:
         raise MotionError("there are no aligned clips", code="too-few-clips")
-    clips = sorted((_example(one) for one in examples), key=lambda clip: clip.uid)
+    clips = sorted((_example(one) for one in examples), key=lambda clip: (clip.name, clip.uid))
     first = examples[0]
     for one in examples[1:]:
         _require_same_set(first, one)

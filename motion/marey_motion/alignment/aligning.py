@@ -58,8 +58,8 @@ class SourceExample:
 
     Parameters
     ----------
-    uid : what names the example for good; ties go to the lower one
-    name : for people
+    uid : what names the example for good
+    name : for people; ties go to the lower one, then to the lower uid
     cuts : frames of the clip that all examples have under the same labels, in the order of time (`segments.cuts_of`)
     """
 
@@ -139,7 +139,7 @@ def align_clips(
     """
     run = _Aligning(body, options or AlignOptions(), threads, progress or (lambda _done, _total, _note: None))
     run.on_refusal = on_refusal
-    return run.align(sorted(clips, key=lambda one: one.uid))
+    return run.align(sorted(clips, key=lambda one: (one.name, one.uid)))
 
 
 class _Aligning:

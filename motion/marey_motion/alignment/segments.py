@@ -86,10 +86,10 @@ def sections_of(cuts: Sequence[Cut], frame_count: int, *, rate_ratio: float = 1.
 
 
 def common_labels(all_labels: Mapping[str, tuple[tuple[str, ...], ...]]) -> tuple[tuple[str, ...], ...]:
-    """The labels of bounds that most examples, by uid, have; of several, those of the first uid."""
+    """The labels of bounds that most examples have, given by uid; of several, those of the first example."""
     counts = Counter(all_labels.values())
     most = max(counts.values())
-    return next(labels for _, labels in sorted(all_labels.items()) if counts[labels] == most)
+    return next(labels for labels in all_labels.values() if counts[labels] == most)
 
 
 def require_labels(own: tuple[tuple[str, ...], ...], common: tuple[tuple[str, ...], ...]) -> None:
