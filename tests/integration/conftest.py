@@ -1,5 +1,6 @@
 """Fixtures of the integration tests."""
 
+from command_line import run
 from rest_server import owner, server
 
-__all__ = ["owner", "server"]
+__all__ = ["owner", "run", "server"]

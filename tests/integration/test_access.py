@@ -62,6 +62,10 @@ BODIES = {
     "UploadCreate": {"length": 5},
     "CoverageStreamCreate": {"frame_rate_hz": 60},
     "CoverageFrames": {"offset": 0, "ends_take": True},
+    "AnnotationChange": {"commands": [{"command": "clear"}]},
+    "AnnotationImport": {"document": {"sections": [{"start_idx": 0, "end_idx": 0}]}},
+    "EditPreviewRequest": {"commands": [{"command": "trim", "start": 0, "stop": 1}]},
+    "SearchRequest": {"constraints": [{"type": "root_heading", "at": "end", "heading_deg": 0}]},
 }
 """A body for every model that a route takes; a route with a new one fails here until it gets one."""
 
@@ -95,6 +99,9 @@ def house(server: Server) -> House:
     motion = {**MOTION, "skeleton": {"item": skeleton, "revision": 1}}
     made = owner.post("/projects/lab/clips", json={"name": CANARY, "parts": {"motion": motion, "info": info}})
     assert made.status_code == 201, made.text
+    layer = {"schema": "marey/annotation@1", "clip": {"item": made.json()["id"], "revision": 1}, "layer": CANARY}
+    annotation = owner.post("/projects/lab/annotations", json={"name": CANARY, "parts": {"annotation": layer}})
+    assert annotation.status_code == 201, annotation.text
     contributor = server.client(tokens["contributor"])
     job = contributor.post(
         "/projects/lab/jobs", json={"kind": "export", "inputs": {"clips": [{"item": made.json()["id"]}]}}
@@ -112,7 +119,7 @@ def house(server: Server) -> House:
         "project": "lab", "collection": collection, "kind": "clips", "item": made.json()["id"], "part": "info",
         "revision": "1", "user": "reader", "job": lease["job"], "fence": str(lease["fence"]), "digest": SECRET_DIGEST,
         "job_kind": "import", "figure": "offsets", "stream": stream.json()["id"],
-        "token": "token_of_nobody", "upload": "upload_of_nobody",
+        "token": "token_of_nobody", "upload": "upload_of_nobody", "annotation": annotation.json()["id"],
     }  # fmt: skip
     return House(server, tokens, variables)
 
@@ -143,8 +150,12 @@ def send(house: House, route, role: str) -> httpx.Response:
             content = {"json": BODIES[name]}
     if template.endswith("/{kind}") and operation.method == "POST":
         variables["kind"] = "skeletons"
+    if template.endswith("/commands"):
+        variables |= {"kind": "annotations", "item": variables["annotation"]}
+    if "/samples" in template or "/search" in template:
+        variables |= {"kind": "models", "item": "model_of_nobody"}
     address = house.server.address + template.format(**variables)
-    query = {"format": "original"} if template.endswith("/export") else {}
+    query = {"format": "original"} if template.endswith("{item}/export") else {}
     client = house.server.client(house.tokens[role])
     if template.endswith("/logout") and role not in ("none", "attempt"):  # sign out of a session made for it
         client = house.server.client(client.post("/tokens", json=BODIES["TokenCreate"]).json()["secret"])

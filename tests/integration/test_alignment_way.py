@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -56,24 +53,6 @@ def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
     (folder / "blink.bvh").write_bytes(write_bvh(examples[0].clip.sliced(0, 3)))
     project.imports.upload(find_files([folder]).files, ImportOptions(collection="walks"))
     return project
-
-
-@pytest.fixture
-def run(server: ServerProcess, tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Runs the command line against the server, in a folder of its own."""
-
-    def run(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
-        surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
-        known = {"MAREY_URL": server.url, "MAREY_DATA": str(server.data), "HOME": str(tmp_path)}
-        ended = subprocess.run(
-            [sys.executable, "-m", "marey_client.cli", *map(str, arguments)],
-            env={**surroundings, **known, "XDG_CONFIG_HOME": str(tmp_path)},
-            capture_output=True, text=True, cwd=tmp_path, timeout=240,
-        )  # fmt: skip
-        assert ended.returncode == status, ended.stdout + ended.stderr
-        return ended
-
-    return run
 
 
 def done(project: ProjectHandle, job: Job) -> dict[str, Any]:

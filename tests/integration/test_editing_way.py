@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from math import radians
 from pathlib import Path
@@ -175,24 +172,6 @@ def test_a_preview_shows_what_the_job_makes_and_stores_nothing(marey: Marey, lab
     assert np.array_equal(walk.preview(edit, frames=slice(20, 50)).motion.poses, shown.motion.poses)  # type: ignore[union-attr]
     with pytest.raises(RequestFailed, match=r"commands\[0\] \(trim\)"):
         walk.preview([{"command": "trim", "start": 100_000}])
-
-
-@pytest.fixture
-def run(server: ServerProcess, tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Runs the command line against the server, in a folder of its own."""
-
-    def run(*arguments: object, status: int = 0, stdin: str = "") -> subprocess.CompletedProcess[str]:
-        surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
-        known = {"MAREY_URL": server.url, "MAREY_DATA": str(server.data), "HOME": str(tmp_path)}
-        done = subprocess.run(
-            [sys.executable, "-m", "marey_client.cli", *map(str, arguments)],
-            env={**surroundings, **known, "XDG_CONFIG_HOME": str(tmp_path)},
-            capture_output=True, text=True, input=stdin, cwd=tmp_path, timeout=240,
-        )  # fmt: skip
-        assert done.returncode == status, done.stdout + done.stderr
-        return done
-
-    return run
 
 
 def test_an_animator_edits_from_the_command_line(lab: ProjectHandle, run: Callable[..., Any], tmp_path: Path) -> None:

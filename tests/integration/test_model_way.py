@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import subprocess
-import sys
 import zipfile
 from collections.abc import Callable, Iterator
 from math import radians
@@ -64,24 +61,6 @@ def lab(marey: Marey, tmp_path_factory: pytest.TempPathFactory) -> ProjectHandle
 @pytest.fixture(scope="module")
 def walk(lab: ProjectHandle) -> ModelHandle:
     return lab.model(lab.train_model("aligned", name="walk", into="models", tags=("nightly",), seed=5))
-
-
-@pytest.fixture
-def run(server: ServerProcess, tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Runs the command line against the server, in a folder of its own."""
-
-    def run(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
-        surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
-        known = {"MAREY_URL": server.url, "MAREY_DATA": str(server.data), "HOME": str(tmp_path)}
-        done = subprocess.run(
-            [sys.executable, "-m", "marey_client.cli", *map(str, arguments)],
-            env={**surroundings, **known, "XDG_CONFIG_HOME": str(tmp_path)},
-            capture_output=True, text=True, cwd=tmp_path, timeout=240,
-        )  # fmt: skip
-        assert done.returncode == status, done.stdout + done.stderr
-        return done
-
-    return run
 
 
 def test_a_model_tells_how_good_it_is_and_what_it_was_made_of(lab: ProjectHandle, walk: ModelHandle) -> None:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from math import radians
 from pathlib import Path
@@ -75,24 +72,6 @@ def walk(lab: ProjectHandle) -> ModelHandle:
     made = lab.model(lab.train_model("aligned", name="walk", into="models", report=False))
     made.make_tree(seed=3, samples=4000)
     return lab.models.get(made.id)
-
-
-@pytest.fixture
-def run(server: ServerProcess, tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Runs the command line against the server, in a folder of its own."""
-
-    def run(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
-        surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
-        known = {"MAREY_URL": server.url, "MAREY_DATA": str(server.data), "HOME": str(tmp_path)}
-        done = subprocess.run(
-            [sys.executable, "-m", "marey_client.cli", *map(str, arguments)],
-            env={**surroundings, **known, "XDG_CONFIG_HOME": str(tmp_path)},
-            capture_output=True, text=True, cwd=tmp_path, timeout=240,
-        )  # fmt: skip
-        assert done.returncode == status, done.stdout + done.stderr
-        return done
-
-    return run
 
 
 def test_a_tree_becomes_a_part_of_its_model_and_leaves_the_others(walk: ModelHandle) -> None:

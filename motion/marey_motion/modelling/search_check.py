@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.modelling.constraints import JointPosition
+from marey_motion.modelling.optimise import RefineOptions
 from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.reconstruction import CM_PER_M
 from marey_motion.modelling.sample_quality import toe_positions
@@ -27,6 +28,8 @@ HELD_OUT_EVERY = 5
 LEAST_EXAMPLES = 10
 MOST_TARGETS = 60
 SAMPLES = 2000
+REFINING = RefineOptions(likelihood_weight=0.01)
+"""What is asked is how near the model can come."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +77,7 @@ def check_search(
     for example, place in wanted:
         x, y, z = places[example, frames[place], place].tolist()
         step = Step(primitive, (JointPosition(names[place], float(frames[place]), (x, y, z)),), standard_joints)
-        found = search_steps([step], [tree])
+        found = search_steps([step], [tree], refining=REFINING)
         searched.append(float(found.sampled.errors[0][0]))
         refined.append(float(found.measured.errors[0][0]))
     return SearchCheck(

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from marey_schemas.access import Role
 from marey_schemas.annotations import MAX_NAME_LENGTH, AnnotationChange, AnnotationImport, command_arguments
 from marey_schemas.documents import Annotation, RevisionRef
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
 from marey_server.errors import Invalid, NotFound
+from marey_server.store import projects
 from marey_server.store.items.changing import prepare_parts, put_part
 from marey_server.store.items.reading import read_item, read_part
 from marey_server.store.revs import moved_on
@@ -28,6 +30,7 @@ def apply_commands(
     from marey_motion.editing.annotations.layers import COMMANDS
     from marey_motion.errors import MotionError
 
+    projects.require(tx, project, Role.CONTRIBUTOR, "write")
     found = read_part(tx, project, Kind.ANNOTATION, item_id, "annotation")
     if expected_rev not in (None, found.rev):
         raise moved_on(found.rev)
