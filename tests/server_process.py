@@ -75,6 +75,10 @@ class MareyProcess:
             raise
 
 
+READY_S = 120.0
+"""A machine that does much else at once takes its time."""
+
+
 class ServerProcess(MareyProcess):
     """`marey serve` on a port of its own."""
 
@@ -91,7 +95,7 @@ class ServerProcess(MareyProcess):
         """Start, and wait until it can serve."""
         environment = self._environment | ({"MAREY_FAULT": fault} if fault else {})
         self.spawn(["marey_client.cli", "serve", "--workers", str(workers)], environment)
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + READY_S
         while time.monotonic() < deadline:
             assert self.process is not None
             assert self.process.poll() is None, f"the server ended:\n{self.log.read_text()[-3000:]}"
