@@ -6,8 +6,10 @@ The compiled code is kept on disk; later processes load it in a fraction of a se
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -15,6 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.clip import Clip
+
+PACKAGE = Path(__file__).parent
+STAMP = Path(os.environ.get("NUMBA_CACHE_DIR") or PACKAGE / "__pycache__") / "kernels-compiled"
 
 _ASF = b""":version 1.10
 :units
@@ -48,12 +53,26 @@ def discard_outdated_kernels() -> None:
 
     The cache compares each kernel with its own file only, and a kernel holds a copy of those that it calls.
     """
-    package = Path(__file__).parent
-    sources = [*package.rglob("*_kernels.py"), *package.rglob("*_lanes.py")]
-    changed = max(source.stat().st_mtime for source in sources)
-    for compiled in package.rglob("__pycache__/*.nb[ic]"):
+    changed = _changed()
+    for compiled in PACKAGE.rglob("__pycache__/*.nb[ic]"):
         if compiled.stat().st_mtime < changed:
             compiled.unlink(missing_ok=True)
+
+
+def _changed() -> float:
+    """When a source of kernels was changed last."""
+    return max(source.stat().st_mtime for form in ("*_kernels.py", "*_lanes.py") for source in PACKAGE.rglob(form))
+
+
+def _is_done() -> bool:
+    """Whether everything was compiled since, by the compiler that is installed."""
+    return STAMP.is_file() and STAMP.stat().st_mtime >= _changed() and STAMP.read_text() == version("numba")
+
+
+def _note_done() -> None:
+    """Note that everything is compiled, where the compiled code lies; without the right to write there, do not."""
+    if os.access(STAMP.parent, os.W_OK):
+        STAMP.write_text(version("numba"))
 
 
 def compile_kernels(stages: Sequence[str], processes: int = 1) -> None:
@@ -230,8 +249,12 @@ def main() -> None:
     arguments = parser.parse_args()
     if unknown := set(arguments.stages) - set(STAGES):
         parser.error(f"no stage {', '.join(sorted(unknown))}; there are {', '.join(STAGES)}")
+    if not arguments.stages and _is_done():
+        return
     discard_outdated_kernels()
     compile_kernels(arguments.stages or tuple(STAGES), arguments.processes)
+    if not arguments.stages:
+        _note_done()
 
 
 if __name__ == "__main__":
