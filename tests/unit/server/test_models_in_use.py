@@ -53,7 +53,7 @@ def test_a_document_of_samples_names_its_model_and_seed(loaded):
 def test_files_of_samples_are_the_same_bytes_alone_and_in_an_archive(loaded):
     model = parse_model(loaded)
     one, many = (sample_file(FOUND, model, count, 2, "npz", "cm") for count in (1, 3))
-    assert (one.name, many.name) == ("sway 2.npz", "sway 2.zip")
+    assert (one.name, many.name) == ("sway_2.npz", "sway_2.zip")
     assert zipfile.ZipFile(io.BytesIO(many.data)).read("sway_2_0001.npz") == one.data
     assert sample_file(FOUND, model, 3, 2, "npz", "cm").data == many.data
 
