@@ -158,7 +158,7 @@ def test_an_archive_of_samples_is_the_same_bytes_every_time(walk: ModelHandle) -
 
     first = archive()
     assert first == archive()
-    assert zipfile.ZipFile(io.BytesIO(first)).namelist() == [f"walk 1 000{place}.bvh" for place in (1, 2, 3)]
+    assert zipfile.ZipFile(io.BytesIO(first)).namelist() == [f"walk_1_000{place}.bvh" for place in (1, 2, 3)]
 
 
 def test_samples_become_clips_on_the_models_skeleton(lab: ProjectHandle, walk: ModelHandle) -> None:
