@@ -78,7 +78,7 @@ def test_a_piece_is_the_frames_of_its_segment_with_its_margins_and_keyframes(pro
     clip, annotation = project.staged
     source = project.parts["clip_walk", 1, "motion"]["poses"]
     np.testing.assert_array_equal(clip.parts["motion"]["poses"], source[30:115])
-    assert (clip.item_name, clip.collection) == ("walk a 01", "walks/a")
+    assert (clip.item_name, clip.collection) == ("walk_a_01", "walks/a")
     assert clip.parts["info"]["source"]["details"] == {
         "clip": {"item": "clip_walk", "revision": 1},
         "annotation": {"item": "annotation_0", "revision": 1},
@@ -102,7 +102,7 @@ def test_margins_end_where_the_clip_ends_and_short_or_long_segments_are_left_out
     )
     cut.run(project, CutParams(shortest_s=0.5, longest_s=2.0, margin_before_s=10.0))
     (clip,) = [one for one in project.staged if one.kind is Kind.CLIP]
-    assert clip.item_name == "walk a 02"
+    assert clip.item_name == "walk_a_02"
     assert len(clip.parts["motion"]["poses"]) == 70
 
 
@@ -116,7 +116,7 @@ def test_a_label_that_no_annotation_has_is_refused_with_those_there_are(project)
 def test_layers_that_would_make_pieces_of_one_name_are_refused(project):
     for layer in ("mine", "yours"):
         annotated(project, segments=[{"label": "a", "start": 0, "end": 10}], layer=layer)
-    with pytest.raises(JobRefused, match="2 pieces would be walks/walk a 01") as refused:
+    with pytest.raises(JobRefused, match="2 pieces would be walks/walk_a_01") as refused:
         cut.run(project, CutParams())
     assert (refused.value.code, project.staged) == ("same-name", [])
     assert cut.run(project, CutParams(layer="yours"))["clips"] == 1
