@@ -1,29 +1,47 @@
 """The command line, as somebody in a folder of their own runs it."""
 
+from __future__ import annotations
+
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-
-import pytest
+from typing import Any
 
 from server_process import ServerProcess
 
+TIME_S = 300.0
 
-@pytest.fixture
-def run(server: ServerProcess, tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Runs the command line against the server, in a folder of its own."""
 
-    def run(*arguments: object, status: int = 0, stdin: str = "") -> subprocess.CompletedProcess[str]:
-        surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
-        known = {"MAREY_URL": server.url, "MAREY_DATA": str(server.data), "HOME": str(tmp_path)}
+@dataclass(frozen=True)
+class CommandLine:
+    """`marey` in `folder`, where somebody has told it of `server`."""
+
+    server: ServerProcess
+    folder: Path
+
+    def __call__(
+        self, *arguments: object, status: int = 0, stdin: str = "", **environment: str
+    ) -> subprocess.CompletedProcess[str]:
+        """Run a command to its end, which must have this exit status."""
         done = subprocess.run(
-            [sys.executable, "-m", "marey_client.cli", *map(str, arguments)],
-            env={**surroundings, **known, "XDG_CONFIG_HOME": str(tmp_path)},
-            capture_output=True, text=True, input=stdin, cwd=tmp_path, timeout=240,
+            self._words(arguments),
+            capture_output=True, text=True, input=stdin, cwd=self.folder, timeout=TIME_S,
+            env=self._surroundings(environment),
         )  # fmt: skip
         assert done.returncode == status, done.stdout + done.stderr
         return done
 
-    return run
+    def start(self, *arguments: object) -> subprocess.Popen[str]:
+        """Start a command and go on; what it prints can be read."""
+        pipe: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        return subprocess.Popen(self._words(arguments), cwd=self.folder, env=self._surroundings({}), **pipe)
+
+    def _words(self, arguments: tuple[object, ...]) -> list[str]:
+        return [sys.executable, "-m", "marey_client.cli", *map(str, arguments)]
+
+    def _surroundings(self, more: dict[str, str]) -> dict[str, str]:
+        others = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
+        known = {"MAREY_URL": self.server.url, "MAREY_DATA": str(self.server.data)}
+        return {**others, **known, "HOME": str(self.folder), "XDG_CONFIG_HOME": str(self.folder), **more}

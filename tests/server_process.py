@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
 
@@ -135,6 +136,17 @@ class WorkerProcess(MareyProcess):
         arguments = ["marey_worker", "--attached", "--server", url, "--name", name, "--cache", str(folder / "cache")]
         self.spawn(arguments, environment, stdin=f"{token}\n".encode())
         return self
+
+
+@contextlib.contextmanager
+def serving(folder: Path, database_url: str | None = None) -> Iterator[ServerProcess]:
+    """A server with one worker, until the block ends; it must end well."""
+    process = ServerProcess(folder, database_url).start(workers=1)
+    try:
+        yield process
+    finally:
+        status = process.stop()
+    assert status == 0, process.log.read_text()[-3000:]
 
 
 def free_port() -> int:

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from evaluation_takes import write_walks
-from marey_client import Marey
+from command_line import CommandLine
 from marey_client.errors import JobUnsuccessful
 from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
 from marey_motion.clip import Clip
 from marey_motion.formats import write_bvh
 from marey_motion.gait import game_skeleton
-from marey_schemas.access import ProjectCreate
 from marey_schemas.imports import ImportOptions
 from marey_schemas.items import ItemChange
-from server_process import ServerProcess
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -29,32 +25,7 @@ SMALL: dict[str, Any] = {"speeds_m_s": (1.0, 2.0), "turn_rates_deg_s": (-50.0, 0
 """12 trials in 2 tasks."""
 
 
-@pytest.fixture
-def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
-    process = ServerProcess(tmp_path, database_url)
-    process.start(workers=1)
-    yield process
-    process.stop()
-
-
-@pytest.fixture
-def marey(server: ServerProcess) -> Iterator[Marey]:
-    with server.client() as client:
-        yield client
-
-
-@pytest.fixture
-def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
-    """A project with nine walks."""
-    project = marey.create_project(ProjectCreate(name="lab"))
-    files = find_files([write_walks(tmp_path / "takes")]).files
-    project.imports.upload(files, ImportOptions(collection="walks"))
-    return project
-
-
-def test_from_a_folder_of_clips_to_a_verdict_and_a_report(
-    lab: ProjectHandle, run: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_from_a_folder_of_clips_to_a_verdict_and_a_report(lab: ProjectHandle, run: CommandLine, tmp_path: Path) -> None:
     grid = ("--speeds", "1:2:1", "--turns=-50:50:50", "--duration", "10")
     told = run("evaluate", "lab/walks", *grid, "--out", "report.html").stdout
     (found,) = lab.evaluations.list()

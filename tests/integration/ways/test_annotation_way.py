@@ -3,48 +3,18 @@
 from __future__ import annotations
 
 import json
-import subprocess
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from evaluation_takes import write_walks
-from marey_client import Marey
+from command_line import CommandLine
 from marey_client.errors import JobUnsuccessful, PreconditionFailed, RequestFailed
-from marey_client.imports import find_files
 from marey_client.jobs import Jobs
 from marey_client.project import ProjectHandle
-from marey_schemas.access import ProjectCreate
-from marey_schemas.imports import ImportOptions
 from marey_schemas.jobs import Job
-from server_process import ServerProcess
 
 pytestmark = pytest.mark.timeout(300)
-
-
-@pytest.fixture
-def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
-    process = ServerProcess(tmp_path, database_url)
-    process.start(workers=1)
-    yield process
-    process.stop()
-
-
-@pytest.fixture
-def marey(server: ServerProcess) -> Iterator[Marey]:
-    with server.client() as client:
-        yield client
-
-
-@pytest.fixture
-def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
-    """A project with nine walks."""
-    project = marey.create_project(ProjectCreate(name="lab"))
-    files = find_files([write_walks(tmp_path / "takes")]).files
-    project.imports.upload(files, ImportOptions(collection="walks"))
-    return project
 
 
 def done(project: ProjectHandle, job: Job) -> Job:
@@ -127,7 +97,7 @@ def test_two_pieces_of_one_name_are_refused_before_any_is_made(lab: ProjectHandl
 
 
 def test_annotations_are_made_corrected_and_exchanged_from_the_command_line(
-    lab: ProjectHandle, run: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
+    lab: ProjectHandle, run: CommandLine, tmp_path: Path
 ) -> None:
     clip, place = "lab/walks/walk 1 0", "lab/walks/walk 1 0 parts"
     told = run("annotation", "create", clip, "--layer", "parts", "--segment", "b=50:90", "--segment", "a=0:50")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +11,12 @@ import numpy as np
 import pytest
 
 from alignment_examples import warped_walks
-from marey_client import Marey
+from command_line import CommandLine
 from marey_client.errors import JobUnsuccessful
-from marey_client.imports import find_files
 from marey_client.jobs import Jobs
 from marey_client.project import ProjectHandle
 from marey_motion.formats import read_motion, write_bvh
-from marey_schemas.access import ProjectCreate
-from marey_schemas.imports import ImportOptions
 from marey_schemas.jobs import Job
-from server_process import ServerProcess
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -28,31 +24,15 @@ NAMES = ("walk a", "walk b", "walk c", "walk d", "walk e")
 
 
 @pytest.fixture
-def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
-    process = ServerProcess(tmp_path, database_url)
-    process.start(workers=1)
-    yield process
-    process.stop()
-
-
-@pytest.fixture
-def marey(server: ServerProcess) -> Iterator[Marey]:
-    with server.client() as client:
-        yield client
-
-
-@pytest.fixture
-def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
+def lab(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandle:
     """A project with five examples of one walk, and one clip that is too short to be aligned."""
-    project = marey.create_project(ProjectCreate(name="lab"))
     folder = tmp_path / "takes"
     folder.mkdir()
     examples, _ = warped_walks(len(NAMES))
     for one in examples:
         (folder / f"{one.name}.bvh").write_bytes(write_bvh(one.clip))
     (folder / "blink.bvh").write_bytes(write_bvh(examples[0].clip.sliced(0, 3)))
-    project.imports.upload(find_files([folder]).files, ImportOptions(collection="walks"))
-    return project
+    return lab_of(folder)
 
 
 def done(project: ProjectHandle, job: Job) -> dict[str, Any]:
@@ -115,7 +95,7 @@ def test_keyframes_of_annotations_are_matched_and_become_those_of_the_set(lab: P
         assert made.time_function()[30] == frames[made.name]
 
 
-def test_the_command_tells_costs_slopes_and_refusals(lab: ProjectHandle, run: Callable[..., Any]) -> None:
+def test_the_command_tells_costs_slopes_and_refusals(lab: ProjectHandle, run: CommandLine) -> None:
     told = run("align", "lab/walks", "--into", "aligned", "--reference", "lab/walks/walk c", status=1)
     assert "walks/blink: it has 3 frames" in told.stderr
     assert "reference" in next(line for line in told.stdout.splitlines() if "walk c" in line)

@@ -5,57 +5,21 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Callable, Iterator
-from math import radians
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from marey_client import Marey
+from command_line import CommandLine
 from marey_client.errors import JobUnsuccessful, RequestFailed
-from marey_client.imports import find_files
 from marey_client.models import ModelHandle
 from marey_client.project import ProjectHandle
-from marey_motion.formats import read_motion, write_bvh
-from marey_motion.gait import generate_gait
-from marey_schemas.access import ProjectCreate
-from marey_schemas.imports import ImportOptions
-from server_process import ServerProcess
+from marey_motion.formats import read_motion
 
 pytestmark = pytest.mark.timeout(300)
 
 EXAMPLES = 12
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
-    process = ServerProcess(tmp_path_factory.mktemp("server"))
-    process.start(workers=1)
-    yield process
-    process.stop()
-
-
-@pytest.fixture(scope="module")
-def marey(server: ServerProcess) -> Iterator[Marey]:
-    with server.client() as client:
-        yield client
-
-
-@pytest.fixture(scope="module")
-def lab(marey: Marey, tmp_path_factory: pytest.TempPathFactory) -> ProjectHandle:
-    """A project with a dozen aligned walks of two steps, and two of another alignment."""
-    project = marey.create_project(ProjectCreate(name="lab"))
-    folder = tmp_path_factory.mktemp("takes")
-    for index in range(EXAMPLES):
-        clip = generate_gait(1.0 + 0.05 * index, radians(10.0 * (index % 3 - 1)), 0.9)
-        (folder / f"walk {index:02}.bvh").write_bytes(write_bvh(clip))
-    project.imports.upload(find_files([folder]).files, ImportOptions(collection="walks"))
-    clips = list(project.clips.list(collection="walks", sort="name"))
-    marey.jobs.wait(project.align(clips, into="aligned").id)
-    marey.jobs.wait(project.align(clips[:2], into="others").id)
-    return project
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +166,7 @@ def test_only_models_have_samples(lab: ProjectHandle) -> None:
         lab.transport.send("GET", f"{clip.url}/samples")
 
 
-def test_from_the_command_line(lab: ProjectHandle, run: Callable[..., Any], tmp_path: Path) -> None:
+def test_from_the_command_line(lab: ProjectHandle, run: CommandLine, tmp_path: Path) -> None:
     told = run("model", "lab/aligned", "--name", "cli", "--into", "models", "--share", "0.9", "--no-report").stdout
     assert told.startswith(f"{EXAMPLES} examples in ")
     assert "left out, cm" in told

@@ -3,61 +3,26 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from math import radians
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from marey_client import Marey
+from command_line import CommandLine
 from marey_client.errors import JobUnsuccessful, RequestFailed
-from marey_client.imports import find_files
 from marey_client.models import ModelHandle
 from marey_client.project import ProjectHandle
 from marey_motion.documents import clip_from_document
-from marey_motion.formats import read_motion, write_bvh
-from marey_motion.gait import generate_gait
+from marey_motion.formats import read_motion
 from marey_motion.kinematics import global_positions
-from marey_schemas.access import ProjectCreate
-from marey_schemas.imports import ImportOptions
 from marey_schemas.jobs import ItemInput, JobCreate
-from server_process import ServerProcess
 
 pytestmark = pytest.mark.timeout(300)
 
 EXAMPLES = 12
 AHEAD = {"type": "root_position", "at": "end", "target_m": [None, 1.2]}
 TAIL = {"type": "joint_position", "at": "end", "joint": "tail", "target_m": [0, 0, 0]}
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
-    process = ServerProcess(tmp_path_factory.mktemp("server"))
-    process.start(workers=1)
-    yield process
-    process.stop()
-
-
-@pytest.fixture(scope="module")
-def marey(server: ServerProcess) -> Iterator[Marey]:
-    with server.client() as client:
-        yield client
-
-
-@pytest.fixture(scope="module")
-def lab(marey: Marey, tmp_path_factory: pytest.TempPathFactory) -> ProjectHandle:
-    """A project with a dozen aligned walks."""
-    project = marey.create_project(ProjectCreate(name="lab"))
-    folder = tmp_path_factory.mktemp("takes")
-    for index in range(EXAMPLES):
-        clip = generate_gait(1.0 + 0.05 * index, radians(10.0 * (index % 3 - 1)), 0.9)
-        (folder / f"walk {index:02}.bvh").write_bytes(write_bvh(clip))
-    project.imports.upload(find_files([folder]).files, ImportOptions(collection="walks"))
-    clips = list(project.clips.list(collection="walks", sort="name"))
-    marey.jobs.wait(project.align(clips, into="aligned").id)
-    return project
 
 
 @pytest.fixture(scope="module")
@@ -209,7 +174,7 @@ def test_only_models_are_searched(lab: ProjectHandle) -> None:
         lab.transport.send("POST", f"{clip.url}/search", content=b'{"constraints": []}')
 
 
-def test_from_the_command_line(run: Callable[..., Any], walk: ModelHandle, tmp_path: Path) -> None:
+def test_from_the_command_line(run: CommandLine, walk: ModelHandle, tmp_path: Path) -> None:
     asked = ("--at", "end:left_wrist=_,0.9,1.2", "--stand", "start=0,0", "--lambda", 0.01)
     told = run("search", "lab/models/walk", *asked, "--out", "found.bvh").stdout
     assert "joint_position left_wrist" in told

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from math import radians
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from command_line import CommandLine
 from marey_client import Marey
 from marey_client.errors import JobUnsuccessful, RequestFailed
-from marey_client.imports import find_files
 from marey_client.motions import ClipHandle
 from marey_client.project import ProjectHandle
 from marey_motion.clip import Clip
@@ -21,11 +21,8 @@ from marey_motion.documents import clip_from_document, commands_of_edit, skeleto
 from marey_motion.editing.registry import edit_clip
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
-from marey_schemas.access import ProjectCreate
 from marey_schemas.editing import EditDocument
-from marey_schemas.imports import ImportOptions
 from marey_schemas.jobs import Job
-from server_process import ServerProcess
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -39,28 +36,12 @@ CLEAN_UP: list[dict[str, Any]] = [
 
 
 @pytest.fixture
-def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
-    process = ServerProcess(tmp_path, database_url)
-    process.start(workers=1)
-    yield process
-    process.stop()
-
-
-@pytest.fixture
-def marey(server: ServerProcess) -> Iterator[Marey]:
-    with server.client() as client:
-        yield client
-
-
-@pytest.fixture
-def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
+def lab(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandle:
     """A project with three walks: straight ahead, to the left and to the right."""
-    project = marey.create_project(ProjectCreate(name="lab"))
     for turn_rate_deg_s in (-30, 0, 30):
         walk = generate_gait(1.3, radians(turn_rate_deg_s), 4.0)
         (tmp_path / f"walk {turn_rate_deg_s}.bvh").write_bytes(write_bvh(walk))
-    project.imports.upload(find_files(sorted(tmp_path.glob("*.bvh"))).files, ImportOptions(collection="walks"))
-    return project
+    return lab_of(*tmp_path.glob("*.bvh"))
 
 
 def clips_of(project: ProjectHandle, folder: str) -> dict[str, ClipHandle]:
@@ -174,7 +155,7 @@ def test_a_preview_shows_what_the_job_makes_and_stores_nothing(marey: Marey, lab
         walk.preview([{"command": "trim", "start": 100_000}])
 
 
-def test_an_animator_edits_from_the_command_line(lab: ProjectHandle, run: Callable[..., Any], tmp_path: Path) -> None:
+def test_an_animator_edits_from_the_command_line(lab: ProjectHandle, run: CommandLine, tmp_path: Path) -> None:
     walk = "lab/walks/walk 0"
     told = run("edit", "preview", walk, "--do", "trim start=10 stop=100", "--do", "find_ground").stdout
     assert "0:90 of 90" in told
@@ -216,7 +197,7 @@ WRONG: tuple[tuple[tuple[str, ...], int, str], ...] = (
 )
 
 
-def test_what_went_wrong_is_told_in_a_line(lab: ProjectHandle, run: Callable[..., Any]) -> None:
+def test_what_went_wrong_is_told_in_a_line(lab: ProjectHandle, run: CommandLine) -> None:
     for arguments, status, told in WRONG:
         done = run(*arguments, status=status)
         assert told in done.stderr

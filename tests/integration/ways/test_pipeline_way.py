@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from benchmarks.pipeline_under_fire import write_takes
 
+from command_line import CommandLine
 from marey_client import Marey
 from marey_client.errors import NoAnnotations
 from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
 from marey_motion.formats import write_motion
 from marey_motion.gait import generate_gait
-from marey_schemas.access import ProjectCreate
 from marey_schemas.imports import ImportOptions
 from marey_schemas.kinds import Kind
-from server_process import ServerProcess
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -37,45 +33,10 @@ CHANGED = "walk-003"
 
 
 @pytest.fixture
-def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
-    process = ServerProcess(tmp_path, database_url)
-    process.start(workers=1)
-    yield process
-    process.stop()
-
-
-@pytest.fixture
-def marey(server: ServerProcess) -> Iterator[Marey]:
-    with server.client() as client:
-        yield client
-
-
-@pytest.fixture
-def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
+def lab(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandle:
     """A project with a skeleton that came with a clip, and beside it a folder of takes that are not there yet."""
-    project = marey.create_project(ProjectCreate(name="lab"))
     write_takes(tmp_path, TAKES)
-    project.imports.upload(find_files([tmp_path / "game.bvh"]).files, ImportOptions(collection="rigs"))
-    return project
-
-
-@pytest.fixture
-def command(server: ServerProcess, tmp_path: Path) -> dict[str, Any]:
-    """How the command line is run against the server, in a folder of its own."""
-    surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
-    known = {"MAREY_URL": server.url, "MAREY_DATA": str(server.data), "HOME": str(tmp_path)}
-    return {"env": {**surroundings, **known, "XDG_CONFIG_HOME": str(tmp_path)}, "cwd": tmp_path, "text": True}
-
-
-@pytest.fixture
-def run(command: dict[str, Any]) -> Callable[..., subprocess.CompletedProcess[str]]:
-    def run(*arguments: object, status: int = 0, **more: Any) -> subprocess.CompletedProcess[str]:
-        told = [sys.executable, "-m", "marey_client.cli", *map(str, arguments)]
-        done = subprocess.run(told, capture_output=True, timeout=400, **command, **more)
-        assert done.returncode == status, done.stdout + done.stderr
-        return done
-
-    return run
+    return lab_of(tmp_path / "game.bvh", collection="rigs")
 
 
 def skeleton_path(lab: ProjectHandle) -> str:
@@ -93,7 +54,7 @@ def attempts(marey: Marey, jobs: dict[str, Any]) -> dict[str, int]:
 
 
 def test_after_one_take_has_changed_the_model_is_stale_and_only_what_depends_on_that_take_is_computed_again(
-    marey: Marey, lab: ProjectHandle, run: Callable[..., Any], tmp_path: Path
+    marey: Marey, lab: ProjectHandle, run: CommandLine, tmp_path: Path
 ) -> None:
     line = ("build-model", "takes", "--project", "lab", "--to", skeleton_path(lab), "--name", "walk", *QUICK_FLAGS)
     first = json.loads(run(*line, "--json").stdout)["jobs"]
@@ -147,7 +108,7 @@ def test_clips_that_are_there_become_a_model_from_python_too(lab: ProjectHandle,
 
 
 def test_a_graph_of_jobs_comes_from_a_file_or_from_standard_input(
-    lab: ProjectHandle, run: Callable[..., Any], tmp_path: Path
+    lab: ProjectHandle, run: CommandLine, tmp_path: Path
 ) -> None:
     lab.imports.upload(find_files([tmp_path / "takes" / f"{CHANGED}.bvh"]).files, ImportOptions(collection="raw"))
     (rig, *_) = lab.skeletons.list(sort="id")
@@ -160,21 +121,20 @@ def test_a_graph_of_jobs_comes_from_a_file_or_from_standard_input(
     told = run("pipeline", "graph.json", "--project", "lab").stdout
     assert told.count("succeeded") == 2
     assert next(lab.clips.list(collection="twice")).path == f"twice/raw/{CHANGED}"
-    again = json.loads(run("pipeline", "-", "--project", "lab", "--json", input=json.dumps({"steps": steps})).stdout)
+    again = json.loads(run("pipeline", "-", "--project", "lab", "--json", stdin=json.dumps({"steps": steps})).stdout)
     assert {job["cached_from"] is not None for job in again["jobs"].values()} == {True}
 
     steps["once"]["inputs"]["clips"] = {"step": "twice"}
-    refused = run("pipeline", "-", "--project", "lab", input=json.dumps({"steps": steps}), status=1).stderr
+    refused = run("pipeline", "-", "--project", "lab", stdin=json.dumps({"steps": steps}), status=1).stderr
     assert "/steps/twice/inputs/clips/step: These steps wait for each other: once -> twice -> once" in refused
-    assert "JSON" in run("pipeline", "-", "--project", "lab", input="steps: {}", status=2).stderr
+    assert "JSON" in run("pipeline", "-", "--project", "lab", stdin="steps: {}", status=2).stderr
 
 
 def test_who_stops_waiting_leaves_the_jobs_running_and_is_told_so(
-    lab: ProjectHandle, command: dict[str, Any], marey: Marey
+    lab: ProjectHandle, run: CommandLine, marey: Marey
 ) -> None:
-    line = ["build-model", "takes", "--project", "lab", "--to", skeleton_path(lab), "--name", "walk", *QUICK_FLAGS]
-    waiting = subprocess.Popen(
-        [sys.executable, "-m", "marey_client.cli", *line], stdout=subprocess.PIPE, stderr=subprocess.PIPE, **command
+    waiting = run.start(
+        "build-model", "takes", "--project", "lab", "--to", skeleton_path(lab), "--name", "walk", *QUICK_FLAGS
     )
     deadline = time.monotonic() + 60
     while not list(lab.jobs()):

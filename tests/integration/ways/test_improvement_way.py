@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from evaluation_takes import write_walks
+from command_line import CommandLine
 from marey_client import Marey
 from marey_client.errors import JobUnsuccessful
 from marey_client.evaluations import EvaluationHandle
-from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
-from marey_schemas.access import Login, ProjectCreate, Role, UserCreate
-from marey_schemas.imports import ImportOptions
+from marey_schemas.access import Login, Role, UserCreate
 from marey_schemas.jobs import CollectionInput, JobCreate
 from server_process import ServerProcess
 
@@ -28,34 +25,11 @@ SMALL: dict[str, Any] = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
-    process = ServerProcess(tmp_path, database_url)
-    process.start(workers=1)
-    yield process
-    process.stop()
-
-
-@pytest.fixture
-def marey(server: ServerProcess) -> Iterator[Marey]:
-    with server.client() as client:
-        yield client
-
-
-@pytest.fixture
-def lab(marey: Marey, tmp_path: Path) -> ProjectHandle:
-    """A project with nine walks, three of which are faster than any trial asks for."""
-    project = marey.create_project(ProjectCreate(name="lab"))
-    files = find_files([write_walks(tmp_path / "takes")]).files
-    project.imports.upload(files, ImportOptions(collection="walks"))
-    return project
-
-
 def evaluated(lab: ProjectHandle, clips: Any = "walks", **options: Any) -> EvaluationHandle:
     return lab.evaluation(lab.evaluate(clips, **{**SMALL, **options}))
 
 
-def test_without_all_that_can_go_no_trial_changes(lab: ProjectHandle, run: Callable[..., Any], tmp_path: Path) -> None:
+def test_without_all_that_can_go_no_trial_changes(lab: ProjectHandle, run: CommandLine, tmp_path: Path) -> None:
     first = evaluated(lab, name="first")
     told = run("suggest", "lab/first", "--removals", 1, "--remove-out", "names.txt").stdout
     names = (tmp_path / "names.txt").read_text(encoding="utf-8").splitlines()
@@ -93,7 +67,7 @@ def test_a_used_clip_that_goes_is_found_to_change_trials(lab: ProjectHandle) -> 
 
 
 def test_evaluations_under_their_own_normalisers_are_refused_with_the_way_out(
-    lab: ProjectHandle, run: Callable[..., Any]
+    lab: ProjectHandle, run: CommandLine
 ) -> None:
     first = evaluated(lab, name="first")
     some = sorted(lab.clips.list(), key=lambda clip: clip.path)[:6]
@@ -107,9 +81,7 @@ def test_evaluations_under_their_own_normalisers_are_refused_with_the_way_out(
     assert "--normaliser" in run("compare", "lab/first", "lab/second", status=1).stderr
 
 
-def test_clips_of_another_folder_fill_the_holes_of_a_set(
-    lab: ProjectHandle, marey: Marey, run: Callable[..., Any]
-) -> None:
+def test_clips_of_another_folder_fill_the_holes_of_a_set(lab: ProjectHandle, marey: Marey, run: CommandLine) -> None:
     straight = [clip for clip in lab.clips.list() if clip.name.endswith(" 0")]
     first = evaluated(lab, straight, name="straight")
     found = first.suggest("walks", removals=0, consider=0).document()
@@ -129,7 +101,7 @@ def test_clips_of_another_folder_fill_the_holes_of_a_set(
     assert job.result["objective_after"] < job.result["objective_before"]
 
 
-def test_weights_are_swept_over_tasks(lab: ProjectHandle, run: Callable[..., Any]) -> None:
+def test_weights_are_swept_over_tasks(lab: ProjectHandle, run: CommandLine) -> None:
     first = evaluated(lab, name="first")
     found = first.sweep(factors=(0.5,))
     assert found.job.size == 8

@@ -10,6 +10,7 @@ import zipfile
 import numpy as np
 import pytest
 
+from command_line import CommandLine
 from marey_client import errors
 from marey_client.imports import FILES_PER_IMPORT, find_files
 from marey_motion.formats import read_motion, write_bvh
@@ -19,15 +20,14 @@ from marey_schemas.documents import SkeletonMapping
 from marey_schemas.imports import ImportFile, ImportOptions
 from marey_schemas.items import ItemChange
 from marey_schemas.jobs import CollectionInput, ImportParams, ItemInput, JobCreate
-from server_process import ServerProcess
+from server_process import serving
 
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
-    process = ServerProcess(tmp_path_factory.mktemp("server"))
-    process.start(workers=1)
-    yield process
-    assert process.stop() == 0
+    folder = tmp_path_factory.mktemp("server")
+    with serving(folder) as process:
+        yield process
 
 
 @pytest.fixture(scope="module")
@@ -55,25 +55,7 @@ def project(marey, request):
 
 @pytest.fixture(scope="module")
 def run(server, tmp_path_factory):
-    """Runs the command line against the server, in a folder of its own."""
-    folder = tmp_path_factory.mktemp("shell")
-
-    def run(*arguments, status=0, **environment):
-        surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
-        known = {
-            "MAREY_URL": server.url,
-            "MAREY_DATA": str(server.data),
-            "XDG_CONFIG_HOME": str(folder),
-            "HOME": str(folder),
-        }
-        done = subprocess.run(
-            [sys.executable, "-m", "marey_client.cli", *map(str, arguments)],
-            env={**surroundings, **known, **environment}, capture_output=True, text=True, cwd=folder, timeout=120,
-        )  # fmt: skip
-        assert done.returncode == status, done.stdout + done.stderr
-        return done
-
-    return run
+    return CommandLine(server, tmp_path_factory.mktemp("shell"))
 
 
 def target_skeleton(project):

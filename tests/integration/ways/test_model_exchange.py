@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 
 import predecessor_models as models
+from marey_client import Marey
 from marey_client.errors import RequestFailed
 from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
@@ -20,23 +20,14 @@ from marey_schemas.access import ProjectCreate
 from marey_schemas.imports import ImportEntry, ImportOptions
 from marey_schemas.items import ItemChange
 from marey_schemas.kinds import Kind
-from server_process import ServerProcess
 
 pytestmark = pytest.mark.timeout(300)
 
 
 @pytest.fixture
-def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
-    process = ServerProcess(tmp_path, database_url)
-    process.start(workers=1)
-    yield process
-    process.stop()
-
-
-@pytest.fixture
-def lab(server: ServerProcess) -> Iterator[ProjectHandle]:
-    with server.client() as client:
-        yield client.create_project(ProjectCreate(name="lab"))
+def lab(marey: Marey) -> ProjectHandle:
+    """An empty project."""
+    return marey.create_project(ProjectCreate(name="lab"))
 
 
 def upload(lab: ProjectHandle, folder: Path, files: dict[str, bytes]) -> dict[str, ImportEntry]:
