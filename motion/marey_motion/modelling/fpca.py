@@ -88,20 +88,19 @@ def find_components(
         )
     mean = coefficients.mean(axis=0)
     deviations = coefficients - mean
-    duals = dual_coefficients(basis, deviations, inner_product) * weights**2
-    size = float(np.linalg.norm(coefficients * weights))
-    lengths, left = _decompose(deviations.reshape(examples, -1) @ duals.reshape(examples, -1).T, size)
+    lengths, left = _decompose(*_inner_products(basis, deviations, mean, weights, inner_product))
     energy = np.cumsum(lengths**2) / max(float((lengths**2).sum()), np.finfo(np.float64).tiny)
     kept = _kept_count(energy, keep)
     shares = (left[:, :kept] / lengths[:kept]).T
     directions = np.tensordot(shares, deviations, axes=1)
     flat = directions.reshape(kept, mean.size)
     signs = np.where(flat[np.arange(kept), np.abs(flat).argmax(axis=1)] < 0.0, -1.0, 1.0)
+    directions *= signs[:, None, None]
     functions = FunctionalComponents(
         basis=basis,
         mean=mean,
-        directions=directions * signs[:, None, None],
-        projections=np.tensordot(shares, duals, axes=1) * signs[:, None, None],
+        directions=directions,
+        projections=dual_coefficients(basis, directions, inner_product) * weights**2,
         variances=lengths[:kept] ** 2 / max(examples - 1, 1),
         energy=energy[:kept],
     )
@@ -115,9 +114,22 @@ def dual_coefficients(basis: SplineBasis, coefficients: Floats, inner_product: I
     return coefficients if inner_product == "coefficients" else np.asarray(basis.products @ coefficients)
 
 
+def _inner_products(
+    basis: SplineBasis, deviations: Floats, mean: Floats, weights: Floats, inner_product: InnerProduct
+) -> tuple[Floats, float]:
+    """Inner products (m, m) of weighted deviations (m, n, D), and the size of all examples, with their mean (n, D)."""
+    weighted, weighted_mean = deviations * weights, mean * weights
+    if inner_product == "l2":
+        root = np.linalg.cholesky(basis.products).T
+        weighted, weighted_mean = root @ weighted, root @ weighted_mean
+    flat = weighted.reshape(len(weighted), -1)
+    products = flat @ flat.T
+    return products, float(np.sqrt(np.trace(products) + len(flat) * (weighted_mean**2).sum()))
+
+
 def _decompose(products: Floats, size: float) -> tuple[Floats, Floats]:
     """Singular values (r,), falling, and left singular vectors (m, r) of examples with inner products (m, m)."""
-    squares, vectors = np.linalg.eigh(0.5 * (products + products.T))
+    squares, vectors = np.linalg.eigh(products)
     lengths = np.sqrt(np.maximum(squares[::-1], 0.0))
     floor = max(SMALLEST_RELATIVE_DEVIATION * float(lengths[0]), SMALLEST_RELATIVE_SPREAD * size)
     rank = min(int((lengths > floor).sum()), len(products) - 1)
