@@ -88,13 +88,11 @@ class ModelledDocuments:
     Parameters
     ----------
     name : what it is called
-    model : part `model`, of which the skeleton may be called `SKELETON_OUTPUT`
-    tree : part `tree` without the digest of its model
+    parts : of a model: `model`, whose skeleton may be called `SKELETON_OUTPUT`, and perhaps `tree`
     """
 
     name: str
-    model: Tree | None = None
-    tree: Tree | None = None
+    parts: Mapping[str, Tree] = field(default_factory=dict)
     graph: PredecessorGraph | None = None
 
 
@@ -175,7 +173,7 @@ def import_file(
     if subject is not None:
         from marey_motion.importing_models import import_modelled
 
-        return import_modelled(planned, *subject, request, None if companion is None else bytes(companion))
+        return import_modelled(planned, *subject, request, digests, None if companion is None else bytes(companion))
     imported = read_motion(
         data,
         planned.name,

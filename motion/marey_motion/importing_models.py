@@ -15,6 +15,7 @@ from marey_motion.formats.predecessor_tree import read_predecessor_tree
 from marey_motion.importing import (
     SAME_OFFSET_M,
     SKELETON_OUTPUT,
+    FileDigests,
     ImportedDocuments,
     ImportRequest,
     ModelledDocuments,
@@ -28,10 +29,17 @@ from marey_motion.modelling.primitive_documents import primitive_to_tree
 from marey_motion.modelling.sample_tree_documents import sample_tree_to_tree
 from marey_motion.modelling.tree import TreeOptions
 from marey_motion.skeleton import same_hierarchy
+from marey_schemas.originals import original_of
+from marey_schemas.references import PartDigestRef
 
 
 def import_modelled(
-    planned: PlannedFile, subject: Subject, document: Mapping[str, Any], request: ImportRequest, tree: bytes | None
+    planned: PlannedFile,
+    subject: Subject,
+    document: Mapping[str, Any],
+    request: ImportRequest,
+    digests: FileDigests,
+    tree: bytes | None,
 ) -> ImportedDocuments:
     """A model with its tree, or a graph, of a file of the predecessor. Raises `FormatError`."""
     file = planned.name
@@ -50,15 +58,19 @@ def import_modelled(
     name = model_name(planned.item_name)
     ref = dict(request.skeleton_ref or {}) if given else {"output": SKELETON_OUTPUT}
     model = primitive_to_tree(replace(found.primitive, name=found.primitive.name or name), ref)
-    model["provenance"] = {
-        "predecessor": {
-            "layout": found.layout,
-            "animated_joints": list(found.animated_joints),
-            "time_form": found.time_form,
-            "time_error_frames": found.time_error_frames,
-        }
+    known: Tree = {
+        "layout": found.layout,
+        "animated_joints": list(found.animated_joints),
+        "time_form": found.time_form,
+        "time_error_frames": found.time_error_frames,
+        "original": original_of("model", model, file, digests.file),
     }
-    modelled = ModelledDocuments(name, model, None if tree is None else _imported_tree(tree, planned, found.primitive))
+    parts = {"model": model}
+    if tree is not None and digests.companion is not None:
+        parts["tree"] = _imported_tree(tree, planned, found.primitive)
+        known["tree"] = original_of("tree", parts["tree"], str(planned.companion), digests.companion)
+    model["provenance"] = {"predecessor": known}
+    modelled = ModelledDocuments(name, parts)
     if given:
         return ImportedDocuments("", None, None, None, None, (), modelled)
     mapping, axes = anatomy_of(skeleton, None)
@@ -79,4 +91,4 @@ def _imported_tree(data: bytes, planned: PlannedFile, primitive: MotionPrimitive
         leaf_size=int(tree.sizes[tree.children == 0].max()),
         features="latent",
     )
-    return sample_tree_to_tree(tree, model_digest="", seed=0, options=options)
+    return sample_tree_to_tree(tree, model_digest=PartDigestRef(digest_of="model"), seed=0, options=options)

@@ -38,9 +38,3 @@ def original_of(part: str, document: Mapping[str, Any], file: str, digest: str) 
     """What to keep of the file that a part was imported from."""
     name = file.replace("\\", "/").rpartition("/")[2]
     return StoredOriginal(name=name, blob=digest, content=content_digest(part, document)).model_dump()
-
-
-def with_original(model: Mapping[str, Any], **originals: Mapping[str, Any]) -> dict[str, Any]:
-    """Part `model` that was imported, with what to keep of its file (`original`) and of that of its tree (`tree`)."""
-    provenance = {**model["provenance"]["predecessor"], **originals}
-    return {**model, "provenance": {**model["provenance"], "predecessor": provenance}}

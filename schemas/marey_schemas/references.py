@@ -18,3 +18,9 @@ class OutputRef(Request):
     """A reference to another output of the same write; the store replaces it by the item it becomes."""
 
     output: str
+
+
+class PartDigestRef(Request):
+    """The digest of another part of the same item and the same write; the store replaces it by that digest."""
+
+    digest_of: str

@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Request
 from marey_schemas.names import Digest
+from marey_schemas.references import PartDigestRef
 
 MOST_TREE_SAMPLES = 100_000
 
@@ -38,7 +39,7 @@ class SampleTreeDocument(Request):
     """
 
     schema_: Literal["marey/sample-tree@1"] = Field("marey/sample-tree@1", alias="schema")
-    model_digest: Digest = Field(
+    model_digest: Digest | PartDigestRef = Field(
         description="The part `model` that the samples are of; the tree is of use to no other."
     )
     seed: int = Field(ge=0, lt=2**63, description="That they were drawn with.")

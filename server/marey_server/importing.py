@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from marey_schemas.access import Role
 from marey_schemas.documents import Check, SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, ImportOptions, Refusal
 from marey_schemas.kinds import Kind
-from marey_schemas.originals import original_of, with_original
 from marey_server.errors import MareyError
 from marey_server.importing_graphs import ImportedGraph, graph_draft, graph_to_import
 from marey_server.store import blobs, items, projects
@@ -22,7 +21,7 @@ from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:  # numeric modules take a second to load: only who imports files pays for them
     from marey_motion.errors import MotionError
-    from marey_motion.importing import FileDigests, ImportedDocuments, ImportRequest, PlannedFile
+    from marey_motion.importing import ImportedDocuments, ImportRequest, PlannedFile
 
 log = logging.getLogger(__name__)
 
@@ -53,8 +52,6 @@ class PreparedImport:
     checks: tuple[Check, ...] = ()
     frames: int | None = None
     refusal: Refusal | None = None
-    tree: dict[str, Any] | None = None
-    """Part `tree` of the model among the drafts, but for the digest of the part `model`."""
     graph: ImportedGraph | None = None
 
 
@@ -115,10 +112,9 @@ def prepare(
         found = import_file(planned, file.read(), digests, request, companion.read() if companion else None)
         return PreparedImport(
             planned.name,
-            _drafts(planned, found, options, digests),
+            _drafts(planned, found, options),
             tuple(Check.model_validate(check) for check in found.checks),
             None if found.motion is None else len(found.motion["poses"]),
-            tree=None if found.modelled is None else found.modelled.tree,
             graph=graph_to_import(found.modelled, _collection(planned, options), options.tags, file),
         )
     except MotionError as error:
@@ -132,9 +128,7 @@ def _refusal(error: MotionError) -> Refusal:
     return Refusal(code=error.code, detail=str(error), **place)
 
 
-def _drafts(
-    planned: PlannedFile, found: ImportedDocuments, options: ImportOptions, digests: FileDigests
-) -> tuple[Draft, ...]:
+def _drafts(planned: PlannedFile, found: ImportedDocuments, options: ImportOptions) -> tuple[Draft, ...]:
     drafts = []
     if found.hierarchy is not None and found.mapping is not None:
         parts = {"hierarchy": found.hierarchy, "mapping": found.mapping}
@@ -143,14 +137,10 @@ def _drafts(
         parts = {"motion": found.motion, "info": found.info}
         place = _collection(planned, options)
         drafts.append(_draft("clip", Kind.CLIP, planned.item_name, place, parts, "by_name", options.tags))
-    if found.modelled is not None and found.modelled.model is not None:
-        of_model = found.modelled
-        known = {"original": original_of("model", found.modelled.model, planned.name, digests.file)}
-        if of_model.tree is not None and digests.companion is not None:
-            known["tree"] = original_of("tree", of_model.tree, digests.companion_name or "", digests.companion)
-        model = with_original(found.modelled.model, **known)
+    if found.modelled is not None and found.modelled.parts:
         place = _collection(planned, options)
-        drafts.append(_draft("model", Kind.MODEL, of_model.name, place, {"model": model}, "by_name", options.tags))
+        made = found.modelled
+        drafts.append(_draft("model", Kind.MODEL, made.name, place, made.parts, "by_name", options.tags))
     return tuple(drafts)
 
 
@@ -179,12 +169,6 @@ def publish(tx: Transaction, project: str, prepared: PreparedImport, sources: Se
             blobs.put_blob(tx, source.content, expected=source.digest)
     author = tx.principal.user_id
     published = items.publish(tx, row, prepared.drafts, author_id=author)
-    if prepared.tree is not None:
-        model = next(one for one in published if one.kind is Kind.MODEL)
-        found = items.find_part(tx, project, Kind.MODEL, model.item, "model", revision=model.revision)
-        tree = prepare_document({**prepared.tree, "model_digest": found.digest}, schema=prepared.tree["schema"])
-        draft = replace(next(one for one in prepared.drafts if one.kind is Kind.MODEL), parts={"tree": tree})
-        published += items.publish(tx, row, [draft], author_id=author)
     if prepared.graph is not None:
         published += items.publish(tx, row, [graph_draft(tx, project, prepared.graph)], author_id=author)
     return published

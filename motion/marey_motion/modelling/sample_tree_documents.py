@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 
 from marey_motion.modelling.tree import SampleTree, TreeOptions
+from marey_schemas.references import PartDigestRef
 
 TREE_SCHEMA = "marey/sample-tree@1"
 
 Tree = dict[str, Any]
 
 
-def sample_tree_to_tree(tree: SampleTree, *, model_digest: str, seed: int, options: TreeOptions) -> Tree:
+def sample_tree_to_tree(
+    tree: SampleTree, *, model_digest: str | PartDigestRef, seed: int, options: TreeOptions
+) -> Tree:
     """Part `tree` of a model.
 
     Parameters
@@ -25,7 +28,7 @@ def sample_tree_to_tree(tree: SampleTree, *, model_digest: str, seed: int, optio
     """
     return {
         "schema": TREE_SCHEMA,
-        "model_digest": model_digest,
+        "model_digest": model_digest if isinstance(model_digest, str) else model_digest.model_dump(),
         "seed": seed,
         "options": asdict(options),
         "samples": np.ascontiguousarray(tree.samples),

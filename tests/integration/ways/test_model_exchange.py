@@ -19,6 +19,7 @@ from marey_motion.formats.predecessor_model import read_predecessor_model
 from marey_schemas.access import ProjectCreate
 from marey_schemas.imports import ImportEntry, ImportOptions
 from marey_schemas.items import ItemChange
+from marey_schemas.jobs import ImportParams, JobCreate
 from marey_schemas.kinds import Kind
 
 pytestmark = pytest.mark.timeout(300)
@@ -165,9 +166,23 @@ def test_a_tree_alone_and_a_model_without_a_skeleton_are_refused_with_what_to_do
     assert entry.status == "created", entry.error
 
 
-def test_models_of_a_large_upload_come_in_by_a_job(lab: ProjectHandle, tmp_path: Path) -> None:
-    files = {f"walk{number}_mm.json": json.dumps(models.layout_3(number)).encode() for number in range(60)}
-    entries = upload(lab, tmp_path / "in", files)
-    assert {entry.status for entry in entries.values()} == {"created"}
-    model = lab.items(Kind.MODEL).get(str(entries["walk7_mm.json"].item))
+def test_models_of_a_large_upload_come_in_by_a_job_with_their_trees(
+    marey: Marey, lab: ProjectHandle, tmp_path: Path
+) -> None:
+    files = {f"walk{number}_mm.json": json.dumps(models.layout_3(number)).encode() for number in range(9)}
+    files |= {f"walk{number}_cluster_tree.json": json.dumps(models.tree()).encode() for number in (0, 7)}
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
+    sent = lab.imports.send(find_files([folder]).files)
+    job = marey.jobs.wait(lab.submit(JobCreate(kind="import", params=ImportParams(files=sent).model_dump())).id)
+    assert job.result is not None
+    assert {entry["status"] for entry in job.result["entries"]} == {"created", "companion"}
+    model = next(one for one in lab.items(Kind.MODEL).list() if one.name == "walk7")
     assert model.export(tmp_path / "out", format="predecessor").read_bytes() == files["walk7_mm.json"]
+    tree = model.export(tmp_path / "out", format="predecessor", part="tree")
+    assert tree.read_bytes() == files["walk7_cluster_tree.json"]
+    assert model.part("tree")["model_digest"] == model.item.parts["model"].document
+    with pytest.raises(RequestFailed, match="name its digest"):
+        model.put_part("tree", {**model.part("tree"), "model_digest": {"digest_of": "model"}})

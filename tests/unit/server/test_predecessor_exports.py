@@ -8,7 +8,6 @@ import pytest
 import predecessor_models as models
 from marey_motion.importing import FileDigests, ImportRequest, import_file, plan_imports
 from marey_schemas.kinds import Kind
-from marey_schemas.originals import original_of, with_original
 from marey_server.errors import Invalid, NotFound
 from marey_server.predecessor_exports import PredecessorOptions, unchanged_original, write_predecessor
 
@@ -22,13 +21,9 @@ def stored():
     assert (planned.companion, companion.role) == ("in/walk_cluster_tree.json", "companion")
     data, tree = (json.dumps(one).encode() for one in (models.layout_3(), models.tree()))
     found = import_file(planned, data, FileDigests(FILE, TREE_FILE, companion.name), ImportRequest(), tree)
-    modelled = found.modelled
-    known = {
-        "original": original_of("model", modelled.model, planned.name, FILE),
-        "tree": original_of("tree", modelled.tree, companion.name, TREE_FILE),
-    }
-    model = {**with_original(modelled.model, **known), "skeleton": {"item": "skeleton_1", "revision": 1}}
-    return {"model": model, "tree": {**modelled.tree, "model_digest": FILE}}, found.hierarchy
+    parts = found.modelled.parts
+    model = {**parts["model"], "skeleton": {"item": "skeleton_1", "revision": 1}}
+    return {"model": model, "tree": {**parts["tree"], "model_digest": FILE}}, found.hierarchy
 
 
 def test_unchanged_parts_are_given_back_as_their_files(stored):

@@ -7,12 +7,11 @@ from typing import Any
 from marey_motion import importing
 from marey_motion.documents import skeleton_from_document
 from marey_motion.errors import MotionError
-from marey_motion.importing import FileDigests, ImportedDocuments, ImportRequest, PlannedFile
+from marey_motion.importing import FileDigests, ImportedDocuments, ImportRequest, ModelledDocuments, PlannedFile
 from marey_schemas.documents import Check, OutputRef, SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, Refusal, skeleton_output
 from marey_schemas.jobs import ImportParams, StagedOutput
 from marey_schemas.kinds import Kind
-from marey_schemas.originals import original_of, with_original
 from marey_worker.context import Context, JobRefused, NoSuchThing
 
 SKELETON_COLLECTION = "skeletons"
@@ -132,30 +131,28 @@ class _Importing:
                 )
             )
             self._ready_bytes += motion["poses"].nbytes
-        if found.modelled is not None and found.modelled.model is not None:
-            self._stage_model(planned, found, found.modelled.model)
+        if found.modelled is not None:
+            self._stage_model(planned, found, found.modelled)
         if self._ready_bytes > BYTES_PER_STAGE or len(self._ready) >= 128:
             self._flush()
 
-    def _stage_model(self, planned: PlannedFile, found: ImportedDocuments, model: dict[str, Any]) -> None:
-        """The model under its name. Its tree names the digest of the stored model, which is not known yet."""
-        assert found.modelled is not None
-        if found.modelled.tree is not None:
-            self._context.log(f"{planned.companion}: left out; import the tree with its model in a small request")
+    def _stage_model(self, planned: PlannedFile, found: ImportedDocuments, modelled: ModelledDocuments) -> None:
+        """The model under its name, with its tree."""
+        parts = dict(modelled.parts)
         if found.hierarchy is not None:
-            model = {**model, "skeleton": OutputRef(output=skeleton_output(planned.name)).model_dump()}
-        original = original_of("model", model, planned.name, self._digests[planned.name])
+            parts["model"] = parts["model"] | {"skeleton": OutputRef(output=skeleton_output(planned.name)).model_dump()}
         self._ready.append(
             StagedOutput(
                 name=planned.name,
                 kind=Kind.MODEL,
-                item_name=found.modelled.name,
+                item_name=modelled.name,
                 collection="/".join(part for part in (self._params.collection, planned.folder) if part),
                 tags=self._params.tags,
-                parts={"model": with_original(model, original=original)},
+                parts=parts,
             )
         )
-        self._ready_bytes += sum(part.nbytes for part in model["spatial"].values() if hasattr(part, "nbytes"))
+        arrays = [*parts["model"]["spatial"].values(), *parts.get("tree", {}).values()]
+        self._ready_bytes += sum(part.nbytes for part in arrays if hasattr(part, "nbytes"))
 
     def _flush(self) -> None:
         if self._ready:

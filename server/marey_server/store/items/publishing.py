@@ -39,7 +39,8 @@ def publish(
 ) -> list[Published]:
     """Turn drafts into items and revisions; all of them or none. Answers in the order of the drafts.
 
-    `{"output": name}` in a document refers to another draft and becomes its item and revision. Content that stands
+    `{"output": name}` in a document refers to another draft and becomes its item and revision; `{"digest_of": part}`
+    becomes the digest of another part of its draft. Content that stands
     there already makes no new revision. The caller has authorised the write.
 
     Raises `Invalid` where a draft makes no sense, `Conflict` where a name is taken.
@@ -106,9 +107,11 @@ class _Publication:
         self._references = references.ReferenceCheck(self.tx, self.project)
 
     def add(self, draft: Draft, loaded: Mapping[str, _Part], *, resolve: bool) -> None:
-        digests, bodies = {}, {}
-        for part, held in loaded.items():
+        digests: dict[str, str] = {}
+        bodies: dict[str, Tree] = {}
+        for part, held in sorted(loaded.items(), key=lambda one: references.wants_digests(one[1].body)):
             body = references.resolved(held.body, self.done) if resolve else held.body
+            body = references.with_part_digests(body, digests)
             digests[part] = self._store(held, body)
             bodies[part] = body
         self._references.require(draft.kind, bodies)

@@ -31,6 +31,21 @@ def outputs_in(tree: Any) -> Iterator[str]:
             yield from outputs_in(member)
 
 
+def wants_digests(tree: Mapping[str, Any]) -> bool:
+    """Whether a document names other parts of its item, as `{"digest_of": part}` among its members."""
+    return any(isinstance(member, Mapping) and member.keys() == {"digest_of"} for member in tree.values())
+
+
+def with_part_digests(tree: Tree, digests: Mapping[str, str]) -> Tree:
+    """The document with each part that it names, if that is among `digests`, replaced by its digest."""
+    return {
+        name: digests.get(member["digest_of"], member)
+        if isinstance(member, Mapping) and member.keys() == {"digest_of"}
+        else member
+        for name, member in tree.items()
+    }
+
+
 def in_order(names: Mapping[str, Sequence[str]]) -> list[str]:
     """Names, each after those it refers to; names that stand for nothing here are left out.
 
@@ -74,8 +89,12 @@ class ReferenceCheck:
         """Raise `Invalid` where something the new parts of an item refer to is not there or does not fit."""
         if kind in (Kind.CLIP, Kind.PROCESSED) and "motion" in bodies:
             self._require_joints(bodies["motion"], "/motion")
-        elif kind is Kind.MODEL and "model" in bodies:
-            self._require_joints(bodies["model"], "/model")
+        elif kind is Kind.MODEL:
+            if "model" in bodies:
+                self._require_joints(bodies["model"], "/model")
+            if "tree" in bodies and not isinstance(bodies["tree"]["model_digest"], str):
+                detail = "The part that the tree is of is not in this write; name its digest."
+                raise _invalid("/tree/model_digest", "no-part", detail)
         elif kind is Kind.ANNOTATION:
             self._require_frames(bodies["annotation"])
         elif kind is Kind.GRAPH:
