@@ -39,7 +39,7 @@ from marey_motion.skeleton import Skeleton
 
 Floats = NDArray[np.float64]
 
-FRAMES, BATCH, TARGETS = 47, 1000, 30
+FRAMES, BATCH, TARGETS, PEER_TARGETS = 47, 1000, 30, 5
 SPREAD_M = 0.08
 GOAL = 10
 # Milliseconds per constraint: chain to the root, arm only, several constraints, one with its displacement map.
@@ -104,9 +104,6 @@ def _each(
         f"≥ {GOAL}x the predecessor",
         stated_ms / own_ms >= GOAL,
     )
-
-
-PEER_TARGETS = 5
 
 
 def _with_scipy(skeleton: Skeleton, motion: Motion, targets: list[Target], freedom: Freedom) -> float:

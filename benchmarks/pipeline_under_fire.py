@@ -6,6 +6,7 @@ one worker, with two, and with one that is killed ten times, and prints what tha
 
 from __future__ import annotations
 
+import math
 import random
 import subprocess
 import sys
@@ -38,7 +39,6 @@ TAKES, KILLS, SEED = 200, 10, 7
 SECONDS, RATE_HZ = 1.2, 60.0
 PATIENCE_S = 1800.0
 LONGEST_PAUSE_S = 2.0
-SPARED = 0.4
 QUICK_LEASES = {"MAREY_LEASE_TTL_S": "3", "MAREY_HEARTBEAT_S": "0.5", "MAREY_CANCEL_GRACE_S": "2"}
 PARTS = {Kind.PROCESSED: ("motion", "info"), Kind.MODEL: ("model", "tree")}
 
@@ -76,14 +76,13 @@ def run_pipeline(
     workers: int = 1,
     kills: int = 0,
     chance: random.Random | None = None,
-    spared: float = 0.0,
     settings: Mapping[str, str] = MappingProxyType({}),
     **choices: Any,
 ) -> Outcome:
     """Bring the takes of a folder from files to a model on a server of its own; `choices` are those of the plan.
 
-    So many times, a moment after a worker has begun some work, all workers are killed and started anew; the share
-    `spared` of such beginnings is let go.
+    So many times, a moment after a worker has begun some work, all workers are killed and started anew; each step gets
+    its share of that.
     """
     data.parent.mkdir(parents=True, exist_ok=True)
     with running(data, **QUICK_LEASES, **settings) as server, server.client() as marey:
@@ -92,7 +91,7 @@ def run_pipeline(
         started = time.monotonic()
         with at_work(server, workers) as shift:
             run = lab.pipeline(wanted)
-            fire = _Fire(marey, run, shift, chance or random.Random(), spared)
+            fire = _Fire(marey, run, shift, chance or random.Random(), math.ceil(kills / len(wanted.steps)))
             moments = [fire.shoot() for _ in range(kills)]
             run.wait(timeout_s=PATIENCE_S)
         tries = list(_attempts(marey, lab))
@@ -184,21 +183,23 @@ def at_work(server: LocalServer, count: int) -> Iterator[Shift]:
 class _Fire:
     """Kills workers under a pipeline."""
 
-    def __init__(self, marey: Marey, run: PipelineRun, shift: Shift, chance: random.Random, spared: float) -> None:
+    def __init__(self, marey: Marey, run: PipelineRun, shift: Shift, chance: random.Random, at_each_step: int) -> None:
         self._marey = marey
         self._run = run
         self._shift = shift
         self._chance = chance
-        self._spared = spared
+        self._left = dict.fromkeys(run.refresh(), at_each_step)
         self._seen: set[tuple[str, int]] = set()
 
     def shoot(self) -> str:
         """Kill every worker a moment after one has begun something; what it had begun."""
         deadline = time.monotonic() + PATIENCE_S
-        while not (begun := self._begun()) or self._chance.random() < self._spared:
+        while not (begun := [step for step in self._begun() if self._left[step] > 0]):
             if self._run.ended or time.monotonic() > deadline:
                 raise RuntimeError(f"there was nobody left to kill: {self._run}; use more takes")
             time.sleep(0.05)
+        for step in begun:
+            self._left[step] -= 1
         pause_s = self._chance.uniform(0.0, LONGEST_PAUSE_S)
         time.sleep(pause_s)
         self._shift.kill()
@@ -231,9 +232,7 @@ def main(takes: int = TAKES, kills: int = KILLS, seed: int = SEED) -> None:
         _tell("one worker", alone)
         double = run_pipeline(material, Path(folder, "two", "data"), workers=2)
         _tell("two workers", double)
-        fired = run_pipeline(
-            material, Path(folder, "fire", "data"), kills=kills, chance=random.Random(seed), spared=SPARED
-        )
+        fired = run_pipeline(material, Path(folder, "fire", "data"), kills=kills, chance=random.Random(seed))
         _tell(f"one worker, killed {kills} times", fired)
         for moment in fired.moments:
             print(f"    {moment}")
