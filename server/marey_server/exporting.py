@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from marey_schemas import codecs
+from marey_schemas.alignment import AlignmentInfo
 from marey_schemas.documents import Motion, SkeletonHierarchy
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
@@ -18,6 +19,7 @@ WITH_MOTION = (Kind.CLIP, Kind.PROCESSED)
 """The kinds whose part `motion` can be written as a file of motion."""
 
 ExportFormat = Literal["original", "bvh", "npz", "predecessor", "json"]
+ExportTime = Literal["canonical", "source"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,8 +94,12 @@ def find_original(tx: Transaction, project: str, kind: Kind, item_id: str, revis
     raise NotFound("It was not made from a file; ask for another format, such as bvh.", code="no-original")
 
 
-def write_file(source: ExportSource, file_format: ExportFormat, unit: str, options: PredecessorOptions) -> ExportedFile:
+def write_file(
+    source: ExportSource, file_format: ExportFormat, unit: str, time: ExportTime, options: PredecessorOptions
+) -> ExportedFile:
     """The file of an item. Raises `Invalid` where the format cannot hold it."""
+    if time == "source" and source.item.kind is not Kind.PROCESSED:
+        raise Invalid("Only an aligned clip has a time of its own and that of its source.", code="no-such-export")
     beside = source.item.kind is Kind.PROCESSED and options.part == "alignment"
     if file_format == "predecessor" and (beside or source.item.kind not in WITH_MOTION):
         name, data = write_predecessor(source.item.kind, source.item.name, source.parts, source.hierarchy, options)
@@ -102,6 +108,7 @@ def write_file(source: ExportSource, file_format: ExportFormat, unit: str, optio
         return ExportedFile(f"{source.item.name}.json", codecs.JSON, codecs.encode_tree(_as_tree(source), codecs.JSON))
     if source.item.kind not in WITH_MOTION or source.hierarchy is None:
         raise Invalid(f"A {source.item.kind} is exported as json.", code="no-such-export")
+    from marey_motion.alignment.aligned_documents import restored_clip
     from marey_motion.documents import clip_from_document, skeleton_from_document
     from marey_motion.errors import MotionError
     from marey_motion.exporting import write_clip_file
@@ -109,6 +116,8 @@ def write_file(source: ExportSource, file_format: ExportFormat, unit: str, optio
     skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(source.hierarchy))
     clip = clip_from_document(Motion.model_validate(source.parts["motion"]), skeleton)
     try:
+        if time == "source":
+            clip = restored_clip(clip, AlignmentInfo.model_validate(source.parts["info"]).model_dump())
         written = write_clip_file(clip, file_format, unit=unit, info=source.parts.get("info"))
     except MotionError as error:
         raise Invalid(str(error), code="cannot-be-exported") from error

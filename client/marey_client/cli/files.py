@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,7 +15,7 @@ from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, print_pairs, print_table, progress, tell
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from marey_client.items import ItemHandle
     from marey_client.marey import Marey
@@ -241,15 +241,17 @@ def download(
     format: Annotated[str, typer.Option(help="original, bvh, npz, predecessor or json.")] = "original",  # noqa: A002
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write to.")] = Path(),
     unit: Annotated[str | None, typer.Option(help="Unit of a BVH file: cm or m.")] = None,
+    restored: Annotated[bool, typer.Option(help="Aligned clips in their own time, where they stood.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write clips to files. A folder comes with the folders below it."""
+    """Write clips to files. A folder comes with the folders below it; one without clips with its aligned clips."""
     if format not in FORMATS:
         raise WrongUsage(f"{format!r} is no format; there are {', '.join(FORMATS)}")
     address = Address.parse(place)
     with connect(context) as marey:
         clips, base = _clips_at(marey, address)
-        written, refused = _download_all(clips, base, output, format, unit)
+        options = {"format": format, "unit": unit}
+        written, refused = _download_all(clips, base, output, options | {"time": "source"} if restored else options)
     if as_json:
         print_json({"files": [str(path) for path in written], "refused": refused})
     else:
@@ -264,19 +266,24 @@ def _clips_at(marey: Marey, address: Address) -> tuple[list[ItemHandle], str]:
     """What an address means to a download, and the folder that paths are told from: a clip, a folder, another item."""
     from marey_schemas.kinds import Kind
 
-    clip = find_item(marey, address, [Kind.CLIP])
-    below = [] if clip else list(marey.project(address.project).clips.list(collection=address.path))
+    project = marey.project(address.project)
+    clip = find_item(marey, address, [Kind.CLIP, Kind.PROCESSED])
+    below: list[ItemHandle] = []
+    if clip is None:
+        below += project.clips.list(collection=address.path)
+    if clip is None and not below:
+        below += project.processed.list(collection=address.path)
     others = [Kind.SKELETON, Kind.MODEL, Kind.GRAPH, Kind.ANNOTATION]
     single = clip or (None if below else find_item(marey, address, others))
     if single is not None:
         return [single], single.item.collection
     if not below:
         raise WrongUsage(f"there is no clip at {address}; marey ls {address.project} shows what there is")
-    return list(below), address.path
+    return below, address.path
 
 
 def _download_all(
-    clips: Sequence[ItemHandle], base: str, output: Path, file_format: str, unit: str | None
+    clips: Sequence[ItemHandle], base: str, output: Path, options: Mapping[str, Any]
 ) -> tuple[list[Path], dict[str, str]]:
     from marey_client.cli.failures import sentence
     from marey_client.downloads import safe_file_name
@@ -289,7 +296,7 @@ def _download_all(
         below = clip.item.collection.removeprefix(base).strip("/")
         try:
             folder = output.joinpath(*(safe_file_name(name) for name in below.split("/") if name))
-            return clip.export(folder, format=file_format, unit=unit)
+            return clip.export(folder, **options)
         except RequestFailed as error:
             if error.status >= 500 or error.status == 401:
                 raise

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Placement
-from marey_motion.alignment.aligning import MIRRORED
+from marey_motion.alignment.aligning import MIRRORED, restore
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.motion import Motion
@@ -98,6 +98,16 @@ def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
         reference=_uid(reference) if reference else "",
         keyframes=dict(first.info.get("keyframes") or {}),
     )
+
+
+def restored_clip(clip: Clip, info: Mapping[str, Any]) -> Clip:
+    """The clip that a stored example was made of: its frames at the set's rate, in its own time, where it stood.
+
+    `clip` holds the canonical frames, `info` is the tree that `example_to_tree` made. Raises `MotionError` where the
+    two do not belong together.
+    """
+    example = _example(StoredExample("", clip, info))
+    return restore(example, clip.skeleton).as_clip(clip.skeleton, clip.frame_rate_hz)
 
 
 def _example(stored: StoredExample) -> AlignedClip:

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from marey_schemas.base import Request
 from marey_server import exporting
-from marey_server.exporting import ExportFormat
+from marey_server.exporting import ExportFormat, ExportTime
 from marey_server.handlers.declarations import Access, Bytes, reads
 from marey_server.handlers.items import kind_of
 from marey_server.handlers.queries import MAX_INTEGER
@@ -36,6 +36,10 @@ class ExportQuery(Request):
     )
     layout: Literal["2", "3"] | None = Field(
         None, description="Of a model of the predecessor; absent: as it was imported, else 3."
+    )
+    time: ExportTime = Field(
+        "canonical",
+        description="Of an aligned clip: its canonical frames, or those of the clip it was made of, where that stood.",
     )
     revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Absent: the newest.")
 
@@ -77,7 +81,7 @@ class Export(BlobSender):
             if unchanged is not None:
                 return await self.send_blob(unchanged.digest, disposition=attachment(unchanged.name))
         source = await self.look_up(exporting.read_source, *place)
-        file = await self.compute(exporting.write_file, source, query.format, query.unit, options)
+        file = await self.compute(exporting.write_file, source, query.format, query.unit, query.time, options)
         headers = {"Content-Disposition": attachment(file.name), "Cache-Control": "private, no-cache"}
         return Reply(file.data, media_type=file.media_type, headers=headers)
 

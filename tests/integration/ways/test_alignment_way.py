@@ -80,6 +80,20 @@ def test_clips_of_a_folder_are_aligned_listed_exported_and_traced_back(lab: Proj
     assert read.frame_count == 60
 
 
+def test_an_aligned_clip_is_given_back_in_its_own_time_where_it_stood(
+    lab: ProjectHandle, run: CommandLine, tmp_path: Path
+) -> None:
+    done(lab, lab.align("walks", into="aligned"))
+    run("download", "lab/aligned", "--format", "npz", "--restored", "-o", "restored")
+    (source,) = lab.clips.list(path="walks/walk b")
+    read = read_motion((tmp_path / "restored" / "walks" / "walk b.npz").read_bytes(), "walk b.npz").clip
+    assert read is not None
+    wanted = source.motion()
+    assert read.frame_count == len(wanted.poses)
+    np.testing.assert_allclose(read.poses[:, :3], wanted.root_translations, atol=0.02)
+    assert "time of its own" in run("download", "lab/walks/walk b", "--format", "npz", "--restored", status=1).stderr
+
+
 def test_keyframes_of_annotations_are_matched_and_become_those_of_the_set(lab: ProjectHandle) -> None:
     _, warps = warped_walks(len(NAMES))
     frames = {}
