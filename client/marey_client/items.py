@@ -39,7 +39,7 @@ class ItemHandle:
     @property
     def path(self) -> str:
         """Collection and name."""
-        return f"{self.item.collection}/{self.item.name}".lstrip("/")
+        return self.item.path
 
     @property
     def url(self) -> str:

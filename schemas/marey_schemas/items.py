@@ -78,6 +78,11 @@ class Item(Answer):
     deleted_at: datetime | None = None
     rev: int = Field(description="Counts every change of name, place, tags and revision; the number in the ETag.")
 
+    @property
+    def path(self) -> str:
+        """Collection and name."""
+        return f"{self.collection}/{self.name}".lstrip("/")
+
 
 class Revision(Answer):
     """One immutable state of an item."""

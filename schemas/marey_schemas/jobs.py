@@ -10,6 +10,7 @@ from marey_schemas.base import Answer, Request
 from marey_schemas.imports import ImportFile, ImportOptions
 from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath, ItemName, Message, Tag
+from marey_schemas.references import RevisionRef
 
 PROTOCOL_VERSION = 1
 """Version of the worker protocol; sent with every claim."""
@@ -266,6 +267,20 @@ class PinnedInput(Answer):
     def folder(self) -> str:
         """Where below the job's `into` results go that keep the place of this input."""
         return self.collection if self.below is None else self.below
+
+    @property
+    def path(self) -> str:
+        """Collection and name."""
+        return f"{self.collection}/{self.name}".lstrip("/")
+
+    @property
+    def ref(self) -> RevisionRef:
+        """As documents refer to it."""
+        return RevisionRef(item=self.item, revision=self.revision)
+
+    def as_input(self) -> ItemInput:
+        """As results name what they were made of."""
+        return ItemInput(item=self.item, revision=self.revision)
 
 
 class Lease(Answer):

@@ -71,7 +71,7 @@ def _find_model(tx: Transaction, project: str, name: str, collection: str) -> di
     page = items.list_items(tx, project, Kind.MODEL, ItemFilters(name=name), limit=100)
     found = [one for one in page.items if one.collection == collection] or list(page.items)
     if len(found) != 1:
-        places = ", ".join(f"{one.collection}/{one.name}".lstrip("/") for one in found[:FEW])
+        places = ", ".join(one.path for one in found[:FEW])
         there = f"{len(found)} models are called {name!r} ({places})" if found else f"no model is called {name!r}"
         advice = "import the models of a graph first, beside it"
         raise Invalid(f"The graph has a node {name!r}, but {there}; {advice}.", code="no-model")

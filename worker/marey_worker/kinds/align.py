@@ -29,10 +29,11 @@ from marey_motion.matching.body import MatchingBody
 from marey_schemas.alignment import MOST_EXAMPLES, AlignParams
 from marey_schemas.canonical import document_digest
 from marey_schemas.documents import Annotation, Motion, RevisionRef
-from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
+from marey_schemas.jobs import PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused
-from marey_worker.kinds.matching_clips import place_of, refusing_motion_errors
+from marey_worker.kinds.matching_clips import refusing_motion_errors
+from marey_worker.kinds.refusals import Refusals
 from marey_worker.kinds.rigged import Rig, read_rigged
 
 OUTPUTS_PER_STAGE = 64
@@ -70,7 +71,7 @@ class _Job:
         self._context = context
         self._params = params
         self._pins = {_uid(pin): pin for pin in context.inputs["clips"]}
-        self._refused: list[dict[str, str]] = []
+        self._refusals = Refusals(context)
         self._annotations: dict[str, PinnedInput] = {}
 
     def run(self) -> dict[str, Any]:
@@ -87,7 +88,9 @@ class _Job:
                 self._options(body),
                 threads=self._context.threads,
                 progress=self._context.progress,
-                on_refusal=lambda example, error: self._refuse(self._pin_of(example.uid), error, name=example.name),
+                on_refusal=lambda example, error: self._refusals.add(
+                    self._pin_of(example.uid), error, name=example.name
+                ),
             )
         digest = self._digest(clips, examples, rig)
         self._stage(aligned, rig.skeleton, digest)
@@ -102,7 +105,7 @@ class _Job:
             try:
                 motion = Motion.model_validate(tree)
             except ValidationError as error:
-                self._refuse(pin, error)
+                self._refusals.add(pin, error)
                 continue
             yield _Clip(pin, motion, document_digest(tree), RevisionRef.model_validate(motion.skeleton.model_dump()))
 
@@ -117,13 +120,13 @@ class _Job:
                     "with marey retarget",
                     code="skeleton-mismatch",
                 )
-                self._refuse(clip.pin, error)
+                self._refusals.add(clip.pin, error)
         return [clip for clip in clips if clip.skeleton.item == most]
 
     def _rig(self, clips: Sequence[_Clip]) -> Rig:
         """The skeleton at its newest revision in use, with the mapping to go by."""
         if not clips:
-            raise JobRefused("too-few-clips", f"none of {len(self._pins)} clips can be read{self._first_reason()}")
+            raise JobRefused("too-few-clips", f"none of {len(self._pins)} clips can be read{self._refusals.first}")
         skeleton = max((clip.skeleton for clip in clips), key=lambda ref: ref.revision)
         for edited in self._context.inputs.get("rig", ()):
             if edited.item != skeleton.item:
@@ -138,15 +141,15 @@ class _Job:
                 clip = documents.clip_from_document(one.motion, body.skeleton)
                 cuts = self._cuts(one, annotations) if annotations is not None else ()
             except MotionError as error:
-                self._refuse(one.pin, error)
+                self._refusals.add(one.pin, error)
                 continue
-            yield SourceExample(_uid(one.pin), place_of(one.pin), clip, cuts)
+            yield SourceExample(_uid(one.pin), one.pin.path, clip, cuts)
 
     def _require_examples(self, examples: Sequence[SourceExample], clips: Sequence[_Clip]) -> None:
         count = len(examples) * (2 if self._params.mirroring == "add" else 1)
         if count < 2:
             raise JobRefused(
-                "too-few-clips", f"{len(examples)} of {len(clips)} clips are left to align{self._first_reason()}"
+                "too-few-clips", f"{len(examples)} of {len(clips)} clips are left to align{self._refusals.first}"
             )
         if count > MOST_EXAMPLES and self._params.reference == MEDOID:
             raise JobRefused(
@@ -261,13 +264,13 @@ class _Job:
         reference = self._pin_of(aligned.reference)
         mirrored = " mirrored" if one.uid.endswith(MIRRORED) else ""
         motion = documents.clip_to_document(one.motion.as_clip(aligned.skeleton, aligned.frame_rate_hz), skeleton)
-        sources = {"clips": tuple(map(_input, dict.fromkeys((pin, reference))))}
+        sources = {"clips": tuple(used.as_input() for used in dict.fromkeys((pin, reference)))}
         if _uid(pin) in self._annotations:
-            sources["annotations"] = (_input(self._annotations[_uid(pin)]),)
+            sources["annotations"] = (self._annotations[_uid(pin)].as_input(),)
         if rig := self._context.inputs.get("rig"):
-            sources["rig"] = tuple(map(_input, rig))
+            sources["rig"] = tuple(used.as_input() for used in rig)
         return StagedOutput(
-            name=f"{place_of(pin)}{mirrored}",
+            name=f"{pin.path}{mirrored}",
             kind=Kind.PROCESSED,
             item_name=f"{pin.name}{self._params.suffix}{mirrored}",
             collection=pin.folder,
@@ -290,17 +293,8 @@ class _Job:
             "mean_cost": float(np.mean([one.cost for one in aligned.clips])),
             "set": digest,
             "aligned": [_row(one) for one in aligned.clips],
-            "refused": self._refused,
+            "refused": self._refusals.entries,
         }
-
-    def _refuse(self, pin: PinnedInput, error: MotionError | ValidationError, *, name: str | None = None) -> None:
-        code = error.code if isinstance(error, MotionError) else "bad-document"
-        shown = name or place_of(pin)
-        self._context.log(f"{shown}: {error}")
-        self._refused.append({"name": shown, "item": pin.item, "code": code, "detail": str(error)})
-
-    def _first_reason(self) -> str:
-        return f"; {self._refused[0]['name']}: {self._refused[0]['detail']}" if self._refused else ""
 
 
 def _row(one: AlignedClip) -> dict[str, Any]:
@@ -325,7 +319,3 @@ def _joint(name: str, body: MatchingBody) -> int:
 
 def _uid(pin: PinnedInput) -> str:
     return aligned_documents.uid_of(pin.item, pin.revision)
-
-
-def _input(pin: PinnedInput) -> ItemInput:
-    return ItemInput(item=pin.item, revision=pin.revision)

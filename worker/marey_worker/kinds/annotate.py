@@ -27,9 +27,9 @@ from marey_schemas.documents import Motion, RevisionRef
 from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused
+from marey_worker.kinds.refusals import Refusals
 from marey_worker.kinds.rigged import Rig, Rigged, read_rigged
-
-OUTPUTS_PER_STAGE = 64
+from marey_worker.kinds.staged_results import StagedResults
 
 Propose = Callable[[Clip, Rigged], Layer]
 
@@ -45,40 +45,37 @@ def run(context: Context, params: AnnotateParams) -> dict[str, Any]:
     pins = context.inputs["clips"]
     layer_name = params.layer or params.proposal.method
     labels: Counter[str] = Counter()
-    refused: list[dict[str, str]] = []
+    refusals = Refusals(context)
     empty: list[str] = []
-    ready: list[StagedOutput] = []
+    results = StagedResults(context)
     for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
         context.progress(done, len(pins), f"annotating {pin.name}")
-        place = f"{pin.collection}/{pin.name}".lstrip("/")
         try:
             motion = Motion.model_validate(tree)
             used = RevisionRef.model_validate(motion.skeleton.model_dump())
             edited = rigs.get(used.item)
-            rigged = read_rigged(context, Rig(used, _ref(edited) if edited else used))
+            rigged = read_rigged(context, Rig(used, edited.ref if edited else used))
             layer = propose(documents.clip_from_document(motion, rigged.skeleton), rigged)
             _require_name(pin, layer_name)
         except (MotionError, ValidationError) as error:
-            code = error.code if isinstance(error, MotionError) else "bad-document"
-            context.log(f"{place}: {error}")
-            refused.append({"name": place, "item": pin.item, "code": code, "detail": str(error)})
+            refusals.add(pin, error)
             continue
         if not (layer.segments or layer.keyframes):
-            empty.append(place)
+            empty.append(pin.path)
             continue
         labels.update(segment.label for segment in layer.segments)
         sources: dict[str, tuple[ItemInput, ...]] = {
-            "clips": (_input(pin),),
-            **({"rigs": (_input(edited),)} if edited else {}),
+            "clips": (pin.as_input(),),
+            **({"rigs": (edited.as_input(),)} if edited else {}),
         }
-        ready.append(_output(pin, layer, layer_name, params, sources))
-        if len(ready) == OUTPUTS_PER_STAGE:
-            context.stage(ready)
-            ready = []
-    if ready:
-        context.stage(ready)
-    annotated = len(pins) - len(empty) - len(refused)
-    return {"annotations": annotated, "segments": dict(sorted(labels.items())), "empty": empty, "refused": refused}
+        results.add(_output(pin, layer, layer_name, params, sources))
+    results.flush()
+    return {
+        "annotations": results.count,
+        "segments": dict(sorted(labels.items())),
+        "empty": empty,
+        "refused": refusals.entries,
+    }
 
 
 def _proposal(params: AnnotateParams) -> Propose:
@@ -131,7 +128,7 @@ def _require_name(pin: PinnedInput, layer_name: str) -> None:
 def _output(
     pin: PinnedInput, layer: Layer, name: str, params: AnnotateParams, sources: dict[str, tuple[ItemInput, ...]]
 ) -> StagedOutput:
-    document = documents.layer_to_document(layer, _ref(pin), name, "algorithm")
+    document = documents.layer_to_document(layer, pin.ref, name, "algorithm")
     return StagedOutput(
         name=f"{pin.collection}/{pin.name}",
         kind=Kind.ANNOTATION,
@@ -141,11 +138,3 @@ def _output(
         parts={"annotation": document.model_dump(mode="json", by_alias=True)},
         sources=sources,
     )
-
-
-def _ref(pin: PinnedInput) -> RevisionRef:
-    return RevisionRef(item=pin.item, revision=pin.revision)
-
-
-def _input(pin: PinnedInput) -> ItemInput:
-    return ItemInput(item=pin.item, revision=pin.revision)

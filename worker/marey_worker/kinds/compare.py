@@ -11,7 +11,6 @@ from marey_motion.evaluation.suggestion_documents import comparison_to_tree
 from marey_schemas.improvement import CompareParams
 from marey_worker.context import Context, JobRefused
 from marey_worker.kinds.evaluated_set import read_result, store_document, store_file
-from marey_worker.kinds.matching_clips import place_of
 
 STEPS = 3
 
@@ -29,14 +28,14 @@ def run(context: Context, params: CompareParams) -> dict[str, Any]:
     try:
         comparison = compare_results(before, after)
     except MotionError as error:
-        again = f"`marey evaluate … --normaliser PROJECT/{place_of(first)}` and its options make one that can be"
+        again = f"`marey evaluate … --normaliser PROJECT/{first.path}` and its options make one that can be"
         raise JobRefused(error.code, f"{error}; {again}") from error
-    document = {**comparison_to_tree(comparison), "names": {"before": place_of(first), "after": place_of(second)}}
+    document = {**comparison_to_tree(comparison), "names": {"before": first.path, "after": second.path}}
     result = {**_counts(comparison), "document": store_document(context, document)}
     if params.report:
         context.progress(2, STEPS, "writing the report")
         labels = (first.name, second.name) if first.name != second.name else ("before", "after")
-        title = params.title or f"{place_of(first)} and {place_of(second)}"
+        title = params.title or f"{first.path} and {second.path}"
         page = render_comparison(before, after, title=title, comparison=comparison, labels=labels)
         result["report"] = store_file(context, page.encode())
     return result

@@ -18,9 +18,8 @@ from marey_schemas.items import Item
 from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused, NoSuchThing
-
-BYTES_PER_STAGE = 2 << 20
-OUTPUTS_PER_STAGE = 64
+from marey_worker.kinds.refusals import Refusals
+from marey_worker.kinds.staged_results import StagedResults
 
 
 def run(context: Context, params: CutParams) -> dict[str, Any]:
@@ -48,29 +47,28 @@ class _Cutting:
         self._context = context
         self._params = params
         self._clip_pins = {(pin.item, pin.revision): pin for pin in context.inputs.get("clips", ())}
-        self._ready: list[StagedOutput] = []
-        self._ready_bytes = 0
+        self._results = StagedResults(context)
+        self._refusals = Refusals(context)
 
     def run(self) -> dict[str, Any]:
         """All annotations; how many pieces were made of each label, and what was refused."""
-        refused: list[dict[str, str]] = []
         labels: Counter[str] = Counter()
-        todo = self._read(refused)
-        self._require_pieces(todo, refused)
+        todo = self._read()
+        self._require_pieces(todo)
         for done, one in enumerate(todo):
             self._context.progress(done, len(todo), f"cutting {one.item.name}")
             try:
                 for output, label in self._pieces(one):
                     labels.update([label] if label else [])
-                    self._add(output)
+                    self._results.add(output)
             except (MotionError, ValidationError, NoSuchThing) as error:
-                refused.append(self._refusal(one.pin, error))
-        self._flush()
-        return {"clips": labels.total(), "labels": dict(sorted(labels.items())), "refused": refused}
+                self._refusals.add(one.pin, error)
+        self._results.flush()
+        return {"clips": labels.total(), "labels": dict(sorted(labels.items())), "refused": self._refusals.entries}
 
     # -- what there is to cut --
 
-    def _read(self, refused: list[dict[str, str]]) -> list[_Annotated]:
+    def _read(self) -> list[_Annotated]:
         pins = self._context.inputs["annotations"]
         found = []
         for pin, tree in self._context.documents(pins, "annotation"):
@@ -79,7 +77,7 @@ class _Cutting:
                 clip = RevisionRef.model_validate(annotation.clip.model_dump())
                 item = self._clip_pins.get((clip.item, clip.revision)) or self._context.item(Kind.CLIP, clip.item)
             except (ValidationError, NoSuchThing) as error:
-                refused.append(self._refusal(pin, error))
+                self._refusals.add(pin, error)
                 continue
             if self._params.layer in (None, annotation.layer):
                 found.append(_Annotated(pin, annotation, clip, item, tuple(self._named(annotation, item))))
@@ -94,13 +92,14 @@ class _Cutting:
                 name = self._params.piece_name(clip.name, one.label, numbers[one.label])
                 yield Segment(one.label, one.start, one.end), name
 
-    def _require_pieces(self, todo: Sequence[_Annotated], refused: Sequence[dict[str, str]]) -> None:
+    def _require_pieces(self, todo: Sequence[_Annotated]) -> None:
         places = Counter((self._folder(one, segment), name) for one in todo for segment, name in one.pieces)
         if not places:
             labels = sorted({segment.label for one in todo for segment in one.annotation.segments})
             known = f"the labels there are: {', '.join(labels)}" if labels else "they have none"
-            why = f"; {refused[0]['detail']}" if refused else ""
-            raise JobRefused("nothing-to-cut", f"no segment of {len(todo)} annotations is asked for; {known}{why}")
+            raise JobRefused(
+                "nothing-to-cut", f"no segment of {len(todo)} annotations is asked for; {known}{self._refusals.first}"
+            )
         (folder, name), count = places.most_common(1)[0]
         if count > 1:
             raise JobRefused(
@@ -162,30 +161,10 @@ class _Cutting:
         return ClipInfo.model_validate(stored).model_copy(update={"checks": ()})
 
     def _sources(self, one: _Annotated) -> dict[str, tuple[ItemInput, ...]]:
-        sources: dict[str, tuple[ItemInput, ...]] = {"annotations": (_input(one.pin),)}
+        sources: dict[str, tuple[ItemInput, ...]] = {"annotations": (one.pin.as_input(),)}
         if clip := self._clip_pins.get((one.clip.item, one.clip.revision)):
-            sources["clips"] = (_input(clip),)
+            sources["clips"] = (clip.as_input(),)
         return sources
-
-    # -- results --
-
-    def _refusal(self, pin: PinnedInput, error: Exception) -> dict[str, str]:
-        code = {NoSuchThing: "no-clip", ValidationError: "bad-document"}.get(type(error), getattr(error, "code", ""))
-        place = f"{pin.collection}/{pin.name}".lstrip("/")
-        self._context.log(f"{place}: {error}")
-        return {"name": place, "item": pin.item, "code": code, "detail": str(error)}
-
-    def _add(self, output: StagedOutput) -> None:
-        self._ready.append(output)
-        if output.kind is Kind.CLIP:
-            self._ready_bytes += output.parts["motion"]["poses"].nbytes
-        if self._ready_bytes > BYTES_PER_STAGE or len(self._ready) >= OUTPUTS_PER_STAGE:
-            self._flush()
-
-    def _flush(self) -> None:
-        if self._ready:
-            self._context.stage(self._ready)
-        self._ready, self._ready_bytes = [], 0
 
 
 def _sliced(motion: Motion, frames: tuple[int, int]) -> dict[str, Any]:
@@ -199,13 +178,9 @@ def _sliced(motion: Motion, frames: tuple[int, int]) -> dict[str, Any]:
 def _piece_info(info: ClipInfo, one: _Annotated, segment: Segment, frames: tuple[int, int]) -> dict[str, Any]:
     details = {
         "clip": one.clip.model_dump(),
-        "annotation": _input(one.pin).model_dump(),
+        "annotation": one.pin.as_input().model_dump(),
         "label": segment.label,
         "frames": list(frames),
     }
     cut = info.model_copy(update={"source": Source(format="cut", details=details)})
     return cut.model_dump(mode="json", by_alias=True, exclude_none=True)
-
-
-def _input(pin: PinnedInput) -> ItemInput:
-    return ItemInput(item=pin.item, revision=pin.revision)

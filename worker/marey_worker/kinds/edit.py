@@ -16,10 +16,10 @@ from marey_motion.errors import EditError, MotionError
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents import ClipInfo, Motion, RevisionRef, SkeletonHierarchy, Source
 from marey_schemas.editing import EditDocument, EditParams
-from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
+from marey_schemas.jobs import PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused, NoSuchThing
-from marey_worker.kinds.matching_clips import place_of
+from marey_worker.kinds.refusals import Refusals
 from marey_worker.kinds.rigged import Rig, read_rigged
 from marey_worker.kinds.staged_results import StagedResults
 
@@ -45,7 +45,7 @@ class _Editing:
         self._rigs = {pin.item: pin for pin in context.inputs.get("rigs", ())}
         self._bodies: dict[RevisionRef, EditedBody] = {}
         self._frames = 0
-        self._refused: list[dict[str, Any]] = []
+        self._refusals = Refusals(context)
         self._findings: list[dict[str, Any]] = []
         _require_clear_place(context, params)
         self._edit_pin, self._edit = _wanted_edit(context, params)
@@ -62,7 +62,7 @@ class _Editing:
             try:
                 outputs = list(self._edited(pin, Motion.model_validate(motion), sources))
             except (MotionError, ValidationError) as error:
-                self._refuse(pin, error)
+                self._refusals.add(pin, error)
                 continue
             for output in outputs:
                 self._results.add(output)
@@ -72,7 +72,7 @@ class _Editing:
             "frames": self._frames,
             "seconds": round(time.monotonic() - started, 4),
             "findings": self._findings,
-            "refused": self._refused,
+            "refused": self._refusals.entries,
         }
 
     def _read_sources(self) -> dict[str, Clip]:
@@ -83,7 +83,7 @@ class _Editing:
             try:
                 sources[pin.item] = documents.clip_from_document(motion, self._body(motion).skeleton)
             except MotionError as error:
-                raise JobRefused(error.code, f"the source {place_of(pin)}: {error}") from error
+                raise JobRefused(error.code, f"the source {pin.path}: {error}") from error
         return sources
 
     def _edited(self, pin: PinnedInput, motion: Motion, sources: Mapping[str, Clip]) -> Iterator[StagedOutput]:
@@ -110,7 +110,7 @@ class _Editing:
             "sources": [*self._source_pins.values()],
             "rigs": [rig],
         }
-        sources = {role: tuple(_input(one) for one in many if one is not None) for role, many in pins.items()}
+        sources = {role: tuple(one.as_input() for one in many if one is not None) for role, many in pins.items()}
         return StagedOutput(
             name=f"{pin.collection}/{name}",
             kind=Kind.CLIP,
@@ -142,8 +142,8 @@ class _Editing:
 
     def _info(self, pin: PinnedInput) -> ClipInfo:
         """What was known of the clip and still holds, and what was done to it."""
-        edit = None if self._edit_pin is None else _input(self._edit_pin).model_dump()
-        done = {"clip": _input(pin).model_dump(), "edit": edit, "commands": [name for name, _ in self._commands]}
+        edit = None if self._edit_pin is None else self._edit_pin.as_input().model_dump()
+        done = {"clip": pin.as_input().model_dump(), "edit": edit, "commands": [name for name, _ in self._commands]}
         try:
             stored = self._context.document(Kind.CLIP, pin.item, pin.revision, "info")
         except NoSuchThing:
@@ -184,11 +184,6 @@ class _Editing:
             {"name": place, "item": pin.item, "command": one.command, **one.values} for one in made.findings
         ]
 
-    def _refuse(self, pin: PinnedInput, error: MotionError | ValidationError) -> None:
-        code = error.code if isinstance(error, MotionError) else "bad-document"
-        self._context.log(f"{place_of(pin)}: {error}")
-        self._refused.append({"name": place_of(pin), "item": pin.item, "code": code, "detail": str(error)})
-
 
 def _require_clear_place(context: Context, params: EditParams) -> None:
     """Refuse what would change the clips themselves unasked, or not change them though asked. Raises `JobRefused`."""
@@ -212,7 +207,7 @@ def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | No
     try:
         return pin, EditDocument.model_validate(context.document(Kind.EDIT, pin.item, pin.revision, "edit"))
     except ValidationError as error:
-        raise JobRefused("bad-document", f"the edit {place_of(pin)} cannot be applied: {error}") from error
+        raise JobRefused("bad-document", f"the edit {pin.path} cannot be applied: {error}") from error
 
 
 def _wanted_sources(context: Context, edit: EditDocument) -> dict[str, PinnedInput]:
@@ -229,7 +224,3 @@ def _wanted_sources(context: Context, edit: EditDocument) -> dict[str, PinnedInp
 
 def _skeleton_of(motion: Motion) -> RevisionRef:
     return RevisionRef.model_validate(motion.skeleton.model_dump())
-
-
-def _input(pin: PinnedInput) -> ItemInput:
-    return ItemInput(item=pin.item, revision=pin.revision)

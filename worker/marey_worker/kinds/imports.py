@@ -13,9 +13,9 @@ from marey_schemas.imports import ImportEntry, Refusal, skeleton_output
 from marey_schemas.jobs import ImportParams, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused, NoSuchThing
+from marey_worker.kinds.staged_results import StagedResults
 
 SKELETON_COLLECTION = "skeletons"
-BYTES_PER_STAGE = 8 << 20
 
 
 def run(context: Context, params: ImportParams) -> dict[str, Any]:
@@ -31,8 +31,7 @@ class _Importing:
         self._params = params
         self._digests = {file.name: file.blob for file in params.files}
         self._request = self._read_request()
-        self._ready: list[StagedOutput] = []
-        self._ready_bytes = 0
+        self._results = StagedResults(context)
 
     def run(self) -> dict[str, Any]:
         """All files; what became of them, in the order given."""
@@ -41,7 +40,7 @@ class _Importing:
         for done, planned in enumerate(plan):
             self._context.progress(done, len(plan), f"importing {planned.name}")
             entries.append(self._entry(planned))
-        self._flush()
+        self._results.flush()
         imported = [entry for entry in entries if entry.status == "created"]
         return {
             "entries": [entry.model_dump(mode="json", exclude_none=True) for entry in entries],
@@ -106,7 +105,7 @@ class _Importing:
         """The clip under the file's name, its skeleton beside it; an equal skeleton of the project is used instead."""
         skeleton_name = skeleton_output(planned.name)
         if found.hierarchy is not None and found.mapping is not None:
-            self._ready.append(
+            self._results.add(
                 StagedOutput(
                     name=skeleton_name,
                     kind=Kind.SKELETON,
@@ -120,7 +119,7 @@ class _Importing:
             motion = found.motion
             if found.hierarchy is not None:
                 motion = {**motion, "skeleton": OutputRef(output=skeleton_name).model_dump()}
-            self._ready.append(
+            self._results.add(
                 StagedOutput(
                     name=planned.name,
                     kind=Kind.CLIP,
@@ -130,18 +129,15 @@ class _Importing:
                     parts={"motion": motion, "info": found.info},
                 )
             )
-            self._ready_bytes += motion["poses"].nbytes
         if found.modelled is not None:
             self._stage_model(planned, found, found.modelled)
-        if self._ready_bytes > BYTES_PER_STAGE or len(self._ready) >= 128:
-            self._flush()
 
     def _stage_model(self, planned: PlannedFile, found: ImportedDocuments, modelled: ModelledDocuments) -> None:
         """The model under its name, with its tree."""
         parts = dict(modelled.parts)
         if found.hierarchy is not None:
             parts["model"] = parts["model"] | {"skeleton": OutputRef(output=skeleton_output(planned.name)).model_dump()}
-        self._ready.append(
+        self._results.add(
             StagedOutput(
                 name=planned.name,
                 kind=Kind.MODEL,
@@ -151,10 +147,3 @@ class _Importing:
                 parts=parts,
             )
         )
-        arrays = [*parts["model"]["spatial"].values(), *parts.get("tree", {}).values()]
-        self._ready_bytes += sum(part.nbytes for part in arrays if hasattr(part, "nbytes"))
-
-    def _flush(self) -> None:
-        if self._ready:
-            self._context.stage(self._ready)
-        self._ready, self._ready_bytes = [], 0

@@ -104,9 +104,7 @@ def read_evaluated_clips(
 ) -> MatchingClips:
     """The clips of an evaluation as they were, under its normaliser. Raises `JobRefused` for one that names none."""
     if "clip_set" not in document:
-        raise JobRefused(
-            "clips-unknown", f"{place_of(evaluation)} does not tell which clips it is of; evaluate them again"
-        )
+        raise JobRefused("clips-unknown", f"{evaluation.path} does not tell which clips it is of; evaluate them again")
     wanted = ClipSet.from_tree(document["clip_set"])
     normaliser = Normaliser.from_tree(document["normaliser"])
     with refusing_motion_errors():
@@ -148,7 +146,7 @@ def build_clips(
     clips = [
         SourceClip(
             uid=uid_of(pin),
-            name=place_of(pin),
+            name=pin.path,
             clip=documents.clip_from_document(motion, body.skeleton),
             content=content,
             loop=pin.item in wanted.loops or LOOP_TAG in (info or {}).get("tags", ()),
@@ -178,9 +176,9 @@ def _common_rig(context: Context, wanted: ClipSet, motions: Sequence[tuple[str, 
     used = [RevisionRef.model_validate(motion.skeleton.model_dump()) for _, motion in motions]
     (most, count), *others = Counter(ref.item for ref in used).most_common()
     if others:
-        odd = [place_of(pin) for pin, ref in zip(wanted.clips, used, strict=True) if ref.item != most]
+        odd = [pin.path for pin, ref in zip(wanted.clips, used, strict=True) if ref.item != most]
         commonest = context.item(Kind.SKELETON, most)
-        place = f"{commonest.collection}/{commonest.name}".lstrip("/")
+        place = commonest.path
         raise JobRefused(
             "several-skeletons",
             f"the clips move {len(others) + 1} skeletons: {count} of {len(used)} move {place}, but not {_listed(odd)}; "
@@ -198,7 +196,7 @@ def _trim(pin: PinnedInput, motion: Motion, trims: Mapping[str, tuple[int, int]]
     trim = trims.get(pin.item)
     if trim is not None and trim[1] > len(motion.poses):
         frames = len(motion.poses)
-        raise JobRefused("bad-trim", f"{place_of(pin)}: the frames {trim[0]}:{trim[1]} are not there; it has {frames}")
+        raise JobRefused("bad-trim", f"{pin.path}: the frames {trim[0]}:{trim[1]} are not there; it has {frames}")
     return trim
 
 
@@ -208,11 +206,6 @@ def _pinned_normaliser(context: Context) -> Normaliser | None:
         evaluation = context.document(Kind.EVALUATION, pin.item, pin.revision, "evaluation")
         return Normaliser.from_tree(evaluation["normaliser"])
     return None
-
-
-def place_of(pin: PinnedInput) -> str:
-    """Folder and name."""
-    return f"{pin.collection}/{pin.name}".lstrip("/")
 
 
 def _listed(names: Sequence[str]) -> str:

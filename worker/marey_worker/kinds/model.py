@@ -20,7 +20,7 @@ from marey_schemas.jobs import PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_schemas.modelling import ModelParams
 from marey_worker.context import Context, JobRefused
-from marey_worker.kinds.matching_clips import place_of, refusing_motion_errors
+from marey_worker.kinds.matching_clips import refusing_motion_errors
 from marey_worker.kinds.model_report import write_model_report
 
 OPTIONS = set(DEFAULT_OPTIONS.as_tree())
@@ -72,7 +72,7 @@ def _read(context: Context, pins: Sequence[PinnedInput]) -> tuple[list[Motion], 
         try:
             AlignmentInfo.model_validate(tree)
         except ValidationError as error:
-            raise JobRefused("bad-document", f"{place_of(pin)}: {error}") from error
+            raise JobRefused("bad-document", f"{pin.path}: {error}") from error
         infos.append(tree)
     return motions, infos
 
@@ -84,7 +84,7 @@ def _common_skeleton(pins: Sequence[PinnedInput], motions: Sequence[Motion]) -> 
         if ref.item != used[0].item:
             raise JobRefused(
                 "several-skeletons",
-                f"{place_of(pin)} moves another skeleton than {place_of(pins[0])}; align clips of one skeleton",
+                f"{pin.path} moves another skeleton than {pins[0].path}; align clips of one skeleton",
             )
     return max(used, key=lambda ref: ref.revision)
 
@@ -111,7 +111,7 @@ def _provenance(
 ) -> dict[str, Any]:
     """Where the examples come from."""
     return {
-        "aligned": [{"item": pin.item, "revision": pin.revision, "name": place_of(pin)} for pin in pins],
+        "aligned": [{"item": pin.item, "revision": pin.revision, "name": pin.path} for pin in pins],
         "set": infos[0].get("set"),
         "reference": aligned.reference,
         "seed": context.seed,

@@ -1,9 +1,11 @@
-"""Clips handed over as they get ready, so that the server takes them in while the next ones are computed."""
+"""Results handed over as they get ready, so that the server takes them in while the next ones are computed."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from marey_schemas.jobs import StagedOutput
-from marey_schemas.kinds import Kind
 from marey_worker.context import Context
 
 BYTES_PER_STAGE = 2 << 20
@@ -28,8 +30,7 @@ class StagedResults:
         """One more; handed over with its neighbours."""
         self.names.add(output.name)
         self._ready.append(output)
-        if output.kind is Kind.CLIP:
-            self._ready_bytes += output.parts["motion"]["poses"].nbytes
+        self._ready_bytes += _array_bytes(output.parts)
         if self._ready_bytes > BYTES_PER_STAGE or len(self._ready) >= OUTPUTS_PER_STAGE:
             self.flush()
 
@@ -38,3 +39,9 @@ class StagedResults:
         if self._ready:
             self._context.stage(self._ready)
         self._ready, self._ready_bytes = [], 0
+
+
+def _array_bytes(tree: Any) -> int:
+    if isinstance(tree, Mapping):
+        return sum(map(_array_bytes, tree.values()))
+    return int(getattr(tree, "nbytes", 0))

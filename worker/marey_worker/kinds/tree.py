@@ -14,7 +14,7 @@ from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_schemas.sample_trees import TreeParams
 from marey_worker.context import Context, JobRefused
-from marey_worker.kinds.matching_clips import place_of, refusing_motion_errors
+from marey_worker.kinds.matching_clips import refusing_motion_errors
 from marey_worker.kinds.rigged import Rig, read_rigged
 
 
@@ -63,4 +63,4 @@ def _require_same_place(context: Context, pin: PinnedInput) -> None:
         raise JobRefused("ambiguous-place", f"a tree becomes a part of its model; it cannot go to {context.into}")
     now = context.item(Kind.MODEL, pin.item)
     if (now.collection, now.name) != (pin.collection, pin.name):
-        raise JobRefused("model-moved", f"{place_of(pin)} was moved or renamed while the job waited; try again")
+        raise JobRefused("model-moved", f"{pin.path} was moved or renamed while the job waited; try again")
