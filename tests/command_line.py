@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from server_process import ServerProcess
 
@@ -34,9 +34,12 @@ class CommandLine:
         return done
 
     def start(self, *arguments: object) -> subprocess.Popen[str]:
-        """Start a command and go on; what it prints can be read."""
-        pipe: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        return subprocess.Popen(self._words(arguments), cwd=self.folder, env=self._surroundings({}), **pipe)
+        """Start a command and go on; what it prints can be read, and it can be interrupted."""
+        return subprocess.Popen(
+            self._words(arguments),
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=self.folder, env=self._surroundings({}),
+            preexec_fn=_hear_interrupts,
+        )  # fmt: skip
 
     def _words(self, arguments: tuple[object, ...]) -> list[str]:
         return [sys.executable, "-m", "marey_client.cli", *map(str, arguments)]
@@ -45,3 +48,8 @@ class CommandLine:
         others = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
         known = {"MAREY_URL": self.server.url, "MAREY_DATA": str(self.server.data)}
         return {**others, **known, "HOME": str(self.folder), "XDG_CONFIG_HOME": str(self.folder), **more}
+
+
+def _hear_interrupts() -> None:
+    """Whoever runs the tests in the background may have them ignore interrupts, which processes pass on."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
