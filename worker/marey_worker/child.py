@@ -21,7 +21,7 @@ from marey_worker.context import Context, JobRefused
 from marey_worker.limits import allow_memory, die_with_parent
 from marey_worker.messages import Done, End, Failed, Ready, Run
 
-DETAIL_BYTES = 16_000
+DETAIL_CHARACTERS = 1000
 
 
 def main() -> None:
@@ -75,8 +75,9 @@ def run_job(run: Run, pipe: Connection) -> End:
         limit_mb = run.memory_limit_bytes >> 20
         return Failed("memory-limit", f"the job needs more than its {limit_mb} MB of memory", "memory-limit", True)
     except Exception as error:  # noqa: BLE001 - whatever a kind raises ends this job, not the process
-        text = "".join(traceback.format_exception(error))[-DETAIL_BYTES:]
-        sys.stderr.write(text)
+        sys.stderr.write("".join(traceback.format_exception(error)))
+        what = "".join(traceback.format_exception_only(error)).strip()[:DETAIL_CHARACTERS]
+        text = f"{what}; the job's log tells where"
         code = getattr(error, "code", "exception")
         return Failed(code if isinstance(code, str) else "exception", text, signatures.of_exception(error), True)
     finally:

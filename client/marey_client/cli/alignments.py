@@ -10,7 +10,7 @@ from marey_client.cli.addresses import Address, find_item, require_item
 from marey_client.cli.failures import Refused, WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import clips_at, follow
-from marey_client.cli.output import print_json, print_table, tell
+from marey_client.cli.output import print_json, print_table, tell_refused
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
@@ -134,8 +134,7 @@ def _print_ended(ended: Job, as_json: bool) -> None:
             for one in result.get("aligned", ())
         ]
         print_table(COLUMNS, rows, right=COLUMNS[1:5])
-        for one in refused:
-            tell(f"{one['name']}: {one['detail']} ({one['code']})")
+        tell_refused(refused)
         keyframes = ", ".join(f"{label} {frame}" for label, frame in result.get("keyframes", {}).items())
         typer.echo(
             f"{result.get('clips')} clips of {result.get('frames')} frames at {result.get('frame_rate_hz'):g} Hz"

@@ -13,7 +13,7 @@ from marey_client.cli.addresses import Address, find_item, require_item
 from marey_client.cli.failures import Refused, WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import clips_at, follow
-from marey_client.cli.output import print_json, print_pairs, print_table, tell
+from marey_client.cli.output import print_json, print_pairs, print_table, tell, tell_refused
 
 if TYPE_CHECKING:
     from marey_client.annotations import AnnotationHandle
@@ -338,8 +338,7 @@ def _finish(marey: Marey, job: Job, wait: bool, as_json: bool) -> None:
     counts = result.get("segments") or result.get("labels") or {}
     made = f"{result['clips']} clips" if "clips" in result else f"{result['annotations']} annotations"
     typer.echo(", ".join([made, *(f"{count} {label}" for label, count in counts.items())]))
-    for one in result.get("refused", ()):
-        tell(f"{one['name']}: {one['detail']} ({one['code']})")
+    tell_refused(result.get("refused", ()))
     if empty := result.get("empty"):
         tell(f"nothing was found in {len(empty)} clips, such as {empty[0]}")
     if result.get("refused"):

@@ -10,7 +10,7 @@ import typer
 from marey_client.cli.addresses import Address, find_item, require_item
 from marey_client.cli.failures import Refused, WrongUsage
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import Advance, print_json, print_pairs, print_table, progress, tell
+from marey_client.cli.output import Advance, print_json, print_pairs, print_table, progress, tell, tell_refused
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
@@ -95,8 +95,7 @@ def print_ended(ended: Job, as_json: bool) -> None:
     if as_json:
         print_json(ended)
     else:
-        for one in refused:
-            tell(f"{one.get('name')}: {one.get('detail')} ({one.get('code')})")
+        tell_refused(refused)
         told = ", ".join(f"{value} {name}" for name, value in result.items() if isinstance(value, int))
         typer.echo(f"{ended.id} {ended.state}" + (f": {told}" if told else "") + f"; {len(refused)} refused")
     if refused:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -54,6 +54,15 @@ def print_pairs(pairs: Iterable[tuple[str, object]]) -> None:
 def tell(text: str) -> None:
     """Tell the person at the terminal something that is no result."""
     typer.echo(text, err=True)
+
+
+def tell_refused(refused: Sequence[Mapping[str, Any]], *, most: int | None = None) -> None:
+    """Tell what a job refused of its inputs, and why: a line each, `most` of them."""
+    for one in refused[:most]:
+        name, detail = str(one.get("name")), str(one.get("detail"))
+        tell(f"{detail if detail.startswith(name) else f'{name}: {detail}'} ({one.get('code')})")
+    if most is not None and len(refused) > most:
+        tell(f"and {len(refused) - most} more")
 
 
 Advance = Callable[[str, float, float | None], None]

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from marey_client.cli.failures import Refused
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_table, tell
+from marey_client.cli.output import print_json, print_table, tell, tell_refused
 
 if TYPE_CHECKING:
     from marey_client.pipelines import PipelineRun
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 COLUMNS = ("step", "kind", "state", "done", "job", "")
+COUNTED = ("clips", "annotations", "frames", "samples", "nodes")
+REFUSED_SHOWN = 3
 
 Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until every job has ended.")]
 
@@ -46,7 +49,10 @@ def pipeline(
 
 
 def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> None:
-    """Wait for the jobs of a pipeline, if that is wanted, and print how they stand. Raises `JobUnsuccessful`."""
+    """Wait for the jobs of a pipeline, if that is wanted, and print how they stand.
+
+    Raises `JobUnsuccessful`, and `Refused` where jobs refused some of their inputs.
+    """
     if not wait:
         return print_steps(run, as_json)
     try:
@@ -58,7 +64,31 @@ def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> 
         raise typer.Exit(INTERRUPTED) from None
     finally:
         print_steps(run, as_json)
+        if not as_json:
+            _tell_shortfalls(run)
+    if any(map(_refused, run.steps.values())):
+        raise Refused
     return None
+
+
+def _refused(job: Job) -> list[Mapping[str, Any]]:
+    """What a job refused of its inputs; of an import, files."""
+    result = job.result or {}
+    failed = [entry for entry in result.get("entries", ()) if entry["status"] == "failed"]
+    return [*result.get("refused", ()), *({"name": entry["name"], **entry["error"]} for entry in failed)]
+
+
+def _tell_shortfalls(run: PipelineRun) -> None:
+    """What did not go into the results of steps, and what their makers had to remark."""
+    for step, job in run.steps.items():
+        if refused := _refused(job):
+            tell(f"{step} refused {len(refused)}:")
+            tell_refused(refused, most=REFUSED_SHOWN)
+        result = job.result or {}
+        if empty := result.get("empty"):
+            tell(f"{step} found nothing in {len(empty)} clips, such as {empty[0]}")
+        for note in result.get("notes", ()):
+            tell(f"{step}: {note}")
 
 
 def print_steps(run: PipelineRun, as_json: bool) -> None:
@@ -117,4 +147,4 @@ def _remark(job: Job) -> str:
     if job.progress is not None and not job.state.terminal:
         return job.progress.note
     result: Mapping[str, Any] = job.result or {}
-    return ", ".join(f"{value} {name}" for name, value in result.items() if isinstance(value, int))
+    return result.get("verdict") or ", ".join(f"{result[name]} {name}" for name in COUNTED if name in result)

@@ -25,7 +25,7 @@ OUTLIER_DEVIATIONS = 5.0
 """Robust standard deviations below the median from which on an example's likelihood stands out."""
 
 DEVIATION_OF_MEDIAN = 1.4826
-ROUNDING = 1e-9
+DURATION_SLACK = 0.05
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class ExampleReport:
 
 @dataclass(frozen=True)
 class Durations:
-    """Of motions, in seconds; `outside_share` lie outside the range of the examples."""
+    """Of motions, in seconds; `outside_share` are over 5 % outside the range of the examples."""
 
     least_s: float
     mean_s: float
@@ -174,7 +174,7 @@ def _at(errors: ReconstructionErrors, components: int) -> int:
 
 
 def _durations(durations: Floats, span: tuple[float, float]) -> Durations:
-    outside = (durations < span[0] * (1.0 - ROUNDING)) | (durations > span[1] * (1.0 + ROUNDING))
+    outside = (durations < span[0] * (1.0 - DURATION_SLACK)) | (durations > span[1] * (1.0 + DURATION_SLACK))
     return Durations(float(durations.min()), float(durations.mean()), float(durations.max()), float(outside.mean()))
 
 

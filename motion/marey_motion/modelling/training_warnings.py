@@ -93,7 +93,7 @@ def _of_samples(report: TrainingReport) -> list[Warned]:
         found.append(
             Warned(
                 "odd-durations",
-                f"{durations.outside_share:.0%} of the samples last longer or shorter than any example",
+                f"{durations.outside_share:.0%} of the samples last over 5% longer or shorter than any example",
             )
         )
     return found

@@ -130,6 +130,20 @@ def test_a_graph_of_jobs_comes_from_a_file_or_from_standard_input(
     assert "JSON" in run("pipeline", "-", "--project", "lab", stdin="steps: {}", status=2).stderr
 
 
+def test_takes_that_did_not_get_into_the_model_are_told_with_why(
+    lab: ProjectHandle, run: CommandLine, tmp_path: Path
+) -> None:
+    takes = tmp_path / "takes"
+    (takes / "broken.bvh").write_bytes(b"HIERARCHY\nROOT Hips\n{\n  OFFSET 0 0 nonsense\n")
+    (tmp_path / "game.bvh").rename(takes / "another body.bvh")
+    ended = run("build-model", "takes", "--project", "lab", "--name", "walk", *QUICK_FLAGS, status=1)
+    assert "import refused 1:\nbroken.bvh" in ended.stderr
+    assert "align refused 1:\nwalk/takes/another body: it moves another skeleton than 20 of 21 clips" in ended.stderr
+    assert "which move walk/takes/skeletons/" in ended.stderr
+    assert "20 examples in " in ended.stdout
+    assert len(list(lab.items(Kind.PROCESSED).list(collection="walk/aligned"))) == TAKES
+
+
 def test_who_stops_waiting_leaves_the_jobs_running_and_is_told_so(
     lab: ProjectHandle, run: CommandLine, marey: Marey
 ) -> None:

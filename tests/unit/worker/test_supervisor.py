@@ -98,6 +98,13 @@ def test_a_crash_leaves_its_traceback_in_the_log(server, start_worker):
     assert b"_segfault" in server.logs[job]
 
 
+def test_an_exception_is_named_in_the_answer_and_traced_in_the_log(server, start_worker):
+    start_worker()
+    job = server.submit("misbehave", {"how": "raise"})
+    assert "Traceback" not in server.ended(job)["detail"]
+    assert b"Traceback" in server.logs[job]
+
+
 def test_memory_hoarded_by_a_grandchild_is_noticed_and_all_are_killed(server, start_worker):
     mark = {"MAREY_TEST_HOARDER": str(uuid.uuid4())}
     start_worker(env=mark)

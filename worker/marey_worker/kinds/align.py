@@ -113,13 +113,15 @@ class _Job:
         """The clips of the skeleton that most of them move; the others are refused."""
         counts = Counter(clip.skeleton.item for clip in clips)
         most = min(counts, key=lambda item: (-counts[item], item), default=None)
-        for clip in clips:
-            if clip.skeleton.item != most:
-                error = MotionError(
-                    f"it moves another skeleton than {counts[str(most)]} of {len(clips)} clips; move it to theirs "
-                    "with marey retarget",
-                    code="skeleton-mismatch",
-                )
+        others = [clip for clip in clips if clip.skeleton.item != most]
+        if others:
+            theirs = self._context.item(Kind.SKELETON, str(most)).path
+            error = MotionError(
+                f"it moves another skeleton than {counts[str(most)]} of {len(clips)} clips, which move {theirs}; "
+                "carry all over to one with marey retarget, or build-model --to",
+                code="skeleton-mismatch",
+            )
+            for clip in others:
                 self._refusals.add(clip.pin, error)
         return [clip for clip in clips if clip.skeleton.item == most]
 
