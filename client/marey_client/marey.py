@@ -11,6 +11,7 @@ import httpx
 
 from marey_client.access import Tokens, Users
 from marey_client.blobs import Blobs
+from marey_client.credentials import resolve
 from marey_client.jobs import Jobs
 from marey_client.paging import pages
 from marey_client.project import ProjectHandle
@@ -24,8 +25,9 @@ class Marey:
 
     Parameters
     ----------
-    url : address of the server, such as `https://marey.example.org`
-    token : a personal token; None reads public projects only
+    url : address of the server, such as `https://marey.example.org`; without one, server and token are those that
+        the environment or `marey login` name, as for the command line
+    token : a personal token; None with a url reads public projects only
     retries : how often and how long requests that cannot harm are sent again
     timeout_s : how long the server may stay silent
     http : replaces the network in tests
@@ -33,13 +35,16 @@ class Marey:
 
     def __init__(
         self,
-        url: str,
+        url: str | None = None,
         token: str | None = None,
         *,
         retries: Retries | None = None,
         timeout_s: float = 60.0,
         http: httpx.BaseTransport | None = None,
     ) -> None:
+        if url is None:
+            known = resolve()
+            url, token = known.url, token or known.token
         self.transport = Transport(url, token, retries=retries, timeout_s=timeout_s, http=http)
 
     def __repr__(self) -> str:

@@ -2,9 +2,11 @@
 
 import json
 
+import httpx
 import pytest
 
-from marey_client import credentials, errors
+from marey_client import Marey, credentials, errors
+from marey_client.retries import ONCE
 
 SERVER = "https://marey.example.org"
 
@@ -28,6 +30,21 @@ def test_a_token_file_comes_before_the_variable_and_that_before_the_stored_login
     assert credentials.resolve(SERVER, None, environment).token == "variable"
     file = write_secret(tmp_path / "token", "from-file\n")
     assert credentials.resolve(SERVER, file, environment).token == "from-file"
+
+
+def test_a_session_without_an_address_goes_where_the_command_line_goes(environment, monkeypatch):
+    for name, value in {**environment, "MAREY_URL": SERVER, "MAREY_TOKEN": "variable"}.items():
+        monkeypatch.setenv(name, value)
+    sent = []
+
+    def answer(request):
+        sent.append(request)
+        return httpx.Response(401, json={})
+
+    with Marey(http=httpx.MockTransport(answer), retries=ONCE) as marey, pytest.raises(errors.RequestFailed):
+        marey.me()
+    assert str(sent[0].url).startswith(SERVER)
+    assert sent[0].headers["Authorization"] == "Bearer variable"
 
 
 def test_the_server_is_the_one_named_or_the_one_logged_in_to_last(environment):
