@@ -117,6 +117,28 @@ def test_skeletons_survive_both_forms(body: Skeleton, form: Any) -> None:
     assert same_hierarchy(imported.skeleton, body, tolerance_m=1e-9)
 
 
+def described(document: dict[str, Any]) -> list[dict[str, Any]]:
+    """All nodes of a skeleton document, whichever form it has."""
+    if "jointDescs" in document:
+        return list(document["jointDescs"])
+    nodes = [document["root"]]
+    for node in nodes:
+        nodes += node["children"]
+    return nodes
+
+
+@pytest.mark.parametrize("form", ["database", "file"])
+def test_rest_rotations_survive_both_forms(body: Skeleton, form: Any) -> None:
+    turned = quaternions.normalise(np.random.default_rng(8).normal(size=(body.joint_count, 4)))
+    skeleton = Skeleton(body.joint_names, body.parents, body.offsets, turned, body.end_sites)
+    written = write_predecessor_skeleton(skeleton, form=form)
+    assert same_hierarchy(read_motion(written, "body.json").skeleton, skeleton, tolerance_m=1e-9)
+    nodes = described(json.loads(written))
+    assert {node["name"] for node in nodes} > set(body.joint_names)
+    lengths = [np.linalg.norm(node["rotation"]) for node in nodes]
+    np.testing.assert_allclose(lengths, 1.0, rtol=0, atol=1e-12)
+
+
 def test_joints_that_move_against_their_parents_are_refused_by_name(
     body: Skeleton, tumbling: Callable[..., Clip]
 ) -> None:
