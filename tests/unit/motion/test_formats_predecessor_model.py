@@ -1,17 +1,23 @@
 """The predecessor's motion primitives: every layout in, layouts 3 and 2 out."""
 
 import copy
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
+import model_examples
 import predecessor_models as models
 from marey_motion.errors import FormatError
 from marey_motion.formats.predecessor_encoding import encode_document
 from marey_motion.formats.predecessor_model import read_predecessor_model
 from marey_motion.formats.predecessor_model_writer import write_predecessor_model
+from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.training import train_primitive
+
+QUICK = ModelOptions(leave_one_out=False, folds=0, report_samples=0)
 
 SCORES = np.random.default_rng(3).normal(scale=0.3, size=(20, models.SPATIAL + models.TEMPORAL))
 
@@ -142,6 +148,18 @@ def test_what_is_written_in_a_layout_is_read_as_the_same_model(layout):
     assert np.abs(ours - theirs).max() < 1.5
     assert np.abs(primitive.durations_s(latents) - again.primitive.durations_s(latents)).max() < 1.0 / 72.0
     assert again.primitive.keyframes == primitive.keyframes
+
+
+@pytest.mark.parametrize(("layout", "most_frames"), [("3", 0.3), ("2", 1e-3)])
+def test_time_varies_as_much_after_writing(layout, most_frames):
+    trained = train_primitive(model_examples.walks(24), QUICK).primitive
+    again = read_predecessor_model(write_predecessor_model(trained, layout=layout), "again.json").primitive
+    latents = trained.sample(50, 4)
+    # Files of the predecessor hold no range of durations: the motions of the first model are not held to it either.
+    free = dataclasses.replace(trained, duration_range_s=None)
+    before, after = (one.time_functions(latents) for one in (free, again))
+    assert np.ptp(before[:, -1]) > 50.0
+    assert np.abs(after - before).max() < most_frames
 
 
 def test_layout_3_is_written_with_the_numbers_that_were_read():
