@@ -4,8 +4,10 @@ from itertools import product
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
 
-from marey_motion.alignment.dtw import align, distance_bound, distances, warped_distance
+from marey_motion.alignment.dtw import align, distance_bound, distances, least_total, warped_distance
 from marey_motion.errors import MotionError
 
 STEPS = ((1, 1), (1, 0), (0, 1))
@@ -42,6 +44,43 @@ def cheapest_way(costs, max_run=None):
     return min((sum(costs[cell] for cell in way) for way in all_ways(*costs.shape, max_run)), default=None)
 
 
+def links_between_layers(max_run):
+    """(layer, step, layer that the step leads to); a cell stands once in each layer.
+
+    Layers are what a way has done last: 0 a step in both motions, then 1 to `max_run` steps in a row in the first
+    alone, then as many in the second alone. Without a limit there is one layer.
+    """
+    if max_run is None:
+        return [(0, step, 0) for step in STEPS]
+    count = 1 + 2 * max_run
+    links = [(layer, (1, 1), 0) for layer in range(count)]
+    for first, step in ((1, (1, 0)), (1 + max_run, (0, 1))):
+        run = range(first, first + max_run)
+        for layer in range(count):
+            after = layer + 1 if layer in run else first
+            links += [(layer, step, after)] if after in run else []
+    return links
+
+
+def step_graph(n, m, max_run):
+    """Nodes (e,) that each edge leads from and to; the node of a cell in a layer is its place in (layers, n, m)."""
+    cells = np.arange(n * m).reshape(n, m)
+    edges = [
+        np.stack(
+            (cells[: n - down, : m - right] + before * n * m, cells[down:, right:] + after * n * m), axis=-1
+        ).reshape(-1, 2)
+        for before, (down, right), after in links_between_layers(max_run)
+    ]
+    return np.concatenate(edges).T
+
+
+def shortest_way(costs, edges):
+    """From the first cell to the last in any layer, by Dijkstra's algorithm; an edge costs the cell it leads to."""
+    nodes = edges.max() + 1
+    graph = coo_array((costs.ravel()[edges[1] % costs.size], tuple(edges)), shape=(nodes, nodes)).tocsr()
+    return costs[0, 0] + dijkstra(graph, indices=0)[costs.size - 1 :: costs.size].min()
+
+
 def walking_points(frames, speed=1.0, phase=0.0, points=5, seed=0):
     """(frames, points, 3) that swing like limbs."""
     random = np.random.default_rng(seed)
@@ -55,6 +94,16 @@ def test_the_total_is_that_of_a_plain_dynamic_program(shape):
     for seed in range(20):
         costs = np.random.default_rng(seed).random(shape)
         assert align(costs).total == pytest.approx(plain_total(costs), rel=1e-14)
+
+
+@pytest.mark.parametrize("max_run", [None, 1, 3])
+def test_totals_are_those_of_an_independent_library(max_run):
+    edges = step_graph(23, 31, max_run)
+    for seed in range(100):
+        costs = np.random.default_rng(seed).random((23, 31))
+        expected = shortest_way(costs, edges)
+        assert align(costs, max_run=max_run).total == pytest.approx(expected, rel=0, abs=1e-12)
+        assert least_total(costs, max_run=max_run) == pytest.approx(expected, rel=0, abs=1e-12)
 
 
 @pytest.mark.parametrize("max_run", [None, 0, 1, 2, 3])
