@@ -83,6 +83,14 @@ def test_refining_brings_hands_and_feet_together_at_the_seams():
     assert max(jumps[1:].max() for jumps in refined.measured.jumps_m) < 0.12
 
 
+def test_both_hands_and_both_feet_go_on_within_centimetres_of_where_they_were():
+    sequel, _ = found_three(refining=RefineOptions(0.01))
+    assert set(sequel.joints) == {"left_wrist", "right_wrist", "left_ankle", "right_ankle"}
+    for jumps in sequel.measured.jumps_m:
+        assert jumps.shape == (5,)
+        assert jumps[1:].max() < 0.05
+
+
 def test_steps_end_where_they_were_asked_to():
     sequel, found = found_three(transitions=TransitionOptions(tolerance_m=0.3))
     positions = found.motion.positions(found.skeleton)[:, standard_joints()["pelvis"]]
