@@ -9,10 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from marey_motion.errors import MotionError
+from marey_motion.kinematics import forward_kinematics
 from marey_motion.modelling.constraints import JointPosition, RootPosition
 from marey_motion.modelling.objective import build_objective
+from marey_motion.modelling.optimise import RefineOptions, refine
+from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.search import search_all, search_closely, search_tree
-from marey_motion.modelling.tree import SampleTree, TreeOptions, build_tree
+from marey_motion.modelling.steps import SeveralSteps, Step
+from marey_motion.modelling.training import train_primitive
+from marey_motion.modelling.tree import END_EFFECTORS, SampleTree, TreeOptions, build_tree
+from modelling_examples import walks
 from search_primitives import sliding, standard_joints, walking
 
 EVERYTHING = 10**6
@@ -167,3 +173,38 @@ def test_what_lies_between_samples_is_told_from_samples_and_costs_what_it_says()
     assert found.samples.tolist() == [-1]
     assert np.array_equal(objective.costs(found.latents), found.costs)
     assert search_closely(objective, tree, passes=1).samples[0] >= 0
+
+
+def own_keyframes(**options):
+    """A model of walks is asked to put the left wrist where each of its examples has it at the keyframe.
+
+    Objectives by example, the model's tree, constraints by example, and the latent vectors (m, L) of the examples.
+    """
+    aligned, joints = walks(24), standard_joints()
+    primitive = train_primitive(aligned, ModelOptions(leave_one_out=False, report_samples=0, **options)).primitive
+    tree = build_tree(primitive, 0, TreeOptions(10_000), end_effectors=[joints[name] for name in END_EFFECTORS])
+    poses = aligned.poses[:, aligned.keyframes["contact"]]
+    wrists = forward_kinematics(aligned.skeleton, poses)[:, joints["left_wrist"]]
+    wanted = [(JointPosition("left_wrist", "contact", tuple(place)),) for place in wrists.tolist()]
+    objectives = [build_objective(primitive, one, joints) for one in wanted]
+    return objectives, tree, wanted, primitive.latents_of(aligned.poses, aligned.time_functions)
+
+
+def test_what_an_example_does_at_a_keyframe_is_found_as_near_as_the_model_holds_that_example():
+    objectives, tree, _, latents = own_keyframes()
+    for objective, own in zip(objectives, latents, strict=True):
+        found = search_closely(objective, tree)
+        assert objective.errors(found.latents)[0, 0] <= objective.errors(own[None])[0, 0]
+
+
+def test_a_model_that_keeps_more_finds_it_within_millimetres_and_refined_within_one():
+    objectives, tree, wanted, _ = own_keyframes(spatial_share=0.999)
+    searched, refined = [], []
+    for objective, constraints in zip(objectives, wanted, strict=True):
+        found = search_closely(objective, tree).latents
+        problem = SeveralSteps.of([Step(objective.primitive, constraints, standard_joints())])
+        searched.append(objective.errors(found)[0, 0])
+        refined.append(objective.errors(refine(problem, found[0], RefineOptions(0.01)).latents[None])[0, 0])
+    assert np.median(searched) < 1e-3
+    assert max(searched) < 5e-3
+    assert max(refined) < 1e-3
