@@ -57,6 +57,18 @@ def test_copies_of_one_clip_give_that_clip(copies):
     assert [warning.code for warning in trained.warnings] == ["no-variation"]
 
 
+@pytest.mark.parametrize("copies", [1, 5])
+def test_copies_of_what_a_cubic_spline_can_hold_come_back_to_the_last_digits(copies):
+    turned = np.random.default_rng(1).standard_normal((4, 4))
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    t = np.linspace(0.0, 1.0, 30)
+    poses = np.concatenate((np.stack((t, t**2, t**3), axis=1), np.tile(turned.ravel(), (30, 1))), axis=1)
+    times = np.repeat(warps(1, 30), copies, axis=0)
+    primitive = train_primitive(aligned_set(chain(), np.stack([poses] * copies), times), QUICK).primitive
+    for drawn in primitive.poses(primitive.sample(3, 1)):
+        np.testing.assert_allclose(drawn, poses, rtol=0, atol=1e-9)
+
+
 def test_every_sampled_quaternion_has_unit_length():
     primitive = train_primitive(walks(), QUICK).primitive
     poses = primitive.poses(primitive.sample(50, 2))
