@@ -101,7 +101,7 @@ def axis_directions(clip, joint, axis):
     return quaternions.rotate_vectors(rotations[:, joint], axis)
 
 
-def assert_bones_point_alike(source, target, result, plan, tolerance_deg=0.1):
+def assert_bones_point_alike(source, target, result, plan, tolerance_deg=1e-3):
     for start, end in LIMBS:
         expected = bone_directions(source.clip, source.joint(start), source.joint(end))
         found = bone_directions(result, target.joint(start), target.joint(end))
@@ -131,6 +131,41 @@ def assert_no_flips_of_its_own(source, result, plan):
         )
         assert np.abs(turns - turned).max() < 0.1, pair
     assert np.sum(result.rotations[1:] * result.rotations[:-1], axis=-1).min() >= 0.0
+
+
+def assert_changes_nothing(plan):
+    assert np.abs(plan.corrections - quaternions.identity(len(plan.corrections))).max() < 1e-12
+    assert plan.scale == pytest.approx(1.0, rel=0, abs=1e-12)
+
+
+def assert_pelvis_travels(source, target, clip, result, plan):
+    """As far as the source's, times the scale."""
+    expected = plan.scale * kinematics.global_positions(clip)[:, source.joint("pelvis")].astype(np.float64)
+    found = kinematics.global_positions(result)[:, target.joint("pelvis")].astype(np.float64)
+    assert np.abs(found - expected).max() < 1e-6
+
+
+def assert_same_motion(result, expected):
+    angles = quaternions.angle_between(result.rotations.astype(float), expected.rotations.astype(float))
+    assert angles.max() < 1e-6
+    assert np.abs(result.root_translations - expected.root_translations).max() < 1e-6
+
+
+def after_rest_pose(clip):
+    """The clip with the rest pose as a frame before it."""
+    return Clip(
+        clip.skeleton, clip.frame_rate_hz, np.concatenate((resting(clip.skeleton).poses, clip.poses), dtype=np.float32)
+    )
+
+
+def with_lowered_arms(skeleton, angle_deg):
+    """The skeleton with both arms lowered at rest, from reaching out sideways."""
+    rest = skeleton.rest_rotations.copy()
+    for name, sign in (("LeftArm", -1.0), ("RightArm", 1.0)):
+        arm = skeleton.index_of(name)
+        lowering = quaternions.from_axis_angle((0.0, 0.0, 1.0), sign * np.radians(angle_deg))
+        rest[arm] = quaternions.multiply(lowering, rest[arm])
+    return replace(skeleton, rest_rotations=rest)
 
 
 def algorithm_1(source, target, plan, frame):
@@ -171,14 +206,14 @@ def test_the_precomputed_corrections_equal_algorithm_1_done_pose_by_pose(studio,
 
 def test_the_same_skeleton_gives_the_same_motion(studio, game):
     for actor, clip in ((studio, studio.clip), (game, tumbling(game.skeleton))):
-        result = retarget(clip, plan_between(actor, actor))
+        plan = plan_between(actor, actor)
+        assert_changes_nothing(plan)
+        result = retarget(clip, plan)
 
         angles = quaternions.angle_between(result.rotations.astype(float), clip.rotations.astype(float))
         assert angles.max() < 1e-6
         assert np.sum(result.rotations[0] * clip.rotations[0], axis=-1).min() > 0.0
-        pelvis = actor.joint("pelvis")
-        moved = kinematics.global_positions(result)[:, pelvis] - kinematics.global_positions(clip)[:, pelvis]
-        assert np.abs(moved).max() < 1e-5
+        assert_pelvis_travels(actor, actor, clip, result, plan)
 
 
 def test_every_joint_of_a_copy_is_carried_along_mapped_or_not(game):
@@ -196,7 +231,7 @@ def test_bones_point_where_the_source_points_them_on_another_rig(studio, game):
     plan = plan_between(studio, game)
     result = retarget(studio.clip, plan)
 
-    assert_bones_point_alike(studio, game, result, plan, tolerance_deg=0.01)
+    assert_bones_point_alike(studio, game, result, plan)
     assert_no_flips_of_its_own(studio, result, plan)
     assert result.skeleton is game.skeleton
     assert result.frame_rate_hz == studio.clip.frame_rate_hz
@@ -257,9 +292,24 @@ def test_each_frame_depends_on_itself_alone_and_no_frame_is_a_reference_pose(stu
     whole = retarget(studio.clip, plan)
     part = retarget(studio.clip.sliced(70, 120), plan)
 
-    angles = quaternions.angle_between(whole.rotations[70:120].astype(float), part.rotations.astype(float))
-    assert angles.max() < 1e-6
-    assert np.abs(whole.root_translations[70:120] - part.root_translations).max() < 1e-6
+    assert_same_motion(part, whole.sliced(70, 120))
+
+
+def test_a_rest_pose_before_the_clip_changes_no_frame_after_it(studio, game):
+    longer = Actor(after_rest_pose(studio.clip))
+    assert_same_motion(
+        retarget(longer.clip, plan_between(longer, game)).sliced(1, longer.clip.frame_count),
+        retarget(studio.clip, plan_between(studio, game)),
+    )
+
+
+@pytest.mark.parametrize("angle_deg", [20.0, 45.0, 70.0])
+def test_a_rest_pose_with_lower_arms_moves_another_body_alike(studio, game, angle_deg):
+    lowered = Actor(replace(studio.clip, skeleton=with_lowered_arms(studio.skeleton, angle_deg)))
+    expected, found = (retarget(actor.clip, plan_between(actor, game)) for actor in (studio, lowered))
+
+    turns = [kinematics.global_rotations(clip).astype(np.float64) for clip in (expected, found)]
+    assert np.degrees(quaternions.angle_between(*turns).max()) < 1.5
 
 
 def test_signs_stay_continuous_when_the_source_flips_its_own(studio, game):
@@ -380,10 +430,22 @@ def test_skeletons_of_one_joint_are_refused(studio):
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_real_motion_on_its_own_skeleton_stays_as_it_is(real, folder):
     actor = real[folder]
-    result = retarget(actor.clip, plan_between(actor, actor))
+    plan = plan_between(actor, actor)
+    assert_changes_nothing(plan)
+    result = retarget(actor.clip, plan)
 
     angles = quaternions.angle_between(result.rotations.astype(float), actor.clip.rotations.astype(float))
     assert angles.max() < 1e-6
+    assert_pelvis_travels(actor, actor, actor.clip, result, plan)
+
+
+@pytest.mark.parametrize("folder", ["cmu-amc/16", "snu-mss"])
+def test_a_rest_pose_that_stands_changes_no_frame_of_a_real_clip_after_it(real, game, folder):
+    longer = Actor(after_rest_pose(real[folder].clip))
+    assert_same_motion(
+        retarget(longer.clip, plan_between(longer, game)).sliced(1, longer.clip.frame_count),
+        retarget(real[folder].clip, plan_between(real[folder], game)),
+    )
 
 
 @pytest.mark.parametrize(("from_folder", "to_folder"), list(permutations(FOLDERS, 2)))
@@ -396,6 +458,7 @@ def test_real_motion_points_all_bones_alike_on_another_rig(real, from_folder, to
     assert np.isfinite(result.poses).all()
     assert_bones_point_alike(source, target, result, plan)
     assert_no_flips_of_its_own(source, result, plan)
+    assert_pelvis_travels(source, target, source.clip, result, plan)
 
 
 @pytest.mark.parametrize(("from_folder", "to_folder"), list(permutations(FOLDERS, 2)))
