@@ -85,6 +85,12 @@ def test_the_number_of_kinds_is_found():
     assert best.components == 2
 
 
+@pytest.mark.parametrize(("examples", "dimensions", "most"), [(40, 4, 5), (47, 4, 5), (48, 4, 6), (11, 6, 1)])
+def test_components_are_tried_as_long_as_each_has_two_examples_for_every_dimension(examples, dimensions, most):
+    fitted = fit_mixture(np.random.default_rng(7).standard_normal((examples, dimensions)))
+    assert [one.components for one in fitted.candidates] == list(range(1, most + 1))
+
+
 def test_one_kind_in_many_dimensions_is_one_component():
     """The published choice, by Akaike's criterion up to 40 components, finds 24 in such data."""
     one_kind = np.random.default_rng(2).standard_normal((89, 12)) * np.linspace(3.0, 0.3, 12)
