@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from alignment_examples import body_of, moved, played, sine_warp, walk, warped_walks
+from marey_motion.alignment import aligning
 from marey_motion.alignment.aligning import (
     MIRRORED,
     AlignOptions,
@@ -112,6 +113,19 @@ def test_the_medoid_is_nearer_to_the_others_than_an_outlier():
     strange = generate_gait(2.4, -1.0, 1.0)
     aligned = align_clips([SourceExample("a@1", "a", strange), *examples], BODY)
     assert aligned.reference != "a@1"
+
+
+def test_a_reference_that_is_named_is_found_without_comparing_pairs(monkeypatch):
+    examples, _ = warped_walks(4)
+
+    def compare(*_arguments, **_options):
+        raise AssertionError("pairs were compared")
+
+    monkeypatch.setattr(aligning, "pairwise_totals", compare)
+    with pytest.raises(AssertionError, match="pairs were compared"):
+        align_clips(examples, BODY)
+    for one in examples:
+        assert align_clips(examples, BODY, AlignOptions(reference=one.uid)).reference == one.uid
 
 
 def test_cuts_are_matched_exactly_and_become_keyframes():
