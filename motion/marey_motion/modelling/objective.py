@@ -198,7 +198,7 @@ def _row(
 
     match constraint:
         case KeyframeTime():
-            _require_possible(primitive, constraint)
+            _require_possible(primitive, constraint, frame)
             return _Row(kernels.TIME, moments.setdefault(frame, len(moments)), (constraint.seconds,))
         case RootHeading():
             return _Row(kernels.HEADING, place(facing(frame, standard_joints)), (constraint.heading_rad,))
@@ -220,10 +220,13 @@ def _row(
             return _Row(kernels.POINT, joint, point, _unit(constraint.axis))
 
 
-def _require_possible(primitive: MotionPrimitive, constraint: KeyframeTime) -> None:
-    """Raise `ConstraintError` for a time that no motion of the primitive reaches."""
-    if primitive.duration_range_s is not None and constraint.seconds > primitive.duration_range_s[1]:
-        least, most = primitive.duration_range_s
+def _require_possible(primitive: MotionPrimitive, constraint: KeyframeTime, frame: float) -> None:
+    """Raise `ConstraintError` for a time that no motion of the primitive reaches, at a canonical frame."""
+    if primitive.duration_range_s is None:
+        return
+    least, most = primitive.duration_range_s
+    ends = frame == primitive.frame_count - 1
+    if constraint.seconds > most or (ends and constraint.seconds < least):
         raise ConstraintError(f"motions of {primitive.name} last {least:.2f} to {most:.2f} s", where="seconds")
 
 

@@ -89,19 +89,26 @@ def _items(chains, placement, positions, rotations, points, turns):  # type: ign
 
 @_compiled
 def _times(clocks, latent, first, log_steps, times):  # type: ignore[no-untyped-def]
-    """Seconds since the beginning at each clock; the steps that they add up stay in `log_steps`."""
+    """Seconds since the beginning at each clock; the steps that they add up stay in `log_steps`.
+
+    Returns what the times were multiplied by to keep the whole motion within its range, and its seconds without that.
+    """
     log_steps[:] = clocks.mean
     for component in range(clocks.directions.shape[0]):
         score = latent[first + component]
         for step in range(log_steps.shape[0]):
             log_steps[step] += score * clocks.directions[component, step]
+    lasting = 0.0
     for step in range(log_steps.shape[0]):
-        log_steps[step] = math.exp(log_steps[step])
+        log_steps[step] = math.exp(min(max(log_steps[step], -clocks.most_log_slope), clocks.most_log_slope))
+        lasting += log_steps[step] * clocks.frame_s
+    factor = min(max(lasting, clocks.range_s[0]), clocks.range_s[1]) / lasting
     for clock in range(times.shape[0]):
         total = 0.0
         for step in range(log_steps.shape[0]):
             total += clocks.weights[clock, step] * log_steps[step]
-        times[clock] = total
+        times[clock] = factor * total
+    return factor, lasting
 
 
 @_compiled

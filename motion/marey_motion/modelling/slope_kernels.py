@@ -107,14 +107,20 @@ def _add_turned(cos, sin, sign, slopes, first, out):  # type: ignore[no-untyped-
 def keep_time(clocks, latent, first, times, slopes):  # type: ignore[no-untyped-def]
     """Fill seconds (n,) at the clocks and their derivatives (n, W); the temporal numbers begin at `first`."""
     steps = np.empty(clocks.mean.shape[0])
-    _times(clocks, latent, first, steps, times)
+    factor, lasting = _times(clocks, latent, first, steps, times)
     slopes[:] = 0.0
-    for clock in range(times.shape[0]):
-        for number in range(clocks.directions.shape[0]):
+    for number in range(clocks.directions.shape[0]):
+        longer = 0.0
+        for step in range(steps.shape[0]):
+            longer += clocks.frame_s * steps[step] * clocks.directions[number, step]
+        for clock in range(times.shape[0]):
             total = 0.0
             for step in range(steps.shape[0]):
                 total += clocks.weights[clock, step] * steps[step] * clocks.directions[number, step]
-            slopes[clock, first + number] = total
+            if factor == 1.0:
+                slopes[clock, first + number] = total
+            else:  # the whole lasts as long as it may, whatever its steps
+                slopes[clock, first + number] = factor * total - times[clock] * longer / lasting
 
 
 @_compiled

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MappingError
-from marey_motion.modelling.primitive import MotionPrimitive
+from marey_motion.modelling.primitive import MOST_LOG_SLOPE, MotionPrimitive
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -70,11 +70,18 @@ class Clocks(NamedTuple):
     ----------
     mean, directions : (N - 1,), (k, N - 1) logarithms of steps, and what one unit of each temporal number adds to them
     weights : (n, N - 1) seconds that one frame of each step counts for each moment
+    frame_s : seconds of one frame
+    range_s : (2,) how long motions last, at least and at most; what would last longer or shorter is played faster or
+        slower as a whole
+    most_log_slope : logarithms of steps are cut off beyond plus and minus this
     """
 
     mean: Floats
     directions: Floats
     weights: Floats
+    frame_s: float
+    range_s: Floats
+    most_log_slope: float
 
 
 def standing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
@@ -133,6 +140,9 @@ def track_times(primitive: MotionPrimitive, moments: Sequence[float]) -> Clocks:
         mean=temporal.basis.at_frames @ temporal.mean[:, 0],
         directions=np.ascontiguousarray(directions / primitive.temporal_weight),
         weights=np.ascontiguousarray(passed / primitive.frame_rate_hz).reshape(len(moments), len(steps)),
+        frame_s=1.0 / primitive.frame_rate_hz,
+        range_s=np.array(primitive.duration_range_s or (0.0, np.inf)),
+        most_log_slope=MOST_LOG_SLOPE,
     )
 
 

@@ -1,5 +1,7 @@
 """Constraints and Equation 1, against forward kinematics of whole motions and formulas written out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -97,6 +99,30 @@ def test_errors_are_those_of_the_whole_motions():
         )
 
 
+def kept_within(count):
+    """A primitive whose motions last 0.9 to 1.1 s, and latent vectors of which many would last longer or shorter."""
+    free, _ = walking()
+    latents = free.sample(count, 1)
+    lasting = free.durations_s(latents)
+    assert (lasting < 0.9).sum() > 3
+    assert (lasting > 1.1).sum() > 3
+    assert ((lasting > 0.9) & (lasting < 1.1)).sum() > 3
+    return replace(free, duration_range_s=(0.9, 1.1)), latents
+
+
+def test_times_are_those_of_motions_that_are_kept_within_their_range():
+    primitive, latents = kept_within(50)
+    wanted = (KeyframeTime(10.5, 0.4), KeyframeTime("end", 1.09), KeyframeTime("end", 0.91))
+    objective = build_objective(primitive, wanted, standard_joints())
+    for column, constraint in zip(objective.errors(latents).T, wanted, strict=True):
+        np.testing.assert_allclose(
+            column, plain_error(primitive, standard_joints(), latents, constraint), atol=1e-9, err_msg=str(constraint)
+        )
+    for seconds in (0.85, 1.15):
+        with pytest.raises(ConstraintError, match=r"0\.90 to 1\.10 s"):
+            build_objective(primitive, [KeyframeTime("end", seconds)], standard_joints())
+
+
 def test_the_objective_is_the_sum_of_weighted_errors_in_their_tolerances():
     primitive, _ = walking()
     latents = primitive.sample(20, 2)
@@ -147,6 +173,13 @@ def test_derivatives_are_those_of_finite_differences(constraint):
     primitive, _ = walking()
     problem = SeveralSteps.of([Step(primitive, (constraint,), standard_joints())], PLACEMENT)
     for latent in primitive.sample(5, 6):
+        assert_derivatives(problem, latent)
+
+
+def test_derivatives_of_times_are_those_of_finite_differences_where_the_whole_lasts_as_long_as_it_may():
+    primitive, latents = kept_within(50)
+    problem = SeveralSteps.of([Step(primitive, (KeyframeTime(10.5, 0.4),), standard_joints())], PLACEMENT)
+    for latent in latents:
         assert_derivatives(problem, latent)
 
 
