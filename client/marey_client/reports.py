@@ -50,7 +50,7 @@ class ReportedHandle(ItemHandle):
         for form in ("png", "svg", "json"):
             yield f"{name}.{form}", self.figure(figure.name, form, trial=figure.trial)
         for table in figure.csv:
-            yield f"{name} {table}.csv", self.figure(figure.name, "csv", trial=figure.trial, table=table)
+            yield f"{name}-{table}.csv", self.figure(figure.name, "csv", trial=figure.trial, table=table)
 
     def _fetch(self, path: str, accept: str, params: Mapping[str, str | None] | None = None) -> bytes:
         given = {name: value for name, value in (params or {}).items() if value is not None}
