@@ -11,10 +11,11 @@ import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from sqlalchemy import Row, and_, insert, or_, select, update
+from sqlalchemy import and_, delete, insert, or_, select, update
 
 from marey_schemas.canonical import canonical_json
 from marey_schemas.job_kinds import KindDeclaration
+from marey_server.errors import MareyError
 from marey_server.store import blobs, staging
 from marey_server.store.fencing import QUEUED, RUNNING, WAITING
 from marey_server.store.job_ends import Ended, end_jobs
@@ -157,7 +158,7 @@ def join(tx: Transaction, joining: Sequence[tuple[Any, Source]]) -> list[Ended]:
 
 def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
     """Give waiting jobs (`id`) the results of the finished jobs in their `cached_from`; what is too much at once waits
-    for the leader. A job whose result is no longer stored is queued instead.
+    for the leader. A job whose result is no longer stored, or cannot be published for it, is queued instead.
     """
     ended: list[Ended] = []
     for row in rows[:SHARED_AT_ONCE]:
@@ -182,9 +183,26 @@ def share_waiting(tx: Transaction) -> list[Ended]:
 
 
 def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
+    """Give one job the result it waits for. Where that cannot be its own, it is computed after all: what only this job
+    is refused must stop neither the one that brings the result nor others that wait for it.
+    """
+    try:
+        with tx.connection.begin_nested():
+            ended = _publish_anew(tx, job_id)
+    except MareyError:
+        ended = []
+    if not ended:
+        _compute_again(tx, job_id)
+    return ended
+
+
+def _publish_anew(tx: Transaction, job_id: str) -> list[Ended]:
+    """Publish the result that a job waits for as its own; nothing if it is no longer stored. Raises what `publish`
+    raises.
+    """
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")
-    own = (job.c.id, job.c.project_id, job.c.kind, job.c.into_path, job.c.author_id, job.c.message, job.c.inputs)
+    own = (job.c.id, job.c.project_id, job.c.into_path, job.c.author_id, job.c.message, job.c.inputs)
     shared = (
         source.c.inputs.label("source_inputs"),
         source.c.fence,
@@ -199,11 +217,11 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     ).one()
     place = (row.source_id, row.fence)
     drafts = staging.staged_drafts(tx, [place]).get(place, {})
+    tx.shared_outputs += len(drafts)
     named = set(staging.named_blobs(row.result))
     if not staging.take_up_documents(tx, drafts) or named - blobs.hold(tx, named):
-        return _compute_again(tx, row)
+        return []
     outputs = staging.publish_drafts(tx, row, staging.with_inputs(drafts, row.source_inputs, row.inputs))
-    tx.shared_outputs += len(outputs)
     blobs.keep_for_job(tx, row.id, named)
     return end_jobs(
         tx,
@@ -217,11 +235,14 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     )
 
 
-def _compute_again(tx: Transaction, row: Row[Any]) -> list[Ended]:
+def _compute_again(tx: Transaction, job_id: str) -> None:
+    """Queue a job that waited to share a result. It does not come after the job that has it: it never needed that."""
+    row = tx.execute(select(job.c.kind, job.c.cached_from).where(job.c.id == job_id)).one()
+    waited = and_(job_dependency.c.job_id == job_id, job_dependency.c.on_job_id == row.cached_from)
+    tx.execute(delete(job_dependency).where(waited))
     tx.execute(
         update(job)
-        .where(job.c.id == row.id, job.c.state == WAITING)
+        .where(job.c.id == job_id, job.c.state == WAITING)
         .values(state="queued", cached_from=None, dependencies_left=0, rev=job.c.rev + 1)
     )
     wake_workers(tx, [row.kind])
-    return []

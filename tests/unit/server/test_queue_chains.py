@@ -14,6 +14,7 @@ from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import Conflict, Forbidden, Invalid, LeaseLost, NotFound
 from marey_server.store import blobs, garbage, items, jobs, members, retrying, users
 from marey_server.store.items.drafts import Draft
+from marey_server.store.job_cache import SHARED_AT_ONCE
 from marey_server.store.reaper import share_waiting
 from marey_server.store.tables import staged_output
 from marey_server.store.transaction import Transaction
@@ -624,6 +625,43 @@ def test_more_shared_results_than_fit_one_transaction_are_served_bit_by_bit(desk
     while desk.database.write(SYSTEM, share_waiting):
         pass
     assert {desk.state(job) for job in joined} == {"succeeded"}
+
+
+LONG_PATH = "/".join(["long" * 50] * 5)
+"""Where a collection of 20 letters and more finds no place any more."""
+
+
+def test_a_job_that_cannot_have_a_shared_result_stops_neither_its_source_nor_others(desk: Desk) -> None:
+    first = desk.submit("sum")
+    misplaced, other = desk.submit("sum", into=LONG_PATH), desk.submit("sum", into="other")
+    assert (desk.state(misplaced), desk.state(other)) == ("waiting", "waiting")
+    lease = desk.claim()
+    desk.stage(lease, "total", collection="deep" * 5)
+    desk.complete(lease)
+    assert (desk.state(first), desk.state(other)) == ("succeeded", "succeeded")
+    assert [one.name for one in desk.outputs(other)] == ["total"]
+    assert desk.job(misplaced).model_dump(include={"state", "cached_from", "after"}) == {
+        "state": "queued",
+        "cached_from": None,
+        "after": (),
+    }
+    lease = desk.claim()
+    assert lease.job == misplaced
+    desk.stage(lease, "total")  # by itself it may do better, or fail
+    desk.complete(lease)
+    assert desk.state(misplaced) == "succeeded"
+
+
+def test_a_job_that_cannot_have_a_result_that_is_there_is_computed_and_those_behind_it_get_theirs(desk: Desk) -> None:
+    desk.submit("sum")
+    lease = desk.claim()
+    desk.stage(lease, "total", collection="deep" * 5)
+    desk.complete(lease)
+    places = [*(f"place{n}" for n in range(SHARED_AT_ONCE)), LONG_PATH, "last"]
+    jobs = desk.submit_many(*(JobCreate(kind="sum", into=place) for place in places))
+    assert [desk.state(job) for job in jobs[-3:]] == ["succeeded", "waiting", "waiting"]
+    assert desk.database.write(SYSTEM, share_waiting) == 1
+    assert [desk.state(job) for job in jobs[-3:]] == ["succeeded", "queued", "succeeded"]
 
 
 def test_tasks_find_the_results_of_earlier_tasks(desk: Desk) -> None:
