@@ -1,7 +1,7 @@
 """What the server does by itself: takes back overdue leases, serves waiting results, collects garbage.
 
 One process at a time leads; what it does is safe beside others all the same, since every step repeats its conditions
-in the statement that takes it.
+in the statement that takes it. Each chore is a task of its own, so that one that fails keeps no other from being done.
 """
 
 from __future__ import annotations
@@ -11,11 +11,10 @@ import logging
 import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import MareyError
+from marey_server.errors import MareyError, Unavailable
 from marey_server.services import Services
 from marey_server.store import leader, reaper
 from marey_server.store.garbage import collect_garbage
@@ -24,6 +23,8 @@ from marey_server.store.transaction import Transaction
 
 P = ParamSpec("P")
 T = TypeVar("T")
+Chore = Callable[[Services, str], Awaitable[None]]
+"""Gets the services and the name under which this process leads."""
 
 log = logging.getLogger(__name__)
 
@@ -39,8 +40,8 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
     holder = secrets.token_hex(8)
     tick_s = min(LONGEST_TICK_S, services.queue_policy.lease_ttl_s / 4)
     tasks = [
-        asyncio.create_task(_repeat(services, tick_s, partial(_tend_queue, services, holder))),
-        asyncio.create_task(_repeat(services, GARBAGE_EVERY_S, partial(_collect_garbage, services, holder))),
+        asyncio.create_task(_repeat(services, holder, every_s, chore))
+        for every_s, chore in ((tick_s, _reap), (tick_s, _share_results), (GARBAGE_EVERY_S, _collect_garbage))
     ]
     try:
         yield
@@ -51,34 +52,35 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
         await _write(services, leader.give_up_lead, LEAD, holder)
 
 
-async def _repeat(services: Services, every_s: float, action: Callable[[], Awaitable[None]]) -> None:
-    """Do it now and then. A failure is told and is no reason to stop; a database that was away gets its grace."""
+async def _repeat(services: Services, holder: str, every_s: float, chore: Chore) -> None:
+    """Do a chore now and then. A failure is told and is no reason to stop."""
     while True:
         await asyncio.sleep(every_s)
         try:
-            await action()
+            await chore(services, holder)
         except MareyError as error:
-            services.start_grace.restart()
             log.warning("housekeeping was interrupted: %s", error.detail)
         except Exception:
             log.exception("housekeeping failed")
 
 
-async def _tend_queue(services: Services, holder: str) -> None:
-    leads, may_reap = await _write(services, _look_round, holder, services.start_grace)
-    if leads and may_reap:
-        await _reap(services)
-    while leads and await _write(services, reaper.share_waiting) > 0:
-        pass
+async def _reap(services: Services, holder: str) -> None:
+    """Take back every overdue lease, page by page; not before workers have had time to renew them."""
+    try:
+        leads, may_reap = await _write(services, _look_round, holder, services.start_grace)
+        if leads and may_reap:
+            await _reap_pages(services)
+    except Unavailable:
+        services.start_grace.restart()
+        raise
 
 
 def _look_round(tx: Transaction, holder: str, grace: StartGrace) -> tuple[bool, bool]:
     """Whether this process leads, and whether workers have had time to renew their leases."""
-    return leader.take_lead(tx, LEAD, holder, LEAD_TTL_US) is not None, grace.over(tx.now_us)
+    return _leads(tx, holder), grace.over(tx.now_us)
 
 
-async def _reap(services: Services) -> None:
-    """Take back every overdue lease, page by page."""
+async def _reap_pages(services: Services) -> None:
     if await _write(services, reaper.correct_times, services.queue_policy):
         log.warning("the database's clock was set back; times of leases were corrected")
     page = await _write(services, reaper.reap_page, services.queue_policy)
@@ -90,8 +92,20 @@ async def _reap(services: Services) -> None:
         log.warning("took %d jobs back from workers that are not heard of any more", taken)
 
 
+async def _share_results(services: Services, holder: str) -> None:
+    """Serve the jobs that wait for a result that is there."""
+    if await _write(services, _leads, holder):
+        while await _write(services, reaper.share_waiting) > 0:
+            pass
+
+
+def _leads(tx: Transaction, holder: str) -> bool:
+    """Whether this process leads."""
+    return leader.take_lead(tx, LEAD, holder, LEAD_TTL_US) is not None
+
+
 async def _collect_garbage(services: Services, holder: str) -> None:
-    if await _write(services, leader.take_lead, LEAD, holder, LEAD_TTL_US) is not None:
+    if await _write(services, _leads, holder):
         collected = await asyncio.wrap_future(services.submit(collect_garbage, services.database))
         log.info("collected garbage: %s", collected)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -15,8 +16,10 @@ import pytest
 from database_fixtures import AdjustableClock
 from marey_schemas import codecs
 from marey_server.access.principal import SYSTEM
+from marey_server.errors import Invalid
 from marey_server.store import reaper
 from marey_server.store.database import Database
+from marey_server.store.transaction import Transaction
 from rest_server import Server, running
 
 BLOCKS = "application/msgpack; arrays=blocks"
@@ -229,6 +232,26 @@ def test_the_kinds_of_job_are_told_to_anybody(server: Server) -> None:
     assert {"import", "retarget", "export"} <= {kind["name"] for kind in kinds}
     assert ok(anybody.get("/job-kinds/retarget"))["inputs"]["clips"]["kind"] == "clip"
     assert anybody.get("/job-kinds/levitate").status_code == 404
+
+
+def test_jobs_of_lost_workers_are_taken_back_whatever_becomes_of_the_other_chores(
+    database: Database, tmp_path: Path, test_kinds: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried = threading.Event()
+
+    def share_nothing(tx: Transaction) -> int:
+        tried.set()
+        raise Invalid("This result is not to be had.")
+
+    monkeypatch.setattr(reaper, "share_waiting", share_nothing)
+    with running(database, tmp_path, lease_ttl_s=1, heartbeat_s=0.3) as server:
+        owner = server.client(server.make_project())
+        worker = server.client(server.make_user("wanda", administrator=True, scopes=("work",)))
+        job = submit(owner)
+        claim(worker)
+        assert tried.wait(5)
+        (again,) = claim(worker, wait_s=5)
+        assert again["job"] == job["id"]
 
 
 def test_the_server_takes_back_jobs_of_lost_workers_by_itself(
