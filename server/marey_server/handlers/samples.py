@@ -91,8 +91,8 @@ class SampleFiles(ModelUser):
 
 
 def _state(found: FoundModel, query: SampleQuery) -> str:
-    """What names these samples: the model by its content, how many, and the seed."""
-    return f"{found.part.digest.removeprefix('sha256:')[:32]}.{query.n}.{query.seed}"
+    """What names these samples: the model by its content and by its revision, which is told, how many, and the seed."""
+    return f"{found.part.digest.removeprefix('sha256:')[:32]}.{found.part.revision}.{query.n}.{query.seed}"
 
 
 def _caching(query: SampleQuery) -> dict[str, str]:

@@ -1,0 +1,40 @@
+"""Samples of models over HTTP: a client that holds them is told when they are of another revision."""
+
+import hashlib
+
+import httpx
+
+from marey_motion.documents import skeleton_to_document
+from marey_motion.modelling.primitive_documents import primitive_to_tree
+from marey_schemas import codecs
+from search_primitives import walking
+
+
+def created(owner: httpx.Client, kind: str, name: str, **parts: object) -> dict:
+    body = codecs.encode_tree({"name": name, "parts": parts}, codecs.MSGPACK)
+    headers = {"Content-Type": codecs.MSGPACK, "Accept": "application/json"}
+    made = owner.post(f"/projects/lab/{kind}", content=body, headers=headers)
+    assert made.status_code == 201, made.text
+    return made.json()
+
+
+def test_samples_change_their_tag_with_the_revision_they_name(owner: httpx.Client) -> None:
+    primitive, _ = walking()
+    rig = created(
+        owner, "skeletons", "rig", hierarchy=skeleton_to_document(primitive.skeleton).model_dump(by_alias=True)
+    )
+    model = created(owner, "models", "walk", model=primitive_to_tree(primitive, {"item": rig["id"], "revision": 1}))
+    place = f"/projects/lab/models/{model['id']}"
+    first = owner.get(f"{place}/samples")
+    held = {"If-None-Match": first.headers["ETag"]}
+    assert owner.get(f"{place}/samples", headers=held).status_code == 304
+
+    page = b"<!doctype html><title>Walk</title>"
+    digest = f"sha256:{hashlib.sha256(page).hexdigest()}"
+    assert owner.put(f"/blobs/{digest}", content=page).is_success
+    report = {"schema": "marey/model-report@1", "title": "walk", "html": {"blob": digest, "size_bytes": len(page)}}
+    revised = owner.put(f"{place}/parts/report", json=report, headers={"If-Match": "*"})
+    assert revised.is_success, revised.text
+    second = owner.get(f"{place}/samples", headers=held)
+    assert (second.status_code, second.json()["model"]["revision"]) == (200, 2)
+    assert second.json()["motions"] == first.json()["motions"]
