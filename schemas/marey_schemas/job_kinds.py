@@ -15,13 +15,13 @@ from typing import Any, Literal
 from marey_schemas.alignment import AlignParams
 from marey_schemas.annotations import AnnotateParams, CutParams
 from marey_schemas.base import Request
-from marey_schemas.editing import EditParams
+from marey_schemas.editing import EditParams, edit_place_fault
 from marey_schemas.evaluation import EvaluateParams, count_evaluation_tasks
 from marey_schemas.improvement import CompareParams, OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
 from marey_schemas.jobs import ExportParams, ImportParams, InputSpec, JobKind, RetargetParams
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.modelling import ModelParams
-from marey_schemas.sample_trees import TreeParams
+from marey_schemas.sample_trees import TreeParams, tree_place_fault
 
 ENTRY_POINT_GROUP = "marey.job_kinds"
 MOST_TASKS = 1000
@@ -40,6 +40,9 @@ class KindDeclaration:
     all inputs and learns from `context.task` which it is. When all have succeeded, a worker runs `gathering`, a
     function `gather(context, params, results)`, over what they returned, in their order. Where `task_count` says one,
     a single job runs both functions.
+
+    `place_fault` says, of the checked parameters and `into`, why the results cannot go to that collection, or nothing
+    where they can. Where they keep the places of an input's items below `into`, `keeps_places_of` names that input.
     """
 
     name: str
@@ -53,11 +56,15 @@ class KindDeclaration:
     batch_size: int = 1
     task_count: Callable[[Any], int] | None = None
     gathering: str | None = None
+    place_fault: Callable[[Any, str], str | None] | None = None
+    keeps_places_of: str | None = None
     deterministic: bool = True
 
     def __post_init__(self) -> None:
         if self.fan_out is not None and not (self.fan_out in self.inputs and self.inputs[self.fan_out].many):
             raise ValueError(f"{self.name}: fan_out {self.fan_out!r} must be an input that takes many items")
+        if self.keeps_places_of is not None and self.keeps_places_of not in self.inputs:
+            raise ValueError(f"{self.name}: keeps_places_of {self.keeps_places_of!r} must be an input")
         for name, spec in self.inputs.items():
             if unknown := set(spec.parts) - PARTS[spec.kind].keys():
                 raise ValueError(f"{self.name}: input {name!r}: a {spec.kind} has no part {sorted(unknown)[0]!r}")
@@ -121,6 +128,7 @@ RETARGET = KindDeclaration(
     outputs={"clips": Kind.CLIP},
     fan_out="clips",
     batch_size=16,
+    keeps_places_of="clips",
 )
 
 EXPORT = KindDeclaration(
@@ -231,6 +239,8 @@ EDIT = KindDeclaration(
     outputs={"clips": Kind.CLIP},
     fan_out="clips",
     batch_size=16,
+    place_fault=edit_place_fault,
+    keeps_places_of="clips",
 )
 
 ANNOTATE = KindDeclaration(
@@ -251,6 +261,7 @@ ANNOTATE = KindDeclaration(
     outputs={"annotations": Kind.ANNOTATION},
     fan_out="clips",
     batch_size=16,
+    keeps_places_of="clips",
 )
 
 CUT = KindDeclaration(
@@ -271,6 +282,7 @@ CUT = KindDeclaration(
         ),
     },
     outputs={"clips": Kind.CLIP, "annotations": Kind.ANNOTATION},
+    keeps_places_of="clips",
 )
 
 ALIGN = KindDeclaration(
@@ -294,6 +306,7 @@ ALIGN = KindDeclaration(
         ),
     },
     outputs={"processed": Kind.PROCESSED},
+    keeps_places_of="clips",
 )
 
 MODEL = KindDeclaration(
@@ -318,6 +331,7 @@ TREE = KindDeclaration(
         "model": InputSpec(kind=Kind.MODEL, parts=("model",), description="The model, which gets the tree as a part.")
     },
     outputs={"model": Kind.MODEL},
+    place_fault=tree_place_fault,
 )
 
 BUILT_IN = (

@@ -31,6 +31,11 @@ class TreeParams(Request):
     )
 
 
+def tree_place_fault(params: TreeParams, into: str) -> str | None:  # noqa: ARG001 - as every kind's
+    """Why a tree cannot go to the collection `into`."""
+    return f"a tree becomes a part of its model and cannot go to {into}; leave `into` empty" if into else None
+
+
 class SampleTreeDocument(Request):
     """Part `tree` of a model: samples of it, grouped by k-means in k-means.
 

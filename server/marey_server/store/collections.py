@@ -27,7 +27,7 @@ _ALIVE = collection.c.deleted_us.is_(None)
 
 def ensure(tx: Transaction, project_row: ProjectRow, path: str) -> str:
     """Id of the collection at `path`, made with those above it where there is none; it cannot be deleted meanwhile."""
-    _check_length(path)
+    check_length(path)
     found = _lock(tx, project_row.id, path)
     while found is None:
         if path:
@@ -49,7 +49,8 @@ def _lock(tx: Transaction, project_id: str, path: str) -> str | None:
     return found
 
 
-def _check_length(path: str) -> None:
+def check_length(path: str) -> None:
+    """Raise `Invalid` for a path that is too long to be stored."""
     if len(path) > MAX_PATH_LENGTH or len(path.encode()) > MAX_PATH_BYTES:
         raise Invalid(f"A path has at most {MAX_PATH_LENGTH} characters and {MAX_PATH_BYTES} bytes.", code="long-path")
 
@@ -155,7 +156,7 @@ def move_collection(
 def _move_contents(tx: Transaction, project_row: ProjectRow, old: str, new: str) -> None:
     inside = (collection.c.project_id == project_row.id, _ALIVE, at_or_below(old), collection.c.path != old)
     for path in tx.execute(select(collection.c.path).where(*inside)).scalars():
-        _check_length(new + path[len(old) :])
+        check_length(new + path[len(old) :])
     tx.execute(
         update(collection)
         .where(*inside)

@@ -73,7 +73,8 @@ def pin_inputs(
 
     `known` holds what `find_items` found of the request's items.
     Raises `Invalid`, with a pointer below `at` for each thing that is wrong: an input the kind does not have or lacks,
-    an item or revision that is not in the project, an item of another kind, a collection that holds none.
+    nothing for one that is required, an item or revision that is not in the project, an item of another kind, a
+    collection that holds none.
     """
     errors = _misnamed(kind, request, at)
     pins: PinnedInputs = {}
@@ -121,6 +122,8 @@ def _pin_input(
     errors: list[FieldError],
 ) -> list[Pin]:
     single = not isinstance(choices, tuple)
+    if spec.required and not _as_many(choices):
+        errors.append(_error(pointer, "empty-input", f"This input takes at least one {spec.kind.value}; name some."))
     pins: dict[tuple[str, int], Pin] = {}
     made: dict[str, Pin] = {}
     for index, choice in enumerate(_as_many(choices)):

@@ -13,7 +13,7 @@ import pytest
 
 from command_line import CommandLine
 from marey_client import Marey
-from marey_client.errors import JobUnsuccessful, RequestFailed
+from marey_client.errors import Invalid, RequestFailed
 from marey_client.motions import ClipHandle
 from marey_client.project import ProjectHandle
 from marey_motion.clip import Clip
@@ -97,9 +97,9 @@ def test_the_originals_stay_unless_they_are_edited_in_place(marey: Marey, lab: P
 
 
 def test_where_results_should_go_must_be_clear(marey: Marey, lab: ProjectHandle) -> None:
-    with pytest.raises(JobUnsuccessful, match="would take the place of the clips"):
+    with pytest.raises(Invalid, match="would take the place of the clips"):
         ended(marey, lab.edit("walks", [{"command": "mirror"}]))
-    with pytest.raises(JobUnsuccessful, match="cannot both take the place"):
+    with pytest.raises(Invalid, match="cannot both take the place"):
         ended(marey, lab.edit("walks", [{"command": "mirror"}], in_place=True, into="elsewhere"))
     (first, *_) = clips_of(lab, "walks").values()
     ended(marey, lab.edit(first, [{"command": "trim", "start": 10}], in_place=True))

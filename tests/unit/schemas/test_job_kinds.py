@@ -58,6 +58,11 @@ def test_a_kind_that_counts_its_tasks_says_who_gathers_them_and_spreads_no_input
     assert declare(task_count=lambda _params: 2, gathering="tidy:gather").document().gathers
 
 
+def test_a_kind_keeps_the_places_of_an_input_that_it_has() -> None:
+    with pytest.raises(ValueError, match="must be an input"):
+        declare(keeps_places_of="clips")
+
+
 def test_an_unknown_kind_is_refused_with_the_known_ones() -> None:
     with pytest.raises(UnknownKindError, match="retarget"):
         find_kind("levitate")

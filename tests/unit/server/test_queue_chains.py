@@ -104,6 +104,8 @@ def test_a_collection_stands_for_all_items_of_the_kind_in_it_and_below(desk: Des
         ({}, "/inputs", "missing-input"),
         ({"things": {"item": "study_none"}}, "/inputs/things/item", "unknown-item"),
         ({"things": [{"collection": "empty"}]}, "/inputs/things/0/collection", "empty-collection"),
+        ({"things": []}, "/inputs/things", "empty-input"),
+        ({"things": [], "ruler": []}, "/inputs/things", "empty-input"),
         ({"things": {"collection": "raw"}, "others": {"collection": "raw"}}, "/inputs/others", "unknown-input"),
         ({"things": {"collection": "raw"}, "ruler": {"collection": "raw"}}, "/inputs/ruler", "one-item"),
     ],
@@ -115,6 +117,35 @@ def test_inputs_that_make_no_sense_are_refused_with_their_place(
     with pytest.raises(Invalid) as refused:
         desk.submit("square", inputs=inputs)
     assert [(error.pointer, error.code) for error in refused.value.errors] == [(pointer, code)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields"),
+    [
+        ("tree", {"inputs": {"model": {}}, "into": "elsewhere"}),
+        ("edit", {"inputs": {"clips": {}}, "params": {"in_place": True}, "into": "elsewhere"}),
+        ("edit", {"inputs": {"clips": {}}}),
+    ],
+)
+def test_a_job_whose_results_have_no_clear_place_is_refused(desk: Desk, kind: str, fields: dict[str, Any]) -> None:
+    maker = desk.submit()
+    fields["inputs"] = {name: {"job": maker} for name in fields["inputs"]}
+    with pytest.raises(Invalid) as refused:
+        desk.submit(kind, **fields)
+    assert [(error.pointer, error.code) for error in refused.value.errors] == [("/into", "ambiguous-place")]
+
+
+def test_results_that_would_lie_too_deep_are_refused_before_they_are_made(desk: Desk) -> None:
+    desk.things(1, "raw/deep")
+    inputs = {"things": {"collection": "raw"}}
+    deepest = "/".join(["d" * 202] * 5)  # ten characters remain
+    desk.submit("square", inputs=inputs, into=deepest)
+    many_bytes = "/".join(["\U0001f9a6" * 255] * 3)
+    for kind, given, into in (("square", inputs, f"{deepest}dd"), ("sum", {}, many_bytes)):
+        with pytest.raises(Invalid) as refused:
+            desk.submit_many(JobCreate(kind="sum"), JobCreate(kind=kind, inputs=given, into=into))
+        assert [(error.pointer, error.code) for error in refused.value.errors] == [("/jobs/1/into", "long-path")]
+    desk.submit("sum", into=f"{deepest}dd")  # whose results keep no places below it
 
 
 def test_a_revision_that_does_not_exist_is_refused(desk: Desk) -> None:

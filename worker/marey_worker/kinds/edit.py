@@ -15,7 +15,7 @@ from marey_motion.editing.take import EditedBody
 from marey_motion.errors import EditError, MotionError
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents import ClipInfo, Motion, RevisionRef, SkeletonHierarchy, Source
-from marey_schemas.editing import EditDocument, EditParams
+from marey_schemas.editing import EditDocument, EditParams, edit_place_fault
 from marey_schemas.jobs import PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused, NoSuchThing
@@ -47,7 +47,8 @@ class _Editing:
         self._frames = 0
         self._refusals = Refusals(context)
         self._findings: list[dict[str, Any]] = []
-        _require_clear_place(context, params)
+        if fault := edit_place_fault(params, context.into):
+            raise JobRefused("ambiguous-place", fault)
         self._edit_pin, self._edit = _wanted_edit(context, params)
         self._commands: tuple[NamedCommand, ...] = documents.commands_of_edit(self._edit)
         self._source_pins = _wanted_sources(context, self._edit)
@@ -183,18 +184,6 @@ class _Editing:
         self._findings += [
             {"name": place, "item": pin.item, "command": one.command, **one.values} for one in made.findings
         ]
-
-
-def _require_clear_place(context: Context, params: EditParams) -> None:
-    """Refuse what would change the clips themselves unasked, or not change them though asked. Raises `JobRefused`."""
-    if params.in_place and context.into:
-        raise JobRefused(
-            "ambiguous-place", f"the results cannot both take the place of the clips and go to {context.into}"
-        )
-    if not (params.in_place or context.into or params.suffix):
-        raise JobRefused(
-            "ambiguous-place", "the results would take the place of the clips; give a folder or a suffix, or in_place"
-        )
 
 
 def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | None, EditDocument]:

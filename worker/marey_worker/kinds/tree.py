@@ -12,7 +12,7 @@ from marey_schemas.canonical import document_digest
 from marey_schemas.documents import RevisionRef
 from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
-from marey_schemas.sample_trees import TreeParams
+from marey_schemas.sample_trees import TreeParams, tree_place_fault
 from marey_worker.context import Context, JobRefused
 from marey_worker.kinds.matching_clips import refusing_motion_errors
 from marey_worker.kinds.rigged import Rig, read_rigged
@@ -25,6 +25,8 @@ def run(context: Context, params: TreeParams) -> dict[str, Any]:
     """
     started = time.monotonic()
     (pin,) = context.inputs["model"]
+    if fault := tree_place_fault(params, context.into):
+        raise JobRefused("ambiguous-place", fault)
     _require_same_place(context, pin)
     context.progress(0, 2, "reading the model")
     model = context.document(Kind.MODEL, pin.item, pin.revision, "model")
@@ -59,8 +61,6 @@ def run(context: Context, params: TreeParams) -> dict[str, Any]:
 
 def _require_same_place(context: Context, pin: PinnedInput) -> None:
     """Raise `JobRefused` unless what is published under the model's name becomes a part of this model."""
-    if context.into:
-        raise JobRefused("ambiguous-place", f"a tree becomes a part of its model; it cannot go to {context.into}")
     now = context.item(Kind.MODEL, pin.item)
     if (now.collection, now.name) != (pin.collection, pin.name):
         raise JobRefused("model-moved", f"{pin.path} was moved or renamed while the job waited; try again")
