@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
-from sqlalchemy import Row, select
+from sqlalchemy import ColumnElement, Row, Select, select
 
 from marey_schemas.access import Role
 from marey_schemas.job_kinds import UnknownKindError, find_kind
@@ -22,6 +22,7 @@ from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import Transaction
 
 MOST_AT_ONCE = 1000
+IN_LIST = 1000
 UNSUCCESSFUL = ("failed", "cancelled")
 
 
@@ -176,12 +177,12 @@ def _concurrency_key(tx: Transaction, row: Row[Any]) -> str | None:
 
 
 def _rows(tx: Transaction, ids: Collection[str]) -> dict[str, Row[Any]]:
-    rows = tx.execute(select(job).where(job.c.id.in_(ids)).order_by(job.c.id))
+    rows = _select_in(tx, select(job).order_by(job.c.id), job.c.id, ids)
     return {row.id: row for row in rows}
 
 
 def _states(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
-    rows = tx.execute(select(job.c.id, job.c.state).where(job.c.id.in_(ids)).order_by(job.c.id))
+    rows = _select_in(tx, select(job.c.id, job.c.state).order_by(job.c.id), job.c.id, ids)
     return {row.id: row.state for row in rows}
 
 
@@ -190,8 +191,8 @@ def _needs(tx: Transaction, rows: Mapping[str, Row[Any]]) -> dict[str, dict[str,
     need.
     """
     needs: dict[str, dict[str, str]] = {one: {} for one in rows}
-    statement = select(job_dependency).where(job_dependency.c.job_id.in_(rows)).order_by(job_dependency.c.on_job_id)
-    for row in tx.execute(statement):
+    statement = select(job_dependency).order_by(job_dependency.c.on_job_id)
+    for row in _select_in(tx, statement, job_dependency.c.job_id, rows):
         if row.on_job_id != rows[row.job_id].cached_from:
             needs[row.job_id][row.on_job_id] = row.on_job_id
     latest = _latest_tries(tx, {one for named in needs.values() for one in named})
@@ -203,8 +204,20 @@ def _latest_tries(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
     latest = {one: one for one in ids}
     looking: Collection[str] = set(ids)
     while looking:
-        statement = select(job.c.id, job.c.retry_of).where(job.c.retry_of.in_(looking)).order_by(job.c.id)
-        newer = {row.retry_of: row.id for row in tx.execute(statement)}
+        statement = select(job.c.id, job.c.retry_of).order_by(job.c.id)
+        newer = {row.retry_of: row.id for row in _select_in(tx, statement, job.c.retry_of, looking)}
         latest = {one: newer.get(last, last) for one, last in latest.items()}
         looking = set(newer.values())
     return latest
+
+
+def _select_in(
+    tx: Transaction, statement: Select[Any], column: ColumnElement[str], values: Iterable[str]
+) -> Iterator[Row[Any]]:
+    """The rows whose `column` is among `values`, however many those are; in the order of the statement, page by page.
+
+    A thousand jobs may come after a thousand others each, and databases take only so many parameters.
+    """
+    wanted = sorted(set(values))
+    for start in range(0, len(wanted), IN_LIST):
+        yield from tx.execute(statement.where(column.in_(wanted[start : start + IN_LIST]))).all()

@@ -777,3 +777,13 @@ def test_what_happened_to_a_job_can_be_told(desk: Desk) -> None:
     ]
     attempts = desk.database.read(desk.user, jobs.list_attempts, job).items
     assert [(one.fence, one.outcome) for one in attempts] == [(1, "failed"), (2, "succeeded")]
+
+
+def test_the_latest_tries_of_more_jobs_than_a_statement_takes_are_found(desk: Desk) -> None:
+    failed = desk.submit()
+    fail_for_good(desk, failed)
+    again = desk.database.write(desk.user, retrying.retry_job, failed).id
+    many = {failed, *(f"job_{n}" for n in range(70_000))}
+    latest = desk.database.read(desk.user, retrying._latest_tries, many)
+    assert len(latest) == len(many)
+    assert {one: last for one, last in latest.items() if one != last} == {failed: again}
