@@ -35,6 +35,8 @@ from marey_server.store.tables import (
 from marey_server.store.transaction import Transaction
 
 BATCH = 200
+MOST_UPLOADS = 10_000
+"""Dropped in one round: a statement takes only so many parameters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +145,8 @@ def _remove_stray(tx: Transaction, digest: str) -> int:
 
 def _drop_old_uploads(tx: Transaction) -> int:
     old = upload.c.updated_us < tx.now_us - uploads.LIFETIME_US
-    found = list(tx.execute(select(upload.c.id).where(old).with_for_update(skip_locked=True)).scalars())
+    some = select(upload.c.id).where(old).limit(MOST_UPLOADS).with_for_update(skip_locked=True)
+    found = list(tx.execute(some).scalars())
     uploads.drop(tx, found)
     return len(found)
 
