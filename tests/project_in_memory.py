@@ -29,10 +29,11 @@ class ProjectInMemory:
     blobs: dict = field(default_factory=dict)
     staged: list = field(default_factory=list)
     told: list = field(default_factory=list)
+    into: str = ""
 
     def document(self, kind, item, revision, part):
         if (item, revision, part) not in self.parts:
-            raise NoSuchThing(f"{item} has no {part}")
+            raise NoSuchThing(f"{item} has no {part}", f"no-{kind}")
         return self.parts[item, revision, part]
 
     def documents(self, pins, part, *, required=True):

@@ -11,7 +11,7 @@ from pydantic import Field, StringConstraints, field_validator, model_validator
 from marey_schemas.annotations import Label, LayerName
 from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Request
-from marey_schemas.names import Digest, JointName, Tag
+from marey_schemas.names import Digest, JointName, NameSuffix, Tag
 
 MOST_EXAMPLES = 2000
 """That are all compared with each other, mirrored ones counted."""
@@ -24,7 +24,7 @@ Metres = Annotated[float, Field(allow_inf_nan=False)]
 class AlignParams(Request):
     """Parameters of `align`."""
 
-    suffix: str = Field("", max_length=64, description="Appended to the names of the results.")
+    suffix: NameSuffix = Field("", description="Appended to the names of the results.")
     tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the results.")
     reference: ReferenceChoice = Field(
         "medoid",

@@ -8,11 +8,10 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, StringConstraints, field_validator, model_validator
 
 from marey_schemas.base import Request
-from marey_schemas.names import ItemName, Message, Tag
+from marey_schemas.names import MAX_NAME_LENGTH, ItemName, Message, Tag
 
 MAX_FRAME = 2**31 - 1
 MAX_COMMANDS = 1000
-MAX_NAME_LENGTH = 255
 
 _NAME_FIELD = re.compile(r"\{(clip|label|number)(?::([1-9]))?\}")
 

@@ -30,7 +30,7 @@ from marey_schemas.edit_commands import (
     Trim,
 )
 from marey_schemas.edit_constraints import Constrain, PlantFeet
-from marey_schemas.names import Tag
+from marey_schemas.names import NameSuffix, Tag
 
 MOST_COMMANDS = 256
 
@@ -88,7 +88,7 @@ class EditParams(Request):
     in_place: bool = Field(
         False, description="Make each result the next revision of its clip; otherwise it is a clip of its own."
     )
-    suffix: str = Field("", max_length=64, pattern=r"^[^/\x00-\x1f\x7f]*$", description="Appended to the names.")
+    suffix: NameSuffix = Field("", description="Appended to the names.")
     tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the results.")
 
     @model_validator(mode="after")

@@ -102,11 +102,11 @@ def _params_schema(params: type[Request]) -> dict[str, Any]:
 
 IMPORT = KindDeclaration(
     name="import",
-    description="Reads motion files the server already has and makes clips and skeletons of them.",
+    description="Reads files the server already has and makes clips, skeletons and models of them.",
     params=ImportParams,
     implementation="marey_worker.kinds.imports:run",
-    version=1,
-    outputs={"clips": Kind.CLIP, "skeletons": Kind.SKELETON},
+    version=2,
+    outputs={"clips": Kind.CLIP, "skeletons": Kind.SKELETON, "models": Kind.MODEL},
 )
 
 RETARGET = KindDeclaration(
@@ -114,7 +114,7 @@ RETARGET = KindDeclaration(
     description="Carries the motion of clips over to another skeleton.",
     params=RetargetParams,
     implementation="marey_worker.kinds.retarget:run",
-    version=1,
+    version=2,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to carry over."),
         "skeleton": InputSpec(kind=Kind.SKELETON, description="The skeleton that shall move."),
@@ -220,7 +220,7 @@ EDIT = KindDeclaration(
     description="Applies the commands of an edit to clips: trims, joins, smooths, places and repairs them.",
     params=EditParams,
     implementation="marey_worker.kinds.edit:run",
-    version=1,
+    version=2,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to edit."),
         "edit": InputSpec(
@@ -269,7 +269,7 @@ CUT = KindDeclaration(
     description="Cuts clips along the segments of their annotations, and keeps the keyframes of each piece.",
     params=CutParams,
     implementation="marey_worker.kinds.cut:run",
-    version=1,
+    version=2,
     inputs={
         "annotations": InputSpec(
             kind=Kind.ANNOTATION, many=True, description="The annotations; each names its clip and that revision."

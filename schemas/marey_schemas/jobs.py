@@ -9,7 +9,7 @@ from pydantic import Field
 from marey_schemas.base import Answer, Request
 from marey_schemas.imports import ImportFile, ImportOptions
 from marey_schemas.kinds import Kind
-from marey_schemas.names import CollectionPath, ItemName, Message, Tag
+from marey_schemas.names import CollectionPath, ItemName, Message, NameSuffix, Tag
 from marey_schemas.references import RevisionRef
 
 PROTOCOL_VERSION = 1
@@ -55,7 +55,7 @@ class RetargetParams(Request):
     """Parameters of `retarget`."""
 
     scale: float | None = Field(None, gt=0, lt=1000, description="Root scale; absent: ratio of the hip heights.")
-    suffix: str = Field("", max_length=64, description="Appended to the names of the results.")
+    suffix: NameSuffix = Field("", description="Appended to the names of the results.")
     tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the results.")
 
 

@@ -9,8 +9,13 @@ ProjectName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9_-]{
 
 UserName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9._-]{0,62}[a-z0-9])?$")]
 
-ItemName = Annotated[str, StringConstraints(min_length=1, max_length=255, pattern=r"^[^/\x00-\x1f\x7f]+$")]
+MAX_NAME_LENGTH = 255
+
+ItemName = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NAME_LENGTH, pattern=r"^[^/\x00-\x1f\x7f]+$")]
 """Any printable name without a slash."""
+
+NameSuffix = Annotated[str, StringConstraints(max_length=64, pattern=r"^[^/\x00-\x1f\x7f]*$")]
+"""What may be appended to a name."""
 
 CollectionPath = Annotated[
     str, StringConstraints(max_length=1024, pattern=r"^(?:[^/\x00-\x1f\x7f]{1,255}(?:/[^/\x00-\x1f\x7f]{1,255})*)?$")

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from marey_schemas.job_kinds import KindDeclaration, find_kind
 from marey_worker import signatures
-from marey_worker.context import Context, JobRefused
+from marey_worker.context import Context, JobRefused, NoSuchThing
 from marey_worker.limits import allow_memory, die_with_parent
 from marey_worker.messages import Done, End, Failed, Ready, Run
 
@@ -69,6 +69,8 @@ def run_job(run: Run, pipe: Connection) -> End:
         context.finish_staging()
     except JobRefused as error:
         return Failed(error.code, error.detail, None, retryable=False)
+    except NoSuchThing as error:  # inputs are pinned: what is not there now will not be there at the next try
+        return Failed(error.code, str(error), None, retryable=False)
     except ValidationError as error:
         return Failed("bad-params", str(error), None, retryable=False)
     except MemoryError:

@@ -38,7 +38,11 @@ class RequestRefused(Exception):
 
 
 class NoSuchThing(RequestRefused):
-    """What the job asked for does not exist, or the job may not see it."""
+    """What the job asked for does not exist, or the job may not see it. `code` tells what: `no-skeleton`, for one."""
+
+    def __init__(self, detail: str, code: str = "not-found") -> None:
+        super().__init__(detail)
+        self.code = code
 
 
 class Task(NamedTuple):
@@ -69,7 +73,8 @@ class Context:
 
     def document(self, kind: Kind, item: str, revision: int, part: str) -> Any:
         """A part of a revision; arrays are numpy arrays. Raises `NoSuchThing` where there is none."""
-        return _decoded(self._ask(lambda request: ReadPart(request, kind, item, revision, part)))
+        asked = self._send(lambda request: ReadPart(request, kind, item, revision, part))
+        return _decoded(self._value(asked, f"no-{kind}"))
 
     def documents(
         self, pins: Iterable[PinnedInput], part: str, *, required: bool = True
@@ -81,7 +86,7 @@ class Context:
 
         for pin, request in self._read_ahead(pins, request_for):
             try:
-                yield pin, _decoded(self._value(request))
+                yield pin, _decoded(self._value(request, f"no-{pin.kind}"))
             except NoSuchThing:
                 if required:
                     raise
@@ -89,7 +94,8 @@ class Context:
 
     def item(self, kind: Kind, item: str) -> Item:
         """An item as it is now. Raises `NoSuchThing` where there is none."""
-        found: Item = self._ask(lambda request: ReadItem(request, kind, item))
+        asked = self._send(lambda request: ReadItem(request, kind, item))
+        found: Item = self._value(asked, f"no-{kind}")
         return found
 
     def task_results(self) -> list[dict[str, Any]]:
@@ -99,7 +105,7 @@ class Context:
 
     def blob(self, digest: str) -> bytes:
         """Bytes by digest."""
-        data: bytes = self._ask(lambda request: ReadBlob(request, digest))
+        data: bytes = self._value(self._send(lambda request: ReadBlob(request, digest)), "no-blob")
         return data
 
     # -- writing --
@@ -149,13 +155,14 @@ class Context:
         self._pipe.send(make(request))
         return request
 
-    def _value(self, request: int) -> Any:
+    def _value(self, request: int, missing: str = "not-found") -> Any:
+        """What was answered. Raises `NoSuchThing` with the code `missing`, and `RequestRefused`."""
         while request not in self._replies:
             reply: Reply = self._pipe.recv()
             self._replies[reply.request] = reply
         reply = self._replies.pop(request)
         if reply.refusal is not None:
-            raise NoSuchThing(reply.refusal) if reply.missing else RequestRefused(reply.refusal)
+            raise NoSuchThing(reply.refusal, missing) if reply.missing else RequestRefused(reply.refusal)
         return reply.value
 
 

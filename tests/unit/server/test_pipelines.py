@@ -8,7 +8,7 @@ from marey_schemas.jobs import Job
 from marey_schemas.kinds import Kind
 from marey_schemas.pipelines import PipelineCreate
 from marey_server.errors import Invalid
-from marey_server.store import items, jobs, pipelines
+from marey_server.store import blobs, items, jobs, pipelines
 from queue_desk import Desk
 
 
@@ -90,6 +90,16 @@ def test_one_bad_step_lets_none_in(desk: Desk, changes: dict[str, Any], pointer:
         submit(desk, steps)
     assert [(error.pointer, error.code) for error in refused.value.errors] == [(pointer, code)]
     assert desk.database.read(desk.user, jobs.list_jobs, "lab").items == ()
+
+
+def test_a_tree_may_wait_for_a_model_that_is_imported(desk: Desk) -> None:
+    digest = desk.database.write(desk.user, blobs.put_blob, b"a model of another program")
+    files = [{"name": "walk_quaternion_mm.json", "blob": digest}]
+    steps = {
+        "takes": {"kind": "import", "params": {"files": files}},
+        "tree": {"kind": "tree", "inputs": {"model": {"step": "takes"}}},
+    }
+    assert submit(desk, steps)["tree"].inputs["model"]
 
 
 def test_what_fails_in_a_pipeline_takes_only_those_along_that_need_it(desk: Desk) -> None:

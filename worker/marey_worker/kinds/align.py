@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import ValidationError
 
 from marey_motion import documents
 from marey_motion.alignment import aligned_documents
@@ -31,12 +30,15 @@ from marey_schemas.canonical import document_digest
 from marey_schemas.documents import Annotation, Motion, RevisionRef
 from marey_schemas.jobs import PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
+from marey_schemas.names import MAX_NAME_LENGTH
 from marey_worker.context import Context, JobRefused
 from marey_worker.kinds.matching_clips import refusing_motion_errors
-from marey_worker.kinds.refusals import Refusals
+from marey_worker.kinds.refusals import UNUSABLE, Refusals, present
+from marey_worker.kinds.result_places import require_different
 from marey_worker.kinds.rigged import Rig, read_rigged
+from marey_worker.kinds.staged_results import StagedResults
 
-OUTPUTS_PER_STAGE = 64
+MIRRORED_NAME = " mirrored"
 
 
 class _Clip(NamedTuple):
@@ -59,7 +61,7 @@ class _Annotated(NamedTuple):
 def run(context: Context, params: AlignParams) -> dict[str, Any]:
     """Align the clips of the job; those that do not fit are refusals in the result, with code and reason.
 
-    Raises `JobRefused` where fewer than two are left.
+    Raises `JobRefused` where fewer than two are left, and where two results would get one name.
     """
     return _Job(context, params).run()
 
@@ -75,6 +77,7 @@ class _Job:
         self._annotations: dict[str, PinnedInput] = {}
 
     def run(self) -> dict[str, Any]:
+        self._require_names()
         clips = self._of_one_skeleton(list(self._read()))
         rig = self._rig(clips)
         with refusing_motion_errors():
@@ -98,13 +101,25 @@ class _Job:
 
     # -- what is aligned --
 
+    def _require_names(self) -> None:
+        """Raise `JobRefused` where results would get one name, or one that is too long: before anything is computed."""
+        twins = ("", MIRRORED_NAME) if self._params.mirroring == "add" else ("",)
+        names = [(pin.folder, self._name(pin, twin)) for pin in self._pins.values() for twin in twins]
+        require_different(names)
+        long = [name for _, name in names if len(name) > MAX_NAME_LENGTH]
+        if long:
+            raise JobRefused("name-too-long", f"{long[0]!r} has {len(long[0])} of {MAX_NAME_LENGTH} characters")
+
+    def _name(self, pin: PinnedInput, twin: str) -> str:
+        return f"{pin.name}{self._params.suffix}{twin}"
+
     def _read(self) -> Iterator[_Clip]:
         pins = self._context.inputs["clips"]
-        for done, (pin, tree) in enumerate(self._context.documents(pins, "motion")):
+        for done, (pin, tree) in enumerate(self._context.documents(pins, "motion", required=False)):
             self._context.progress(done, len(pins), f"reading {pin.name}")
             try:
-                motion = Motion.model_validate(tree)
-            except ValidationError as error:
+                motion = Motion.model_validate(present(pin, tree))
+            except UNUSABLE as error:
                 self._refusals.add(pin, error)
                 continue
             yield _Clip(pin, motion, document_digest(tree), RevisionRef.model_validate(motion.skeleton.model_dump()))
@@ -254,17 +269,18 @@ class _Job:
 
     def _stage(self, aligned: AlignedSet, skeleton: RevisionRef, digest: str) -> None:
         options = self._params.model_dump(mode="json")
-        for start in range(0, len(aligned.clips), OUTPUTS_PER_STAGE):
-            self._context.progress(start, len(aligned.clips), "writing results")
-            some = aligned.clips[start : start + OUTPUTS_PER_STAGE]
-            self._context.stage([self._output(aligned, one, skeleton, digest, options) for one in some])
+        results = StagedResults(self._context)
+        for done, one in enumerate(aligned.clips):
+            self._context.progress(done, len(aligned.clips), "writing results")
+            results.add(self._output(aligned, one, skeleton, digest, options))
+        results.flush()
 
     def _output(
         self, aligned: AlignedSet, one: AlignedClip, skeleton: RevisionRef, digest: str, options: dict[str, Any]
     ) -> StagedOutput:
         pin = self._pin_of(one.uid)
         reference = self._pin_of(aligned.reference)
-        mirrored = " mirrored" if one.uid.endswith(MIRRORED) else ""
+        twin = MIRRORED_NAME if one.uid.endswith(MIRRORED) else ""
         motion = documents.clip_to_document(one.motion.as_clip(aligned.skeleton, aligned.frame_rate_hz), skeleton)
         sources = {"clips": tuple(used.as_input() for used in dict.fromkeys((pin, reference)))}
         if _uid(pin) in self._annotations:
@@ -272,9 +288,9 @@ class _Job:
         if rig := self._context.inputs.get("rig"):
             sources["rig"] = tuple(used.as_input() for used in rig)
         return StagedOutput(
-            name=f"{pin.path}{mirrored}",
+            name=f"{pin.collection}/{self._name(pin, twin)}",
             kind=Kind.PROCESSED,
-            item_name=f"{pin.name}{self._params.suffix}{mirrored}",
+            item_name=self._name(pin, twin),
             collection=pin.folder,
             tags=self._params.tags,
             parts={

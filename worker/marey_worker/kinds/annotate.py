@@ -6,8 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from pydantic import ValidationError
-
 from marey_motion import documents
 from marey_motion.clip import Clip
 from marey_motion.editing.annotations.contacts import ContactOptions
@@ -16,18 +14,14 @@ from marey_motion.editing.annotations.speed_proposals import PauseOptions, Reach
 from marey_motion.editing.annotations.step_proposals import StepOptions, propose_steps
 from marey_motion.errors import AnnotationError, MotionError, UnknownJoint
 from marey_motion.matching.body import MatchingBody
-from marey_schemas.annotations import (
-    MAX_NAME_LENGTH,
-    AnnotateParams,
-    StepsProposal,
-    VelocityMinimaProposal,
-    WristContactProposal,
-)
+from marey_schemas.annotations import AnnotateParams, StepsProposal, VelocityMinimaProposal, WristContactProposal
 from marey_schemas.documents import Motion, RevisionRef
 from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
+from marey_schemas.names import MAX_NAME_LENGTH
 from marey_worker.context import Context, JobRefused
-from marey_worker.kinds.refusals import Refusals
+from marey_worker.kinds.refusals import UNUSABLE, Refusals, present
+from marey_worker.kinds.result_places import require_different
 from marey_worker.kinds.rigged import Rig, Rigged, read_rigged
 from marey_worker.kinds.staged_results import StagedResults
 
@@ -38,26 +32,28 @@ def run(context: Context, params: AnnotateParams) -> dict[str, Any]:
     """Annotate every clip of the job.
 
     A clip that cannot be annotated is a refusal in the result, with code and reason; the others are annotated all the
-    same. A clip in which nothing is found gets no annotation.
+    same. A clip in which nothing is found gets no annotation. Raises `JobRefused` where two annotations would get one
+    name.
     """
     propose = _proposal(params)
     rigs = {pin.item: pin for pin in context.inputs.get("rigs", ())}
     pins = context.inputs["clips"]
+    require_different((pin.folder, pin.name) for pin in pins)
     layer_name = params.layer or params.proposal.method
     labels: Counter[str] = Counter()
     refusals = Refusals(context)
     empty: list[str] = []
     results = StagedResults(context)
-    for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
+    for done, (pin, tree) in enumerate(context.documents(pins, "motion", required=False)):
         context.progress(done, len(pins), f"annotating {pin.name}")
         try:
-            motion = Motion.model_validate(tree)
+            motion = Motion.model_validate(present(pin, tree))
             used = RevisionRef.model_validate(motion.skeleton.model_dump())
             edited = rigs.get(used.item)
             rigged = read_rigged(context, Rig(used, edited.ref if edited else used))
             layer = propose(documents.clip_from_document(motion, rigged.skeleton), rigged)
             _require_name(pin, layer_name)
-        except (MotionError, ValidationError) as error:
+        except UNUSABLE as error:
             refusals.add(pin, error)
             continue
         if not (layer.segments or layer.keyframes):

@@ -7,18 +7,19 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import ValidationError
 
 from marey_motion import documents
 from marey_motion.editing.annotations.layers import Segment, piece_of
 from marey_motion.errors import MotionError
-from marey_schemas.annotations import MAX_NAME_LENGTH, CutParams
+from marey_schemas.annotations import CutParams
 from marey_schemas.documents import Annotation, ClipInfo, Motion, OutputRef, RevisionRef, Source
 from marey_schemas.items import Item
 from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
+from marey_schemas.names import MAX_NAME_LENGTH
 from marey_worker.context import Context, JobRefused, NoSuchThing
-from marey_worker.kinds.refusals import Refusals
+from marey_worker.kinds.refusals import UNUSABLE, Refusals, present
+from marey_worker.kinds.result_places import ResultPlaces
 from marey_worker.kinds.staged_results import StagedResults
 
 
@@ -47,6 +48,8 @@ class _Cutting:
         self._context = context
         self._params = params
         self._clip_pins = {(pin.item, pin.revision): pin for pin in context.inputs.get("clips", ())}
+        self._clips = {pin.item: pin for pin in context.inputs.get("clips", ())}
+        self._places = ResultPlaces(context)
         self._results = StagedResults(context)
         self._refusals = Refusals(context)
 
@@ -58,10 +61,13 @@ class _Cutting:
         for done, one in enumerate(todo):
             self._context.progress(done, len(todo), f"cutting {one.item.name}")
             try:
+                for segment, name in one.pieces:
+                    for kind in (Kind.CLIP, Kind.ANNOTATION):
+                        self._places.take(kind, self._folder(one, segment), name)
                 for output, label in self._pieces(one):
                     labels.update([label] if label else [])
                     self._results.add(output)
-            except (MotionError, ValidationError, NoSuchThing) as error:
+            except UNUSABLE as error:
                 self._refusals.add(one.pin, error)
         self._results.flush()
         return {"clips": labels.total(), "labels": dict(sorted(labels.items())), "refused": self._refusals.entries}
@@ -71,17 +77,34 @@ class _Cutting:
     def _read(self) -> list[_Annotated]:
         pins = self._context.inputs["annotations"]
         found = []
-        for pin, tree in self._context.documents(pins, "annotation"):
+        for pin, tree in self._context.documents(pins, "annotation", required=False):
             try:
-                annotation = Annotation.model_validate(tree)
+                annotation = Annotation.model_validate(present(pin, tree))
+                if self._params.layer not in (None, annotation.layer):
+                    continue
                 clip = RevisionRef.model_validate(annotation.clip.model_dump())
-                item = self._clip_pins.get((clip.item, clip.revision)) or self._context.item(Kind.CLIP, clip.item)
-            except (ValidationError, NoSuchThing) as error:
+                item = self._clip_of(clip)
+            except UNUSABLE as error:
                 self._refusals.add(pin, error)
                 continue
-            if self._params.layer in (None, annotation.layer):
-                found.append(_Annotated(pin, annotation, clip, item, tuple(self._named(annotation, item))))
+            found.append(_Annotated(pin, annotation, clip, item, tuple(self._named(annotation, item))))
         return found
+
+    def _clip_of(self, clip: RevisionRef) -> Item | PinnedInput:
+        """The annotated clip with its name and place: as it was when the job was handed in, where clips were given.
+
+        Only what is pinned may decide the results then, since they are kept for jobs with the same inputs.
+        Raises `MotionError`, `NoSuchThing`.
+        """
+        if not self._clips:
+            return self._context.item(Kind.CLIP, clip.item)
+        if clip.item not in self._clips:
+            raise MotionError(
+                f"it is of the clip {clip.item}, which is not among the clips that are given; give that one, too, or "
+                "no clips",
+                code="clip-not-given",
+            )
+        return self._clip_pins.get((clip.item, clip.revision), self._clips[clip.item])
 
     def _named(self, annotation: Annotation, clip: Item | PinnedInput) -> Iterator[tuple[Segment, str]]:
         """The wanted segments with their names; what is left out of a label is counted all the same."""

@@ -19,11 +19,10 @@ from marey_schemas.editing import EditDocument, EditParams, edit_place_fault
 from marey_schemas.jobs import PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused, NoSuchThing
-from marey_worker.kinds.refusals import Refusals
+from marey_worker.kinds.refusals import UNUSABLE, Refusals, present
+from marey_worker.kinds.result_places import ResultPlaces
 from marey_worker.kinds.rigged import Rig, read_rigged
 from marey_worker.kinds.staged_results import StagedResults
-
-MAX_NAME_LENGTH = 255
 
 
 def run(context: Context, params: EditParams) -> dict[str, Any]:
@@ -46,6 +45,7 @@ class _Editing:
         self._bodies: dict[RevisionRef, EditedBody] = {}
         self._frames = 0
         self._refusals = Refusals(context)
+        self._places = ResultPlaces(context)
         self._findings: list[dict[str, Any]] = []
         if fault := edit_place_fault(params, context.into):
             raise JobRefused("ambiguous-place", fault)
@@ -58,11 +58,11 @@ class _Editing:
         pins = self._context.inputs["clips"]
         started = time.monotonic()
         sources = self._read_sources()
-        for done, (pin, motion) in enumerate(self._context.documents(pins, "motion")):
+        for done, (pin, motion) in enumerate(self._context.documents(pins, "motion", required=False)):
             self._context.progress(done, len(pins), f"editing {pin.name}")
             try:
-                outputs = list(self._edited(pin, Motion.model_validate(motion), sources))
-            except (MotionError, ValidationError) as error:
+                outputs = list(self._edited(pin, Motion.model_validate(present(pin, motion)), sources))
+            except UNUSABLE as error:
                 self._refusals.add(pin, error)
                 continue
             for output in outputs:
@@ -88,7 +88,7 @@ class _Editing:
         return sources
 
     def _edited(self, pin: PinnedInput, motion: Motion, sources: Mapping[str, Clip]) -> Iterator[StagedOutput]:
-        """The results of one clip. Raises `MotionError`."""
+        """The results of one clip. Raises `MotionError`, `NoSuchThing`."""
         if self._params.in_place:
             self._require_newest(pin)
         body = self._body(motion)
@@ -97,9 +97,12 @@ class _Editing:
         if self._params.in_place and len(made) > 1:
             raise EditError("it was split, and several clips cannot take the place of one", code="several-clips")
         info = self._info(pin)
-        for one in made:
-            name = f"{pin.name}{self._params.suffix}" + "".join(f"-{number}" for number in one.pieces)
-            self._require_free(pin, name)
+        names = [f"{pin.name}{self._params.suffix}" + "".join(f"-{n}" for n in one.pieces) for one in made]
+        if self._params.in_place:
+            self._places.keep(pin)
+        else:
+            self._places.take(Kind.CLIP, pin.folder, *names)
+        for name, one in zip(names, made, strict=True):
             self._note(pin, name, one)
             yield self._output(pin, name, one.clip, motion, info)
 
@@ -169,12 +172,6 @@ class _Editing:
             )
         if (now.collection, now.name) != (pin.collection, pin.name):
             raise EditError("it was moved or renamed while the job waited; try again", code="clip-changed")
-
-    def _require_free(self, pin: PinnedInput, name: str) -> None:
-        if len(name) > MAX_NAME_LENGTH:
-            raise EditError(f"{name!r} has {len(name)} of {MAX_NAME_LENGTH} characters", code="name-too-long")
-        if f"{pin.collection}/{name}" in self._results.names:
-            raise EditError(f"another result of the job is called {name!r}; give a suffix", code="same-name")
 
     # -- what is told --
 

@@ -49,7 +49,7 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
             context.progress(done, len(pins), f"writing {pin.name}")
             try:
                 file = exporting.file_of(pin)
-            except (_Unwritable, MotionError) as error:
+            except (_Unwritable, MotionError, NoSuchThing) as error:
                 refused.append({"name": _place(pin), "item": pin.item, "code": error.code, "detail": str(error)})
                 continue
             name = file.name if file.name not in written else f"{pin.item}-{file.name.rpartition('/')[2]}"

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pydantic import ValidationError
 
 from marey_motion.errors import MotionError
 from marey_schemas.jobs import PinnedInput
 from marey_worker.context import Context, NoSuchThing
 
-CODES = {ValidationError: "bad-document", NoSuchThing: "no-clip"}
+UNUSABLE = (MotionError, ValidationError, NoSuchThing)
+"""What is wrong with one input and keeps no other from being used."""
+
+
+def present(pin: PinnedInput, document: Any) -> Any:
+    """A document of an input. Raises `NoSuchThing` for None: the input was deleted while the job waited."""
+    if document is None:
+        raise NoSuchThing(f"revision {pin.revision} of {pin.item} is not there any more", f"no-{pin.kind}")
+    return document
 
 
 class Refusals:
@@ -23,7 +33,7 @@ class Refusals:
     ) -> None:
         """One more; `name` is what its result would have been called, where that is not the input's path."""
         shown = name or pin.path
-        code = error.code if isinstance(error, MotionError) else CODES[type(error)]
+        code = "bad-document" if isinstance(error, ValidationError) else error.code
         self._context.log(f"{shown}: {error}")
         self.entries.append({"name": shown, "item": pin.item, "code": code, "detail": str(error)})
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from pydantic import ValidationError
-
 from marey_motion import documents
 from marey_motion.errors import MotionError
 from marey_motion.retargeting import RetargetPlan, retarget
@@ -14,7 +12,8 @@ from marey_schemas.documents import ClipInfo, Motion, RevisionRef, Source
 from marey_schemas.jobs import PinnedInput, RetargetParams, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused, NoSuchThing
-from marey_worker.kinds.refusals import Refusals
+from marey_worker.kinds.refusals import UNUSABLE, Refusals, present
+from marey_worker.kinds.result_places import ResultPlaces
 from marey_worker.kinds.rigged import Rig, plan_between, read_rigged
 from marey_worker.kinds.staged_results import StagedResults
 
@@ -35,6 +34,7 @@ class _Retargeting:
         self._params = params
         self._refusals = Refusals(context)
         self._results = StagedResults(context)
+        self._places = ResultPlaces(context)
         self._frames = 0
 
         (self._target_pin,) = context.inputs["skeleton"]
@@ -49,11 +49,11 @@ class _Retargeting:
         """All clips; what became of them."""
         pins = self._context.inputs["clips"]
         started = time.monotonic()
-        for done, (pin, motion) in enumerate(self._context.documents(pins, "motion")):
+        for done, (pin, motion) in enumerate(self._context.documents(pins, "motion", required=False)):
             self._context.progress(done, len(pins), f"retargeting {pin.name}")
             try:
-                self._results.add(self._retargeted(pin, Motion.model_validate(motion)))
-            except (MotionError, ValidationError) as error:
+                self._results.add(self._retargeted(pin, Motion.model_validate(present(pin, motion))))
+            except UNUSABLE as error:
                 self._refusals.add(pin, error)
         self._results.flush()
         return {
@@ -64,6 +64,8 @@ class _Retargeting:
         }
 
     def _retargeted(self, pin: PinnedInput, motion: Motion) -> StagedOutput:
+        name = f"{pin.name}{self._params.suffix}"
+        self._places.take(Kind.CLIP, pin.folder, name)
         used = RevisionRef.model_validate(motion.skeleton.model_dump())
         edited = self._rigs.get(used.item)
         source = Rig(used, edited.ref if edited else used)
@@ -73,7 +75,7 @@ class _Retargeting:
         return StagedOutput(
             name=f"{pin.collection}/{pin.name}",
             kind=Kind.CLIP,
-            item_name=f"{pin.name}{self._params.suffix}",
+            item_name=name,
             collection=pin.folder,
             tags=self._params.tags,
             parts={

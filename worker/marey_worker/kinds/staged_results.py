@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from marey_schemas.jobs import StagedOutput
-from marey_worker.context import Context
+from marey_worker.context import Context, JobRefused
 
 BYTES_PER_STAGE = 2 << 20
 OUTPUTS_PER_STAGE = 64
@@ -27,7 +27,12 @@ class StagedResults:
         return len(self.names)
 
     def add(self, output: StagedOutput) -> None:
-        """One more; handed over with its neighbours."""
+        """One more; handed over with its neighbours.
+
+        Raises `JobRefused` for a second one of the same name, which would replace the first without a word.
+        """
+        if output.name in self.names:
+            raise JobRefused("same-name", f"two results of the job would be {output.name}")
         self.names.add(output.name)
         self._ready.append(output)
         self._ready_bytes += _array_bytes(output.parts)

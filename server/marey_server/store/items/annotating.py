@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from marey_schemas.access import Role
-from marey_schemas.annotations import MAX_NAME_LENGTH, AnnotationChange, AnnotationImport, command_arguments
+from marey_schemas.annotations import AnnotationChange, AnnotationImport, command_arguments
 from marey_schemas.documents import Annotation, RevisionRef
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
+from marey_schemas.names import MAX_NAME_LENGTH
 from marey_schemas.problems import FieldError
 from marey_server.errors import Invalid, NotFound
 from marey_server.store import projects

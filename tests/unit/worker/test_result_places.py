@@ -1,0 +1,185 @@
+"""Where the results of jobs of many clips go, and what one clip that cannot be used does to the others."""
+
+from math import radians
+
+import pytest
+
+from marey_motion.gait import generate_gait
+from marey_schemas.alignment import AlignParams
+from marey_schemas.annotations import AnnotateParams, CutParams
+from marey_schemas.documents import Annotation
+from marey_schemas.editing import EditParams
+from marey_schemas.jobs import ExportParams, PinnedInput, RetargetParams, StagedOutput
+from marey_schemas.kinds import Kind
+from marey_worker.context import JobRefused
+from marey_worker.kinds import align, annotate, cut, edit, export, retarget, rigged
+from marey_worker.kinds.rigged import Kept
+from marey_worker.kinds.staged_results import StagedResults
+from project_in_memory import ProjectInMemory, add_clip
+
+SHORTER = ({"command": "trim", "stop": 40},)
+STEPS = AnnotateParams.model_validate({"proposal": {"method": "steps"}})
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """Two walks of one skeleton; nothing is kept of earlier tests."""
+    monkeypatch.setattr(rigged, "_skeletons", Kept(4))
+    monkeypatch.setattr(rigged, "_plans", Kept(4))
+    made = ProjectInMemory(tmp_path)
+    made.log = lambda text: None
+    for name, turn in (("left", 20), ("right", -20)):
+        add_clip(made, name, generate_gait(1.4, radians(turn), 3.0))
+    skeleton = {"item": "skeleton_a", "revision": 1, "kind": Kind.SKELETON, "name": "a", "collection": "rigs"}
+    made.inputs["skeleton"] = (PinnedInput(**skeleton),)
+    return made
+
+
+def move(project, into, **of_all):
+    """Let every clip be what another job made."""
+    project.into = into
+    project.inputs["clips"] = tuple(pin.model_copy(update=of_all) for pin in project.inputs["clips"])
+
+
+def again(project, position, **changes):
+    """Let one of the clips be there once more, with these changes."""
+    pin = project.inputs["clips"][position]
+    twin = pin.model_copy(update=changes)
+    project.parts[twin.item, twin.revision, "motion"] = project.parts[pin.item, pin.revision, "motion"]
+    project.inputs["clips"] = (*project.inputs["clips"], twin)
+
+
+def codes(result):
+    return [one["code"] for one in result["refused"]]
+
+
+KINDS = {
+    "edit": lambda project, **params: edit.run(project, EditParams(commands=SHORTER, **params)),
+    "retarget": lambda project, **params: retarget.run(project, RetargetParams(**params)),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_results_that_would_replace_what_they_are_made_of_are_refused(project, kind):
+    move(project, "game", collection="game", below="")
+    result = KINDS[kind](project)
+    assert (result["clips"], codes(result), project.staged) == (0, ["own-input"] * 2, [])
+    assert "game/left, which is an input" in result["refused"][0]["detail"]
+    assert "another folder" in result["refused"][0]["detail"]
+    assert KINDS[kind](project, suffix="-short")["clips"] == 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_result_that_would_replace_another_input_is_refused(project, kind):
+    again(project, 0, item="clip_other", name="left-short")
+    move(project, "", below=None)
+    result = KINDS[kind](project, suffix="-short")
+    assert (result["clips"], codes(result)) == (2, ["own-input"])
+
+
+def test_an_edit_in_place_replaces_its_clips(project):
+    project.item = lambda kind, item: next(
+        pin.model_copy() for pin in project.inputs["clips"] if (pin.kind, pin.item) == (kind, item)
+    )
+    result = KINDS["edit"](project, in_place=True)
+    assert (result["clips"], result["refused"]) == (2, [])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_two_revisions_of_a_clip_the_second_is_refused(project, kind):
+    again(project, 0, revision=2)
+    project.into = "out"
+    result = KINDS[kind](project)
+    assert (result["clips"], codes(result)) == (2, ["same-name"])
+
+
+def add_annotation(project, clip="clip_left", revision=1):
+    document = Annotation.model_validate(
+        {"clip": {"item": clip, "revision": revision}, "segments": [{"label": "a", "start": 0, "end": 30}]}
+    )
+    project.parts["annotation_1", 1, "annotation"] = document.model_dump(mode="json", by_alias=True)
+    pin = {"item": "annotation_1", "revision": 1, "kind": Kind.ANNOTATION, "name": "said", "collection": "walks"}
+    project.inputs["annotations"] = (PinnedInput(**pin),)
+
+
+def test_a_piece_that_would_replace_an_input_is_refused(project):
+    add_annotation(project)
+    again(project, 1, item="clip_piece", name="left_a_01")
+    result = cut.run(project, CutParams())
+    assert (result["clips"], codes(result), project.staged) == (0, ["own-input"], [])
+    project.into = "pieces"
+    assert cut.run(project, CutParams())["clips"] == 1
+
+
+def test_pieces_are_named_after_the_clips_that_are_given_at_any_revision(project):
+    add_annotation(project, revision=2)
+    project.parts["clip_left", 2, "motion"] = project.parts["clip_left", 1, "motion"]
+    cut.run(project, CutParams())
+    assert [output.item_name for output in project.staged if output.kind is Kind.CLIP] == ["left_a_01"]
+    project.inputs["clips"] = project.inputs["clips"][1:]
+    with pytest.raises(JobRefused, match="not among the clips that are given"):
+        cut.run(project, CutParams())
+
+
+@pytest.mark.parametrize(
+    ("run", "params"), [(annotate.run, STEPS), (align.run, AlignParams(suffix=" aligned"))], ids=["annotate", "align"]
+)
+def test_results_that_would_get_one_name_are_refused_before_any_is_computed(project, run, params):
+    again(project, 0, revision=2)
+    with pytest.raises(JobRefused, match="2 results would be walks/left") as refused:
+        run(project, params)
+    assert (refused.value.code, project.told) == ("same-name", [])
+
+
+def test_a_clip_called_like_the_mirrored_twin_of_another_is_refused_before_any_is_computed(project):
+    again(project, 1, item="clip_twin", name="left mirrored")
+    with pytest.raises(JobRefused, match="2 results would be walks/left mirrored"):
+        align.run(project, AlignParams(mirroring="add"))
+    assert project.told == []
+    align.run(project, AlignParams(mirroring="add", suffix=" aligned"))
+    assert len({output.name for output in project.staged}) == len(project.staged) == 6
+
+
+def test_a_second_result_of_one_name_is_refused_and_does_not_replace_the_first(project):
+    results = StagedResults(project)
+    one = StagedOutput(name="a", kind=Kind.CLIP, item_name="a", parts={"motion": {}})
+    results.add(one)
+    results.flush()
+    with pytest.raises(JobRefused, match="two results of the job would be a"):
+        results.add(one)
+
+
+def annotated(project):
+    return annotate.run(project, STEPS)
+
+
+@pytest.mark.parametrize("run", [*KINDS.values(), annotated], ids=[*KINDS, "annotate"])
+def test_a_clip_whose_skeleton_was_deleted_keeps_no_other_from_being_made(project, run):
+    add_clip(project, "odd", generate_gait(1.2, 0.0, 3.0), skeleton="skeleton_gone")
+    del project.parts["skeleton_gone", 1, "hierarchy"]
+    project.into = "out"
+    result = run(project)
+    assert len(project.staged) == 2
+    assert [(one["name"], one["code"]) for one in result["refused"]] == [("walks/odd", "no-skeleton")]
+
+
+@pytest.mark.parametrize("run", [*KINDS.values(), annotated], ids=[*KINDS, "annotate"])
+def test_a_clip_that_was_deleted_while_the_job_waited_keeps_no_other_from_being_made(project, run):
+    del project.parts["clip_left", 1, "motion"]
+    project.into = "out"
+    result = run(project)
+    assert (len(project.staged), codes(result)) == (1, ["no-clip"])
+
+
+def test_an_archive_leaves_out_the_clip_whose_skeleton_was_deleted(project):
+    add_clip(project, "odd", generate_gait(1.2, 0.0, 3.0), skeleton="skeleton_gone")
+    del project.parts["skeleton_gone", 1, "hierarchy"]
+    result = export.run(project, ExportParams())
+    assert (result["clips"], codes(result)) == (2, ["no-skeleton"])
+
+
+@pytest.mark.parametrize("params", [AlignParams, EditParams, RetargetParams])
+@pytest.mark.parametrize("suffix", ["/a", "\n", "x" * 65])
+def test_a_suffix_that_no_name_may_have_is_refused_before_the_job(params, suffix):
+    with pytest.raises(ValueError, match="suffix"):
+        params.model_validate({"suffix": suffix})

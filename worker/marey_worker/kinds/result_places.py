@@ -1,0 +1,61 @@
+"""Where results of a job go: each to a place of its own, and none to that of what it was made of."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+
+from marey_motion.errors import MotionError
+from marey_schemas.jobs import PinnedInput
+from marey_schemas.kinds import Kind
+from marey_schemas.names import MAX_NAME_LENGTH
+from marey_worker.context import Context, JobRefused
+
+
+class ResultPlaces:
+    """The places that the results of one job have taken, and those that its inputs hold."""
+
+    def __init__(self, context: Context) -> None:
+        self._into = context.into
+        self._inputs = {(pin.kind, pin.collection, pin.name) for many in context.inputs.values() for pin in many}
+        self._taken: set[tuple[Kind, str, str]] = set()
+
+    def take(self, kind: Kind, collection: str, *names: str) -> None:
+        """Give these names in a collection below `into` to results that take the place of nothing.
+
+        Raises `MotionError`, and gives none of them, where one is too long, taken, or that of an input.
+        """
+        for name in names:
+            self._require_free(kind, collection, name)
+            if (kind, "/".join(filter(None, (self._into, collection))), name) in self._inputs:
+                path = "/".join(filter(None, (self._into, collection, name)))
+                raise MotionError(
+                    f"the result would take the place of {path}, which is an input of the job; send results into "
+                    "another folder, or let their names differ",
+                    code="own-input",
+                )
+        self._taken |= {(kind, collection, name) for name in names}
+
+    def keep(self, pin: PinnedInput) -> None:
+        """Let a result take the place of this input. Raises `MotionError` where another one has."""
+        self._require_free(pin.kind, pin.collection, pin.name)
+        self._taken.add((pin.kind, pin.collection, pin.name))
+
+    def _require_free(self, kind: Kind, collection: str, name: str) -> None:
+        if len(name) > MAX_NAME_LENGTH:
+            raise MotionError(f"{name!r} has {len(name)} of {MAX_NAME_LENGTH} characters", code="name-too-long")
+        if (kind, collection, name) in self._taken:
+            raise MotionError(f"another result of the job is called {name!r}", code="same-name")
+
+
+def require_different(places: Iterable[tuple[str, str]]) -> None:
+    """Raise `JobRefused` unless these results, by folder and name, all differ: before any of them is computed."""
+    counts = Counter(places)
+    for (folder, name), count in counts.most_common(1):
+        if count > 1:
+            path = "/".join(filter(None, (folder, name)))
+            raise JobRefused(
+                "same-name",
+                f"{count} results would be {path}; name each clip at one revision, and clips of one folder"
+                " so that their results differ",
+            )
