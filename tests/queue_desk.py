@@ -74,7 +74,6 @@ SQUARE = KindDeclaration(
     outputs={"squares": Kind.STUDY},
     fan_out="things",
     batch_size=2,
-    keeps_places_of="things",
 )
 SURVEY = KindDeclaration(
     name="survey",

@@ -97,13 +97,10 @@ class EditParams(Request):
             raise ValueError("suffix: results that take the place of their clips keep their names")
         return self
 
-
-def edit_place_fault(params: EditParams, into: str) -> str | None:
-    """Why an edit's results cannot go to the collection `into`: they would change the clips themselves unasked, or not
-    change them though asked.
-    """
-    if params.in_place and into:
-        return f"the results cannot both take the place of the clips and go to {into}"
-    if not (params.in_place or into or params.suffix):
-        return "the results would take the place of the clips; give a folder or a suffix, or in_place"
-    return None
+    def unclear_place(self, into: str) -> str | None:
+        """Why results that go into this collection would change the clips themselves unasked, or not though asked."""
+        if self.in_place and into:
+            return f"the results cannot both take the place of the clips and go to {into}"
+        if not (self.in_place or into or self.suffix):
+            return "the results would take the place of the clips; give a folder or a suffix, or in_place"
+        return None

@@ -15,13 +15,13 @@ from typing import Any, Literal
 from marey_schemas.alignment import AlignParams
 from marey_schemas.annotations import AnnotateParams, CutParams
 from marey_schemas.base import Request
-from marey_schemas.editing import EditParams, edit_place_fault
+from marey_schemas.editing import EditParams
 from marey_schemas.evaluation import EvaluateParams, count_evaluation_tasks
 from marey_schemas.improvement import CompareParams, OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
 from marey_schemas.jobs import ExportParams, ImportParams, InputSpec, JobKind, RetargetParams
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.modelling import ModelParams
-from marey_schemas.sample_trees import TreeParams, tree_place_fault
+from marey_schemas.sample_trees import TreeParams
 
 ENTRY_POINT_GROUP = "marey.job_kinds"
 MOST_TASKS = 1000
@@ -41,8 +41,17 @@ class KindDeclaration:
     function `gather(context, params, results)`, over what they returned, in their order. Where `task_count` says one,
     a single job runs both functions.
 
-    `place_fault` says, of the checked parameters and `into`, why the results cannot go to that collection, or nothing
-    where they can. Where they keep the places of an input's items below `into`, `keeps_places_of` names that input.
+    Results are published again for identical jobs: for those of the same parameters, seed, and inputs, each with its
+    name, place and content. What else decides them is declared, and makes other jobs of them:
+
+    * `place_counts`: the collection they go to.
+    * `newest_of`: parameters that each name an item, or none, whose newest revision is read.
+    * `in_place`: a parameter with which results replace what they are made of, if that is still the newest.
+      `never_cached_without`: inputs without which a job goes by names as they are while it runs. The results of such
+      jobs answer no other.
+
+    `named_after` is the input whose items lend their places and names to the results; the parameter `suffix` is
+    appended. `unclear_place` says of checked parameters and a collection why it is open where results would go.
     """
 
     name: str
@@ -56,15 +65,23 @@ class KindDeclaration:
     batch_size: int = 1
     task_count: Callable[[Any], int] | None = None
     gathering: str | None = None
-    place_fault: Callable[[Any, str], str | None] | None = None
-    keeps_places_of: str | None = None
     deterministic: bool = True
+    place_counts: bool = False
+    newest_of: tuple[str, ...] = ()
+    in_place: str | None = None
+    never_cached_without: tuple[str, ...] = ()
+    named_after: str | None = None
+    unclear_place: Callable[[Any, str], str | None] | None = None
 
     def __post_init__(self) -> None:
         if self.fan_out is not None and not (self.fan_out in self.inputs and self.inputs[self.fan_out].many):
             raise ValueError(f"{self.name}: fan_out {self.fan_out!r} must be an input that takes many items")
-        if self.keeps_places_of is not None and self.keeps_places_of not in self.inputs:
-            raise ValueError(f"{self.name}: keeps_places_of {self.keeps_places_of!r} must be an input")
+        for name in (*self.never_cached_without, *filter(None, [self.named_after])):
+            if name not in self.inputs:
+                raise ValueError(f"{self.name}: it has no input {name!r}")
+        for name in (*self.newest_of, *filter(None, [self.in_place])):
+            if name not in self.params.model_fields:
+                raise ValueError(f"{self.name}: it has no parameter {name!r}")
         for name, spec in self.inputs.items():
             if unknown := set(spec.parts) - PARTS[spec.kind].keys():
                 raise ValueError(f"{self.name}: input {name!r}: a {spec.kind} has no part {sorted(unknown)[0]!r}")
@@ -107,6 +124,7 @@ IMPORT = KindDeclaration(
     implementation="marey_worker.kinds.imports:run",
     version=2,
     outputs={"clips": Kind.CLIP, "skeletons": Kind.SKELETON, "models": Kind.MODEL},
+    newest_of=("skeleton",),
 )
 
 RETARGET = KindDeclaration(
@@ -128,7 +146,8 @@ RETARGET = KindDeclaration(
     outputs={"clips": Kind.CLIP},
     fan_out="clips",
     batch_size=16,
-    keeps_places_of="clips",
+    place_counts=True,
+    named_after="clips",
 )
 
 EXPORT = KindDeclaration(
@@ -239,8 +258,10 @@ EDIT = KindDeclaration(
     outputs={"clips": Kind.CLIP},
     fan_out="clips",
     batch_size=16,
-    place_fault=edit_place_fault,
-    keeps_places_of="clips",
+    place_counts=True,
+    in_place="in_place",
+    named_after="clips",
+    unclear_place=EditParams.unclear_place,
 )
 
 ANNOTATE = KindDeclaration(
@@ -261,7 +282,7 @@ ANNOTATE = KindDeclaration(
     outputs={"annotations": Kind.ANNOTATION},
     fan_out="clips",
     batch_size=16,
-    keeps_places_of="clips",
+    named_after="clips",
 )
 
 CUT = KindDeclaration(
@@ -282,7 +303,8 @@ CUT = KindDeclaration(
         ),
     },
     outputs={"clips": Kind.CLIP, "annotations": Kind.ANNOTATION},
-    keeps_places_of="clips",
+    place_counts=True,
+    never_cached_without=("clips",),
 )
 
 ALIGN = KindDeclaration(
@@ -306,7 +328,7 @@ ALIGN = KindDeclaration(
         ),
     },
     outputs={"processed": Kind.PROCESSED},
-    keeps_places_of="clips",
+    named_after="clips",
 )
 
 MODEL = KindDeclaration(
@@ -331,7 +353,8 @@ TREE = KindDeclaration(
         "model": InputSpec(kind=Kind.MODEL, parts=("model",), description="The model, which gets the tree as a part.")
     },
     outputs={"model": Kind.MODEL},
-    place_fault=tree_place_fault,
+    place_counts=True,
+    unclear_place=TreeParams.unclear_place,
 )
 
 BUILT_IN = (

@@ -30,10 +30,9 @@ class TreeParams(Request):
         "end_effectors", description="What is grouped: where hands, feet and head are, or the spatial scores."
     )
 
-
-def tree_place_fault(params: TreeParams, into: str) -> str | None:  # noqa: ARG001 - as every kind's
-    """Why a tree cannot go to the collection `into`."""
-    return f"a tree becomes a part of its model and cannot go to {into}; leave `into` empty" if into else None
+    def unclear_place(self, into: str) -> str | None:
+        """Why the tree cannot go into this collection."""
+        return f"a tree becomes a part of its model and cannot go to {into}; leave `into` empty" if into else None
 
 
 class SampleTreeDocument(Request):

@@ -21,6 +21,7 @@ from marey_server.store.job_ends import Ended, end_jobs, failure_document
 from marey_server.store.job_events import emit_job_events, wake_workers
 from marey_server.store.job_inputs import MOST_INPUTS, Pin, PinnedInputs, items_by_id, pin
 from marey_server.store.job_layout import NewJob, Submission
+from marey_server.store.result_places import find_clash
 from marey_server.store.tables import job
 from marey_server.store.transaction import Transaction
 
@@ -77,6 +78,8 @@ def _bound(tx: Transaction, row: Row[Any]) -> NewJob:
         detail = f"{kind.name} does not take these parameters any more: {error.errors()[0]['msg']}"
         raise UnbindableError("invalid-params", detail) from error
     pins = _pin_outputs(tx, row, kind)
+    if (clash := find_clash(kind, params, pins, row.into_path)) is not None:
+        raise UnbindableError(clash.code, clash.detail)
     submission = Submission(
         kind,
         job_layout.request_of(row),

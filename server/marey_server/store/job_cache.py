@@ -2,13 +2,16 @@
 
 Jobs are identical when kind, version of the kind, parameters, seed and inputs are; an input counts with its item, its
 name, its place and the content of those of its documents that the kind reads, since results are named after inputs and
-refer to them. Results are published anew for each job, into the collection it names. Caching stays within a project.
+refer to them. A kind declares what counts besides: the place of the results, the newest revision of an item that the
+parameters name. Jobs that go by how things are while they run have no key. Results are published anew for each job,
+into the collection it names. Caching stays within a project.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from sqlalchemy import and_, delete, insert, or_, select, update
@@ -49,12 +52,32 @@ def cache_key(
     seed: int,
     inputs: Any,
     task: tuple[int | None, int] | None = None,
+    *,
+    into: str = "",
+    newest: Mapping[str, int] = MappingProxyType({}),
 ) -> str:
-    """The name of a computation. `inputs` as `input_contents` tells them; `task` is which of how many has them."""
+    """The name of a computation. `inputs` as `input_contents` tells them; `task` is which of how many has them; `into`
+    is where the results go; `newest` holds the newest revisions of `named_items`.
+    """
     tree = {"kind": kind.code_version, "params": params, "seed": seed, "inputs": inputs}
     if task is not None:
         tree["task"] = task
+    if kind.place_counts:
+        tree["into"] = into
+    if kind.newest_of:
+        tree["newest"] = [[item, newest.get(item)] for item in named_items(kind, params)]
     return f"sha256:{hashlib.sha256(canonical_json(tree)).hexdigest()}"
+
+
+def has_key(kind: KindDeclaration, params: Mapping[str, Any], inputs: Collection[str]) -> bool:
+    """Whether a job with these parameters and with inputs of these names depends on nothing but its key."""
+    in_place = kind.in_place is not None and params.get(kind.in_place)
+    return kind.deterministic and not in_place and set(kind.never_cached_without) <= set(inputs)
+
+
+def named_items(kind: KindDeclaration, params: Mapping[str, Any]) -> list[str]:
+    """The ids of the items that the parameters name and whose newest revisions are read."""
+    return [params[name] for name in kind.newest_of if params.get(name)]
 
 
 def part_digests(tx: Transaction, inputs: Iterable[PinnedInputs]) -> dict[tuple[str, int], dict[str, str]]:

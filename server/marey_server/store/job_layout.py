@@ -13,7 +13,7 @@ from marey_schemas.jobs import JobCreate, Resources
 from marey_server.store import job_cache
 from marey_server.store.ids import new_id
 from marey_server.store.job_ends import Ended
-from marey_server.store.job_inputs import PinnedInputs
+from marey_server.store.job_inputs import PinnedInputs, items_by_id
 from marey_server.store.transaction import Transaction
 
 
@@ -135,13 +135,37 @@ def _shares(submission: Submission) -> list[PinnedInputs]:
 
 
 def _set_cache_keys(tx: Transaction, jobs: Sequence[NewJob]) -> None:
-    cached = [one for one in jobs if one.submission.kind.deterministic and one.cache_mode != "off"]
+    cached = [one for one in jobs if one.cache_mode != "off" and _has_key(one.submission)]
     parts = job_cache.part_digests(tx, {id(one.submission): one.submission.pins for one in cached}.values())
+    newest = _newest_revisions(tx, cached)
     for one in cached:
         submission = one.submission
         contents = job_cache.input_contents(submission.kind, one.pins, parts)
         task = None if one.parent_id is None or submission.kind.fan_out else (one.position, submission.task_count)
-        one.cache_key = job_cache.cache_key(submission.kind, submission.params, submission.request.seed, contents, task)
+        one.cache_key = job_cache.cache_key(
+            submission.kind,
+            submission.params,
+            submission.request.seed,
+            contents,
+            task,
+            into=submission.request.into,
+            newest=newest,
+        )
+
+
+def _has_key(submission: Submission) -> bool:
+    given = [name for name, pins in submission.pins.items() if pins]
+    return job_cache.has_key(submission.kind, submission.params, given)
+
+
+def _newest_revisions(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, int]:
+    """Of the items that the parameters of jobs name; those that are not there in the job's project are left out."""
+    wanted: dict[str, set[str]] = {}
+    for one in jobs:
+        named = job_cache.named_items(one.submission.kind, one.submission.params)
+        wanted.setdefault(one.project_id, set()).update(named)
+    found = (items_by_id(tx, project_id, ids) for project_id, ids in wanted.items())
+    return {item: one.head for items in found for item, one in items.items()}
 
 
 def new_row(tx: Transaction, one: NewJob) -> dict[str, Any]:

@@ -16,15 +16,16 @@ from marey_schemas.jobs import Job, JobCreate, JobState
 from marey_schemas.problems import FieldError
 from marey_server import faults
 from marey_server.errors import Invalid
-from marey_server.store import collections, job_cache, staging
+from marey_server.store import job_cache, staging
 from marey_server.store.binding import bind
 from marey_server.store.job_documents import job_documents
 from marey_server.store.job_ends import dependency_failure
 from marey_server.store.job_events import emit_job_events, wake_workers
-from marey_server.store.job_inputs import FoundItem, PinnedInputs, find_items, late_inputs, pin_inputs
+from marey_server.store.job_inputs import FoundItem, find_items, late_inputs, pin_inputs
 from marey_server.store.job_layout import NewJob, Submission, lay_out, new_row
 from marey_server.store.labels import labels_key
 from marey_server.store.projects import ProjectRow, require
+from marey_server.store.result_places import find_clash
 from marey_server.store.settling import settle
 from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import Transaction
@@ -119,7 +120,8 @@ def _check(
         detail = f"These are no parameters of {kind.name}: {found[0].pointer}: {found[0].detail}"
         raise Invalid(detail, errors=found) from error
     pins = pin_inputs(tx, project, kind, request, known, at)
-    _check_place(kind, params, request.into, pins, at)
+    if (clash := find_clash(kind, params, pins, request.into)) is not None:
+        raise _invalid(f"{at}{clash.place}", clash.code, clash.detail)
     tasks, plain = _count_tasks(kind, params, at), params.model_dump(mode="json")
     late = [maker for _, _, maker in late_inputs(request, at)]
     return Submission(
@@ -133,20 +135,6 @@ def _check(
         after=tuple(dict.fromkeys((*request.after, *late))),
         unbound=bool(late),
     )
-
-
-def _check_place(kind: KindDeclaration, params: Any, into: str, pins: PinnedInputs, at: str) -> None:
-    """Refuse a job whose results could not go where they are to go."""
-    fault = kind.place_fault(params, into) if kind.place_fault is not None else None
-    if fault is not None:
-        raise _invalid(f"{at}/into", "ambiguous-place", f"{kind.name}: {fault}.")
-    kept = pins.get(kind.keeps_places_of or "", ()) if into else ()
-    for folder in sorted({"", *(pin["collection"] for pin in kept if "collection" in pin)}):
-        try:
-            collections.check_length(f"{into}/{folder}".strip("/"))
-        except Invalid as error:
-            detail = f"The results would go to {into}/{folder}. {error.detail}"
-            raise _invalid(f"{at}/into", error.error_code, detail) from error
 
 
 def _count_tasks(kind: KindDeclaration, params: Any, at: str) -> int:

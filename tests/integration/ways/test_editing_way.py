@@ -98,9 +98,9 @@ def test_the_originals_stay_unless_they_are_edited_in_place(marey: Marey, lab: P
 
 def test_where_results_should_go_must_be_clear(marey: Marey, lab: ProjectHandle) -> None:
     with pytest.raises(Invalid, match="would take the place of the clips"):
-        ended(marey, lab.edit("walks", [{"command": "mirror"}]))
+        lab.edit("walks", [{"command": "mirror"}])
     with pytest.raises(Invalid, match="cannot both take the place"):
-        ended(marey, lab.edit("walks", [{"command": "mirror"}], in_place=True, into="elsewhere"))
+        lab.edit("walks", [{"command": "mirror"}], in_place=True, into="elsewhere")
     (first, *_) = clips_of(lab, "walks").values()
     ended(marey, lab.edit(first, [{"command": "trim", "start": 10}], in_place=True))
     stale = ended(marey, lab.edit(first, [{"command": "trim", "start": 20}], in_place=True))

@@ -58,9 +58,12 @@ def test_a_kind_that_counts_its_tasks_says_who_gathers_them_and_spreads_no_input
     assert declare(task_count=lambda _params: 2, gathering="tidy:gather").document().gathers
 
 
-def test_a_kind_keeps_the_places_of_an_input_that_it_has() -> None:
-    with pytest.raises(ValueError, match="must be an input"):
-        declare(keeps_places_of="clips")
+@pytest.mark.parametrize(
+    "wrong", [{"in_place": "x"}, {"newest_of": ("x",)}, {"named_after": "x"}, {"never_cached_without": ("x",)}]
+)
+def test_what_a_kind_says_of_its_results_names_parameters_and_inputs_it_has(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="'x'"):
+        declare(**wrong)
 
 
 def test_an_unknown_kind_is_refused_with_the_known_ones() -> None:

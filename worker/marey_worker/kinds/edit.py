@@ -15,7 +15,7 @@ from marey_motion.editing.take import EditedBody
 from marey_motion.errors import EditError, MotionError
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents import ClipInfo, Motion, RevisionRef, SkeletonHierarchy, Source
-from marey_schemas.editing import EditDocument, EditParams, edit_place_fault
+from marey_schemas.editing import EditDocument, EditParams
 from marey_schemas.jobs import PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused, NoSuchThing
@@ -47,8 +47,8 @@ class _Editing:
         self._refusals = Refusals(context)
         self._places = ResultPlaces(context)
         self._findings: list[dict[str, Any]] = []
-        if fault := edit_place_fault(params, context.into):
-            raise JobRefused("ambiguous-place", fault)
+        if (unclear := params.unclear_place(context.into)) is not None:
+            raise JobRefused("ambiguous-place", unclear)
         self._edit_pin, self._edit = _wanted_edit(context, params)
         self._commands: tuple[NamedCommand, ...] = documents.commands_of_edit(self._edit)
         self._source_pins = _wanted_sources(context, self._edit)

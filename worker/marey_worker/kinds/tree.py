@@ -12,7 +12,7 @@ from marey_schemas.canonical import document_digest
 from marey_schemas.documents import RevisionRef
 from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
-from marey_schemas.sample_trees import TreeParams, tree_place_fault
+from marey_schemas.sample_trees import TreeParams
 from marey_worker.context import Context, JobRefused
 from marey_worker.kinds.matching_clips import refusing_motion_errors
 from marey_worker.kinds.rigged import Rig, read_rigged
@@ -25,8 +25,8 @@ def run(context: Context, params: TreeParams) -> dict[str, Any]:
     """
     started = time.monotonic()
     (pin,) = context.inputs["model"]
-    if fault := tree_place_fault(params, context.into):
-        raise JobRefused("ambiguous-place", fault)
+    if (unclear := params.unclear_place(context.into)) is not None:
+        raise JobRefused("ambiguous-place", unclear)
     _require_same_place(context, pin)
     context.progress(0, 2, "reading the model")
     model = context.document(Kind.MODEL, pin.item, pin.revision, "model")
