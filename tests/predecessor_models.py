@@ -1,9 +1,12 @@
 """Models as the predecessor wrote them, in every layout, made up of seeded numbers."""
 
+import json
+
 import numpy as np
 
 from marey_motion.formats.predecessor_skeleton import skeleton_document
 from marey_motion.gait import generate_gait
+from marey_motion.importing import FileDigests, ImportRequest, import_file, plan_imports
 from marey_motion.modelling.splines import SplineBasis
 
 FRAMES, SPATIAL, TEMPORAL = 48, 5, 3
@@ -129,3 +132,15 @@ def tree(generator=None):
         "options": {"n_subdivisions": 4, "clustering_method": 0, "use_feature_mean": False},
         "root": node(list(range(40)), 0),
     }
+
+
+FILE, TREE_FILE = f"sha256:{'1' * 64}", f"sha256:{'2' * 64}"
+
+
+def imported():
+    """The parts of a model with its tree that two files become, and the hierarchy of the skeleton."""
+    planned, companion = plan_imports(["in/walk_mm.json", "in/walk_cluster_tree.json"])
+    assert (planned.companion, companion.role) == ("in/walk_cluster_tree.json", "companion")
+    data, beside = (json.dumps(one).encode() for one in (layout_3(), tree()))
+    found = import_file(planned, data, FileDigests(FILE, TREE_FILE, companion.name), ImportRequest(), beside)
+    return found.modelled.parts, found.hierarchy

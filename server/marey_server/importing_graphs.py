@@ -68,11 +68,13 @@ def graph_draft(tx: Transaction, project: str, wanted: ImportedGraph) -> Draft:
 
 
 def _find_model(tx: Transaction, project: str, name: str, collection: str) -> dict[str, Any]:
-    page = items.list_items(tx, project, Kind.MODEL, ItemFilters(name=name), limit=100)
-    found = [one for one in page.items if one.collection == collection] or list(page.items)
-    if len(found) != 1:
-        places = ", ".join(one.path for one in found[:FEW])
-        there = f"{len(found)} models are called {name!r} ({places})" if found else f"no model is called {name!r}"
-        advice = "import the models of a graph first, beside it"
-        raise Invalid(f"The graph has a node {name!r}, but {there}; {advice}.", code="no-model")
-    return {"item": found[0].id, "revision": found[0].revision}
+    """The model beside the graph, else the only one that is called so."""
+    for folder in (collection, None):
+        named = ItemFilters(exact_name=name, directly_in=folder)
+        page = items.list_items(tx, project, Kind.MODEL, named, limit=FEW, count=True)
+        if page.count == 1:
+            return {"item": page.items[0].id, "revision": page.items[0].revision}
+    places = ", ".join(one.path for one in page.items)
+    there = f"{page.count} models are called {name!r} ({places})" if page.count else f"no model is called {name!r}"
+    advice = "import the models of a graph first, beside it"
+    raise Invalid(f"The graph has a node {name!r}, but {there}; {advice}.", code="no-model")

@@ -38,6 +38,8 @@ class ItemFilters:
     """Folder and name."""
     name: str | None = None
     """Exact, or the start of the name before a final `*`."""
+    exact_name: str | None = None
+    """Exact, whatever it ends in."""
     tags: tuple[str, ...] = ()
     """Any of these."""
     skeleton: str | None = None
@@ -98,6 +100,8 @@ def _conditions(project_id: str, kind: Kind, filters: ItemFilters) -> list[Colum
         conditions += [_directly_in(project_id, folder, deleted=filters.deleted), item.c.name == name]
     if filters.name is not None:
         conditions += _named(filters.name)
+    if filters.exact_name is not None:
+        conditions.append(item.c.name == filters.exact_name)
     if filters.tags:
         tagged = select(item_tag.c.item_id).where(item_tag.c.tag.in_(filters.tags))
         conditions.append(item.c.id.in_(tagged))

@@ -1,0 +1,62 @@
+"""A graph finds the models of its nodes by their names."""
+
+import pytest
+
+from marey_motion.formats.predecessor_graph import GraphNode, PredecessorGraph
+from marey_schemas.kinds import Kind
+from marey_server.errors import Invalid
+from marey_server.importing_graphs import ImportedGraph, graph_draft
+from marey_server.store import items, projects
+from marey_server.store.items import Draft
+from predecessor_models import imported
+
+
+@pytest.fixture(scope="module")
+def parts():
+    return imported()
+
+
+def add_models(lab, parts, *paths):
+    """The same model in several places; ids by path."""
+    found, hierarchy = parts
+    model = {**found["model"], "skeleton": {"output": "rig"}, "provenance": {}}
+    drafts = [Draft("rig", Kind.SKELETON, "rig", {"hierarchy": hierarchy}, reuse="by_content")]
+    for path in paths:
+        folder, _, name = path.rpartition("/")
+        drafts.append(Draft(path, Kind.MODEL, name, {"model": model}, folder))
+
+    def run(tx):
+        project_row = projects.require(tx, "lab", scope="write")
+        return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id)
+
+    return {one.name: one.item for one in lab.write(run)}
+
+
+def models_of(lab, *names):
+    """Ids of the models that the nodes of a graph in the folder `g` get."""
+    nodes = {("idle", name): GraphNode("?", "idle", (("idle", name),)) for name in names}
+    graph = PredecessorGraph(nodes, ("idle", names[0]))
+    draft = lab.read(graph_draft, "lab", ImportedGraph("graph", "g", (), graph, "graph.json", f"sha256:{'3' * 64}"))
+    group = draft.parts["graph"].body["actions"]["idle"]["primitives"]
+    return [group[name]["model"]["item"] for name in names]
+
+
+def test_a_node_whose_name_ends_in_an_asterisk_is_no_search_by_the_start_of_names(lab, parts):
+    add_models(lab, parts, "g/stand")
+    with pytest.raises(Invalid, match=r"no model is called 'stan\*'"):
+        models_of(lab, "stan*")
+    ids = add_models(lab, parts, "g/stan*")
+    assert models_of(lab, "stan*") == [ids["g/stan*"]]
+
+
+def test_the_model_beside_the_graph_is_taken_however_many_there_are_elsewhere(lab, parts):
+    ids = add_models(lab, parts, "g/stand", *(f"other {number:03d}/stand" for number in range(101)))
+    assert models_of(lab, "stand") == [ids["g/stand"]]
+
+
+def test_the_only_model_elsewhere_is_taken_and_one_of_several_is_not_guessed(lab, parts):
+    ids = add_models(lab, parts, "far/stand")
+    assert models_of(lab, "stand") == [ids["far/stand"]]
+    add_models(lab, parts, "farther/stand")
+    with pytest.raises(Invalid, match="2 models are called 'stand'"):
+        models_of(lab, "stand")
