@@ -5,15 +5,17 @@ The options are those of `marey_motion.modelling.options`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Request
 from marey_schemas.names import ItemName, JointName, Tag
+from marey_schemas.originals import StoredOriginal
 from marey_schemas.references import OutputRef, RevisionRef
 
 MOST_JOINTS = 4096
@@ -113,6 +115,40 @@ class MixtureDocument(Request):
         return self
 
 
+class Noted(Request):
+    """What is written down beside a model: some of it is read again, anything else may stand there too."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class PredecessorOrigin(Noted):
+    """Where a model that was imported from the predecessor comes from."""
+
+    animated_joints: tuple[JointName, ...] = Field((), max_length=MOST_JOINTS, description="Those that it moves.")
+    original: StoredOriginal | None = Field(None, description="The file of the model.")
+    tree: StoredOriginal | None = Field(None, description="The file of its tree.")
+
+
+class ModelProvenance(Noted):
+    """The examples of a model, and where they come from."""
+
+    predecessor: PredecessorOrigin | None = None
+
+
+class ExampleNotes(Noted):
+    """How well a model knows one of its examples."""
+
+    log_likelihood: float | None = Field(
+        None, allow_inf_nan=False, description="Natural logarithm of the density of the example."
+    )
+
+
+class TrainingNotes(Noted):
+    """How good a model is, in numbers."""
+
+    examples: tuple[ExampleNotes, ...] = Field((), description="One by one.")
+
+
 class MotionPrimitiveDocument(Request):
     """Part `model`: a generative model of one action.
 
@@ -140,8 +176,10 @@ class MotionPrimitiveDocument(Request):
     duration_range_s: tuple[float, float] | None = Field(None, description="Within which samples last.")
     scaling: dict[str, Any] | None = Field(None, description="Method and weights of the channels; undone above.")
     options: dict[str, Any] | None = Field(None, description="What it was trained with.")
-    provenance: dict[str, Any] = Field(default_factory=dict, description="The examples, and where they come from.")
-    training: dict[str, Any] | None = Field(None, description="How good it is, in numbers.")
+    provenance: ModelProvenance = Field(
+        default_factory=ModelProvenance, description="The examples, and where they come from."
+    )
+    training: TrainingNotes | None = Field(None, description="How good it is, in numbers.")
 
     @model_validator(mode="after")
     def _check_shapes(self) -> Self:
@@ -154,3 +192,25 @@ class MotionPrimitiveDocument(Request):
         if self.mixture.means.shape[1] != dimensions:
             raise ValueError(f"mixture: {self.mixture.means.shape[1]} dimensions for {dimensions} components")
         return self
+
+
+def checked_model(part: Mapping[str, Any]) -> MotionPrimitiveDocument:
+    """A stored part `model` without its notes, which older documents may hold in ways of their own."""
+    return MotionPrimitiveDocument.model_validate({**part, "provenance": {}, "training": None})
+
+
+def predecessor_origin(model: Mapping[str, Any]) -> PredecessorOrigin:
+    """Where a stored part `model` was imported from; nothing where an older document says it in a way of its own."""
+    try:
+        return ModelProvenance.model_validate(model.get("provenance", {})).predecessor or PredecessorOrigin()
+    except ValidationError:
+        return PredecessorOrigin()
+
+
+def log_likelihoods(model: Mapping[str, Any]) -> tuple[float, ...]:
+    """Of the examples of a stored part `model`; none where an older document says them in a way of its own."""
+    try:
+        examples = TrainingNotes.model_validate(model.get("training") or {}).examples
+    except ValidationError:
+        return ()
+    return tuple(one.log_likelihood for one in examples if one.log_likelihood is not None)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from marey_schemas.base import Request
@@ -21,6 +23,6 @@ class OutputRef(Request):
 
 
 class PartDigestRef(Request):
-    """The digest of another part of the same item and the same write; the store replaces it by that digest."""
+    """The digest of the part `model` of the same item and the same write; the store replaces it by that digest."""
 
-    digest_of: str
+    digest_of: Literal["model"]

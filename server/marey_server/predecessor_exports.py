@@ -11,7 +11,7 @@ from marey_schemas.alignment import AlignmentInfo
 from marey_schemas.documents import Annotation, SkeletonHierarchy
 from marey_schemas.graphs import ModelGraph
 from marey_schemas.kinds import Kind
-from marey_schemas.modelling import MotionPrimitiveDocument
+from marey_schemas.modelling import checked_model, predecessor_origin
 from marey_schemas.originals import StoredOriginal, content_digest
 from marey_schemas.references import RevisionRef
 from marey_schemas.sample_trees import SampleTreeDocument
@@ -19,7 +19,8 @@ from marey_server.errors import Invalid, NotFound
 
 Parts = Mapping[str, dict[str, Any]]
 
-ENDINGS = {"model": "_mm.json", "tree": "_cluster_tree.json", "graph": ".json"}
+PARTS_OF: dict[Kind, tuple[str, ...]] = {Kind.MODEL: ("model", "tree"), Kind.PROCESSED: ("alignment",)}
+"""Which parts of an item are files of the predecessor of their own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +37,13 @@ class PredecessorOptions:
     part: Literal["model", "tree", "alignment"] | None = None
     layout: Literal["2", "3"] | None = None
 
+    def require_part_of(self, kind: Kind) -> None:
+        """Raise `Invalid` where a part is asked for that items of a kind do not have."""
+        if self.part is not None and self.part not in PARTS_OF.get(kind, ()):
+            held = " or ".join(PARTS_OF.get(kind, ())) or "none"
+            detail = f"A {kind} has no part {self.part!r} of its own as a file of the predecessor; it has {held}."
+            raise Invalid(detail, code="no-part")
+
 
 def unchanged_original(kind: Kind, parts: Parts, options: PredecessorOptions) -> StoredOriginal | None:
     """The file that a model, a tree or a graph was imported from, where it says the same as the part that is asked for.
@@ -45,36 +53,50 @@ def unchanged_original(kind: Kind, parts: Parts, options: PredecessorOptions) ->
     if options.layout is not None:
         return None
     if kind is Kind.GRAPH:
-        part, known = "graph", parts["graph"].get("original")
-    elif kind is Kind.MODEL and (options.part or "model") in parts:
-        part = options.part or "model"
-        known = parts["model"].get("provenance", {}).get("predecessor", {}).get(_MEMBERS.get(part))
-    else:
-        return None
-    if known is None or known["content"] != content_digest(part, parts[part]):
-        return None
-    return StoredOriginal.model_validate(known)
+        known = parts["graph"].get("original")
+        return _if_unchanged("graph", parts["graph"], None if known is None else StoredOriginal.model_validate(known))
+    if kind is Kind.MODEL:
+        origin = predecessor_origin(parts["model"])
+        if options.part == "tree":
+            return _if_unchanged("tree", parts.get("tree"), origin.tree)
+        return _if_unchanged("model", parts["model"], origin.original)
+    return None
 
 
-_MEMBERS = {"model": "original", "tree": "tree"}
+def _if_unchanged(part: str, document: Mapping[str, Any] | None, known: StoredOriginal | None) -> StoredOriginal | None:
+    if document is None or known is None or known.content != content_digest(part, document):
+        return None
+    return known
 
 
 def write_predecessor(
     kind: Kind, name: str, parts: Parts, hierarchy: Mapping[str, Any] | None, options: PredecessorOptions
 ) -> tuple[str, bytes]:
     """Name and bytes of a file. Raises `Invalid` where the item has none, `NotFound` for a model without a tree."""
+    from marey_motion.errors import MotionError
+
+    try:
+        ending, data = _written(kind, parts, hierarchy, options)
+    except MotionError as error:
+        raise Invalid(str(error), code="cannot-be-exported") from error
+    return f"{name}{ending}", data
+
+
+def _written(
+    kind: Kind, parts: Parts, hierarchy: Mapping[str, Any] | None, options: PredecessorOptions
+) -> tuple[str, bytes]:
     if kind is Kind.ANNOTATION:
-        return f"{name}_sections.json", _annotation(parts["annotation"], options)
+        return "_sections.json", _annotation(parts["annotation"], options)
     if kind is Kind.GRAPH:
-        return f"{name}{ENDINGS['graph']}", _graph(parts["graph"])
+        return ".json", _graph(parts["graph"])
     if kind is Kind.PROCESSED:
-        return f"{name}_alignment.json", _alignment(parts["info"])
+        return "_alignment.json", _alignment(parts["info"])
     if kind is Kind.MODEL and hierarchy is not None:
         if options.part != "tree":
-            return f"{name}{ENDINGS['model']}", _model(parts["model"], hierarchy, options.layout or "3")
+            return "_mm.json", _model(parts["model"], hierarchy, options.layout or "3")
         if "tree" not in parts:
             raise NotFound("The model has no tree.", code="no-part")
-        return f"{name}{ENDINGS['tree']}", _tree(parts["model"], parts["tree"])
+        return "_cluster_tree.json", _tree(parts["model"], parts["tree"])
     raise Invalid(f"A {kind} is exported as json.", code="no-such-export")
 
 
@@ -99,18 +121,13 @@ def _alignment(part: Mapping[str, Any]) -> bytes:
 
 def _model(part: Mapping[str, Any], hierarchy: Mapping[str, Any], layout: Literal["2", "3"]) -> bytes:
     from marey_motion.documents import skeleton_from_document
-    from marey_motion.errors import MotionError
     from marey_motion.formats.predecessor_model_writer import write_predecessor_model
     from marey_motion.modelling.primitive_documents import primitive_from_tree
 
-    model = MotionPrimitiveDocument.model_validate(part)
     skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
-    animated = model.provenance.get("predecessor", {}).get("animated_joints", ())
-    try:
-        primitive = primitive_from_tree(model.model_dump(by_alias=True), skeleton)
-        return write_predecessor_model(primitive, layout=layout, animated_joints=tuple(animated))
-    except MotionError as error:
-        raise Invalid(str(error), code="cannot-be-exported") from error
+    primitive = primitive_from_tree(checked_model(part).model_dump(by_alias=True), skeleton)
+    animated = predecessor_origin(part).animated_joints
+    return write_predecessor_model(primitive, layout=layout, animated_joints=animated)
 
 
 def _tree(model: Mapping[str, Any], part: Mapping[str, Any]) -> bytes:
@@ -118,9 +135,8 @@ def _tree(model: Mapping[str, Any], part: Mapping[str, Any]) -> bytes:
     from marey_motion.modelling.sample_tree_documents import sample_tree_from_tree
 
     document = SampleTreeDocument.model_validate(part)
-    spatial = len(MotionPrimitiveDocument.model_validate(model).spatial.directions)
     tree = sample_tree_from_tree(document.model_dump())
-    return write_predecessor_tree(tree, spatial, document.options.branching)
+    return write_predecessor_tree(tree, len(checked_model(model).spatial.directions), document.options.branching)
 
 
 def _graph(part: Mapping[str, Any]) -> bytes:

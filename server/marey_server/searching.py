@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from marey_schemas.documents import SkeletonMapping
 from marey_schemas.kinds import Kind
+from marey_schemas.modelling import log_likelihoods
 from marey_schemas.search import SearchRequest
 from marey_server import models
 from marey_server.errors import Invalid, NotFound
@@ -110,7 +111,8 @@ def parse_searchable(loaded: LoadedSearchable, seed: int) -> Searchable:
         tree.means, tree.starts  # noqa: B018    computed here, once for all searches
     except MotionError as error:
         raise Invalid(f"The model cannot be searched: {error}", code=error.code) from error
-    return Searchable(usable, tree, stored, mapping, standard_joints, _log_likelihoods(loaded.model.model))
+    likelihoods = tuple(sorted(log_likelihoods(loaded.model.model)))
+    return Searchable(usable, tree, stored, mapping, standard_joints, likelihoods)
 
 
 class SearchableCache:
@@ -149,11 +151,6 @@ def _find(tx: Transaction, project: str, item_id: str) -> FoundSearchable:
     if "mapping" in held:
         mapping = items.find_part(tx, project, Kind.SKELETON, ref["item"], "mapping")
     return FoundSearchable(model, tree, mapping)
-
-
-def _log_likelihoods(model: dict[str, Any]) -> tuple[float, ...]:
-    training = model.get("training") or {}
-    return tuple(sorted(one["log_likelihood"] for one in training.get("examples", ())))
 
 
 def _size_bytes(made: Searchable) -> int:

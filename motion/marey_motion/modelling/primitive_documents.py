@@ -15,7 +15,7 @@ from marey_motion.modelling.mixture_fitting import Candidate
 from marey_motion.modelling.primitive import FunctionalComponents, MotionPrimitive
 from marey_motion.modelling.reconstruction import ReconstructionErrors
 from marey_motion.modelling.sample_quality import FootQuality
-from marey_motion.modelling.splines import SplineBasis
+from marey_motion.modelling.splines import DEGREE, SplineBasis
 from marey_motion.modelling.training import TrainedPrimitive
 from marey_motion.modelling.training_report import Durations, ExampleReport, TrainingReport
 from marey_motion.modelling.verdict import headline_of, verdict_of
@@ -133,7 +133,7 @@ def _components_from_tree(tree: Mapping[str, Any], columns: NDArray[np.int64] | 
     if columns is not None:
         for name in ("mean", "directions", "projections"):
             arrays[name] = np.ascontiguousarray(arrays[name][..., columns])
-    return FunctionalComponents(basis=SplineBasis(np.asarray(tree["knots"]), int(tree["degree"])), **arrays)
+    return FunctionalComponents(basis=SplineBasis(np.asarray(tree["knots"]), int(tree.get("degree", DEGREE))), **arrays)
 
 
 def _columns(joints: list[str], skeleton: Skeleton) -> NDArray[np.int64] | None:

@@ -32,7 +32,7 @@ class ExportQuery(Request):
     part: Literal["model", "tree", "alignment"] | None = Field(
         None,
         description="For the predecessor: the tree of a model, or what is kept beside an aligned clip: its time "
-        "function and sections. Absent: the model, or the clip.",
+        "function and sections. Absent: the model, or the clip. Other items have none.",
     )
     layout: Literal["2", "3"] | None = Field(
         None, description="Of a model of the predecessor; absent: as it was imported, else 3."
@@ -72,10 +72,11 @@ class Export(BlobSender):
         given back as it came.
         """
         place = (project, kind_of(kind), item, query.revision)
+        options = PredecessorOptions(query.end_index, query.form, query.part, query.layout)
+        options.require_part_of(place[1])
         if query.format == "original":
             original = await self.look_up(exporting.find_original, *place)
             return await self.send_blob(original.digest, disposition=attachment(original.name))
-        options = PredecessorOptions(query.end_index, query.form, query.part, query.layout)
         if query.format == "predecessor":
             unchanged = await self.look_up(exporting.find_unchanged_original, *place, options)
             if unchanged is not None:

@@ -6,24 +6,18 @@ import numpy as np
 import pytest
 
 import predecessor_models as models
-from marey_motion.importing import FileDigests, ImportRequest, import_file, plan_imports
 from marey_schemas.kinds import Kind
 from marey_server.errors import Invalid, NotFound
 from marey_server.predecessor_exports import PredecessorOptions, unchanged_original, write_predecessor
-
-FILE, TREE_FILE = f"sha256:{'1' * 64}", f"sha256:{'2' * 64}"
+from predecessor_models import FILE, TREE_FILE
 
 
 @pytest.fixture(scope="module")
 def stored():
     """The parts of a model with its tree, as they are stored when they are imported, and the skeleton's hierarchy."""
-    planned, companion = plan_imports(["in/walk_mm.json", "in/walk_cluster_tree.json"])
-    assert (planned.companion, companion.role) == ("in/walk_cluster_tree.json", "companion")
-    data, tree = (json.dumps(one).encode() for one in (models.layout_3(), models.tree()))
-    found = import_file(planned, data, FileDigests(FILE, TREE_FILE, companion.name), ImportRequest(), tree)
-    parts = found.modelled.parts
+    parts, hierarchy = models.imported()
     model = {**parts["model"], "skeleton": {"item": "skeleton_1", "revision": 1}}
-    return {"model": model, "tree": {**parts["tree"], "model_digest": FILE}}, found.hierarchy
+    return {"model": model, "tree": {**parts["tree"], "model_digest": FILE}}, hierarchy
 
 
 def test_unchanged_parts_are_given_back_as_their_files(stored):
@@ -82,3 +76,50 @@ def test_the_time_function_beside_an_aligned_clip_is_written_in_whole_frames():
 def test_other_kinds_have_no_file_of_the_predecessor():
     with pytest.raises(Invalid, match="exported as json"):
         write_predecessor(Kind.STUDY, "s", {"study": {}}, None, PredecessorOptions())
+
+
+@pytest.mark.parametrize(
+    "predecessor",
+    [
+        "x",
+        5,
+        None,
+        {"original": "x"},
+        {"original": {}},
+        {"tree": [1]},
+        {"animated_joints": 5},
+        {"animated_joints": [1]},
+    ],
+)
+@pytest.mark.parametrize("part", ["model", "tree"])
+def test_a_model_that_an_older_server_took_with_odd_notes_is_written_anew(stored, predecessor, part):
+    parts, hierarchy = stored
+    noted = {"provenance": {"predecessor": predecessor}, "training": {"examples": 5}}
+    parts = {**parts, "model": {**parts["model"], **noted}}
+    options = PredecessorOptions(part=part)
+    assert unchanged_original(Kind.MODEL, parts, options) is None
+    assert json.loads(write_predecessor(Kind.MODEL, "walk", parts, hierarchy, options)[1])
+
+
+def test_a_tree_whose_nodes_are_none_is_refused(stored):
+    parts, hierarchy = stored
+    parts = {**parts, "tree": {**parts["tree"], "children": np.ones_like(parts["tree"]["children"])}}
+    with pytest.raises(Invalid) as refused:
+        write_predecessor(Kind.MODEL, "walk", parts, hierarchy, PredecessorOptions(part="tree"))
+    assert refused.value.error_code == "cannot-be-exported"
+
+
+@pytest.mark.parametrize(
+    ("kind", "part"),
+    [(Kind.MODEL, "alignment"), (Kind.PROCESSED, "tree"), (Kind.CLIP, "model"), (Kind.ANNOTATION, "alignment")],
+)
+def test_a_part_that_items_of_a_kind_do_not_have_is_refused(kind, part):
+    with pytest.raises(Invalid, match=f"{kind} has no part '{part}'") as refused:
+        PredecessorOptions(part=part).require_part_of(kind)
+    assert refused.value.error_code == "no-part"
+    PredecessorOptions().require_part_of(kind)
+
+
+@pytest.mark.parametrize(("kind", "part"), [(Kind.MODEL, "model"), (Kind.MODEL, "tree"), (Kind.PROCESSED, "alignment")])
+def test_a_part_that_items_of_a_kind_have_may_be_asked_for(kind, part):
+    PredecessorOptions(part=part).require_part_of(kind)

@@ -10,6 +10,7 @@ from marey_schemas.kinds import Kind
 from marey_server.errors import Conflict, Invalid
 from marey_server.store import documents, items, projects
 from marey_server.store.items import Draft, StoredDocument, references
+from predecessor_models import imported
 from store_fixtures import motion_tree, skeleton_tree
 
 
@@ -215,3 +216,34 @@ def test_references_are_followed_before_what_refers(refers):
     assert sorted(order) == sorted(refers)
     for name, others in refers.items():
         assert all(order.index(other) < order.index(name) for other in others if other in refers)
+
+
+def model_drafts(**changes):
+    """A model with its tree, and their skeleton."""
+    parts, hierarchy = imported()
+    model = {**parts["model"], "skeleton": {"output": "rig"}, "provenance": {}, **changes}
+    yield Draft("walk", Kind.MODEL, "walk", {"tree": parts["tree"], "model": model})
+    yield Draft("rig", Kind.SKELETON, "rig", {"hierarchy": hierarchy})
+
+
+def test_a_tree_gets_the_digest_of_the_model_it_comes_with(lab):
+    publish(lab, *model_drafts())
+    (model,) = listed(lab, Kind.MODEL)
+    tree = lab.read(items.read_part, "lab", Kind.MODEL, model.id, "tree").tree
+    assert tree["model_digest"] == model.parts["model"].document
+
+
+@pytest.mark.parametrize(
+    "notes", [{"provenance": {"digest_of": ["x"]}}, {"headline": {"digest_of": "tree"}}, {"options": {"digest_of": 5}}]
+)
+def test_nothing_but_the_model_of_a_tree_is_replaced_by_a_digest(lab, notes):
+    publish(lab, *model_drafts(**notes))
+    (found,) = listed(lab, Kind.MODEL)
+    model = lab.read(items.read_part, "lab", Kind.MODEL, found.id, "model").tree
+    assert {name: model[name] for name in notes} == notes
+
+
+def test_a_tree_of_another_part_than_the_model_is_refused(lab):
+    parts, _ = imported()
+    with pytest.raises(Invalid, match="model_digest"):
+        publish(lab, Draft("walk", Kind.MODEL, "walk", {"tree": {**parts["tree"], "model_digest": {"digest_of": "x"}}}))

@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy import and_, insert, select
 
-from marey_schemas.kinds import PARTS
+from marey_schemas.kinds import PARTS, Kind
 from marey_server import faults
 from marey_server.errors import Conflict, Invalid
 from marey_server.store import collections, documents
@@ -39,9 +39,9 @@ def publish(
 ) -> list[Published]:
     """Turn drafts into items and revisions; all of them or none. Answers in the order of the drafts.
 
-    `{"output": name}` in a document refers to another draft and becomes its item and revision; `{"digest_of": part}`
-    becomes the digest of another part of its draft. Content that stands
-    there already makes no new revision. The caller has authorised the write.
+    `{"output": name}` in a document refers to another draft and becomes its item and revision; the `model_digest` of a
+    tree may name the model of its own draft. Content that stands there already makes no new revision. The caller has
+    authorised the write.
 
     Raises `Invalid` where a draft makes no sense, `Conflict` where a name is taken.
     """
@@ -109,9 +109,11 @@ class _Publication:
     def add(self, draft: Draft, loaded: Mapping[str, _Part], *, resolve: bool) -> None:
         digests: dict[str, str] = {}
         bodies: dict[str, Tree] = {}
-        for part, held in sorted(loaded.items(), key=lambda one: references.wants_digests(one[1].body)):
+        for part in (part for part in PARTS[draft.kind] if part in loaded):
+            held = loaded[part]
             body = references.resolved(held.body, self.done) if resolve else held.body
-            body = references.with_part_digests(body, digests)
+            if draft.kind is Kind.MODEL and part == "tree":
+                body = references.with_model_digest(body, digests.get("model"))
             digests[part] = self._store(held, body)
             bodies[part] = body
         self._references.require(draft.kind, bodies)

@@ -31,19 +31,11 @@ def outputs_in(tree: Any) -> Iterator[str]:
             yield from outputs_in(member)
 
 
-def wants_digests(tree: Mapping[str, Any]) -> bool:
-    """Whether a document names other parts of its item, as `{"digest_of": part}` among its members."""
-    return any(isinstance(member, Mapping) and member.keys() == {"digest_of"} for member in tree.values())
-
-
-def with_part_digests(tree: Tree, digests: Mapping[str, str]) -> Tree:
-    """The document with each part that it names, if that is among `digests`, replaced by its digest."""
-    return {
-        name: digests.get(member["digest_of"], member)
-        if isinstance(member, Mapping) and member.keys() == {"digest_of"}
-        else member
-        for name, member in tree.items()
-    }
+def with_model_digest(tree: Tree, digest: str | None) -> Tree:
+    """A part `tree` with the digest of the model of its own write, where it names that as `PartDigestRef`."""
+    if digest is None or isinstance(tree["model_digest"], str):
+        return tree
+    return {**tree, "model_digest": digest}
 
 
 def in_order(names: Mapping[str, Sequence[str]]) -> list[str]:

@@ -1,0 +1,58 @@
+"""What stands beside the numbers of a model: what is read again is checked, anything else is kept."""
+
+import pytest
+from pydantic import ValidationError
+
+import predecessor_models as models
+from marey_schemas.modelling import MotionPrimitiveDocument, log_likelihoods, predecessor_origin
+from predecessor_models import FILE
+
+
+@pytest.fixture(scope="module")
+def model():
+    return models.imported()[0]["model"]
+
+
+@pytest.mark.parametrize(
+    ("notes", "place"),
+    [
+        ({"provenance": {"predecessor": "x"}}, "provenance/predecessor"),
+        ({"provenance": {"predecessor": {"original": "x"}}}, "provenance/predecessor/original"),
+        ({"provenance": {"predecessor": {"original": {}}}}, "provenance/predecessor/original/blob"),
+        (
+            {"provenance": {"predecessor": {"tree": {"blob": FILE, "content": 5}}}},
+            "provenance/predecessor/tree/content",
+        ),
+        ({"provenance": {"predecessor": {"animated_joints": 5}}}, "provenance/predecessor/animated_joints"),
+        ({"training": {"examples": 5}}, "training/examples"),
+        ({"training": {"examples": [1]}}, "training/examples/0"),
+        ({"training": {"examples": [{"log_likelihood": "a"}]}}, "training/examples/0/log_likelihood"),
+        ({"training": {"examples": [{"log_likelihood": float("nan")}]}}, "training/examples/0/log_likelihood"),
+    ],
+)
+def test_notes_that_could_not_be_read_again_are_refused_with_their_place(model, notes, place):
+    with pytest.raises(ValidationError) as refused:
+        MotionPrimitiveDocument.model_validate({**model, **notes})
+    assert "/".join(map(str, refused.value.errors()[0]["loc"])) == place
+
+
+def test_other_notes_may_stand_beside_them(model):
+    notes = {
+        "provenance": {"digest_of": ["x"], "predecessor": {"layout": "3"}, "set": 5},
+        "training": {"examples": [{"name": "a", "odd": True}, {"log_likelihood": 2.0}], "warnings": ["any"]},
+    }
+    noted = {**model, **notes}
+    MotionPrimitiveDocument.model_validate(noted)
+    assert log_likelihoods(noted) == (2.0,)
+    assert predecessor_origin(noted).original is None
+
+
+@pytest.mark.parametrize(
+    "training", [None, {}, {"examples": 5}, {"examples": [1]}, {"examples": [{"log_likelihood": "a"}]}]
+)
+def test_an_older_document_with_odd_likelihoods_has_none(training):
+    assert log_likelihoods({"training": training}) == ()
+
+
+def test_an_older_document_with_odd_notes_comes_from_nowhere():
+    assert predecessor_origin({"provenance": {"predecessor": "x"}}) == predecessor_origin({})
