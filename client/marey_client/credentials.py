@@ -14,7 +14,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from marey_client.errors import BadCredentialFile
+import httpx
+
+from marey_client.errors import BadAddress, BadCredentialFile
 
 DEFAULT_URL = "http://127.0.0.1:8460"
 DEFAULT_DATA = "marey-data"
@@ -37,10 +39,21 @@ def resolve(
     environment = os.environ if environment is None else environment
     stored = read_logins(logins_path(environment))
     chosen = (url or environment.get("MAREY_URL") or stored.default or DEFAULT_URL).rstrip("/")
+    _require_address(chosen)
     if token_file is not None:
         return Credential(chosen, read_secret(token_file))
     token = environment.get("MAREY_TOKEN") or stored.tokens.get(chosen) or _local_token(chosen, environment)
     return Credential(chosen, token)
+
+
+def _require_address(url: str) -> None:
+    try:
+        parts, _ = urlsplit(url), httpx.URL(url)
+        fits = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except (httpx.InvalidURL, ValueError):
+        fits = False
+    if not fits:
+        raise BadAddress(f"{url!r} is no address of a server; write it as in {DEFAULT_URL}")
 
 
 def read_secret(path: Path) -> str:

@@ -33,6 +33,10 @@ class BadCredentialFile(MareyError):
     """A file that should hold a token does not, or others may read it."""
 
 
+class BadAddress(MareyError):
+    """The address of a server is none."""
+
+
 class DigestMismatch(MareyError):
     """The bytes that arrived are not those that were asked for."""
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
 from typing import Any, TypeVar
+from urllib.parse import quote
 
 import httpx
 from pydantic import BaseModel, ValidationError
@@ -138,7 +139,7 @@ class Transport:
         def once() -> httpx.Response:
             response = self._client.request(
                 method,
-                path,
+                _quoted(path),
                 params=_present(params),
                 content=content() if callable(content) else content,
                 headers=sent_headers,
@@ -196,12 +197,17 @@ class Transport:
         """GET an answer whose bytes are read while they arrive. Not repeated: the caller knows how far it came."""
         sent_headers = {"Accept": "*/*", **(headers or {})}
         with self._client.stream(
-            "GET", path, params=_present(params), headers=sent_headers, auth=self._auth
+            "GET", _quoted(path), params=_present(params), headers=sent_headers, auth=self._auth
         ) as response:
             if response.status_code >= 400:
                 response.read()
             raise_for_problem(response)
             yield response
+
+
+def _quoted(path: str) -> str:
+    """A path whose names may hold anything, as it stands in an address."""
+    return quote(path, safe="/:@!$&'()*+,;=~")
 
 
 def as_json(model: BaseModel | None) -> bytes | None:

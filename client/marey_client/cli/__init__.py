@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 GLOBAL_SWITCHES = ("-v", "--verbose")
@@ -13,9 +14,18 @@ def main() -> None:
     from marey_client.cli.app import app
     from marey_client.cli.failures import reported
 
+    _take_any_text()
     arguments = with_global_options_first(sys.argv[1:])
     with reported(verbose=any(switch in arguments for switch in GLOBAL_SWITCHES)):
         app(args=arguments, prog_name="marey")
+
+
+def _take_any_text() -> None:
+    """Print what the encoding of an output lacks as escapes, and nothing where the output is closed."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - open to the end
+        getattr(sys, name).reconfigure(errors="backslashreplace")
 
 
 def with_global_options_first(arguments: list[str]) -> list[str]:

@@ -11,6 +11,7 @@ import typer
 
 from marey_client.cli.addresses import Address, find_item, require_item
 from marey_client.cli.failures import Refused, WrongUsage
+from marey_client.cli.given_files import read_json
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import clips_at, follow
 from marey_client.cli.output import print_json, print_pairs, print_table, tell, tell_refused
@@ -245,10 +246,7 @@ def import_annotation(
     """Annotate a clip from a file of the predecessor: sections, or the frames of labels."""
     from marey_schemas.kinds import Kind
 
-    try:
-        document = json.loads(file.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise WrongUsage(f"{file} is no JSON: {error}") from None
+    document = read_json(file)
     if not isinstance(document, dict):
         raise WrongUsage(f"{file} holds no JSON object")
     options = {"layer": layer, "name": name, "end_index": end_index.value, "labels": tuple(label) if label else None}
@@ -375,5 +373,5 @@ def _assignment(text: str) -> tuple[str, Any]:
         raise WrongUsage(f"{text!r}: write name=value, as in most_turn_deg=30")
     try:
         return name, json.loads(value)
-    except ValueError:
+    except (ValueError, RecursionError):
         return name, value.split(",") if "," in value or name == "joints" else value

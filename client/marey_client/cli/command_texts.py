@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from marey_client.cli.failures import WrongUsage
+from marey_client.cli.jobs import json_or_text
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -76,21 +77,14 @@ def _value(text: str, schema: Schema) -> Any:
     if _takes(schema, "string"):
         return text
     if not _takes(schema, "array"):
-        return _json_or_text(text)
+        return json_or_text(text)
     if text.startswith("["):
-        return _json_or_text(text)
+        return json_or_text(text)
     bounds = text.split(":")
     if len(bounds) == 2 and all(not bound or bound.isdecimal() for bound in bounds):
         return [int(bounds[0] or 0), int(bounds[1]) if bounds[1] else None]
     of_text = any(one.get("items", {}).get("type") == "string" for one in _choices(schema))
-    return [one if of_text else _json_or_text(one) for one in text.split(",")]
-
-
-def _json_or_text(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
+    return [one if of_text else json_or_text(one) for one in text.split(",")]
 
 
 def _type_of(schema: Schema) -> str:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -12,6 +10,7 @@ import typer
 from marey_client.cli.addresses import Address, require_item
 from marey_client.cli.command_texts import parameter_rows, parse_command
 from marey_client.cli.failures import WrongUsage
+from marey_client.cli.given_files import read_json
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import clips_at, follow, print_ended
 from marey_client.cli.output import print_json, print_pairs, print_table
@@ -189,31 +188,24 @@ def _given(marey: Marey, project: str, do: list[str] | None, file: str | None) -
 
     if (file is None) == (not do):
         raise WrongUsage("give commands by --do, or by --file, and not both")
-    tree: Any = [parse_command(text) for text in do or ()] if file is None else _read(file)
-    commands, title = (tree, "") if isinstance(tree, list) else (tree.get("commands"), tree.get("title", ""))
+    tree: Any = [parse_command(text) for text in do or ()] if file is None else read_json(file)
+    given = tree if isinstance(tree, dict) else {"commands": tree}
+    commands, title = given.get("commands"), given.get("title", "")
     if not isinstance(commands, list):
         raise WrongUsage(f"{file} holds no commands; a list is needed, or an object with `commands`")
     return as_edit([_with_ids(marey, project, one) for one in commands], title=title)
-
-
-def _read(file: str) -> Any:
-    text = sys.stdin.read() if file == "-" else Path(file).read_text(encoding="utf-8")
-    try:
-        tree = json.loads(text)
-    except ValueError as error:
-        raise WrongUsage(f"{file} is no JSON: {error}") from None
-    return tree if isinstance(tree, list | dict) else [tree]
 
 
 def _with_ids(marey: Marey, project: str, command: Any) -> Any:
     """The command with the id of its source, where that is named by its address."""
     from marey_schemas.kinds import Kind
 
-    if not isinstance(command, dict) or "/" not in str(command.get("source", "")):
+    source = command.get("source") if isinstance(command, dict) else None
+    if not isinstance(source, str) or "/" not in source:
         return command
-    place = Address.parse(command["source"])
+    place = Address.parse(source)
     if place.project != project:
-        raise WrongUsage(f"{command['command']}: the source {place} must be in the project {project}")
+        raise WrongUsage(f"{command.get('command', 'a command')}: the source {place} must be in the project {project}")
     return {**command, "source": require_item(marey, place, [Kind.CLIP]).id}
 
 

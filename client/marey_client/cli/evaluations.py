@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -152,6 +153,8 @@ def _values(text: str | None) -> tuple[float, ...] | None:
         numbers = [float(part) for part in text.replace(",", ":").split(":")]
     except ValueError:
         raise WrongUsage(f"{text!r}: write first:last:step, as in 1:3:0.25, or values, as in 1,1.5,2") from None
+    if not all(map(math.isfinite, numbers)):
+        raise WrongUsage(f"{text!r}: all values must be finite")
     if ":" not in text:
         return tuple(numbers)
     if "," in text or len(numbers) != 3:
@@ -159,9 +162,10 @@ def _values(text: str | None) -> tuple[float, ...] | None:
     first, last, step = numbers
     if not (step > 0 and last >= first):
         raise WrongUsage(f"{text!r}: a range goes up in steps above 0")
-    count = int((last - first) / step + 1e-9) + 1
-    if count > MOST_VALUES:
-        raise WrongUsage(f"{text!r}: these are {count} values; at most {MOST_VALUES} are possible")
+    steps = (last - first) / step + 1e-9
+    if steps >= MOST_VALUES:
+        raise WrongUsage(f"{text!r}: these are over {MOST_VALUES} values; at most so many are possible")
+    count = int(steps) + 1
     return tuple(first + index * step for index in range(count))
 
 

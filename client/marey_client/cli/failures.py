@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 FAILED, WRONG_USAGE = 1, 2
+MOST_SHOWN = 80
+"""Characters of a text that cannot be used."""
 
 
 class Refused(Exception):
@@ -29,12 +31,17 @@ def reported(*, verbose: bool) -> Iterator[None]:
     except Exception as error:
         from pydantic import ValidationError
 
-        from marey_client.errors import MareyError
+        from marey_client.errors import BadAddress, MareyError
+        from marey_schemas.codecs import CodecError
 
         if isinstance(error, ValidationError):
             first = error.errors(include_url=False)[0]
             where = ".".join(str(step) for step in first["loc"])
             _exit(WRONG_USAGE, f"{where}: {first['msg']}" if where else first["msg"], verbose)
+        if isinstance(error, BadAddress | CodecError):
+            _exit(WRONG_USAGE, str(error), verbose)
+        if isinstance(error, UnicodeEncodeError):
+            _exit(WRONG_USAGE, f"{error.object[:MOST_SHOWN]!r} is no text in UTF-8", verbose)
         if isinstance(error, MareyError | OSError):
             _exit(FAILED, sentence(error), verbose)
         raise

@@ -202,7 +202,7 @@ def json_or_text(text: str) -> Any:
     """A value of a parameter: JSON where it is, else the text itself."""
     try:
         return json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return text
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -75,7 +75,7 @@ def build_model(
     """
     plan: dict[str, Any] = _chosen(choices or ())
     if propose is not None:
-        plan.setdefault("annotate", {}).setdefault("proposal", {})["method"] = propose.value
+        _choose(plan, ("annotate", "proposal", "method"), propose.value, f"--propose {propose.value}")
         plan["annotate"] |= {"layer": layer} if layer else {}
     elif layer is not None:
         plan["layer"] = layer
@@ -83,7 +83,7 @@ def build_model(
         plan.setdefault("align" if whole else "cut", {}).update({"labels": label} if label else {})
     plan["align"] = {
         **plan.get("align", {}),
-        **({"rate_hz": rate} if rate else {}),
+        **({} if rate is None else {"rate_hz": rate}),
         **({"mirroring": "add"} if mirror else {}),
     }
     plan |= {} if tree else {"tree": None}
@@ -106,11 +106,18 @@ def _chosen(choices: Iterable[str]) -> dict[str, dict[str, Any]]:
         step, *names = path.split(".")
         if not equals or step not in STEPS or not all(names) or not names:
             raise WrongUsage(f"{text!r}: write step.parameter=value, the step one of {', '.join(STEPS)}")
-        place: Any = chosen.setdefault(step, {})
-        for name in names[:-1]:
-            place = place.setdefault(name, {})
-        place[names[-1]] = json_or_text(value)
+        _choose(chosen, (step, *names), json_or_text(value), f"--set {text}")
     return chosen
+
+
+def _choose(chosen: dict[str, Any], path: Sequence[str], value: Any, told: str) -> None:
+    """Put a value at its place. Raises `WrongUsage` where something else was chosen on the way to it."""
+    place: Any = chosen
+    for depth, name in enumerate(path[:-1], start=1):
+        place = place.setdefault(name, {})
+        if not isinstance(place, dict):
+            raise WrongUsage(f"{told} does not go with --set {'.'.join(path[:depth])}={place}; give one of them")
+    place[path[-1]] = value
 
 
 def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.failures import Refused
+from marey_client.cli.given_files import read_json
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, print_table, tell, tell_refused
 
@@ -41,8 +42,7 @@ def pipeline(
     """Hand in a graph of jobs, and follow them. What was computed before is not computed again."""
     from marey_schemas.pipelines import PipelineCreate
 
-    text = sys.stdin.read() if str(file) == "-" else file.read_text(encoding="utf-8")
-    wanted = PipelineCreate.model_validate_json(text)
+    wanted = PipelineCreate.model_validate(read_json(file))
     with connect(context) as marey:
         run = marey.project(project).pipeline(wanted)
         follow_run(run, project, wait=wait, as_json=as_json)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.failures import WrongUsage
+from marey_client.cli.given_files import read_json
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import show_progress
 from marey_client.cli.models import model_at
@@ -79,6 +80,8 @@ def search(
     as_json: AsJson = False,
 ) -> None:
     """Find the motion of a model that meets constraints. WHEN is a keyframe, start, end, or a canonical frame."""
+    from marey_schemas.search import SearchRequest
+
     if format not in FORMATS:
         raise WrongUsage(f"{format!r} is no format; there are {', '.join(FORMATS)}")
     asked: dict[str, Any] = _read_request(request)
@@ -103,6 +106,7 @@ def search(
         "start": None if start is None else _start(start),
     }
     asked |= {name: value for name, value in given.items() if value is not None}
+    SearchRequest.model_validate(asked)
     with connect(context) as marey:
         found = model_at(marey, place)
         answer = found.search(**{**asked, "motion": False})
@@ -118,14 +122,9 @@ def search(
 
 
 def _read_request(path: Path | None) -> dict[str, Any]:
-    import json
-
     if path is None:
         return {}
-    try:
-        read = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise WrongUsage(f"{path}: {error}") from None
+    read = read_json(path)
     if not isinstance(read, dict):
         raise WrongUsage(f"{path}: a request is a JSON object")
     return read

@@ -1,5 +1,6 @@
 """The command line where no server is needed."""
 
+import os
 import subprocess
 import sys
 
@@ -15,11 +16,11 @@ from marey_client.marey import Marey
 from marey_schemas.kinds import Kind
 
 
-def marey(*arguments, env=None, stdin=""):
-    import os
-
+def marey(*arguments, env=None, stdin="", cwd=None):
     command = [sys.executable, "-c", "from marey_client.cli import main; main()", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, input=stdin, env={**os.environ, **(env or {})})
+    return subprocess.run(
+        command, capture_output=True, text=True, input=stdin, env={**os.environ, **(env or {})}, cwd=cwd
+    )
 
 
 @pytest.fixture
@@ -76,6 +77,47 @@ def test_wrong_usage_exits_with_2(arguments, nowhere):
     done = marey(*arguments, env=nowhere)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
+
+
+GIVEN = {
+    "binary.json": b"\xff\xfe\x00",
+    "source.json": b'[{"source": "other/x"}]',
+    "search.json": b'{"steps": [{}], "constraints": 5}',
+    "half.json": b'{"steps": {"a": {"kind": "tree", "params": {"x": "\\ud800"}}}}',
+}
+BUILD = ("build-model", "lab/walks", "--name", "w")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["pipeline", "binary.json", "--project", "lab"], "binary.json is no text in UTF-8"),
+        (["pipeline", "nowhere.json", "--project", "lab"], "nowhere.json cannot be read: No such file or directory"),
+        (["pipeline", "half.json", "--project", "lab"], "/steps/a/params/x: a string contains half of a surrogate"),
+        (["edit", "apply", "lab/a", "--into", "x", "--file", "binary.json"], "binary.json is no text in UTF-8"),
+        (["edit", "apply", "lab/a", "--into", "x", "--file", "source.json"], "source other/x must be in the project"),
+        (["search", "lab/m", "--request", "search.json"], "constraints: Input should be a valid tuple"),
+        ([*BUILD, "--set", "align.window=5", "--set", "align.window.x=2"], "does not go with --set align.window=5"),
+        ([*BUILD, "--set", "annotate.proposal=steps", "--propose", "steps"], "--propose steps does not go with --set"),
+        (["evaluate", "lab/walks", "--speeds", "1:inf:1"], "'1:inf:1': all values must be finite"),
+        (["ls", "lab", "--server", "http://["], "'http://[' is no address of a server; write it as in http://"),
+        (["ls", "lab", "--server", "http://127.0.0.1:99999"], "99999' is no address of a server"),
+        (["ls", "lab", "--server", "nowhere"], "'nowhere' is no address of a server"),
+        (["job", "show", os.fsdecode(b"\xff")], "is no text in UTF-8"),
+    ],
+)
+def test_what_makes_no_sense_is_told_in_one_line_with_exit_status_2(arguments, told, nowhere, tmp_path):
+    for name, data in GIVEN.items():
+        (tmp_path / name).write_bytes(data)
+    done = marey(*arguments, env=nowhere, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert done.stderr.startswith("marey: ")
+    assert told in done.stderr
+
+
+def test_text_that_an_output_cannot_hold_is_escaped(nowhere):
+    done = marey("edit", "commands", "é", env={**nowhere, "PYTHONIOENCODING": "ascii"})
+    assert (done.returncode, done.stderr.startswith(r"marey: there is no command '\xe9'")) == (2, True)
 
 
 def test_a_name_the_server_would_refuse_is_refused_before_it_is_sent(nowhere):

@@ -34,6 +34,14 @@ def test_a_read_is_sent_again_when_the_connection_is_lost(script):
     assert len(script.waited) == 2
 
 
+@pytest.mark.parametrize("name", ["a\n", "a?b=c", "a#b", "a%00", "é", "a b"])
+def test_a_name_of_any_characters_stands_in_the_address_as_it_is(script, name):
+    script.answers = [ok(PROJECT)]
+    script.marey().project(name).read()
+    assert script.requests[0].url.path == f"/api/v1/projects/{name}"
+    assert not script.requests[0].url.query
+
+
 def test_a_post_is_sent_again_under_the_same_idempotency_key(script):
     script.answers = [LOST, ok(PROJECT, 201), ok(PROJECT)]
     script.marey().create_project(ProjectCreate(name="lab"))
