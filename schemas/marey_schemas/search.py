@@ -24,6 +24,8 @@ JointLabel = Annotated[str, StringConstraints(min_length=1, max_length=255)]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Component = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Positive = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
+Tolerance = Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)]
+"""No motion was ever captured so exactly, and squares of errors in smaller ones cannot be computed with."""
 Degrees = Annotated[float, Field(ge=-36_000, le=36_000, allow_inf_nan=False)]
 ItemId = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 
@@ -44,7 +46,7 @@ class JointPositionConstraint(_Constraint):
     target_m: tuple[Coordinate | None, Coordinate | None, Coordinate | None] = Field(
         description="(x, y, z) in the world; null where it is free."
     )
-    tolerance_cm: Positive = Field(1.0, description="The error that counts as 1.")
+    tolerance_cm: Tolerance = Field(1.0, description="The error that counts as 1.")
 
 
 class JointOrientationConstraint(_Constraint):
@@ -53,7 +55,7 @@ class JointOrientationConstraint(_Constraint):
     type: Literal["joint_orientation"]
     joint: JointLabel = Field(description="Its own name, or its standard name.")
     rotation: tuple[Component, Component, Component, Component] = Field(description="(w, x, y, z) in the world.")
-    tolerance_deg: Positive = Field(5.0, description="The error that counts as 1.")
+    tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1.")
 
 
 class LookDirectionConstraint(_Constraint):
@@ -64,7 +66,7 @@ class LookDirectionConstraint(_Constraint):
     direction: tuple[Component, Component, Component] | None = Field(None, description="(x, y, z) in the world.")
     point_m: tuple[Coordinate, Coordinate, Coordinate] | None = Field(None, description="In place of a direction.")
     axis: tuple[Component, Component, Component] = Field((0.0, 0.0, 1.0), description="In the joint's own frame.")
-    tolerance_deg: Positive = Field(5.0, description="The error that counts as 1.")
+    tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1.")
 
 
 class RootPositionConstraint(_Constraint):
@@ -72,7 +74,7 @@ class RootPositionConstraint(_Constraint):
 
     type: Literal["root_position"]
     target_m: tuple[Coordinate | None, Coordinate | None] = Field(description="(x, z); null where it is free.")
-    tolerance_cm: Positive = Field(1.0, description="The error that counts as 1.")
+    tolerance_cm: Tolerance = Field(1.0, description="The error that counts as 1.")
 
 
 class RootHeadingConstraint(_Constraint):
@@ -80,7 +82,7 @@ class RootHeadingConstraint(_Constraint):
 
     type: Literal["root_heading"]
     heading_deg: Degrees = Field(description="0 along +z, positive to the left.")
-    tolerance_deg: Positive = Field(5.0, description="The error that counts as 1.")
+    tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1.")
 
 
 class KeyframeTimeConstraint(_Constraint):
@@ -88,7 +90,7 @@ class KeyframeTimeConstraint(_Constraint):
 
     type: Literal["keyframe_time"]
     seconds: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
-    tolerance_s: Positive = Field(0.05, description="The error that counts as 1.")
+    tolerance_s: Tolerance = Field(0.05, description="The error that counts as 1.")
 
 
 SearchConstraint = Annotated[
@@ -143,7 +145,7 @@ class SearchRequest(Request):
         description="What a likely motion is worth; the less, the nearer it comes to the targets.",
     )
     iterations: int = Field(50, ge=1, le=200, description="Of the optimisation, at most.")
-    transition_tolerance_cm: Positive = Field(2.0, description="For hands, feet and height from step to step.")
+    transition_tolerance_cm: Tolerance = Field(2.0, description="For hands, feet and height from step to step.")
     finish: bool = Field(False, description="Remove what is left of joint positions by inverse kinematics.")
     seed: int = Field(0, ge=0, lt=2**63, description="Of the samples, where the model has no tree of its own.")
     motion: bool = Field(True, description="Send the motion, too.")

@@ -29,7 +29,10 @@ Key = tuple[str, str, str]
 
 @dataclass(frozen=True, slots=True)
 class FoundSearchable:
-    """A model that the caller may search, its tree, and the mapping of its skeleton, as far as there are any."""
+    """A model that the caller may search, its tree, and the mapping of its skeleton, as far as there are any.
+
+    A tree of another state of the model is none of its own.
+    """
 
     model: FoundModel
     tree: FoundPart | None
@@ -102,8 +105,7 @@ def parse_searchable(loaded: LoadedSearchable, seed: int) -> Searchable:
         else:
             mapping = mapping_from_document(SkeletonMapping.model_validate(loaded.mapping), skeleton)[0]
         standard_joints = {name: skeleton.index_of(joint) for name, joint in mapping.joints.items()}
-        stored = loaded.tree is not None and loaded.tree["model_digest"] == loaded.found.model.part.digest
-        if loaded.tree is not None and stored:
+        if loaded.tree is not None:
             tree = sample_tree_from_tree(loaded.tree)
         else:
             known = [standard_joints[name] for name in END_EFFECTORS if name in standard_joints]
@@ -111,6 +113,7 @@ def parse_searchable(loaded: LoadedSearchable, seed: int) -> Searchable:
         tree.means, tree.starts  # noqa: B018    computed here, once for all searches
     except MotionError as error:
         raise Invalid(f"The model cannot be searched: {error}", code=error.code) from error
+    stored = loaded.tree is not None
     likelihoods = tuple(sorted(log_likelihoods(loaded.model.model)))
     return Searchable(usable, tree, stored, mapping, standard_joints, likelihoods)
 
@@ -147,7 +150,9 @@ def _find(tx: Transaction, project: str, item_id: str) -> FoundSearchable:
     held = items.read_item(tx, project, Kind.SKELETON, ref["item"]).parts
     tree = mapping = None
     if "tree" in items.read_item(tx, project, Kind.MODEL, item_id).parts:
-        tree = items.find_part(tx, project, Kind.MODEL, item_id, "tree")
+        found = items.find_part(tx, project, Kind.MODEL, item_id, "tree")
+        if items.load_part(tx, found, arrays="none")["model_digest"] == model.part.digest:
+            tree = found
     if "mapping" in held:
         mapping = items.find_part(tx, project, Kind.SKELETON, ref["item"], "mapping")
     return FoundSearchable(model, tree, mapping)

@@ -86,18 +86,28 @@ def refine(problem: Problem, start: Floats, options: RefineOptions = DEFAULT_REF
     Parameters
     ----------
     start : (W,) latent vectors one after the other
+
+    Raises `MotionError` where the start has no finite cost.
     """
     prior = _Prior(problem.priors, options.likelihood_weight)
     here = np.array(start, dtype=np.float64)
     residuals, slopes = problem.linearise(here)
     cost = start_cost = _cost(residuals, prior, here)
+    if not np.isfinite(cost):
+        raise MotionError(
+            "errors in their tolerances are too large to compute with; take wider tolerances or smaller weights",
+            code="refining-not-finite",
+        )
     damping, evaluations, iterations = FIRST_DAMPING, 1, 0
     while iterations < options.iterations and damping < MOST_DAMPING:
         iterations += 1
         curvature, gradient = prior.quadratic(here)
         curvature += slopes.T @ slopes
         gradient += slopes.T @ residuals
-        step = np.asarray(np.linalg.solve(curvature + damping * np.diag(prior.scales), -gradient))
+        step = _step(curvature + damping * np.diag(prior.scales), gradient)
+        if step is None:
+            damping *= TIGHTENING
+            continue
         there = here + step
         tried = problem.linearise(there)
         evaluations += 1
@@ -113,6 +123,15 @@ def refine(problem: Problem, start: Floats, options: RefineOptions = DEFAULT_REF
                 break
             damping *= TIGHTENING
     return Refined(here, cost, start_cost, iterations, evaluations)
+
+
+def _step(curvature: Floats, gradient: Floats) -> Floats | None:
+    """Where a quadratic is least; None where rounding leaves no such place, so that it must be damped more."""
+    try:
+        step = np.asarray(np.linalg.solve(curvature, -gradient))
+    except np.linalg.LinAlgError:
+        return None
+    return step if np.isfinite(step).all() else None
 
 
 class _Quadratic(NamedTuple):
@@ -155,7 +174,8 @@ def _precisions(mixture: LatentMixture) -> Floats:
 
 
 def _cost(residuals: Floats, prior: _Prior, stacked: Floats) -> float:
-    return 0.5 * float(residuals @ residuals) + prior.cost(stacked)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is no improvement
+        return 0.5 * float(residuals @ residuals) + prior.cost(stacked)
 
 
 def _is_still(step: Floats, here: Floats) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import Placement
+from marey_motion.errors import MotionError
 from marey_motion.modelling.constraints import START, JointPosition
 from marey_motion.modelling.objective import AT_ORIGIN, build_objective
 from marey_motion.modelling.optimise import DEFAULT_REFINING, Refined, RefineOptions, refine
@@ -63,6 +64,7 @@ def search_steps(
     Raises
     ------
     ConstraintError    naming step and constraint
+    MotionError    where numbers become too large to compute with
     """
     problem = SeveralSteps.of(steps, start, transitions)
     searched: list[Found] = []
@@ -75,7 +77,16 @@ def search_steps(
     if refined is not None:
         stacked = refined.latents
         measured = problem.measure(stacked)
+    _require_finite(stacked, *measured.errors, *measured.jumps_m)
     return Sequel(problem.parts(stacked), measured, problem.joints, tuple(searched), sampled, refined)
+
+
+def _require_finite(*found: Floats) -> None:
+    if not all(np.isfinite(numbers).all() for numbers in found):
+        raise MotionError(
+            "what is asked for leads to numbers that are not finite; ask for places nearer to what the model does",
+            code="search-not-finite",
+        )
 
 
 def _search_step(

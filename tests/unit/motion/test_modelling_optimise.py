@@ -153,3 +153,32 @@ def test_a_model_that_never_varies_stays_as_it_is():
 def test_options_out_of_range_are_refused(options):
     with pytest.raises(MotionError):
         RefineOptions(**options)
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_a_target_out_of_all_reach_and_all_proportion_is_approached_as_far_as_rounding_allows(weight):
+    constraints = (JointPosition("head", "end", (1e6, 1e6, 1e6), 1e-8, 1e6),)
+    start = walking()[0].mixture.means[0]
+    found = refine(on_walks(constraints), start, RefineOptions(weight))
+    assert np.isfinite(found.latents).all()
+    assert np.isfinite(found.cost)
+    assert found.cost <= found.start_cost
+
+
+def test_slopes_without_any_curvature_are_damped_instead_of_failing():
+    class Flat:
+        """A constraint that nothing has an influence on, and a prior that counts nothing."""
+
+        priors = (LatentMixture(np.ones(1), np.zeros((1, 2)), 1e40 * np.eye(2)[None]),)
+
+        def linearise(self, stacked):
+            return np.ones(1), np.array([[1e20, 1e20]]) * (1.0 + 0.0 * stacked)
+
+    found = refine(Flat(), np.zeros(2), RefineOptions(0.0))
+    np.testing.assert_array_equal(found.latents, 0.0)
+
+
+def test_errors_that_cannot_be_computed_with_are_told_of():
+    constraints = (JointPosition("head", "end", (1e200, 0.0, 0.0), 1e-8),)
+    with pytest.raises(MotionError, match="too large"):
+        refine(on_walks(constraints), walking()[0].mixture.means[0])
