@@ -5,12 +5,15 @@ from __future__ import annotations
 from marey_schemas.annotations import AnnotationChange, AnnotationImport
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
-from marey_server.errors import NotFound
+from marey_server.errors import Conflict, NotFound, PreconditionFailed
 from marey_server.handlers.declarations import Access, Body, writes
 from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
 from marey_server.handlers.reply import Rendered, Reply
 from marey_server.handlers.resource import Resource
 from marey_server.store import items
+
+MOST_TRIES = 5
+"""Commands that go for any state are applied anew to what others made of an annotation meanwhile, so often."""
 
 
 class AnnotationCommands(Resource):
@@ -36,7 +39,15 @@ class AnnotationCommands(Resource):
         if kind_of(kind) is not Kind.ANNOTATION:
             raise NotFound(f"There are no commands for {kind}; only for annotations.", code="no-commands")
         expected_rev = self.precondition.expected_rev
-        return await self.answer(items.apply_commands, project, item, body, expected_rev=expected_rev)
+        for _ in range(MOST_TRIES):
+            found = await self.look_up(items.find_annotation, project, item)
+            changed = await self.compute(items.apply_commands, found, body, expected_rev=expected_rev)
+            try:
+                return await self.answer(items.put_changed, project, item, changed, body.message)
+            except PreconditionFailed:
+                if expected_rev is not None:
+                    raise
+        raise Conflict("Others keep changing this annotation; try again.", code="changed-meanwhile")
 
 
 class ClipAnnotations(Resource):

@@ -229,3 +229,21 @@ def test_any_commands_leave_ordered_segments_without_overlap_within_the_clip(giv
             assert layer.keyframes == (() if command == "clear" else before.keyframes)
         else:
             assert len(layer.segments) == len(before.segments) - 1
+
+
+def test_commands_look_only_at_what_they_change_however_many_segments_there_are():
+    class Watched(Segment):
+        """A segment that counts who asks for its frames."""
+
+        looks = 0
+
+        @property
+        def start(self):
+            Watched.looks += 1
+            return self[1]
+
+    layer = Layer(5000, tuple(Watched("a", at, at + 1) for at in range(5000)))
+    Watched.looks = 0
+    for _ in range(10):
+        layer = annotations.relabel_segment(layer, 2500, "b")
+    assert Watched.looks < 1000

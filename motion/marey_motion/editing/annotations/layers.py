@@ -2,13 +2,15 @@
 
 Frames are counted from 0; a segment [start, end) is half open, so its last frame is `end - 1` and segments that follow
 each other share a number: where one ends, the next starts. Segments of a layer do not overlap. Each command answers
-with a new layer or raises `AnnotationError`; segments are named by any frame in them.
+with a new layer or raises `AnnotationError`; segments are named by any frame in them. A command looks only at what it
+changes and at what stands beside that: the rest of a layer is in order already.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
@@ -58,36 +60,48 @@ class Layer:
         object.__setattr__(self, "keyframes", tuple(sorted(self.keyframes, key=lambda one: (one.frame, one.label))))
         if self.frame_count < 1:
             raise AnnotationError(f"a clip of {self.frame_count} frames has nothing to annotate", code="no-frames")
-        for segment in self.segments:
-            _require_label(segment.label, str(segment))
-            if segment.end <= segment.start:
-                raise _wrong(segment, "empty-segment", "its end must lie after its start")
-            if segment.start < 0 or segment.end > self.frame_count:
-                raise _wrong(segment, "outside-clip", f"the clip has the frames 0:{self.frame_count}")
-        for before, after in pairwise(self.segments):
-            if after.start < before.end:
-                raise _wrong(after, "segments-overlap", f"{before} has some of its frames")
-        for keyframe in self.keyframes:
-            _require_label(keyframe.label, str(keyframe))
-            if not 0 <= keyframe.frame < self.frame_count:
-                raise _wrong(keyframe, "outside-clip", f"the clip has the frames 0:{self.frame_count}")
-        for earlier, later in pairwise(self.keyframes):
-            if earlier == later:
-                raise _wrong(later, "keyframe-exists", "it stands there already")
+        _require_segments(self.segments, self.frame_count)
+        _require_keyframes(self.keyframes, self.frame_count)
 
     def segment_at(self, frame: int) -> Segment:
         """The segment that holds a frame. Raises `AnnotationError` where none does."""
         return self.segments[self._index_at(frame)]
 
     def _index_at(self, frame: int) -> int:
-        for index, segment in enumerate(self.segments):
-            if segment.start <= frame < segment.end:
-                return index
-        raise AnnotationError("no segment holds this frame", code="no-segment", where=f"frame {frame}")
+        index = bisect_right(self.segments, frame, key=_start) - 1
+        if index < 0 or frame >= self.segments[index].end:
+            raise AnnotationError("no segment holds this frame", code="no-segment", where=f"frame {frame}")
+        return index
 
-    def _with(self, index: int, *segments: Segment) -> Layer:
-        """The layer with others in place of one segment."""
-        return replace(self, segments=(*self.segments[:index], *segments, *self.segments[index + 1 :]))
+    def _among(self, start: int, end: int) -> tuple[int, int]:
+        """The range of the segments that have some of the frames [start, end), or would stand there."""
+        first = bisect_right(self.segments, start, key=_end)
+        return first, max(first, bisect_left(self.segments, end, key=_start))
+
+    def _with(self, first: int, stop: int, *segments: Segment) -> Layer:
+        """The layer with others, in order, in place of a range of segments."""
+        _require_segments(
+            (*self.segments[max(0, first - 1) : first], *segments, *self.segments[stop : stop + 1]), self.frame_count
+        )
+        return self._changed((*self.segments[:first], *segments, *self.segments[stop:]), self.keyframes)
+
+    def _place_of(self, keyframe: Keyframe) -> int:
+        """Where a keyframe stands, or would."""
+        return bisect_left(self.keyframes, _moment(keyframe), key=_moment)
+
+    def _with_keyframes(self, first: int, stop: int, *keyframes: Keyframe) -> Layer:
+        """The layer with others, in order, in place of a range of keyframes."""
+        _require_keyframes(
+            (*self.keyframes[max(0, first - 1) : first], *keyframes, *self.keyframes[stop : stop + 1]), self.frame_count
+        )
+        return self._changed(self.segments, (*self.keyframes[:first], *keyframes, *self.keyframes[stop:]))
+
+    def _changed(self, segments: tuple[Segment, ...], keyframes: tuple[Keyframe, ...]) -> Layer:
+        """The layer with what is known to be in order."""
+        made = object.__new__(Layer)
+        for name, value in (("frame_count", self.frame_count), ("segments", segments), ("keyframes", keyframes)):
+            object.__setattr__(made, name, value)
+        return made
 
 
 # Segments
@@ -96,23 +110,20 @@ class Layer:
 def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite: bool = False) -> Layer:
     """Put [start, end) under a label. With `overwrite` the segments that are there give way, else they forbid it."""
     made = Segment(label, start, end)
-    if not overwrite:
-        for segment in layer.segments:
-            if segment.start < end and start < segment.end:
-                raise _wrong(made, "segments-overlap", f"{segment} has some of its frames; overwrite, or move it first")
-        return replace(layer, segments=(*layer.segments, made))
-    Layer(layer.frame_count, (made,))  # what is no segment must not cut others
-    left_over: list[Segment] = []
-    for segment in layer.segments:
-        before = segment._replace(end=min(segment.end, start))
-        after = segment._replace(start=max(segment.start, end))
-        left_over += [part for part in (before, after) if part.start < part.end]
-    return replace(layer, segments=(*left_over, made))
+    first, stop = layer._among(start, end)
+    covered = layer.segments[first:stop]
+    if covered and not overwrite:
+        raise _wrong(made, "segments-overlap", f"{covered[0]} has some of its frames; overwrite, or move it first")
+    _require_segments((made,), layer.frame_count)  # what is no segment must not cut others
+    before = [one._replace(end=start) for one in covered if one.start < start]
+    after = [one._replace(start=end) for one in covered if one.end > end]
+    return layer._with(first, stop, *before, made, *after)
 
 
 def remove_segment(layer: Layer, at: int) -> Layer:
     """Leave the frames of the segment that holds frame `at` without a label."""
-    return layer._with(layer._index_at(at))
+    index = layer._index_at(at)
+    return layer._with(index, index + 1)
 
 
 def split_segment(layer: Layer, at: int, label: str | None = None) -> Layer:
@@ -122,7 +133,7 @@ def split_segment(layer: Layer, at: int, label: str | None = None) -> Layer:
     if at == segment.start:
         raise _wrong(segment, "empty-segment", f"it starts at frame {at}; split it at a later frame")
     rest = Segment(segment.label if label is None else label, at, segment.end)
-    return layer._with(index, segment._replace(end=at), rest)
+    return layer._with(index, index + 1, segment._replace(end=at), rest)
 
 
 def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", "nearest"] = "next") -> Layer:
@@ -142,7 +153,8 @@ def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", 
     if other is None:
         raise _wrong(segment, "no-neighbour", f"there is no {neighbour} segment to merge with")
     merged = Segment(segment.label, min(segment.start, other.start), max(segment.end, other.end))
-    return replace(layer, segments=(*(one for one in layer.segments if one not in (segment, other)), merged))
+    first = index if neighbour == "next" else index - 1
+    return layer._with(first, first + 2, merged)
 
 
 def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int) -> Layer:
@@ -155,24 +167,24 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
     moved = segment._replace(start=to) if edge == "start" else segment._replace(end=to)
     if moved.end <= moved.start:
         raise _wrong(segment, "empty-segment", f"with its {edge} at {to} nothing is left of it")
-    segments = list(layer.segments)
-    segments[index] = moved
     beside = index - 1 if edge == "start" else index + 1
-    if 0 <= beside < len(segments):
-        other = segments[beside]
-        if edge == "start" and (other.end == segment.start or other.end > to):
-            segments[beside] = other._replace(end=to)
-        elif edge == "end" and (other.start == segment.end or other.start < to):
-            segments[beside] = other._replace(start=to)
-        if segments[beside].end <= segments[beside].start:
-            raise _wrong(other, "neighbour-in-the-way", f"moving the {edge} of {segment} to {to} leaves nothing of it")
-    return replace(layer, segments=tuple(segments))
+    if not 0 <= beside < len(layer.segments):
+        return layer._with(index, index + 1, moved)
+    other = changed = layer.segments[beside]
+    if edge == "start" and (other.end == segment.start or other.end > to):
+        changed = other._replace(end=to)
+    elif edge == "end" and (other.start == segment.end or other.start < to):
+        changed = other._replace(start=to)
+    if changed.end <= changed.start:
+        raise _wrong(other, "neighbour-in-the-way", f"moving the {edge} of {segment} to {to} leaves nothing of it")
+    first = min(index, beside)
+    return layer._with(first, first + 2, *((changed, moved) if edge == "start" else (moved, changed)))
 
 
 def relabel_segment(layer: Layer, at: int, label: str) -> Layer:
     """Give the segment that holds frame `at` another label."""
     index = layer._index_at(at)
-    return layer._with(index, layer.segments[index]._replace(label=label))
+    return layer._with(index, index + 1, layer.segments[index]._replace(label=label))
 
 
 # Keyframes
@@ -180,7 +192,9 @@ def relabel_segment(layer: Layer, at: int, label: str) -> Layer:
 
 def add_keyframe(layer: Layer, label: str, frame: int) -> Layer:
     """Mark a frame."""
-    return replace(layer, keyframes=(*layer.keyframes, Keyframe(label, frame)))
+    made = Keyframe(label, frame)
+    place = layer._place_of(made)
+    return layer._with_keyframes(place, place, made)
 
 
 def move_keyframe(layer: Layer, label: str, frame: int, to: int) -> Layer:
@@ -191,9 +205,10 @@ def move_keyframe(layer: Layer, label: str, frame: int, to: int) -> Layer:
 def remove_keyframe(layer: Layer, label: str, frame: int) -> Layer:
     """Take a mark away."""
     gone = Keyframe(label, frame)
-    if gone not in layer.keyframes:
+    place = layer._place_of(gone)
+    if gone not in layer.keyframes[place : place + 1]:
         raise AnnotationError("there is none", code="no-keyframe", where=str(gone))
-    return replace(layer, keyframes=tuple(one for one in layer.keyframes if one != gone))
+    return layer._with_keyframes(place, place + 1)
 
 
 def clear(layer: Layer) -> Layer:
@@ -232,6 +247,42 @@ def piece_of(layer: Layer, segment: Segment, start: int, end: int) -> Layer:
             if segment.start <= one.frame < segment.end
         ),
     )
+
+
+def _start(segment: Segment) -> int:
+    return segment.start
+
+
+def _end(segment: Segment) -> int:
+    return segment.end
+
+
+def _moment(keyframe: Keyframe) -> tuple[int, str]:
+    return keyframe.frame, keyframe.label
+
+
+def _require_segments(segments: Sequence[Segment], frame_count: int) -> None:
+    """Raise `AnnotationError` for what is no segment of the clip, and for neighbours that overlap."""
+    for segment in segments:
+        _require_label(segment.label, str(segment))
+        if segment.end <= segment.start:
+            raise _wrong(segment, "empty-segment", "its end must lie after its start")
+        if segment.start < 0 or segment.end > frame_count:
+            raise _wrong(segment, "outside-clip", f"the clip has the frames 0:{frame_count}")
+    for before, after in pairwise(segments):
+        if after.start < before.end:
+            raise _wrong(after, "segments-overlap", f"{before} has some of its frames")
+
+
+def _require_keyframes(keyframes: Sequence[Keyframe], frame_count: int) -> None:
+    """Raise `AnnotationError` for what is no keyframe of the clip, and for one that is there twice."""
+    for keyframe in keyframes:
+        _require_label(keyframe.label, str(keyframe))
+        if not 0 <= keyframe.frame < frame_count:
+            raise _wrong(keyframe, "outside-clip", f"the clip has the frames 0:{frame_count}")
+    for earlier, later in pairwise(keyframes):
+        if earlier == later:
+            raise _wrong(later, "keyframe-exists", "it stands there already")
 
 
 def _require_label(label: str, place: str) -> None:

@@ -1,6 +1,12 @@
 """Items: named things with revisions. This package is the only one that writes them."""
 
-from marey_server.store.items.annotating import apply_commands, find_annotated_clip, prepare_annotation
+from marey_server.store.items.annotating import (
+    apply_commands,
+    find_annotated_clip,
+    find_annotation,
+    prepare_annotation,
+    put_changed,
+)
 from marey_server.store.items.changing import (
     change_item,
     create_item,
@@ -28,6 +34,7 @@ __all__ = [
     "create_item",
     "delete_item",
     "find_annotated_clip",
+    "find_annotation",
     "find_part",
     "list_items",
     "list_revisions",
@@ -36,6 +43,7 @@ __all__ = [
     "prepare_part",
     "prepare_parts",
     "publish",
+    "put_changed",
     "put_part",
     "read_item",
     "read_lineage",
