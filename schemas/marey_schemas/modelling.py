@@ -19,6 +19,10 @@ from marey_schemas.originals import StoredOriginal
 from marey_schemas.references import OutputRef, RevisionRef
 
 MOST_JOINTS = 4096
+MOST_KEYFRAMES = 1000
+MOST_CANONICAL_FRAMES = 10_000
+MOST_BASIS_NUMBERS = 20_000_000
+"""Canonical frames times spline coefficients, whose products are kept while a model is in use."""
 MOST_SAMPLES = 1000
 MOST_SEED = 2**63 - 1
 LONGEST_SAMPLE_S = 120.0
@@ -92,6 +96,12 @@ class FunctionalComponentsDocument(Request):
         for name in ("variances", "energy"):
             if getattr(self, name).shape != (count,):
                 raise ValueError(f"{name}: {len(getattr(self, name))} values for {count} components")
+        frames = float(self.knots[-self.degree - 1] - self.knots[self.degree]) + 1.0
+        if not (frames <= MOST_CANONICAL_FRAMES and frames * n <= MOST_BASIS_NUMBERS):
+            raise ValueError(
+                f"knots: {frames:g} canonical frames with {n} coefficients; at most {MOST_CANONICAL_FRAMES} frames are "
+                f"taken, and {MOST_BASIS_NUMBERS:,} as the product of both"
+            )
         return self
 
 
@@ -171,7 +181,7 @@ class MotionPrimitiveDocument(Request):
     temporal_weight: float = Field(gt=0, allow_inf_nan=False)
     mixture: MixtureDocument
     keyframes: dict[str, Annotated[int, Field(ge=0)]] = Field(
-        default_factory=dict, max_length=10_000, description="Canonical frame by label."
+        default_factory=dict, max_length=MOST_KEYFRAMES, description="Canonical frame by label."
     )
     duration_range_s: tuple[float, float] | None = Field(None, description="Within which samples last.")
     scaling: dict[str, Any] | None = Field(None, description="Method and weights of the channels; undone above.")
@@ -188,6 +198,8 @@ class MotionPrimitiveDocument(Request):
             raise ValueError(f"spatial: {self.spatial.mean.shape[1]} channels, but the joints need {width}")
         if self.temporal.mean.shape[1] != 1:
             raise ValueError(f"temporal: {self.temporal.mean.shape[1]} channels where there is 1")
+        if self.duration_range_s is not None and not self.duration_range_s[0] <= self.duration_range_s[1]:
+            raise ValueError("duration_range_s: the most must not be less than the least")
         dimensions = len(self.spatial.directions) + len(self.temporal.directions)
         if self.mixture.means.shape[1] != dimensions:
             raise ValueError(f"mixture: {self.mixture.means.shape[1]} dimensions for {dimensions} components")

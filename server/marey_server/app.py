@@ -26,6 +26,7 @@ from tornado.web import RequestHandler
 
 from marey_schemas.access import TokenCreate
 from marey_server.access.principal import SYSTEM
+from marey_server.computing import compute_on_one_thread_each
 from marey_server.docs_page import render_page
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.handlers.resource import Resource
@@ -185,6 +186,7 @@ async def serve(settings: Settings) -> None:
     """Run a server until SIGTERM or SIGINT."""
     configure_logging(settings.log_form, settings.log_level)
     keep_freed_memory()
+    compute_on_one_thread_each()
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -25,11 +25,13 @@ class CommandFailed(Exception):
 def serve(**settings: Any) -> None:
     """Run a server, and the workers it is told to start, until SIGTERM or SIGINT."""
     from marey_server.app import serve as serve_until_stopped
+    from marey_server.computing import leave
 
     chosen = read_settings(**settings)
     comfort = {"local_workers": 1, "log_form": "text" if sys.stderr.isatty() else "json"}
     unset = {name: value for name, value in comfort.items() if name not in chosen.model_fields_set}
     asyncio.run(serve_until_stopped(read_settings(**settings, **unset)))
+    leave()
 
 
 def read_settings(**given: Any) -> Settings:

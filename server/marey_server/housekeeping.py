@@ -106,7 +106,7 @@ def _leads(tx: Transaction, holder: str) -> bool:
 
 async def _collect_garbage(services: Services, holder: str) -> None:
     if await _write(services, _leads, holder):
-        collected = await asyncio.wrap_future(services.submit(collect_garbage, services.database))
+        collected = await asyncio.wrap_future(services.compute_threads.submit(collect_garbage, services.database))
         log.info("collected garbage: %s", collected)
 
 

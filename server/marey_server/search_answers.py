@@ -12,7 +12,7 @@ from marey_schemas.documents import RevisionRef
 from marey_schemas.problems import FieldError
 from marey_schemas.search import ConstraintError, FoundStep, SearchAnswer, SearchRequest, StartPlacement
 from marey_server.errors import Invalid, TooLarge
-from marey_server.models import SampleFile, SampleFormat
+from marey_server.models import LARGEST_ANSWER_BYTES, SampleFile, SampleFormat
 from marey_server.search_constraints import CM, constraint_of, placement_of
 from marey_server.searching import FoundSearchable, Searchable
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 FAR_CM = 5.0
 """A model that misses a place by more does not reach there: inverse kinematics would hide that."""
 
-MOST_NUMBERS = 600
-"""Numbers of all latent vectors that are refined together: some seconds of one thread."""
+MOST_WORK = 3e9
+"""About nanoseconds of one thread: what a search may take."""
 
 UNITS = {
     "joint_position": "cm", "root_position": "cm", "joint_orientation": "deg", "look_direction": "deg",
@@ -52,33 +52,55 @@ class SearchResult:
 
 
 def search(searchables: Sequence[Searchable], request: SearchRequest) -> SearchResult:
-    """Find the motions that a request asks for. Raises `Invalid` that points at the constraint that is wrong."""
+    """Find the motions that a request asks for.
+
+    Raises `Invalid` that points at the constraint that is wrong, `TooLarge` for what takes more than some seconds.
+    """
     from marey_motion.errors import MotionError
+    from marey_motion.modelling import search_work
     from marey_motion.modelling.finishing import finish_motion
     from marey_motion.modelling.found_motions import found_motion
     from marey_motion.modelling.optimise import RefineOptions
     from marey_motion.modelling.step_search import search_steps
-    from marey_motion.modelling.steps import TransitionOptions
+    from marey_motion.modelling.steps import SeveralSteps, TransitionOptions
 
-    numbers = sum(one.usable.primitive.dimensions for one in searchables)
-    if request.refine and numbers > MOST_NUMBERS:
-        raise TooLarge(f"These steps have {numbers} numbers to refine, over {MOST_NUMBERS}; ask for fewer steps.")
-    steps = _steps_of(searchables, request)
+    steps, trees = _steps_of(searchables, request), [one.tree for one in searchables]
+    refining = RefineOptions(request.likelihood_weight, request.iterations) if request.refine else None
+    effort = {"candidates": request.candidates, "passes": request.passes}
     try:
-        sequel = search_steps(
-            steps,
-            [one.tree for one in searchables],
-            start=placement_of(request.start),
-            candidates=request.candidates,
-            passes=request.passes,
-            refining=RefineOptions(request.likelihood_weight, request.iterations) if request.refine else None,
-            transitions=TransitionOptions(tolerance_m=request.transition_tolerance_cm * CM),
-        )
-        found = found_motion(steps, sequel)
-        finished = finish_motion(steps, found, searchables[0].mapping) if request.finish else None
+        work = search_work.searching_work(SeveralSteps.of(steps), trees, refining=refining, **effort)
+        _require_quick(work)
+        start, tolerance_m = placement_of(request.start), request.transition_tolerance_cm * CM
+        transitions = TransitionOptions(tolerance_m=tolerance_m)
+        sequel = search_steps(steps, trees, start=start, refining=refining, transitions=transitions, **effort)
+        _require_room(steps, sequel)
+        found, finished = found_motion(steps, sequel), None
+        if request.finish:
+            _require_quick(work + search_work.finishing_work(steps, found))
+            finished = finish_motion(steps, found, searchables[0].mapping)
     except MotionError as error:
         raise _invalid(request, error) from error
     return SearchResult(steps, sequel, found, finished)
+
+
+def _require_quick(work: float) -> None:
+    if work > MOST_WORK:
+        raise TooLarge(
+            f"This takes about {work / MOST_WORK:.1f} times as long as a search may; ask for fewer steps, constraints, "
+            "candidates, passes or iterations.",
+            code="search-too-large",
+        )
+
+
+def _require_room(steps: Sequence[Step], sequel: Sequel) -> None:
+    pairs = [(step.primitive, latent[None]) for step, latent in zip(steps, sequel.latents, strict=True)]
+    frames = sum(float(primitive.time_functions(latent)[0, -1]) + 1.5 for primitive, latent in pairs)
+    size = frames * steps[0].primitive.spatial.mean.shape[1] * 4
+    if not size <= LARGEST_ANSWER_BYTES:
+        raise TooLarge(
+            f"What was found lasts {frames:,.0f} frames, too many for an answer; ask for fewer steps.",
+            code="search-too-large",
+        )
 
 
 def _steps_of(searchables: Sequence[Searchable], request: SearchRequest) -> tuple[Step, ...]:

@@ -12,7 +12,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.modelling import log_likelihoods
 from marey_schemas.search import SearchRequest
 from marey_server import models
-from marey_server.errors import Invalid, NotFound
+from marey_server.errors import Invalid, NotFound, TooLarge
 from marey_server.models import FoundModel, LoadedModel, UsableModel
 from marey_server.store import items
 from marey_server.store.items.reading import FoundPart
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from marey_motion.rigs import JointMapping
 
 MOST_KEPT_BYTES = 64 << 20
+
+MOST_DRAWING_WORK = 2e9
+"""For trees of a request that are drawn because models have none: about nanoseconds of one thread."""
 
 Key = tuple[str, str, str]
 
@@ -59,12 +62,13 @@ class Searchable:
     """A model that can be searched.
 
     `stored` says whether the tree is that of the model, or was drawn here because it has none, or one of another model.
-    `log_likelihoods` are those of the examples, in rising order.
+    `drawing_work` is what that took, about nanoseconds. `log_likelihoods` are those of the examples, in rising order.
     """
 
     usable: UsableModel
     tree: SampleTree
     stored: bool
+    drawing_work: float
     mapping: JointMapping
     standard_joints: dict[str, int]
     log_likelihoods: tuple[float, ...]
@@ -90,10 +94,14 @@ def load_searchable(tx: Transaction, project: str, found: FoundSearchable) -> Lo
 
 
 def parse_searchable(loaded: LoadedSearchable, seed: int) -> Searchable:
-    """The model itself, with a tree. Raises `Invalid` where its numbers describe none."""
+    """The model itself, with a tree.
+
+    Raises `Invalid` where its numbers describe none, `TooLarge` where drawing a tree takes too long.
+    """
     from marey_motion.documents import mapping_from_document
     from marey_motion.errors import MotionError
     from marey_motion.modelling.sample_tree_documents import sample_tree_from_tree
+    from marey_motion.modelling.search_work import drawing_work
     from marey_motion.modelling.tree import END_EFFECTORS, build_tree
     from marey_motion.rigs import map_joints
 
@@ -105,17 +113,30 @@ def parse_searchable(loaded: LoadedSearchable, seed: int) -> Searchable:
         else:
             mapping = mapping_from_document(SkeletonMapping.model_validate(loaded.mapping), skeleton)[0]
         standard_joints = {name: skeleton.index_of(joint) for name, joint in mapping.joints.items()}
+        work = 0.0
         if loaded.tree is not None:
             tree = sample_tree_from_tree(loaded.tree)
         else:
             known = [standard_joints[name] for name in END_EFFECTORS if name in standard_joints]
+            work = drawing_work(primitive, end_effectors=known)
+            require_drawable(work)
             tree = build_tree(primitive, seed, end_effectors=known)
         tree.means, tree.starts  # noqa: B018    computed here, once for all searches
     except MotionError as error:
         raise Invalid(f"The model cannot be searched: {error}", code=error.code) from error
     stored = loaded.tree is not None
     likelihoods = tuple(sorted(log_likelihoods(loaded.model.model)))
-    return Searchable(usable, tree, stored, mapping, standard_joints, likelihoods)
+    return Searchable(usable, tree, stored, work, mapping, standard_joints, likelihoods)
+
+
+def require_drawable(work: float) -> None:
+    """Refuse to draw trees for a request that take more than some seconds. Raises `TooLarge`."""
+    if work > MOST_DRAWING_WORK:
+        raise TooLarge(
+            "Drawing samples of so many keyframes, joints or models takes too long for a search; give each model a "
+            "tree of its own first: a job of the kind `tree`, or `marey tree`.",
+            code="tree-missing",
+        )
 
 
 class SearchableCache:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 from marey_server.access.limits import TryLimit
 from marey_server.access.principal import SYSTEM, Principal
+from marey_server.computing import ComputeThreads
 from marey_server.handlers.answer_cache import AnswerCache
 from marey_server.models import ModelCache
 from marey_server.observe import Metrics
@@ -21,9 +20,6 @@ from marey_server.store import tokens
 from marey_server.store.database import Database
 from marey_server.store.queue_policy import QueuePolicy
 from marey_server.store.reaper import StartGrace
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 SIGN_INS_AT_ONCE = 2
 """A password takes 32 MiB and 0.1 s to check."""
@@ -52,16 +48,12 @@ class Services:
         self.draining = asyncio.Event()
         self.in_flight: set[Any] = set()
         self.sign_in_places = asyncio.Semaphore(SIGN_INS_AT_ONCE)
-        self._compute = ThreadPoolExecutor(max(2, os.cpu_count() or 2), thread_name_prefix="marey-compute")
+        self.compute_threads = ComputeThreads()
         self._tries_by_name = TryLimit(settings.login_tries_per_minute)
         self._tries_by_address = TryLimit(10 * settings.login_tries_per_minute)
         self._tokens_noted: dict[str, float] = {}
         self.queue_policy = QueuePolicy(settings.lease_ttl_s, settings.heartbeat_s, settings.cancel_grace_s)
         self.start_grace = StartGrace(self.queue_policy)
-
-    def submit(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Run numeric work or file work in a thread, away from the event loop."""
-        return self._compute.submit(function, *args, **kwargs)
 
     def limit_sign_in(self, name: str, address: str) -> None:
         """Count one attempt to sign in. Raises `TooManyRequests`."""
@@ -80,6 +72,6 @@ class Services:
         self.database.submit_write(SYSTEM, tokens.note_use, token_id)
 
     def close(self) -> None:
-        """Wait for what runs, then let go of everything."""
-        self._compute.shutdown(wait=True)
+        """Wait for transactions that run, then let go of everything."""
+        self.compute_threads.close()
         self.database.close()

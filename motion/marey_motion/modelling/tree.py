@@ -123,6 +123,18 @@ class SampleTree:
         kernels.average(self.samples, self.starts, self.sizes, means)
         return means
 
+    def most_evaluations(self, candidates: int) -> int:
+        """The motions that going down from the best `candidates` nodes of each level may have to evaluate."""
+        total, start, stop = 0, 0, 1
+        while start < stop:
+            children, sizes = self.children[start:stop], self.sizes[start:stop]
+            looked_at = np.where(children > 0, children, np.where(sizes > 1, sizes, 0)).astype(np.int64)
+            if len(looked_at) > candidates:
+                looked_at = np.partition(looked_at, -candidates)[-candidates:]
+            total += int(looked_at.sum())
+            start, stop = stop, stop + int(children.sum())
+        return total
+
 
 def build_tree(
     primitive: MotionPrimitive,
@@ -149,6 +161,12 @@ def build_tree(
     return SampleTree(samples[order], sizes[:nodes].astype(np.int32), children[:nodes].astype(np.int32))
 
 
+def feature_frames(primitive: MotionPrimitive) -> list[float]:
+    """The canonical frames at which end effectors are looked at: keyframes, middle and end."""
+    last = primitive.frame_count - 1
+    return sorted({*map(float, primitive.keyframes.values()), 0.5 * last, float(last)})
+
+
 def _features(
     primitive: MotionPrimitive, samples: Floats, options: TreeOptions, end_effectors: Sequence[int]
 ) -> Floats:
@@ -157,8 +175,7 @@ def _features(
         return np.ascontiguousarray(samples[:, : primitive.spatial.count])
     if not end_effectors:
         raise MotionError("the skeleton's mapping names neither hands nor feet nor head", where="features")
-    last = primitive.frame_count - 1
-    frames = sorted({*map(float, primitive.keyframes.values()), 0.5 * last, float(last)})
+    frames = feature_frames(primitive)
     chains = track_points(primitive, [Tracked(frame, (joint,)) for frame in frames for joint in end_effectors])
     points = np.empty((len(samples), len(chains.turned), 3))
     objective_kernels.track(chains, np.zeros(3), samples, points)

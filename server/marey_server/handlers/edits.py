@@ -25,7 +25,7 @@ class EditPreviewResource(Resource):
         """
         source = await self.look_up(previewing.read_preview, project, kind_of(kind), item, body)
         form, answers = self.answer_form, self.services.answers
-        return await self.compute(lambda: render(Reply(previewing.make_preview(source, body)), form, answers))
+        return await self.compute_long(lambda: render(Reply(previewing.make_preview(source, body)), form, answers))
 
 
 RESOURCES: tuple[type[Resource], ...] = (EditPreviewResource,)

@@ -38,6 +38,6 @@ class Receiver:
     async def _flush(self) -> None:
         batch, self._pending = bytes(self._pending), bytearray()
         try:
-            await asyncio.wrap_future(self._services.submit(self.spool.write, batch))
+            await asyncio.wrap_future(self._services.compute_threads.submit(self.spool.write, batch))
         except OSError as error:
             raise StorageFull(f"There is no room to take this in: {error.strerror}.") from error

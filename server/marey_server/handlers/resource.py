@@ -119,7 +119,12 @@ class Resource(Exchange):
 
     async def compute(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """What `function` returns, computed in a thread away from the event loop."""
-        return await asyncio.wrap_future(self.services.submit(function, *args, **kwargs))
+        return await asyncio.wrap_future(self.services.compute_threads.submit(function, *args, **kwargs))
+
+    async def compute_long(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """As `compute`, for what may take seconds: some of the threads are left to others."""
+        async with self.services.compute_threads.long_place():
+            return await self.compute(function, *args, **kwargs)
 
     def on_finish(self) -> None:
         """The answer is on its way."""

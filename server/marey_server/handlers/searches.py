@@ -15,7 +15,7 @@ from marey_server.handlers.reply import Rendered, Reply, render
 from marey_server.handlers.resource import Resource
 from marey_server.handlers.streaming import attachment
 from marey_server.models import SampleFormat
-from marey_server.searching import FoundSearchable, Searchable
+from marey_server.searching import FoundSearchable, Key, Searchable
 
 
 class FoundFileQuery(Request):
@@ -33,14 +33,20 @@ class Searcher(Resource):
     ) -> tuple[list[FoundSearchable], list[Searchable]]:
         """The model of each step with its tree, parsed; those used last are kept."""
         found = await self.look_up(searching.find_searchables, project, kind_of(kind), item, request)
-        return found, [await self._parsed(project, one, request.seed) for one in found]
+        parsed: dict[Key, Searchable] = {}
+        for one in found:
+            key = one.key(request.seed)
+            if key not in parsed:
+                parsed[key] = await self._parsed(project, one, request.seed)
+                searching.require_drawable(sum(each.drawing_work for each in parsed.values()))
+        return found, [parsed[one.key(request.seed)] for one in found]
 
     async def _parsed(self, project: str, found: FoundSearchable, seed: int) -> Searchable:
         key = found.key(seed)
         known = self.services.searchables.get(key)
         if known is None:
             loaded = await self.look_up(searching.load_searchable, project, found)
-            known = await self.compute(self.services.searchables.parse, key, loaded, seed)
+            known = await self.compute_long(self.services.searchables.parse, key, loaded, seed)
         return known
 
 
@@ -65,7 +71,7 @@ class Search(Searcher):
             result = search_answers.search(searchables, body)
             return render(Reply(search_answers.answer_of(result, searchables, found, body)), form, answers)
 
-        return await self.compute(answered)
+        return await self.compute_long(answered)
 
 
 class SearchFile(Searcher):
@@ -91,7 +97,7 @@ class SearchFile(Searcher):
             headers = {"Content-Disposition": attachment(file.name), "Cache-Control": "private, no-cache"}
             return Reply(file.data, media_type=file.media_type, headers=headers)
 
-        return await self.compute(written)
+        return await self.compute_long(written)
 
 
 RESOURCES: tuple[type[Resource], ...] = (Search, SearchFile)

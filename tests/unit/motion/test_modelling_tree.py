@@ -9,8 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from marey_motion.errors import MotionError
+from marey_motion.modelling.constraints import JointPosition
 from marey_motion.modelling.mixture import LatentMixture
+from marey_motion.modelling.objective import build_objective
 from marey_motion.modelling.sample_tree_documents import sample_tree_from_tree, sample_tree_to_tree
+from marey_motion.modelling.search import search_tree
 from marey_motion.modelling.tree import END_EFFECTORS, SampleTree, TreeOptions, build_tree
 from marey_schemas.codecs import MEDIA_TYPES, decode_tree, encode_tree
 from marey_schemas.sample_trees import SampleTreeDocument
@@ -174,3 +177,16 @@ def test_options_out_of_range_are_refused_by_name(field, value):
 def test_end_effectors_are_needed_to_group_by_them():
     with pytest.raises(MotionError, match="neither hands"):
         build_tree(sliding(), 0)
+
+
+@pytest.mark.parametrize(("branching", "leaf_size", "depth"), [(4, 1, 64), (3, 10, 64), (2, 5, 3), (16, 1, 1)])
+@pytest.mark.parametrize("candidates", [1, 4, 1000])
+def test_no_search_evaluates_more_motions_than_its_tree_tells_before(branching, leaf_size, depth, candidates):
+    primitive = walking()[0]
+    options = TreeOptions(300, branching, leaf_size, depth, "latent")
+    tree = build_tree(primitive, 1, options)
+    for height in (0.8, 1.2):
+        constraints = (JointPosition("left_wrist", "middle", (0.3, height, 0.5)),)
+        objective = build_objective(primitive, constraints, standard_joints())
+        evaluated = search_tree(objective, tree, candidates=candidates).evaluations
+        assert evaluated <= tree.most_evaluations(candidates)

@@ -20,7 +20,7 @@ from marey_server.store.items.reading import read_item, read_part
 from marey_server.store.revs import moved_on
 from marey_server.store.transaction import Transaction
 
-MOST_WORK = 60_000_000
+MOST_WORK = 30_000_000
 """Commands times segments and keyframes: some seconds of one thread."""
 
 

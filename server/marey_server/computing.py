@@ -1,0 +1,79 @@
+"""The threads that compute, and places among them for what takes seconds.
+
+Whatever takes long must leave a thread for what does not: exports, documents, passwords.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import sys
+import threading
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import asynccontextmanager
+from typing import ParamSpec, TypeVar
+
+from marey_server.errors import Unavailable
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+THREAD_NAME = "marey-compute"
+LONGEST_WAIT_S = 20.0
+"""For a place among the long computations; then the caller shall ask again."""
+ASK_AGAIN_S = 5
+BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class ComputeThreads:
+    """As many threads as there are processors, of which all but one may be taken by long computations."""
+
+    def __init__(self, threads: int | None = None) -> None:
+        count = max(2, threads or os.cpu_count() or 2)
+        self._pool = ThreadPoolExecutor(count, thread_name_prefix=THREAD_NAME)
+        self._long_places = asyncio.Semaphore(count - 1)
+
+    def submit(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Run numeric work or file work in a thread, away from the event loop."""
+        return self._pool.submit(function, *args, **kwargs)
+
+    @asynccontextmanager
+    async def long_place(self) -> AsyncIterator[None]:
+        """A place for what may take seconds. Raises `Unavailable` where none gets free."""
+        try:
+            await asyncio.wait_for(self._long_places.acquire(), LONGEST_WAIT_S)
+        except TimeoutError:
+            raise Unavailable(
+                "Others are computing; try again in some seconds.",
+                code="computing",
+                headers={"Retry-After": str(ASK_AGAIN_S)},
+            ) from None
+        try:
+            yield
+        finally:
+            self._long_places.release()
+
+    def close(self) -> None:
+        """Begin nothing more. What runs is not waited for: nobody is there any more who could be answered."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def compute_on_one_thread_each() -> None:
+    """Let each computation of this process have one thread: several at once would only take turns with each other."""
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+    for name in BLAS_VARIABLES:  # for libraries that are not loaded yet
+        os.environ.setdefault(name, "1")
+    threadpool_limits(1)
+
+
+def leave() -> None:
+    """End this process, whose work is done, even though a computation is still running that nobody waits for."""
+    if not any(thread.name.startswith(THREAD_NAME) for thread in threading.enumerate()):
+        return
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
