@@ -3,12 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
 from marey_motion.gait import generate_gait
 from marey_motion.kinematics import global_positions
+from marey_motion.skeleton import Skeleton
 
 
 def make_walk(
@@ -25,6 +26,20 @@ def make_breathing_walk(**given: float) -> Clip:
     phase = np.linspace(0.0, 6.0, walk.frame_count)[:, None, None]
     offsets = walk.skeleton.offsets[list(joints)] * (1.0 + 0.1 * np.sin(phase))
     return replace(walk, translations=offsets.astype(np.float32), translated_joints=joints)
+
+
+def under_static_root(clip: Clip, away: ArrayLike = (0.3, 0.9, -4.0)) -> Clip:
+    """The clip on a skeleton whose root stands still on the floor and whose hips are `away` from it and translated."""
+    own = clip.skeleton
+    skeleton = Skeleton(
+        ("reference", *own.joint_names),
+        np.concatenate(([-1], own.parents + 1)).astype(np.int32),
+        np.concatenate((np.zeros((1, 3)), [away], own.offsets[1:])),
+        np.concatenate((quaternions.identity(1), own.rest_rotations)),
+    )
+    still = np.tile(np.array((0, 0, 0, 1, 0, 0, 0), np.float32), (clip.frame_count, 1))
+    poses = np.concatenate((still, clip.poses[:, 3:]), axis=1)
+    return Clip(skeleton, clip.frame_rate_hz, poses, clip.poses[:, None, :3], (1,))
 
 
 def same_poses(a: Clip, b: Clip, tolerance: float = 2e-6) -> bool:

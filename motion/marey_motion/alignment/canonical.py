@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from marey_motion import quaternions
 from marey_motion.alignment.aligned import Placement
+from marey_motion.carrying import carried_at, spins_of
 from marey_motion.kinematics import forward_directions, headings
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
@@ -60,20 +61,5 @@ def _turn(angle_rad: float) -> Floats:
 
 def _carried(motion: Motion, skeleton: Skeleton, carrier: int, turn: Floats, places: quaternions.Floats) -> Motion:
     """The motion with the joint `carrier` at `places` (F, 3), and turned in the world by `turn`."""
-    above = skeleton.path_to_root(carrier)[:0:-1]
-    arm = np.zeros((motion.frame_count, 3))
-    parent = quaternions.identity(motion.frame_count)
-    for joint, child in zip(above, (*above, carrier)[1:], strict=True):
-        parent = quaternions.multiply(parent, motion.rotations[:, joint])
-        arm += quaternions.rotate_vectors(parent, skeleton.offsets[child])
-    rotations = motion.rotations.copy()
-    local = quaternions.multiply(quaternions.conjugate(parent), quaternions.multiply(turn, parent))
-    rotations[:, carrier] = quaternions.multiply(local, rotations[:, carrier])
-    chain = {*above, carrier}
-    kept = [slot for slot, joint in enumerate(motion.translated_joints) if joint not in chain]
-    return Motion(
-        np.asarray(places - arm, dtype=np.float64),
-        rotations,
-        motion.translations[:, kept],
-        tuple(motion.translated_joints[slot] for slot in kept),
-    )
+    spins = quaternions.multiply(turn, spins_of(motion, skeleton, carrier))
+    return carried_at(motion, skeleton, carrier, np.asarray(places, np.float64), np.asarray(spins, np.float64))

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.carrying import body_first, root_first, root_stands
 from marey_motion.editing.borders import blended, smooth_step
 from marey_motion.editing.offsets import VELOCITY_S, add_offset, dying_away, seam_offset
 from marey_motion.editing.placement import body_track, moved_over
@@ -33,6 +34,8 @@ def concatenate(
 ) -> Take:
     """Append a clip of the same skeleton, at this motion's frame rate.
 
+    Where hips are translated under a root that is a static reference, their travel goes into that of the root.
+
     Parameters
     ----------
     source : the clip
@@ -52,12 +55,14 @@ def concatenate(
     before, after = take.moved(first), added.moved(second)
     count = take.count_frames(blend_s)
     overlap = min(count, before.frame_count, after.frame_count) if blend == "slerp" else 0
-    if place == "seam":
-        after = after.moved(moved_over(second, _seam(before, after, overlap)))
-    if overlap:
-        return take.moved(_faded_over(first, after.motion, overlap))
-    joined = after.motion if count == 0 else _inertialised(before, after, count)
-    return take.moved(_in_a_row(first, joined))
+    if place == "keep" and count == 0:
+        return take.moved(_in_a_row(first, second))
+    seam = _seam(before, after, overlap) if place == "seam" else LoopSeam(0.0, np.zeros(2))
+    body, carrier = take.skeleton, take.body.carrier
+    stays = all(root_stands(motion, body, carrier) for motion in (first, second))
+    first, second = (body_first(motion, body, carrier, root_stays=stays) for motion in (first, second))
+    joined = _joined(first, moved_over(second, seam), overlap, count, take.frame_rate_hz)
+    return take.moved(root_first(joined, body, carrier, root_stays=stays))
 
 
 def _same_rate(take: Take, source: str) -> Take:
@@ -87,12 +92,18 @@ def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
     return loop_seam(rows, np.array([start_headings[0], start_headings[-1], end_headings[0], end_headings[-1]]))
 
 
-def _inertialised(before: Take, after: Take, count: int) -> Motion:
+def _joined(first: Motion, second: Motion, overlap: int, count: int, frame_rate_hz: float) -> Motion:
+    """Both, blended over `count` frames, which overlap or not; 0 for a hard cut."""
+    if overlap:
+        return _faded_over(first, second, overlap)
+    return _in_a_row(first, _inertialised(first, second, count, frame_rate_hz) if count else second)
+
+
+def _inertialised(first: Motion, second: Motion, count: int, frame_rate_hz: float) -> Motion:
     """The second motion, starting with the pose and velocity that the first one ends with."""
-    first, second = before.motion, after.motion
     difference, velocity = seam_offset(first, second)
-    ages = np.arange(min(count, after.frame_count), dtype=np.float64)
-    velocity_life = min(float(count), max(1.0, VELOCITY_S * before.frame_rate_hz))
+    ages = np.arange(min(count, second.frame_count), dtype=np.float64)
+    velocity_life = min(float(count), max(1.0, VELOCITY_S * frame_rate_hz))
     left = dying_away(difference, velocity, ages, float(count), velocity_life)
     return add_offset(second, np.arange(len(ages)), left)
 

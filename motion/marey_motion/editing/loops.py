@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.carrying import body_first, root_first, root_stands
 from marey_motion.editing.offsets import VELOCITY_S, add_offset, dying_away, offset_to, step_of
 from marey_motion.editing.placement import body_track, carried, moved_over
 from marey_motion.editing.take import Take
@@ -19,6 +20,8 @@ FEWEST_FRAMES = 4
 
 def close_loop(take: Take, *, in_place: bool = False, blend_s: float | None = None) -> Take:
     """Make the last frame lead into the first one, elsewhere on the ground where the clip travels.
+
+    Where hips are translated under a root that is a static reference, their travel goes into that of the root.
 
     What is missing between the pose and velocity that the end runs towards and those of the start is shared: half dies
     away from the start onwards, half from the end backwards.
@@ -38,12 +41,15 @@ def close_loop(take: Take, *, in_place: bool = False, blend_s: float | None = No
         raise EditError(f"a loop needs at least {FEWEST_FRAMES} frames, there are {frames}", code="frames-missing")
     places, headings = body_track(take, 0, frames)
     seam = loop_seam(places[:, [0, 2]], headings)
-    motion = take.motion
+    body, carrier = take.skeleton, take.body.carrier
+    stays = root_stands(take.motion, body, carrier)
+    motion = body_first(take.motion, body, carrier, root_stays=stays)
     if in_place:
         motion = _in_place(motion, places, seam)
         seam = LoopSeam(0.0, np.zeros(2))
     life = 0.5 * frames if blend_s is None else min(0.5 * frames, max(1.0, blend_s * take.frame_rate_hz))
-    return take.moved(_closed(motion, seam, life, min(life, max(1.0, VELOCITY_S * take.frame_rate_hz))))
+    closed = _closed(motion, seam, life, min(life, max(1.0, VELOCITY_S * take.frame_rate_hz)))
+    return take.moved(root_first(closed, body, carrier, root_stays=stays))
 
 
 def _in_place(motion: Motion, places: Floats, seam: LoopSeam) -> Motion:

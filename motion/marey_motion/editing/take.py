@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.clip import Clip
-from marey_motion.errors import EditError
+from marey_motion.errors import EditError, MappingError
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
 from marey_motion.rigs import JointMapping, map_joints, symmetric_joints
@@ -55,6 +55,14 @@ class EditedBody:
     def pelvis(self) -> int:
         """The joint that stands for where the body is; the root where no pelvis is known."""
         return self.skeleton.index_of(self.mapping.joints.get("pelvis", self.skeleton.joint_names[0]))
+
+    @cached_property
+    def carrier(self) -> int:
+        """The joint that carries all of the body (`MatchingBody.carrier`); the root where the body is not known."""
+        try:
+            return self.matching.carrier
+        except MappingError:
+            return 0
 
     @cached_property
     def matching(self) -> MatchingBody:

@@ -6,13 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from alignment_examples import body_of, moved, walk
+from edited_takes import under_static_root
 from marey_motion import quaternions
 from marey_motion.alignment.canonical import placed, to_canonical
-from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_directions
 from marey_motion.motion import Motion
-from marey_motion.skeleton import Skeleton
 
 BODY = body_of(walk())
 
@@ -49,21 +48,6 @@ def test_placing_a_canonical_motion_brings_it_back(keep_height):
     canonical, placement = to_canonical(motion, BODY, keep_height=keep_height)
     back = placed(canonical, placement, BODY.skeleton)
     assert back.poses == pytest.approx(motion.poses, abs=1e-12)
-
-
-def under_static_root(clip, away):
-    """The clip on a skeleton whose root stands still on the floor and whose hips are `away` from it and translated."""
-    own = clip.skeleton
-    skeleton = Skeleton(
-        ("reference", *own.joint_names),
-        np.concatenate(([-1], own.parents + 1)).astype(np.int32),
-        np.concatenate(((np.zeros((1, 3))), [away], own.offsets[1:])),
-        np.concatenate((quaternions.identity(1), own.rest_rotations)),
-    )
-    root = np.zeros((clip.frame_count, 3), np.float32)
-    still = np.tile(quaternions.identity(1, dtype=np.float32), (clip.frame_count, 1))
-    poses = np.concatenate((root, still, clip.poses[:, 3:]), axis=1)
-    return Clip(skeleton, clip.frame_rate_hz, poses, clip.poses[:, None, :3], (1,))
 
 
 def test_a_static_root_is_moved_along_while_the_body_is_turned_at_its_hips():

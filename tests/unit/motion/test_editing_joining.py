@@ -1,10 +1,12 @@
 """Clips put after one another."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from edited_takes import largest_step, make_breathing_walk, make_walk, require_sound, same_poses
-from marey_motion import kinematics
+from edited_takes import largest_step, make_breathing_walk, make_walk, require_sound, same_poses, under_static_root
+from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
 from marey_motion.editing.registry import apply_edit
 from marey_motion.errors import EditError
@@ -145,3 +147,35 @@ def test_feet_and_heading_go_on_at_the_seam(blend: str, start: int) -> None:
     assert lowest_foot(joined) > 0.015
     own = np.maximum(turning_and_jolting(first), turning_and_jolting(second))
     assert (turning_and_jolting(joined) <= 1.25 * own).all()
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+@pytest.mark.parametrize("turned_by", [0.0, 1.5, 3.1])
+def test_bodies_under_a_static_root_are_joined_as_bodies_that_are_the_root(blend: str, turned_by: float) -> None:
+    first = make_walk(turn_rate_rad_s=0.6)
+    elsewhere = [("rotate", {"angle_rad": turned_by}), ("translate", {"shift_m": (5.0, 0.0, -3.0)})]
+    second = apply_edit(make_walk(turn_rate_rad_s=-0.4), elsewhere)
+    joined = join(under_static_root(first), under_static_root(second), blend=blend)
+    require_sound(joined)
+    assert np.abs(global_positions(joined)[:, 1:] - global_positions(join(first, second, blend=blend))).max() < 1e-4
+    assert np.abs(joined.rotations[:, 0] - (1.0, 0.0, 0.0, 0.0)).max() < 1e-5
+
+
+def with_turning_root(clip: Clip, rate_rad_s: float) -> Clip:
+    """The clip under a root that turns, which the hips undo, so that the body goes where it went."""
+    under = under_static_root(clip)
+    turns = quaternions.from_axis_angle((0.0, 1.0, 0.0), rate_rad_s / clip.frame_rate_hz * np.arange(clip.frame_count))
+    back = quaternions.conjugate(turns)
+    poses = under.poses.copy()
+    poses[:, 3:7], poses[:, 7:11] = turns, quaternions.multiply(back, under.rotations[:, 1])
+    assert under.translations is not None
+    places = quaternions.rotate_vectors(back, under.translations[:, 0])[:, None].astype(np.float32)
+    return replace(under, poses=poses, translations=places)
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_bodies_under_roots_that_turn_are_joined_as_bodies_that_are_the_root(blend: str) -> None:
+    first, second = make_walk(turn_rate_rad_s=0.6), make_walk(turn_rate_rad_s=-0.4)
+    joined = join(with_turning_root(first, 0.9), with_turning_root(second, 0.3), blend=blend)
+    require_sound(joined)
+    assert np.abs(global_positions(joined)[:, 1:] - global_positions(join(first, second, blend=blend))).max() < 1e-4

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edited_takes import make_breathing_walk, make_walk, require_sound, same_poses
+from edited_takes import make_breathing_walk, make_walk, require_sound, same_poses, under_static_root
 from marey_motion import kinematics
 from marey_motion.clip import Clip
 from marey_motion.editing.registry import apply_edit
@@ -73,3 +73,14 @@ def test_what_loops_already_hardly_changes() -> None:
 def test_a_loop_needs_some_frames() -> None:
     with pytest.raises(EditError, match="at least 4 frames, there are 3"):
         apply_edit(make_walk().sliced(0, 3), [("close_loop", {})])
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_a_body_under_a_static_root_is_looped_as_a_body_that_is_the_root(in_place: bool) -> None:
+    walk = make_walk(turn_rate_rad_s=0.7).sliced(5, 100)
+    closed, own = (
+        apply_edit(clip, [("close_loop", {"in_place": in_place})]) for clip in (under_static_root(walk), walk)
+    )
+    require_sound(closed)
+    assert np.abs(global_positions(closed)[:, 1:] - global_positions(own)).max() < 1e-4
+    assert np.abs(closed.rotations[:, 0] - (1.0, 0.0, 0.0, 0.0)).max() < 1e-5
