@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from marey_motion.editing.constraining import Constraint as Constrained
 from marey_motion.editing.finish import finish
 from marey_motion.editing.inverse_kinematics.solving import limb_ending_at
 from marey_motion.editing.inverse_kinematics.targets import LookAtTarget, OrientationTarget, PositionTarget, Target
+from marey_motion.errors import MappingError
 from marey_motion.modelling.constraints import (
     Constraint,
     JointOrientation,
@@ -21,7 +22,7 @@ from marey_motion.modelling.constraints import (
 )
 from marey_motion.modelling.found_motions import FoundMotion
 from marey_motion.modelling.steps import Step
-from marey_motion.rigs import JointMapping
+from marey_motion.rigs import JointAxes, JointMapping, guess_axes
 
 Floats = NDArray[np.float64]
 
@@ -47,11 +48,12 @@ def finish_motion(steps: Sequence[Step], found: FoundMotion, mapping: JointMappi
 
     Only the limb, or the chain up to the pelvis, moves; where the body stands and when things happen stay as they are.
     """
+    axes = _axes_if_known(found, mapping)
     places: list[tuple[int, int]] = []
     wanted: list[Constrained] = []
     for number, step in enumerate(steps):
         for place, constraint in enumerate(step.constraints):
-            one = _constrained(step, number, constraint, found, mapping)
+            one = _constrained(step, number, constraint, found, mapping, axes)
             if one is not None:
                 places.append((number, place))
                 wanted.append(one)
@@ -62,8 +64,21 @@ def finish_motion(steps: Sequence[Step], found: FoundMotion, mapping: JointMappi
     return Finished(replace(found, motion=made.motion), left)
 
 
+def _axes_if_known(found: FoundMotion, mapping: JointMapping) -> dict[str, JointAxes] | None:
+    """Axes of the mapped joints by name; None where the mapping does not suffice for them."""
+    try:
+        return guess_axes(found.skeleton, mapping, found.motion.as_clip(found.skeleton, found.frame_rate_hz))
+    except MappingError:
+        return None
+
+
 def _constrained(
-    step: Step, number: int, constraint: Constraint, found: FoundMotion, mapping: JointMapping
+    step: Step,
+    number: int,
+    constraint: Constraint,
+    found: FoundMotion,
+    mapping: JointMapping,
+    axes: Mapping[str, JointAxes] | None,
 ) -> Constrained | None:
     """A constraint as inverse kinematics has it; None for one that it has no say in."""
     if not isinstance(constraint, JointPosition | JointOrientation | LookDirection):
@@ -73,7 +88,7 @@ def _constrained(
     if not chain:
         return None
     frame = found.frame_of(number, step.primitive, constraint.at)
-    limb = limb_ending_at(found.skeleton, mapping, joint)
+    limb = limb_ending_at(found.skeleton, mapping, joint, axes)
     return Constrained(_target(constraint, joint, frame, found), frame, frame + 1, chain, limb)
 
 

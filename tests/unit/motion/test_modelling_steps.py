@@ -22,6 +22,7 @@ from marey_motion.modelling.optimise import RefineOptions
 from marey_motion.modelling.step_search import search_steps
 from marey_motion.modelling.steps import MOST_STEPS, Step, TransitionOptions
 from marey_motion.modelling.tree import TreeOptions, build_tree
+from marey_motion.quaternions import from_axis_angle
 from marey_motion.rigs import map_joints
 from search_primitives import sliding, standard_joints, walking
 
@@ -183,6 +184,27 @@ def test_inverse_kinematics_removes_what_is_left():
     pelvis = standard_joints()["pelvis"]
     before, after = (one.motion.positions(found.skeleton)[:, pelvis] for one in (found, finished.found))
     np.testing.assert_allclose(after, before, atol=1e-9)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_straight_legs_are_finished_with_knees_that_bend_forwards(side):
+    step = THREE[0]
+    found = found_motion([step], search_steps([step], [tree()], start=START))
+    hip, knee, ankle = (standard_joints()[f"{side}_{part}"] for part in ("hip", "knee", "ankle"))
+    rotations = found.motion.rotations.copy()
+    rotations[:, knee] = from_axis_angle((1.0, 0.0, 0.0), np.radians(-0.1))
+    found = replace(found, motion=found.motion._replace(rotations=rotations))
+    frame = found.frame_of(0, step.primitive, "middle")
+    before = found.motion.positions(found.skeleton)[frame]
+    up = 0.03 * (before[hip] - before[ankle])
+    raised = replace(step, constraints=(JointPosition(f"{side}_ankle", "middle", tuple(before[ankle] + up)),))
+    finished = finish_motion([raised], found, map_joints(found.skeleton)).found.motion
+    after = finished.positions(found.skeleton)[frame]
+    facing = forward_directions(
+        before[None], (hip,), (standard_joints()["left_hip" if side == "right" else "right_hip"],)
+    )
+    forwards = np.array((facing[0, 0], 0.0, facing[0, 1])) * (1.0 if side == "left" else -1.0)
+    assert (after[knee] - 0.5 * (after[hip] + after[ankle])) @ forwards > 0.05
 
 
 def test_where_nothing_can_be_finished_the_motion_stays():
