@@ -188,7 +188,7 @@ class FixDrift(Request):
     command: Literal["fix_drift"]
     shift_m: Shift = Field((0.0, 0.0, 0.0), description="What the end of the range is shifted by.")
     turn_deg: Degrees = Field(0.0, description="What it is turned by about the vertical, positive to the left.")
-    frames: Frames | None = Field(None, description=WHOLE_OR_RANGE)
+    frames: Frames | None = Field(None, description=f"{WHOLE_OR_RANGE} At least two.")
     profile: Literal["linear", "smooth"] = Field(
         "linear", description="linear: the same share per frame; smooth: starting and ending gently."
     )

@@ -10,6 +10,7 @@ import numpy as np
 from marey_motion.editing.borders import smooth_step
 from marey_motion.editing.placement import carried, pelvis_track
 from marey_motion.editing.take import Take
+from marey_motion.errors import EditError
 from marey_motion.looping import about_vertical
 
 
@@ -27,7 +28,13 @@ def fix_drift(
     `EditError` where the frames are not there or there is but one.
     """
     start, stop = take.frames(frames)
-    places = np.clip((np.arange(take.frame_count) - start) / max(1, stop - 1 - start), 0.0, 1.0)
+    if stop - start < 2:
+        raise EditError(
+            f"drift needs a range of at least 2 frames to spread over; {start}:{stop} is one",
+            code="frames-missing",
+            where="frames",
+        )
+    places = np.clip((np.arange(take.frame_count) - start) / (stop - 1 - start), 0.0, 1.0)
     shares = places if profile == "linear" else smooth_step(places)
     pivots = pelvis_track(take, 0, take.frame_count)
     pivots[stop:] = pivots[stop - 1]

@@ -137,3 +137,10 @@ def test_drift_is_taken_out_little_by_little(profile: str) -> None:
         np.linalg.norm(before[180:] - before[179], axis=-1),
         atol=1e-5,
     )
+
+
+@pytest.mark.parametrize(("frames", "seconds"), [((100, 101), 4.0), (None, 1 / 60)])
+def test_drift_of_a_single_frame_is_refused(frames: tuple[int, int] | None, seconds: float) -> None:
+    walk = make_walk(seconds=4.0).sliced(0, round(60 * seconds))
+    with pytest.raises(EditError, match="at least 2 frames"):
+        apply_edit(walk, [("fix_drift", {"shift_m": (1.0, 0.0, 0.0), "frames": frames})])
