@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve1d, maximum_filter1d
 
 from marey_motion import kinematics, quaternions
-from marey_motion.editing.annotations.contacts import runs
+from marey_motion.editing.annotations.contacts import runs, without_short
 from marey_motion.editing.displacement import spread_displacements, windows_around
 from marey_motion.editing.inverse_kinematics.solving import Limb, solve_two_bone
 from marey_motion.editing.inverse_kinematics.targets import OrientationTarget, PositionTarget
@@ -29,7 +29,6 @@ from marey_motion.skeleton import Skeleton
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Run = tuple[int, int]
 
 MOST_LOWERING_M = 0.1
 # Less than this is rounding.
@@ -137,14 +136,19 @@ def plant_feet(
 
 
 def find_contacts(positions: Floats, foot: Foot, frame_rate_hz: float, options: PlantOptions) -> FootContacts:
-    """When toe and ankle of a foot are slow, from joint positions (F, J, 3) in metres."""
+    """When toe and ankle of a foot are slow, from joint positions (F, J, 3) in metres.
+
+    Contacts shorter than `shortest_s` are noise, and so are gaps in the contacts that are left.
+    """
     points = positions[:, (foot.toe, foot.leg.end)]
     touching = kinematics.foot_contacts(points, frame_rate_hz, speed_limit_m_s=options.speed_m_s)
+    shortest = options.shortest_s * frame_rate_hz
     for side in touching.T:
         for start, stop in runs(side):
-            if stop - start < options.shortest_s * frame_rate_hz:
+            if stop - start < shortest:
                 side[start:stop] = False
-    return FootContacts(touching[:, 0], touching[:, 1])
+    toe, heel = (~without_short(~side, shortest) for side in touching.T)
+    return FootContacts(toe, heel)
 
 
 def foot_slide_m(positions: Floats, foot: Foot, contacts: FootContacts) -> Floats:
@@ -165,34 +169,36 @@ def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, 
     for start, stop in runs(contacts.toe):
         places[start:stop] = np.median(toe[start:stop], axis=0)
     shift = _blended(contacts.toe, places - toe, blend)
+    heel = _standing_heels(contacts, blend)
     firm_toe, firm_heel = (
-        np.clip(_blended(one, np.ones((len(toe), 1)), blend), 0.0, 1.0) for one in (contacts.toe, contacts.heel)
+        np.clip(_blended(one, np.ones((len(toe), 1)), blend), 0.0, 1.0) for one in (contacts.toe, heel)
     )
     led, length = ankle + shift, np.linalg.norm(ankle - toe, axis=1, keepdims=True)
     own = led.copy()
-    for start, stop in _heel_runs(contacts):
+    for start, stop in runs(heel):
         place = np.median(led[start:stop], axis=0)
         if contacts.toe[start:stop].any():
             touching = start + int(np.argmax(contacts.toe[start:stop]))
             place = _at_distance(place, places[touching], length[touching])
         own[start:stop] = place
-    target = led + _blended(contacts.heel, own - led, blend)
+    target = led + _blended(heel, own - led, blend)
     target += firm_toe * (_at_distance(target, toe + shift, length) - target)
     turn = _turn_between(toe - ankle, toe + shift - target)
     rotation = quaternions.multiply(turn, spins[:, foot.leg.end])
     return _Plan(target, np.asarray(rotation, dtype=np.float64), np.maximum(firm_toe, firm_heel)[:, 0])
 
 
-def _heel_runs(contacts: FootContacts) -> list[Run]:
-    """Contacts of the heel, cut where they meet another contact of the toe."""
-    cut = []
-    toes = [start for start, _ in runs(contacts.toe)]
-    for start, stop in runs(contacts.heel):
-        standing = contacts.toe[start:stop].any()
-        inner = [one for one in toes if start < one < stop]
-        bounds = [start, *(inner if contacts.toe[start] or not standing else inner[1:]), stop]
-        cut += list(pairwise(bounds))
-    return cut
+def _standing_heels(contacts: FootContacts, blend: int) -> Flags:
+    """Frames (F,) in which the heel keeps a place: not in the last before the toe of a standing heel takes a new one.
+
+    The ankle goes with the toe, so that it has a place of its own for each contact of the toe; a heel that stands
+    through several would otherwise be in the one until a frame, and in the next one after it.
+    """
+    heel = contacts.heel.copy()
+    for (_, lifted), (landed, _) in pairwise(runs(contacts.toe)):
+        if heel[lifted - 1 : landed + 1].all():
+            heel[max(lifted, landed - blend) : landed] = False
+    return heel
 
 
 def _blended(flags: Flags, values: Floats, blend: int) -> Floats:

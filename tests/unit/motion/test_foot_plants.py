@@ -172,6 +172,38 @@ def test_the_same_motion_is_planted_in_the_same_bytes(walk: Clip, planted: tuple
     assert again.motion.rotations.tobytes() == planted[1].motion.rotations.tobytes()
 
 
+@pytest.mark.parametrize(("frames", "expected"), [(2, [(0, 120)]), (20, [(0, 59), (80, 120)])])
+def test_gaps_in_a_contact_that_are_shorter_than_any_contact_are_noise(
+    walk: Clip, frames: int, expected: list[tuple[int, int]]
+) -> None:
+    foot = _feet(walk.skeleton)[0]
+    positions = np.zeros((120, walk.skeleton.joint_count, 3))
+    positions[60 : 60 + frames, (foot.toe, foot.leg.end)] = np.linspace(0.01, 0.01 * frames, frames)[:, None, None]
+    positions[60 + frames :, (foot.toe, foot.leg.end)] = 0.01 * frames
+    found = find_contacts(positions, foot, 60.0, PlantOptions())
+    for flags in found:
+        assert [(start, stop) for start, stop in runs(flags)] == expected
+
+
+@pytest.mark.parametrize("gap", [8, 14])
+def test_knees_do_not_pop_where_a_toe_flickers_under_a_standing_heel(gap: int) -> None:
+    walk = generate_gait(1.2, 0.1, 4.0, frame_rate_hz=120.0)
+    sliding, feet = _sliding(walk), _feet(walk.skeleton)
+    start, stop = _longest_contact(walk, sliding, feet[0])
+    toe = np.zeros(walk.frame_count, dtype=np.bool_)
+    toe[start:stop] = True
+    heel, nothing = toe.copy(), np.zeros_like(toe)
+    middle = (start + stop) // 2
+    toe[middle - gap : middle] = False
+    contacts = [FootContacts(toe, heel), FootContacts(nothing, nothing)]
+    result = plant_feet(walk.skeleton, sliding, walk.frame_rate_hz, feet, contacts=contacts)
+    turns = [
+        quaternions.angle_between(*(one.rotations[part, feet[0].leg.middle] for part in (slice(1, None), slice(-1))))
+        for one in (sliding, result.motion)
+    ]
+    assert (turns[1] - turns[0]).max() < np.radians(6.0)
+
+
 @pytest.mark.parametrize(
     "name", ["cmu-amc/07/07_01-walk.amc", "cmu-amc/02/02_01.amc", "bandai-namco-2/*walk*normal*001.bvh"]
 )

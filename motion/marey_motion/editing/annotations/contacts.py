@@ -68,8 +68,8 @@ def foot_speed(points: NDArray[np.floating], frame_rate_hz: float) -> Floats:
 
 def _stances(speed: Floats, frame_rate_hz: float, options: ContactOptions) -> list[Stance]:
     standing = _with_hysteresis(speed, options.speed_m_s, LEAVING_FACTOR * options.speed_m_s)
-    standing = ~_without_short(~standing, options.shortest_swing_s * frame_rate_hz)
-    return [Stance(*one) for one in runs(_without_short(standing, options.shortest_stance_s * frame_rate_hz))]
+    standing = ~without_short(~standing, options.shortest_swing_s * frame_rate_hz)
+    return [Stance(*one) for one in runs(without_short(standing, options.shortest_stance_s * frame_rate_hz))]
 
 
 def _with_hysteresis(values: Floats, low: float, high: float) -> NDArray[np.bool_]:
@@ -79,7 +79,7 @@ def _with_hysteresis(values: Floats, low: float, high: float) -> NDArray[np.bool
     return np.asarray(np.where(latest >= 0, values[latest] < low, values < high))
 
 
-def _without_short(states: NDArray[np.bool_], shortest: float) -> NDArray[np.bool_]:
+def without_short(states: NDArray[np.bool_], shortest: float) -> NDArray[np.bool_]:
     """The states (F,) without runs shorter than so many frames; those at the ends may go on outside, and stay."""
     kept = states.copy()
     for start, end in runs(states):
