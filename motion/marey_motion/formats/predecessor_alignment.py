@@ -22,6 +22,7 @@ Floats = NDArray[np.float64]
 
 TIME_FUNCTION, SECTIONS = "time_function", "sections"
 LEAST_SLOPE = 0.01
+MOST_FRAME = 2**31 - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +50,9 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
     frames = number_array(_list(document, TIME_FUNCTION, file), file, TIME_FUNCTION)
     if frames.ndim != 1 or len(frames) < 2 or (frames != np.floor(frames)).any() or (frames < 0).any():
         raise FormatError(f"field {TIME_FUNCTION!r} must be a list of two frames or more", file=file)
+    if frames.max() > MOST_FRAME:
+        message = f"field {TIME_FUNCTION!r} names frame {frames.max():g}, which no source has"
+        raise FormatError(message, code="time-function-invalid", file=file)
     if (np.diff(frames) < 0).any():
         place = int(np.argmax(np.diff(frames) < 0)) + 1
         message = f"field {TIME_FUNCTION!r} goes back at canonical frame {place}"

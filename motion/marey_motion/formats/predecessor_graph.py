@@ -124,7 +124,11 @@ def _transitions(
 
 
 def _start(document: Mapping[str, Any], known: Mapping[tuple[str, str], Place], file: str) -> Place:
-    name = next(name for name in START_FIELDS if name in document)
+    name = next((name for name in START_FIELDS if name in document), None)
+    if name is None:
+        raise FormatError(
+            f"field {START_FIELDS[0]!r} is missing: it names the action and the model to begin with", file=file
+        )
     given = document[name]
     if not isinstance(given, list) or len(given) != 2:
         raise FormatError(f"field {name!r} must be an action and a model", file=file)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.errors import FormatError, MotionError
+from marey_motion.errors import FormatError, FormatLimit, MotionError
 from marey_motion.formats.conversion import convert
 from marey_motion.formats.document_fields import field_of, number_array, text_list
 from marey_motion.formats.predecessor_encoding import decode_document
@@ -40,6 +40,8 @@ Document = Mapping[str, Any]
 
 DEFAULT_FRAME_TIME_S = 1.0 / 30.0
 MOST_COMPONENTS, MOST_DIMENSIONS, MOST_FRAMES = 100, 2000, 20_000
+MOST_VALUES = 10_000_000
+LARGEST = 1e12
 WEIGHTS_TOLERANCE = 1e-3
 
 
@@ -122,7 +124,7 @@ class _Parts:
 def _as_parts(document: Document, layout: Layout, file: str) -> _Parts:
     if layout == "3":
         space = field_of(document, "sspm", dict, file)
-        time = document.get("tspm") or None
+        time: Document | None = field_of(document, "tspm", dict, file) if document.get("tspm") else None
         mixture: Document | None = field_of(document, "gmm", dict, file)
     elif layout == "static":
         space = {
@@ -143,7 +145,7 @@ def _as_parts(document: Document, layout: Layout, file: str) -> _Parts:
     joints = next((one for one in (space, document) if "animated_joints" in one), None)
     if joints is None and isinstance(skeleton, dict) and isinstance(skeleton.get("animated_joints"), list):
         joints = skeleton
-    maxima = number_array(
+    maxima = _numbers(
         document.get("translation_maxima", space.get("translation_maxima", [1, 1, 1])), file, "translation_maxima"
     )
     if maxima.shape != (3,):
@@ -198,12 +200,12 @@ def _time_part(time: Document | None, layout: Layout, file: str) -> tuple[Docume
     Layout 2 was written by two trainers. The first one puts a component into each column of its vectors and means
     increments; the later one puts it into each row, and means coefficients as layout 3 does.
     """
-    if time is None or not len(time.get("mean") or ()):
+    if time is None or not time.get("mean"):
         return None, "coefficients"
+    count = len(field_of(time, "mean", list, file))
     if layout != "2":
         return time, "coefficients"
-    vectors = number_array(time.get("eigen", []), file, _FLAT_TIME["eigen"])
-    count = len(time["mean"])
+    vectors = _numbers(time.get("eigen", []), file, _FLAT_TIME["eigen"])
     if vectors.ndim == 2 and vectors.shape[1] != count and vectors.shape[0] == count:
         return {**time, "eigen": vectors.T.tolist()}, "increments"
     return time, "coefficients"
@@ -257,7 +259,7 @@ def _functions(part: Document, what: str, file: str) -> tuple[SplineBasis, Float
     start, stop = basis.span
     if start != 0.0 or abs(stop - round(stop)) > 1e-6 or stop < 2.0:
         raise FormatError(f"{what}: the knots span {start:g} to {stop:g}, not 0 to a last frame", file=file)
-    mean = number_array(field_of(part, "mean", list, file), file, f"{what}: mean")
+    mean = _numbers(field_of(part, "mean", list, file), file, f"{what}: mean")
     if mean.size % basis.count or mean.size == 0:
         raise FormatError(f"{what}: a mean of {mean.size} numbers for {basis.count} coefficients", file=file)
     if part.get("n_coeffs", basis.count) != basis.count:
@@ -267,7 +269,7 @@ def _functions(part: Document, what: str, file: str) -> tuple[SplineBasis, Float
     if part.get("n_dims", channels) != channels:
         raise FormatError(f"{what}: n_dims is {part['n_dims']}, but the mean has {channels} channels", file=file)
     given = part.get("eigen") or []
-    vectors = number_array(given, file, f"{what}: eigen") if given else np.zeros((0, mean.size))
+    vectors = _numbers(given, file, f"{what}: eigen") if given else np.zeros((0, mean.size))
     if vectors.ndim == 2 and vectors.shape[1] != mean.size and vectors.shape[0] == mean.size:
         vectors = vectors.T
     if vectors.ndim != 2 or vectors.shape[1] != mean.size:
@@ -282,14 +284,24 @@ def _basis(part: Document, what: str, file: str) -> SplineBasis:
         frames, count = (field_of(part, name, int, file) for name in ("n_frames", "n_coeffs"))
         if not 2 <= count <= frames <= MOST_FRAMES:
             raise FormatError(f"{what}: {count} coefficients over {frames} frames", code="model-invalid", file=file)
+        _check_size(frames, count, what, file)
         return SplineBasis.clamped(frames, count)
-    knots = number_array(field_of(part, "knots", list, file), file, f"{what}: knots")
+    knots = _numbers(field_of(part, "knots", list, file), file, f"{what}: knots")
     if knots.ndim != 1 or not 0 < len(knots) <= MOST_FRAMES or np.abs(knots).max() > MOST_FRAMES:
         raise FormatError(f"{what}: knots must be up to {MOST_FRAMES} numbers as high at most", file=file)
     degree = part.get("degree", DEGREE)
-    if degree not in range(1, 10):
+    if isinstance(degree, bool) or not isinstance(degree, int) or not 1 <= degree < 10:
         raise FormatError(f"{what}: degree is {degree!r}, a small whole number is needed", file=file)
-    return SplineBasis(knots, degree)
+    basis = SplineBasis(knots, degree)
+    _check_size(basis.frame_count, basis.count, what, file)
+    return basis
+
+
+def _check_size(frames: int, coefficients: int, what: str, file: str) -> None:
+    """Refuse splines whose values would fill the memory, however small the document is."""
+    if frames * coefficients > MOST_VALUES:
+        message = f"{what}: {coefficients} coefficients over {frames} frames; their product is at most {MOST_VALUES:,}"
+        raise FormatLimit(message, file=file)
 
 
 def _animated(parts: _Parts, basis: SplineBasis, mean: Floats, skeleton: Skeleton, file: str) -> list[str]:
@@ -346,8 +358,10 @@ def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> t
         dimensions = spatial + temporal
         return LatentMixture(np.ones(1), np.zeros((1, dimensions)), np.eye(dimensions)[None]), temporal
     weights, means, covariances = (
-        number_array(field_of(part, name, list, file), file, f"gmm: {name}") for name in ("weights", "means", "covars")
+        _numbers(field_of(part, name, list, file), file, f"gmm: {name}") for name in ("weights", "means", "covars")
     )
+    if means.ndim == 2 and not means.size and not covariances.size:
+        covariances = np.zeros((len(means), 0, 0))  # lists of nothing do not tell how many there are
     if means.ndim != 2 or covariances.shape != (len(means), *[means.shape[1]] * 2) or weights.shape != (len(means),):
         shapes = f"{weights.shape}, {means.shape} and {covariances.shape}"
         raise FormatError(f"gmm: weights, means and covars of shapes {shapes}", code="model-invalid", file=file)
@@ -364,6 +378,14 @@ def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> t
     if means.shape[1]:
         _ = mixture.cholesky  # refuses what is no covariance
     return mixture, covered
+
+
+def _numbers(values: Any, file: str, name: str) -> Floats:
+    """Nested lists as an array; what is made of numbers that no body has could not be computed with."""
+    numbers = number_array(values, file, name)
+    if np.abs(numbers).max(initial=0.0) > LARGEST:
+        raise FormatError(f"field {name!r} holds numbers beyond {LARGEST:g}", code="bad-number", file=file)
+    return numbers
 
 
 def _variances(mixture: LatentMixture) -> Floats:

@@ -28,6 +28,8 @@ TimeForm = Literal["coefficients", "increments"]
 DRAWN, SEED = 512, 0
 """Scores that a linear function is fitted over: so many, drawn with this seed."""
 MOST_LOG_SLOPE = 20.0
+KNOTS_AT_MOST = 500
+"""Within a time function that is taken over: no published model has as many canonical frames."""
 WRITTEN_COEFFICIENTS = 8
 
 
@@ -67,15 +69,18 @@ def as_log_slopes(
     ----------
     variances : (k,) of the scores
     """
-    wanted = time.time_functions(scores)
-    steps = np.diff(wanted, axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
+        wanted = time.time_functions(scores)
+        steps = np.diff(wanted, axis=1)
     if not (np.isfinite(steps).all() and (steps > 0).all() and (np.abs(np.log(steps)) < MOST_LOG_SLOPE).all()):
         raise FormatError(
             "the time function does not run forward at a speed that makes sense", code="bad-time", file=file
         )
-    # As many coefficients as steps: the function is taken over as it is, whatever its own knots.
-    basis = SplineBasis.clamped(steps.shape[1], max(DEGREE + 1, steps.shape[1]))
-    mean, directions = _linear_fit(scores, np.asarray(basis.fit(np.log(steps)[..., None]))[..., 0])
+    basis = _basis_over(steps.shape[1])
+    # The fit over scores comes before the one over time, which is linear as well: a few functions are left by then.
+    at_mean, by_score = _linear_fit(scores, np.log(steps))
+    coefficients = _spline_fit(basis, np.concatenate((at_mean[None], by_score)))
+    mean, directions = coefficients[0], coefficients[1:]
     components = components_of(basis, mean[:, None], directions[..., None], variances)
     made = np.exp((mean + scores @ directions) @ basis.at_frames.T)
     error = np.abs(np.cumsum(made, axis=1) - wanted[:, 1:]).max()
@@ -131,3 +136,27 @@ def _linear_fit(scores: Floats, values: Floats) -> tuple[Floats, Floats]:
     columns = np.concatenate((np.ones((len(scores), 1)), scores), axis=1)
     solution = np.linalg.lstsq(columns, values, rcond=None)[0]
     return np.asarray(solution[0]), np.asarray(solution[1:])
+
+
+def _basis_over(steps: int) -> SplineBasis:
+    """As many coefficients as steps: a function is taken over as it is, whatever its own knots.
+
+    Knots stand at steps, all but the second and the last but one: evenly spaced ones would drift from the steps to
+    between them, where interpolation amplifies rounding. Long functions have fewer.
+    """
+    if steps <= DEGREE:
+        return SplineBasis.clamped(steps, DEGREE + 1)
+    inner = np.arange(2, steps - 2, -(-steps // KNOTS_AT_MOST), dtype=np.float64)
+    return SplineBasis(np.concatenate((np.zeros(DEGREE + 1), inner, np.full(DEGREE + 1, steps - 1.0))))
+
+
+def _spline_fit(basis: SplineBasis, values: Floats) -> Floats:
+    """Coefficients (m, n) of functions with values (m, N) at each canonical frame, by systems of few diagonals."""
+    from scipy.interpolate import make_interp_spline, make_lsq_spline
+
+    frames = np.arange(values.shape[1], dtype=np.float64)
+    if basis.count > len(frames):
+        return np.asarray(basis.fit(values[..., None]))[..., 0]
+    if basis.count == len(frames):
+        return np.asarray(make_interp_spline(frames, values.T, basis.degree, basis.knots).c.T)
+    return np.asarray(make_lsq_spline(frames, values.T, basis.knots, basis.degree).c.T)

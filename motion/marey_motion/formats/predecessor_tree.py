@@ -45,6 +45,10 @@ def tree_of_document(document: Mapping[str, Any], file: str) -> SampleTree:
     samples = number_array(field_of(document, "data", list, file), file, "data")
     if samples.ndim != 2 or not len(samples):
         raise FormatError(f"field 'data' has shape {samples.shape}; a row for each sample is needed", file=file)
+    if np.abs(samples).max(initial=0.0) > np.finfo(np.float32).max:
+        place = int(np.argmax(np.abs(samples).max(axis=1)))
+        message = f"field 'data', row {place}: a number beyond those of single precision, which samples are kept in"
+        raise FormatError(message, code="bad-number", file=file)
     indices, children = _by_levels(field_of(document, "root", dict, file), len(samples), file)
     order = _in_tree_order(indices, children)
     if len(np.unique(order)) != len(samples):

@@ -56,6 +56,7 @@ def test_where_the_stair_stands_time_goes_on_evenly():
         ({}, "'time_function' must be a list"),
         ({"time_function": "["}, "'time_function' cannot be read"),
         ({"time_function": [0, 0.5]}, "list of two frames"),
+        ({"time_function": [0, 1e308]}, "names frame 1e.308, which no source has"),
         ({"time_function": [0, 5, 4]}, "goes back at canonical frame 2"),
         ({"time_function": [0, 1], "sections": [{"start_idx": 0, "end_idx": 3}]}, "section 0:3 is none of the 2"),
     ],

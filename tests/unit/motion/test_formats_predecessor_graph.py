@@ -53,6 +53,12 @@ def test_a_graph_that_was_written_is_read_as_the_same_and_begins_under_both_name
     assert json.loads(write_predecessor_graph(graph_of_document(written, "again.json"))) == written
 
 
+def test_a_graph_without_a_start_is_refused_by_the_field_that_is_missing():
+    with pytest.raises(FormatError, match="'start_node' is missing") as refused:
+        graph_of_document({"nodes": DOCUMENT["nodes"]}, "g.json")
+    assert refused.value.file == "g.json"
+
+
 @pytest.mark.parametrize(
     ("path", "value", "told"),
     [

@@ -14,7 +14,9 @@ from marey_motion.errors import FormatError
 from marey_motion.formats.predecessor_encoding import encode_document
 from marey_motion.formats.predecessor_model import read_predecessor_model
 from marey_motion.formats.predecessor_model_writer import write_predecessor_model
+from marey_motion.formats.predecessor_time import PredecessorTime, as_log_slopes
 from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.splines import SplineBasis
 from marey_motion.modelling.training import train_primitive
 
 QUICK = ModelOptions(leave_one_out=False, folds=0, report_samples=0)
@@ -178,6 +180,33 @@ def test_layout_3_is_written_with_the_numbers_that_were_read():
     assert written["keyframes"] == document["keyframes"]
 
 
+@pytest.mark.parametrize("layout", ["3", "2"])
+def test_a_model_that_only_repeats_one_motion_is_written_and_read_again(layout):
+    primitive = read(models.static()).primitive
+    again = read_predecessor_model(write_predecessor_model(primitive, layout=layout), "again.json").primitive
+    assert again.dimensions == 0
+    np.testing.assert_allclose(again.poses(np.zeros((1, 0))), primitive.poses(np.zeros((1, 0))), atol=1e-9)
+
+
+@pytest.mark.parametrize("frames", [3, 4, 5, 6, 48, 400])
+def test_a_time_function_is_taken_over_as_it_is_however_long(frames):
+    basis = SplineBasis.clamped(frames, min(frames, 8), min(3, frames - 1))
+    time = PredecessorTime("increments", basis, np.linspace(-1.0, 1.0, basis.count) ** 2, np.zeros((0, basis.count)))
+    found, error = as_log_slopes(time, np.zeros((1, 0)), np.zeros(0), "model.json")
+    steps = np.diff(time.time_functions(np.zeros((1, 0))), axis=1)
+    np.testing.assert_allclose(found.basis.at_frames @ found.mean[:, 0], np.log(steps)[0], atol=1e-11)
+    assert error < 1e-10 * frames
+
+
+def test_a_long_time_function_is_taken_over_without_a_coefficient_for_each_frame():
+    document = models.static()
+    document["knots"] = SplineBasis.clamped(6000, models.COEFFICIENTS).knots.tolist()
+    found = read(document)
+    assert found.primitive.temporal.basis.count < 510
+    times = found.primitive.time_functions(np.zeros((1, 0)))[0]
+    np.testing.assert_allclose(times, np.arange(6000), atol=1e-6)
+
+
 def changed(path, value):
     document = copy.deepcopy(models.layout_3())
     *above, last = path
@@ -210,6 +239,12 @@ def changed(path, value):
         (changed(["keyframes"], {"contact0": 48}), "'contact0' is beyond the 48"),
         (changed(["keyframes"], {"contact0": 1.5}), "'contact0' is 1.5"),
         (changed(["tspm", "frame_time"], "x"), "'frame_time' is 'x'"),
+        (changed(["tspm"], 5), "'tspm' must be dict, not int"),
+        (changed(["tspm"], [1]), "'tspm' must be dict, not list"),
+        (changed(["tspm", "mean"], 3), "'mean' must be list, not int"),
+        (changed(["sspm", "degree"], True), "space: degree is True"),
+        (changed(["sspm", "mean"], [1e308] * 459), "'space: mean' holds numbers beyond 1e.12"),
+        (changed(["sspm", "knots"], [0.0] * 4 + [5.0] * 2000 + [19_999.0] * 4), "2004 coefficients over 20000 frames"),
     ],
 )
 def test_damaged_models_are_refused_by_what_is_wrong(document, told):

@@ -57,6 +57,7 @@ def test_a_tree_that_was_written_is_read_again_and_written_the_same():
     [
         (["data"], [], r"'data' has shape \(0,\)"),
         (["data"], [[1.0], [2.0, 3.0]], "'data'"),
+        (["data", 3, 1], 1e308, "'data', row 3: a number beyond those of single precision"),
         (["root", "indices"], [0, 1], "root: its indices must name each of the 40"),
         (["root", "indices"], [*range(39), 40], "root: indices must lie between 0 and 39"),
         (["root", "children", 0, "indices"], [], "root.0: indices must name one sample or more"),
