@@ -418,6 +418,44 @@ def test_a_limb_that_is_straight_or_folded_bends_about_its_hinge(body: Skeleton)
         assert np.isfinite(folded.motion.rotations).all()
 
 
+def _bending_leg(body: Skeleton, bends_rad: np.ndarray, aside_rad: float) -> tuple[Motion, Limb]:
+    """A hanging left leg whose knee goes through these bends, forwards, each with so much of it aside."""
+    frames = len(bends_rad)
+    rotations = np.repeat(body.rest_rotations[None], frames, axis=0)
+    limb = limb_ending_at(body, map_joints(body), body.index_of("LeftFoot"), guess_axes(body, map_joints(body)))
+    assert limb is not None
+    assert limb.hinge is not None
+    axis = quaternions.rotate_vectors(quaternions.from_axis_angle((0.0, 1.0, 0.0), aside_rad), -np.array(limb.hinge))
+    rotations[:, limb.middle] = quaternions.from_rotation_vector(bends_rad[:, None] * axis)
+    return Motion(np.repeat(body.offsets[:1], frames, axis=0), rotations, np.zeros((frames, 0, 3)), ()), limb
+
+
+@pytest.mark.parametrize("aside_deg", [0.0, 25.0])
+@pytest.mark.parametrize("distance", [0.95, 0.985])
+def test_a_limb_bends_as_its_hinge_says_even_where_it_is_beyond_straight(
+    body: Skeleton, distance: float, aside_deg: float
+) -> None:
+    motion, limb = _bending_leg(body, np.radians(np.arange(-12.0, 70.0, 0.25)), np.radians(aside_deg))
+    hip = motion.positions(body)[:, limb.start]
+    length = np.linalg.norm(body.offsets[limb.middle]) + np.linalg.norm(body.offsets[limb.end])
+    target = hip - distance * length * np.array((0.0, 1.0, 0.0))
+    solved = solve_two_bone(body, motion, limb, PositionTarget(limb.end, target))
+    assert solved.reached.all()
+    knees = solved.motion.positions(body)[:, limb.middle]
+    assert (knees[:, 2] - hip[:, 2]).min() > 0.02  # forwards, as knees do
+    # Neighbours differ by a quarter of a degree: what is made of them differs by little, too.
+    steps = quaternions.angle_between(solved.motion.rotations[1:], solved.motion.rotations[:-1])
+    assert np.degrees(steps.max()) < 2.0
+
+
+@pytest.mark.parametrize("bend_deg", [0.5, 6.0, 14.9, 15.1, 22.0, 30.1, 80.0])
+def test_a_limb_that_is_where_it_shall_be_stays_as_it_is(body: Skeleton, bend_deg: float) -> None:
+    motion, limb = _bending_leg(body, np.radians([bend_deg]), np.radians(25.0))
+    target = motion.positions(body)[:, limb.end]
+    solved = solve_two_bone(body, motion, limb, PositionTarget(limb.end, target))
+    assert quaternions.angle_between(solved.motion.rotations, motion.rotations).max() < 1e-6
+
+
 def test_the_end_of_a_limb_keeps_or_gets_an_orientation(body: Skeleton) -> None:
     motion = _moved(body, frames=30)
     limb = Limb(*(body.index_of(name) for name in ("LeftArm", "LeftForeArm", "LeftHand")))

@@ -62,8 +62,8 @@ class Limb:
     Parameters
     ----------
     start, middle, end : indices of shoulder, elbow, wrist, or hip, knee, ankle
-    hinge : unit direction in the middle joint's frame about which the limb stretches. It is read where the limb is
-        nearly straight and does not tell itself; None leaves that to chance.
+    hinge : unit direction in the middle joint's frame about which the limb bends. It is read where the limb is nearly
+        straight, or a little beyond, and does not tell itself; None leaves that to chance.
     """
 
     start: int

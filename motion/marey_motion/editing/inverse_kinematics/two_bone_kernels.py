@@ -26,8 +26,12 @@ from marey_motion.editing.inverse_kinematics.rotation_kernels import (
     vector_at,
 )
 
-# Sine of the bend below which the axis a limb bends about is drawn towards its hinge.
-NEARLY_STRAIGHT = 0.05
+# Radians: a limb bent by less bends about its hinge, one bent by more about the axis that it is bent about now.
+HINGED, TOLD = math.radians(15.0), math.radians(30.0)
+# Sine of the inner angle below which the axis of a folded limb is drawn towards its hinge.
+NEARLY_FOLDED = 0.05
+# What of a hinge's unit direction must be across the upper bone for it to say anything.
+SHORTEST_HINGE = 0.1
 # What becomes of the rotation of the limb's end.
 CARRIED, HELD, GIVEN = 0, 1, 2
 
@@ -62,13 +66,39 @@ def _bent(upper, fore, wished, hinge):  # type: ignore[no-untyped-def]
     """The fore bone's vector, from the middle, at the inner angle `wished` to the way back to the limb's root."""
     back, way = direction(upper), direction(fore)
     axis = cross(back, way)
-    sine = length(axis)
-    if sine < NEARLY_STRAIGHT:
-        axis = plus(axis, scaled(hinge, NEARLY_STRAIGHT - sine))
-    axis = direction(minus(axis, scaled(back, dot(axis, back))))
+    hinge = minus(hinge, scaled(back, dot(hinge, back)))
+    if length(hinge) > SHORTEST_HINGE:
+        hinge = direction(hinge)
+        side = cross(back, hinge)
+        turn = _turn_from_hinge(dot(axis, hinge), dot(axis, side), dot(back, way), math.pi - wished)
+        axis = plus(scaled(hinge, math.cos(turn)), scaled(side, math.sin(turn)))
+    else:
+        axis = direction(minus(axis, scaled(back, dot(axis, back))))
     across = cross(axis, back)
     size = length(fore)
     return plus(scaled(back, size * math.cos(wished)), scaled(across, size * math.sin(wished)))
+
+
+@compiled
+def _turn_from_hinge(along, across, cosine, wished):  # type: ignore[no-untyped-def]
+    """How far from its hinge, about the upper bone, the axis is that a limb shall bend by `wished` radians about.
+
+    A limb that is nearly straight is taken to bend as its hinge says, even where it is a little beyond straight; what
+    it is bent aside stays, what is added is about the hinge. One that is bent tells its axis itself.
+
+    Parameters
+    ----------
+    along, across : the sine of the bend now, about the hinge and about what is across
+    cosine : of the inner angle now
+    """
+    sine = math.hypot(along, across)
+    if cosine > 0.0:  # folded, not straight
+        along += max(0.0, NEARLY_FOLDED - sine)
+    now = math.atan2(sine, -cosine)
+    measured = math.atan2(across, along)
+    hinged = math.asin(now * math.sin(measured) / max(now, wished, 1e-12))
+    told = min(1.0, max(0.0, (now - HINGED) / (TOLD - HINGED)))
+    return hinged + told * told * (3.0 - 2.0 * told) * (measured - hinged)
 
 
 @compiled
