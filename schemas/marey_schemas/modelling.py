@@ -55,7 +55,7 @@ class ModelParams(Request):
     most_temporal_components: int = Field(3, ge=0, le=1000, description="The time components are at most so many.")
     temporal_coefficients: int = Field(8, ge=4, le=1000, description="Of the spline of the time function.")
     temporal_weight: float | None = Field(
-        None, ge=1e-9, le=1e9, allow_inf_nan=False, description="Of time in latent vectors; default: as much as space."
+        None, ge=1e-3, le=1e3, allow_inf_nan=False, description="Of time in latent vectors; default: as much as space."
     )
     criterion: Literal["bic", "aic"] = Field("bic", description="What chooses the number of mixture components.")
     most_mixture_components: int = Field(10, ge=1, le=100, description="Tried at most.")
@@ -184,6 +184,9 @@ class MotionPrimitiveDocument(Request):
         default_factory=dict, max_length=MOST_KEYFRAMES, description="Canonical frame by label."
     )
     duration_range_s: tuple[float, float] | None = Field(None, description="Within which samples last.")
+    log_slope_range: tuple[float, float] | None = Field(
+        None, description="What the temporal function is cut off at: that of the examples, a little widened."
+    )
     scaling: dict[str, Any] | None = Field(None, description="Method and weights of the channels; undone above.")
     options: dict[str, Any] | None = Field(None, description="What it was trained with.")
     provenance: ModelProvenance = Field(
@@ -203,6 +206,8 @@ class MotionPrimitiveDocument(Request):
         dimensions = len(self.spatial.directions) + len(self.temporal.directions)
         if self.mixture.means.shape[1] != dimensions:
             raise ValueError(f"mixture: {self.mixture.means.shape[1]} dimensions for {dimensions} components")
+        if self.log_slope_range is not None and not self.log_slope_range[0] <= self.log_slope_range[1]:
+            raise ValueError("log_slope_range: must be a lower and an upper limit")
         return self
 
 

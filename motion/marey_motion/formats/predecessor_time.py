@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import FormatError
-from marey_motion.modelling.primitive import FunctionalComponents, MotionPrimitive
+from marey_motion.modelling.primitive import MOST_LOG_SLOPE, FunctionalComponents, MotionPrimitive
 from marey_motion.modelling.splines import DEGREE, SplineBasis
 
 Floats = NDArray[np.float64]
@@ -27,7 +27,7 @@ TimeForm = Literal["coefficients", "increments"]
 
 DRAWN, SEED = 512, 0
 """Scores that a linear function is fitted over: so many, drawn with this seed."""
-MOST_LOG_SLOPE = 20.0
+ODD_LOG_SLOPE = 20.0
 KNOTS_AT_MOST = 500
 """Within a time function that is taken over: no published model has as many canonical frames."""
 WRITTEN_COEFFICIENTS = 8
@@ -72,7 +72,7 @@ def as_log_slopes(
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
         wanted = time.time_functions(scores)
         steps = np.diff(wanted, axis=1)
-    if not (np.isfinite(steps).all() and (steps > 0).all() and (np.abs(np.log(steps)) < MOST_LOG_SLOPE).all()):
+    if not (np.isfinite(steps).all() and (steps > 0).all() and (np.abs(np.log(steps)) < ODD_LOG_SLOPE).all()):
         raise FormatError(
             "the time function does not run forward at a speed that makes sense", code="bad-time", file=file
         )
@@ -82,7 +82,7 @@ def as_log_slopes(
     coefficients = _spline_fit(basis, np.concatenate((at_mean[None], by_score)))
     mean, directions = coefficients[0], coefficients[1:]
     components = components_of(basis, mean[:, None], directions[..., None], variances)
-    made = np.exp((mean + scores @ directions) @ basis.at_frames.T)
+    made = np.exp(np.clip((mean + scores @ directions) @ basis.at_frames.T, -MOST_LOG_SLOPE, MOST_LOG_SLOPE))
     error = np.abs(np.cumsum(made, axis=1) - wanted[:, 1:]).max()
     return components, float(error)
 

@@ -99,8 +99,9 @@ def _times(clocks, latent, first, log_steps, times):  # type: ignore[no-untyped-
         for step in range(log_steps.shape[0]):
             log_steps[step] += score * clocks.directions[component, step]
     lasting = 0.0
+    least, most = clocks.log_slope_bounds
     for step in range(log_steps.shape[0]):
-        log_steps[step] = math.exp(min(max(log_steps[step], -clocks.most_log_slope), clocks.most_log_slope))
+        log_steps[step] = math.exp(min(max(log_steps[step], least), most))
         lasting += log_steps[step] * clocks.frame_s
     factor = min(max(lasting, clocks.range_s[0]), clocks.range_s[1]) / lasting
     for clock in range(times.shape[0]):

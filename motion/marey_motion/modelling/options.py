@@ -73,7 +73,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "temporal_share": (0.01, 1.0),
     "most_temporal_components": (0, 1000),
     "temporal_coefficients": (4, 1000),
-    "temporal_weight": (1e-9, 1e9),
+    "temporal_weight": (1e-3, 1e3),
     "most_mixture_components": (1, 100),
     "mixture_components": (1, 100),
     "regularisation": (1e-12, 1.0),

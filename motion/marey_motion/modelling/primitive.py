@@ -20,8 +20,8 @@ Floats = NDArray[np.float64]
 MOST_FRAMES = 100_000
 """Of one motion."""
 
-MOST_LOG_SLOPE = 100.0
-"""Beyond it nothing is a motion, but still a number."""
+MOST_LOG_SLOPE = 12.0
+"""Of models whose examples are not known: steps between e^-12 and e^12 frames add up to times that still rise."""
 
 MOST_ATTEMPTS = 100
 """To draw a motion that lasts neither too short nor too long."""
@@ -89,6 +89,8 @@ class MotionPrimitive:
     mixture : of latent vectors
     keyframes : canonical frame by label
     duration_range_s : within which motions last, or None; normal distributions of logarithms have long tails
+    log_slope_range : what the temporal function is cut off at, or None where the examples are not known: splines swing
+        out at their ends, where a motion would stand still
     """
 
     name: str
@@ -100,6 +102,7 @@ class MotionPrimitive:
     mixture: LatentMixture
     keyframes: Mapping[str, int] = field(default_factory=dict)
     duration_range_s: tuple[float, float] | None = None
+    log_slope_range: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.spatial.mean.shape[1] != 3 + 4 * self.skeleton.joint_count:
@@ -110,6 +113,10 @@ class MotionPrimitive:
             raise MotionError(f"the mixture has {self.mixture.dimensions} dimensions, the components {self.dimensions}")
         if not (np.isfinite(self.temporal_weight) and self.temporal_weight > 0):
             raise MotionError("the temporal weight is a positive number", where="temporal_weight")
+        least, most = self.log_slope_bounds
+        if not -MOST_LOG_SLOPE <= least <= most <= MOST_LOG_SLOPE:
+            message = f"{least:g} to {most:g} is no range within {-MOST_LOG_SLOPE:g} to {MOST_LOG_SLOPE:g}"
+            raise MotionError(message, where="log_slope_range")
 
     @property
     def frame_count(self) -> int:
@@ -120,6 +127,11 @@ class MotionPrimitive:
     def dimensions(self) -> int:
         """L, numbers of a latent vector."""
         return self.spatial.count + self.temporal.count
+
+    @property
+    def log_slope_bounds(self) -> tuple[float, float]:
+        """What logarithms of steps are cut off at: `log_slope_range`, or that of any motion."""
+        return self.log_slope_range or (-MOST_LOG_SLOPE, MOST_LOG_SLOPE)
 
     # -- from latent vectors -------------------------------------------------------------------------------------------
 
@@ -167,7 +179,7 @@ class MotionPrimitive:
         scores = latents[:, self.spatial.count :] / self.temporal_weight
         log_slopes = (self.temporal.basis.at_frames @ self.temporal.coefficients(scores))[..., 0]
         passed = np.zeros((len(latents), self.frame_count))
-        np.cumsum(np.exp(np.clip(log_slopes, -MOST_LOG_SLOPE, MOST_LOG_SLOPE)), axis=1, out=passed[:, 1:])
+        np.cumsum(np.exp(np.clip(log_slopes, *self.log_slope_bounds)), axis=1, out=passed[:, 1:])
         return passed
 
     def durations_s(self, latents: Floats) -> Floats:

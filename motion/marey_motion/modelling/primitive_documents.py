@@ -29,7 +29,6 @@ Floats = NDArray[np.float64]
 
 def primitive_to_tree(primitive: MotionPrimitive, skeleton: Mapping[str, Any]) -> Tree:
     """Part `model` of a primitive whose skeleton is stored as `skeleton`, a reference to a revision."""
-    duration_range = primitive.duration_range_s
     return {
         "schema": PRIMITIVE_SCHEMA,
         "name": primitive.name,
@@ -45,7 +44,8 @@ def primitive_to_tree(primitive: MotionPrimitive, skeleton: Mapping[str, Any]) -
             "covariances": _leaf(primitive.mixture.covariances),
         },
         "keyframes": {label: int(frame) for label, frame in primitive.keyframes.items()},
-        "duration_range_s": None if duration_range is None else list(duration_range),
+        "duration_range_s": _range_leaf(primitive.duration_range_s),
+        "log_slope_range": _range_leaf(primitive.log_slope_range),
     }
 
 
@@ -77,7 +77,6 @@ def primitive_from_tree(tree: Mapping[str, Any], skeleton: Skeleton) -> MotionPr
     """
     if tree.get("schema") != PRIMITIVE_SCHEMA:
         raise ModelError(f"a document of the schema {tree.get('schema')!r}, not {PRIMITIVE_SCHEMA!r}")
-    duration_range = tree.get("duration_range_s")
     return MotionPrimitive(
         name=tree["name"],
         skeleton=skeleton,
@@ -87,7 +86,8 @@ def primitive_from_tree(tree: Mapping[str, Any], skeleton: Skeleton) -> MotionPr
         temporal_weight=float(tree["temporal_weight"]),
         mixture=LatentMixture(**{name: np.asarray(tree["mixture"][name]) for name in _MIXTURE}),
         keyframes=dict(tree.get("keyframes") or {}),
-        duration_range_s=None if duration_range is None else (float(duration_range[0]), float(duration_range[1])),
+        duration_range_s=_range_of(tree, "duration_range_s"),
+        log_slope_range=_range_of(tree, "log_slope_range"),
     )
 
 
@@ -165,6 +165,15 @@ def _report_to_tree(report: TrainingReport) -> Tree:
         "training_feet": None if report.training_feet is None else asdict(report.training_feet),
         "sample_feet": None if report.sample_feet is None else asdict(report.sample_feet),
     }
+
+
+def _range_leaf(limits: tuple[float, float] | None) -> list[float] | None:
+    return None if limits is None else list(limits)
+
+
+def _range_of(tree: Mapping[str, Any], name: str) -> tuple[float, float] | None:
+    limits = tree.get(name)
+    return None if limits is None else (float(limits[0]), float(limits[1]))
 
 
 def _leaf(array: Floats) -> Floats:

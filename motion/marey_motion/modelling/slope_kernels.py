@@ -108,6 +108,10 @@ def keep_time(clocks, latent, first, times, slopes):  # type: ignore[no-untyped-
     """Fill seconds (n,) at the clocks and their derivatives (n, W); the temporal numbers begin at `first`."""
     steps = np.empty(clocks.mean.shape[0])
     factor, lasting = _times(clocks, latent, first, steps, times)
+    least, most = math.exp(clocks.log_slope_bounds[0]), math.exp(clocks.log_slope_bounds[1])
+    for step in range(steps.shape[0]):
+        if not least < steps[step] < most:  # cut off: it stays as long, whatever the numbers are
+            steps[step] = 0.0
     slopes[:] = 0.0
     for number in range(clocks.directions.shape[0]):
         longer = 0.0

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MappingError
-from marey_motion.modelling.primitive import MOST_LOG_SLOPE, MotionPrimitive
+from marey_motion.modelling.primitive import MotionPrimitive
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -73,7 +73,7 @@ class Clocks(NamedTuple):
     frame_s : seconds of one frame
     range_s : (2,) how long motions last, at least and at most; what would last longer or shorter is played faster or
         slower as a whole
-    most_log_slope : logarithms of steps are cut off beyond plus and minus this
+    log_slope_bounds : (2,) what logarithms of steps are cut off at
     """
 
     mean: Floats
@@ -81,7 +81,7 @@ class Clocks(NamedTuple):
     weights: Floats
     frame_s: float
     range_s: Floats
-    most_log_slope: float
+    log_slope_bounds: Floats
 
 
 def standing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
@@ -142,7 +142,7 @@ def track_times(primitive: MotionPrimitive, moments: Sequence[float]) -> Clocks:
         weights=np.ascontiguousarray(passed / primitive.frame_rate_hz).reshape(len(moments), len(steps)),
         frame_s=1.0 / primitive.frame_rate_hz,
         range_s=np.array(primitive.duration_range_s or (0.0, np.inf)),
-        most_log_slope=MOST_LOG_SLOPE,
+        log_slope_bounds=np.array(primitive.log_slope_bounds),
     )
 
 

@@ -14,7 +14,7 @@ from marey_motion.errors import ModelError
 from marey_motion.modelling.fpca import Keep, PrincipalExamples, find_components
 from marey_motion.modelling.mixture_fitting import FittedMixture, MixtureOptions, fit_mixture, one_thread
 from marey_motion.modelling.options import DEFAULT_OPTIONS, ModelOptions
-from marey_motion.modelling.primitive import MotionPrimitive
+from marey_motion.modelling.primitive import MOST_LOG_SLOPE, MotionPrimitive
 from marey_motion.modelling.scaled_fpca import optimised_weights
 from marey_motion.modelling.scaling import jacobian_weights, root_max_weights
 from marey_motion.modelling.splines import SplineBasis, coefficient_count
@@ -28,6 +28,7 @@ Progress = Callable[[int, int | None, str], None]
 MOST_EXAMPLES = 5000
 LEAST_FRAMES = 5
 DURATION_MARGIN = 0.2
+LOG_SLOPE_MARGIN = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +191,7 @@ def _assemble(
         mixture=mixture.mixture,
         keyframes=dict(aligned.keyframes),
         duration_range_s=_sampled_range(aligned),
+        log_slope_range=_log_slope_range(aligned, fitted.temporal),
     )
 
 
@@ -197,3 +199,16 @@ def _sampled_range(aligned: AlignedSet) -> tuple[float, float]:
     """How long samples may last: as the examples, extended by a fifth."""
     durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
     return float(durations.min()) * (1.0 - DURATION_MARGIN), float(durations.max()) * (1.0 + DURATION_MARGIN)
+
+
+def _log_slope_range(aligned: AlignedSet, temporal: PrincipalExamples) -> tuple[float, float]:
+    """Logarithms of the steps of the examples, extended by a twentieth of a step.
+
+    Those that the kept components rebuild count as well, so that each example is rebuilt as it is.
+    """
+    functions = temporal.functions
+    rebuilt = functions.basis.at_frames @ functions.coefficients(_kept_scores(temporal))[..., 0].T
+    given = np.log(np.diff(aligned.time_functions, axis=1))
+    least = min(float(rebuilt.min()), float(given.min())) - LOG_SLOPE_MARGIN
+    most = max(float(rebuilt.max()), float(given.max())) + LOG_SLOPE_MARGIN
+    return max(least, -MOST_LOG_SLOPE), min(most, MOST_LOG_SLOPE)

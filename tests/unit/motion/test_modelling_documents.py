@@ -37,6 +37,7 @@ def test_a_model_comes_back_bit_by_bit(trained, media_type):
     assert document_digest(primitive_to_tree(primitive, SKELETON)) == document_digest(
         primitive_to_tree(trained.primitive, SKELETON)
     )
+    assert primitive.log_slope_range == trained.primitive.log_slope_range
     drawn = primitive.sample(3, 9)
     assert np.array_equal(drawn, trained.primitive.sample(3, 9))
     assert np.array_equal(primitive.poses(drawn), trained.primitive.poses(drawn))
@@ -59,6 +60,24 @@ def test_a_model_without_components_travels_too():
         MotionPrimitiveDocument.model_validate(read)
         primitive = primitive_from_tree(read, chain())
         assert np.array_equal(primitive.poses(np.empty((1, 0))), single.primitive.poses(np.empty((1, 0))))
+
+
+def test_a_model_from_before_steps_were_cut_off_is_read_and_cuts_off_none_of_a_motion(trained):
+    tree = primitive_to_tree(trained.primitive, SKELETON)
+    del tree["log_slope_range"]
+    MotionPrimitiveDocument.model_validate(tree)
+    primitive = primitive_from_tree(tree, trained.primitive.skeleton)
+    assert primitive.log_slope_range is None
+    extreme = 1e6 * trained.primitive.mixture.sample(20, 0)
+    assert (np.diff(primitive.time_functions(extreme), axis=1) > 0.0).all()
+
+
+def test_a_range_of_steps_that_is_none_is_refused(trained):
+    tree = primitive_to_tree(trained.primitive, SKELETON) | {"log_slope_range": [1.0, -1.0]}
+    with pytest.raises(ValidationError, match="a lower and an upper limit"):
+        MotionPrimitiveDocument.model_validate(tree)
+    with pytest.raises(MotionError, match="is no range"):
+        primitive_from_tree(tree, trained.primitive.skeleton)
 
 
 def test_joints_may_stand_in_another_order():

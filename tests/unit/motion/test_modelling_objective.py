@@ -123,6 +123,32 @@ def test_times_are_those_of_motions_that_are_kept_within_their_range():
             build_objective(primitive, [KeyframeTime("end", seconds)], standard_joints())
 
 
+def cut_off(count):
+    """A primitive whose steps are cut off at half the range that its latent vectors draw, and such vectors."""
+    free, _ = walking()
+    latents = free.sample(count, 1)
+    drawn = np.log(np.diff(free.time_functions(latents), axis=1))
+    limits = np.quantile(drawn, (0.25, 0.75))
+    beyond = (drawn < limits[0]) | (drawn > limits[1])
+    assert (beyond.any(axis=1) & ~beyond.all(axis=1)).sum() > 3
+    return replace(free, log_slope_range=tuple(limits.tolist())), latents
+
+
+@pytest.mark.parametrize("lasting_s", [None, (0.95, 1.05)])
+def test_times_and_their_derivatives_are_those_of_motions_whose_steps_are_cut_off(lasting_s):
+    primitive, latents = cut_off(30)
+    primitive = replace(primitive, duration_range_s=lasting_s)
+    wanted = (KeyframeTime(10.5, 0.4), KeyframeTime("end", 1.0))
+    objective = build_objective(primitive, wanted, standard_joints())
+    for column, constraint in zip(objective.errors(latents).T, wanted, strict=True):
+        np.testing.assert_allclose(
+            column, plain_error(primitive, standard_joints(), latents, constraint), atol=1e-9, err_msg=str(constraint)
+        )
+    problem = SeveralSteps.of([Step(primitive, wanted, standard_joints())], PLACEMENT)
+    for latent in latents:
+        assert_derivatives(problem, latent)
+
+
 def test_the_objective_is_the_sum_of_weighted_errors_in_their_tolerances():
     primitive, _ = walking()
     latents = primitive.sample(20, 2)

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from marey_motion.alignment.aligned import AlignedClip
+from marey_motion.alignment.signs import consistent_poses
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.modelling import reconstruction_kernels
@@ -84,11 +85,37 @@ def test_whatever_is_drawn_time_runs_forward():
     assert (np.diff(primitive.time_functions(extreme), axis=1) > 0.0).all()
 
 
+def test_samples_hold_no_frame_longer_or_shorter_than_the_examples_did():
+    aligned = bending_chains(30)
+    primitive = train_primitive(aligned, QUICK).primitive
+    given = np.diff(aligned.time_functions, axis=1)
+    extreme = np.concatenate((primitive.sample(500, 3), 6.0 * primitive.mixture.sample(200, 0)))
+    drawn = np.diff(dataclasses.replace(primitive, duration_range_s=None).time_functions(extreme), axis=1)
+    free = dataclasses.replace(primitive, log_slope_range=None, duration_range_s=None)
+    rebuilt = np.diff(free.time_functions(latents_of_examples(primitive, aligned)), axis=1)
+    least, most = min(given.min(), rebuilt.min()), max(given.max(), rebuilt.max())
+    assert least * 0.95 <= drawn.min()
+    assert drawn.max() <= most * 1.06
+    assert np.diff(free.time_functions(extreme), axis=1).max() > most * 1.06
+
+
+def test_examples_are_rebuilt_as_if_nothing_were_cut_off():
+    for examples, options in ((bending_chains(30), QUICK), (walks(), QUICK)):
+        primitive = train_primitive(examples, options).primitive
+        latents = latents_of_examples(primitive, examples)
+        free = dataclasses.replace(primitive, log_slope_range=None)
+        np.testing.assert_array_equal(primitive.time_functions(latents), free.time_functions(latents))
+
+
+def latents_of_examples(primitive, aligned):
+    return primitive.latents_of(consistent_poses(aligned.poses, aligned.clips[0].motion.poses), aligned.time_functions)
+
+
 def test_samples_last_no_longer_or_shorter_than_the_examples_by_more_than_a_fifth():
     aligned = bending_chains(30)
     primitive = train_primitive(aligned, QUICK).primitive
     durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
-    free = dataclasses.replace(primitive, duration_range_s=None)
+    free = dataclasses.replace(primitive, duration_range_s=None, log_slope_range=None)
     drawn = primitive.durations_s(primitive.sample(2000, 3))
     assert durations.min() * 0.8 <= drawn.min()
     assert drawn.max() <= durations.max() * 1.2
