@@ -23,8 +23,10 @@ if TYPE_CHECKING:  # numeric modules take a second to load: only who looks at pr
 
 Tree = dict[str, Any]
 
-MOST_WORK = 50_000_000
-"""Numbers of all motions times commands: some seconds of one thread. A job has no such limit."""
+MOST_WORK = 5e9
+"""About nanoseconds of one thread. A job has no such limit."""
+MOST_NUMBERS = 50_000_000
+"""Of any motion on the way."""
 MOST_SHOWN = 5_000_000
 """Numbers of the answer."""
 
@@ -49,16 +51,13 @@ def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, reques
         raise NotFound(f"A {kind} is not edited; clips are.", code="not-a-clip")
     edit = EditDocument(commands=request.commands) if request.edit is None else _read_edit(tx, project, request)
     motion = items.read_part(tx, project, Kind.CLIP, item_id, "motion", revision=request.revision).tree
-    work = _size(motion) * len(edit.commands)
+    numbers = _size(motion)
     source = PreviewSource(edit, motion)
     for name in edit.sources:
         source.sources[name] = items.read_part(tx, project, Kind.CLIP, name, "motion").tree
-        work += _size(source.sources[name]) * len(edit.commands)
-    if work > MOST_WORK:
-        raise TooLarge(
-            f"{len(edit.commands)} commands for so long a motion take too long for a preview; hand in a job",
-            code="preview-too-large",
-        )
+        numbers += _size(source.sources[name])
+    if numbers > MOST_NUMBERS:
+        raise TooLarge("The motions are too long for a preview; hand in a job", code="preview-too-large")
     for one in (motion, *source.sources.values()):
         skeleton, revision = one["skeleton"]["item"], one["skeleton"]["revision"]
         hierarchy = items.read_part(tx, project, Kind.SKELETON, skeleton, "hierarchy", revision=revision)
@@ -75,14 +74,13 @@ def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
     from marey_motion.errors import MotionError
     from marey_motion.kinematics import global_positions
 
-    most_numbers = MOST_WORK // len(source.edit.commands)
     try:
         clip, body = _clip_of(source, source.motion)
         sources = {name: _clip_of(source, tree)[0] for name, tree in source.sources.items()}
         commands = commands_of_edit(source.edit)
-        made = edit_clip(clip, commands, body=body, sources=sources, most_numbers=most_numbers)
+        made = edit_clip(clip, commands, body=body, sources=sources, most_numbers=MOST_NUMBERS, most_work=MOST_WORK)
     except MotionError as error:
-        if error.code == "edit-too-large":
+        if error.code in ("edit-too-large", "edit-too-long"):
             raise TooLarge(f"{error}; hand in a job", code="preview-too-large") from error
         raise _invalid("/commands", error.code, str(error)) from error
     if request.piece >= len(made):

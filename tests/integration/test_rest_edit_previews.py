@@ -9,6 +9,7 @@ import pytest
 from edited_takes import make_walk
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, mapping_to_document, skeleton_to_document
+from marey_motion.editing.allowance import PER_COMMAND, PER_NUMBER
 from marey_motion.editing.registry import apply_edit
 from marey_motion.kinematics import global_positions
 from marey_motion.rigs import guess_axes, map_joints
@@ -163,10 +164,11 @@ def test_what_would_take_long_is_left_to_a_job(
 ) -> None:
     answer = preview(owner, clip, commands=[{"command": "resample", "frame_rate_hz": 100_000}])
     assert (answer.status_code, answer.json()["code"]) == (413, "preview-too-large")
-    monkeypatch.setattr(previewing, "MOST_WORK", 3 * walk.poses.size)
+    monkeypatch.setattr(previewing, "MOST_WORK", 3 * (PER_COMMAND + PER_NUMBER * walk.poses.size))
     assert preview(owner, clip, commands=MIRROR * 3).status_code == 200
     answer = preview(owner, clip, commands=MIRROR * 4)
     assert (answer.status_code, answer.json()["code"]) == (413, "preview-too-large")
+    monkeypatch.setattr(previewing, "MOST_WORK", 5e9)
     monkeypatch.setattr(previewing, "MOST_SHOWN", 50 * walk.poses.shape[1])
     assert preview(owner, clip, commands=MIRROR, frames=[0, 50]).status_code == 200
     answer = preview(owner, clip, commands=MIRROR, frames=[0, 51])
@@ -203,3 +205,36 @@ def test_guests_of_a_public_project_may_look(server: Server, owner: httpx.Client
     changed = owner.patch("/projects/lab", json=body, headers={"If-Match": "*"})
     assert changed.status_code == 200, changed.text
     assert preview(server.client(), clip, commands=MIRROR).status_code == 200
+
+
+HELD = {"kind": "position", "joint": "left_wrist", "point_m": [0.1, 1.0, 0.2]}
+
+
+@pytest.mark.parametrize(
+    "costly",
+    [
+        {"command": "plant_feet"},
+        {"command": "smooth", "window_s": 60},
+        {"command": "constrain", "solver": "least_squares", "constraints": [HELD]},
+        {"command": "constrain", "constraints": [{**HELD, "frames": [start, start + 5]} for start in range(40)]},
+    ],
+)
+def test_each_command_counts_by_how_long_it_takes(
+    owner: httpx.Client, clip: str, walk: Clip, monkeypatch: pytest.MonkeyPatch, costly: dict[str, Any]
+) -> None:
+    monkeypatch.setattr(previewing, "MOST_WORK", 1.4 * (PER_COMMAND + PER_NUMBER * walk.poses.size))
+    assert preview(owner, clip, commands=MIRROR).status_code == 200
+    answer = preview(owner, clip, commands=[costly])
+    assert (answer.status_code, answer.json()["code"]) == (413, "preview-too-large")
+
+
+def test_dozens_of_constraints_solved_together_on_a_long_clip_are_left_to_a_job(
+    owner: httpx.Client, skeleton: str
+) -> None:
+    long = add_clip(owner, skeleton, "long", make_walk(turn_rate_rad_s=0.0, seconds=60.0))
+    together = [{**HELD, "offset_m": [0.1 * number, 0, 0]} for number in range(40)]
+    command = {"command": "constrain", "solver": "least_squares", "root_moves": True, "constraints": together}
+    answer = preview(owner, long, commands=[command], frames=[0, 2])
+    assert (answer.status_code, answer.json()["code"]) == (413, "preview-too-large")
+    answer = preview(owner, long, commands=[{"command": "split", "at": list(range(1, 1001))}, *MIRROR * 20])
+    assert (answer.status_code, answer.json()["code"]) == (413, "preview-too-large")

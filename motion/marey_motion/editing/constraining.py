@@ -7,13 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import kinematics, quaternions
+from marey_motion.editing.allowance import PER_MEETING, PER_MET_NUMBER, Allowance
 from marey_motion.editing.displacement import displace, windows_around
-from marey_motion.editing.inverse_kinematics.solving import Limb, Solver, measure_residuals, solve
+from marey_motion.editing.inverse_kinematics.solving import Limb, Solver, limb_targets, measure_residuals, solve
+from marey_motion.editing.inverse_kinematics.solving_work import solving_work
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     LookAtTarget,
@@ -77,6 +80,7 @@ def constrain_motion(
     freedom: Freedom | None = None,
     solver: Solver = "auto",
     options: SolverOptions | None = None,
+    allowance: Allowance | None = None,
 ) -> ConstrainedMotion:
     """Meet constraints in their frames and blend the change in and out before and after them.
 
@@ -86,8 +90,9 @@ def constrain_motion(
     blend_frames : frames before the first and after the last constrained one that may change; 0 for none
     freedom : limits, stiffness and whether the root moves; which joints turn is said by the constraints
     solver : "auto" takes the two-bone solver for limbs and least squares for everything else
+    allowance : the work that this may be, spent as it goes
 
-    Raises `EditError` naming the constraint that cannot be asked for.
+    Raises `EditError` naming the constraint that cannot be asked for, and where the allowance does not suffice.
     """
     freedom = freedom or Freedom()
     for number, constraint in enumerate(constraints):
@@ -95,7 +100,7 @@ def constrain_motion(
     before = tuple(_residuals(skeleton, motion, constraint) for constraint in constraints)
     changed = motion
     for cluster in _clusters(skeleton, constraints, freedom.root_moves):
-        solving = _Cluster(skeleton, cluster, freedom, solver, options or SolverOptions())
+        solving = _Cluster(skeleton, cluster, freedom, solver, options or SolverOptions(), allowance or Allowance())
         changed = solving.constrained(changed, blend_frames)
     after = tuple(_residuals(skeleton, changed, constraint) for constraint in constraints)
     return ConstrainedMotion(changed, before, after)
@@ -157,6 +162,7 @@ class _Cluster:
     freedom: Freedom
     solver: Solver
     options: SolverOptions
+    allowance: Allowance
 
     def constrained(self, motion: Motion, blend_frames: int) -> Motion:
         """The motion with these constraints met and blended in and out.
@@ -175,6 +181,7 @@ class _Cluster:
         return self._met(motion, self.constraints, blend_frames)
 
     def _met(self, motion: Motion, constraints: Sequence[Constraint], blend_frames: int) -> Motion:
+        self.allowance.spend(PER_MEETING + PER_MET_NUMBER * motion.rotations.size)
         frames = np.unique(np.concatenate([np.arange(one.start, one.stop) for one in constraints]))
         active = np.array([(frames >= one.start) & (frames < one.stop) for one in constraints])
         given = motion.at_frames(frames)
@@ -192,6 +199,7 @@ class _Cluster:
         """Those frames of a motion with constraints met that count in all of them."""
         limb = constraints[0].limb if all(one.limb == constraints[0].limb for one in constraints) else None
         joints = tuple(sorted({joint for one in constraints for joint in one.joints}))
+        self.allowance.spend(self._work(len(frames), constraints, limb, joints))
         return solve(
             self.skeleton,
             given,
@@ -201,6 +209,18 @@ class _Cluster:
             solver=self.solver,
             options=self.options,
         ).motion
+
+    def _work(
+        self, frames: int, constraints: Sequence[Constraint], limb: Limb | None, joints: tuple[int, ...]
+    ) -> float:
+        """Of solving these frames, where nothing can be reached."""
+        limited, asked = bool(self.freedom.limits), limb_targets([one.target for one in constraints], limb)
+        alone = limb is not None and set(joints) <= set(limb.joints) and not self.freedom.root_moves
+        method: Literal["ccd", "two_bone", "least_squares"] = "ccd" if self.solver == "ccd" else "least_squares"
+        if self.solver == "two_bone" or (self.solver == "auto" and alone and asked is not None and not limited):
+            method = "two_bone"
+        carriers = {carrier for one in constraints for carrier in self.skeleton.path_to_root(one.target.joint)}
+        return solving_work(frames, len(carriers), len(constraints), method, limited=limited, options=self.options)
 
 
 def _target_at(constraint: Constraint, frames: Ints) -> Target:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.editing.allowance import PER_NUMBER, PER_PLANTED_NUMBER, PER_RIG
 from marey_motion.editing.constraining import Constraint, constrain_motion, current_values
 from marey_motion.editing.foot_plants import Foot, FootContacts, PlantOptions, find_contacts
 from marey_motion.editing.foot_plants import plant_feet as plant
@@ -55,6 +56,7 @@ def constrain(
     MappingError    where limits or a look need axes that the skeleton's joints do not tell
     EditError    naming the constraint that cannot be asked for
     """
+    take.allowance.spend(PER_RIG)
     rig = _Rig(take)
     wanted = [_named(number, _constraint, rig, tree) for number, tree in enumerate(constraints)]
     freedom = Freedom(
@@ -63,8 +65,9 @@ def constrain(
         stiffness={rig.joint(name): value for name, value in (stiffness or {}).items()},
     )
     made = constrain_motion(
-        take.skeleton, take.motion, wanted, blend_frames=take.count_frames(blend_s), freedom=freedom, solver=solver
-    )
+        take.skeleton, take.motion, wanted, blend_frames=take.count_frames(blend_s), freedom=freedom, solver=solver,
+        allowance=take.allowance,
+    )  # fmt: skip
     found = [
         _finding(tree, constraint, before, after)
         for tree, constraint, before, after in zip(
@@ -90,6 +93,7 @@ def plant_feet(
 
     Raises `MappingError` where legs are not known, `EditError` where the frames are not there.
     """
+    take.allowance.spend(PER_RIG + PER_PLANTED_NUMBER * take.size)
     rig = _Rig(take)
     feet = [_foot(rig, side) for side in ("left", "right")]
     options = PlantOptions(blend_s=blend_s, speed_m_s=speed_m_s, knee_damping_rad=knee_damping_rad)
@@ -152,6 +156,7 @@ def _named(number: int, make: Any, *arguments: Any) -> Any:
 
 def _constraint(rig: _Rig, tree: Tree) -> Constraint:
     start, stop = rig.take.frames(tree.get("frames"))
+    rig.take.allowance.spend(PER_NUMBER * (stop - start) * rig.take.size / rig.take.frame_count)
     joint, top = rig.joint(tree["joint"]), tree.get("top")
     skeleton = rig.take.skeleton
     target = _target(rig, joint, tree, start, stop)

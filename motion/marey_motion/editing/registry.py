@@ -11,11 +11,13 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import Any
 
 import numpy as np
 
 from marey_motion.clip import Clip
+from marey_motion.editing.allowance import PER_COMMAND, PER_NUMBER, Allowance
 from marey_motion.editing.constraint_commands import constrain, plant_feet
 from marey_motion.editing.drift import fix_drift
 from marey_motion.editing.ground import find_contacts, find_ground, move_to_ground
@@ -88,6 +90,7 @@ def edit_clip(
     body: EditedBody | None = None,
     sources: Mapping[str, Clip] | None = None,
     most_numbers: int = MOST_NUMBERS,
+    most_work: float = inf,
 ) -> tuple[EditedClip, ...]:
     """Everything that comes of a clip: one, or several where it was split.
 
@@ -100,13 +103,17 @@ def edit_clip(
     body : which joints are which; by default as their names and build suggest
     sources : other clips by the names that the commands call them
     most_numbers : size that the motion may grow to
+    most_work : about nanoseconds of one thread that all commands together may take (`allowance`)
 
     Raises
     ------
     MotionError    where a command cannot be applied; `where` tells which and what of it
     """
     body = body or EditedBody(clip.skeleton)
-    first = Take(motion_of(clip), clip.frame_rate_hz, body, sources or {}, most_numbers=most_numbers)
+    first = Take(
+        motion_of(clip), clip.frame_rate_hz, body, sources or {}, most_numbers=most_numbers,
+        allowance=Allowance(most_work),
+    )  # fmt: skip
     takes: tuple[Take, ...] = (first,)
     for number, (name, parameters) in enumerate(commands):
         try:
@@ -137,8 +144,15 @@ def apply_command(take: Take, name: str, parameters: Mapping[str, Any]) -> tuple
         inspect.signature(command).bind(take, **parameters)
     except TypeError as error:
         raise EditError(f"{error}", code="command-invalid") from None
+    take.allowance.spend(PER_COMMAND + PER_NUMBER * _size_for(take, parameters))
     made = command(take, **parameters)
     return tuple(_settled(one, take.motion) for one in (made if isinstance(made, tuple) else (made,)))
+
+
+def _size_for(take: Take, parameters: Mapping[str, Any]) -> int:
+    """The numbers that a command works on: of the take, and of the clip that it names."""
+    other = take.sources.get(parameters.get("source", ""))
+    return take.size + (0 if other is None else other.poses.size)
 
 
 def _settled(take: Take, before: Motion) -> Take:

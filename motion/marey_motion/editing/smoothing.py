@@ -9,11 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.editing.allowance import MOST_OF_TAPS, PER_TAP
 from marey_motion.editing.borders import blended, range_weights
 from marey_motion.editing.take import Take
 from marey_motion.errors import EditError
 
 Floats = NDArray[np.float64]
+
+LONG_WINDOW = 512
+"""Means over more frames are computed by Fourier transforms, in which the length of the window costs little."""
+CHANNELS_AT_ONCE = 32
+"""In Fourier transforms, which take several times the room of what they transform."""
 
 LEAST_LENGTH = 0.1
 """Of a mean of unit quaternions: with less, what is averaged goes all the way round and has no mean."""
@@ -55,6 +61,7 @@ def smooth(
     chosen = list(every) if joints is None else sorted({take.joint(one) for one in joints})
     columns = slice(None) if joints is None else chosen
     weights = _weights(take, method, window_s, order)
+    take.allowance.spend(take.size * min(PER_TAP * len(weights), MOST_OF_TAPS))
     root, rotations, translations = motion.root_translations.copy(), motion.rotations.copy(), motion.translations.copy()
     if root_translation:
         root[span] += shares[:, None] * (_smooth_positions(root, weights) - root)[span]
@@ -123,4 +130,17 @@ def _averaged(padded: Floats, weights: Floats) -> Floats:
     from scipy.ndimage import correlate1d
 
     reach = len(weights) // 2
+    if len(weights) > LONG_WINDOW:
+        return _averaged_long(padded, weights)
     return np.asarray(correlate1d(padded, weights, axis=0)[reach : len(padded) - reach], dtype=np.float64)
+
+
+def _averaged_long(padded: Floats, weights: Floats) -> Floats:
+    from scipy.signal import oaconvolve
+
+    channels = padded.reshape(len(padded), int(np.prod(padded.shape[1:])))
+    means = np.empty((len(padded) - len(weights) + 1, channels.shape[1]))
+    for first in range(0, channels.shape[1], CHANNELS_AT_ONCE):
+        part = slice(first, first + CHANNELS_AT_ONCE)
+        means[:, part] = oaconvolve(channels[:, part], weights[:, None], mode="valid", axes=0)
+    return means.reshape(len(means), *padded.shape[1:])

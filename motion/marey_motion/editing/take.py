@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.clip import Clip
+from marey_motion.editing.allowance import PER_NUMBER, Allowance
 from marey_motion.errors import EditError, MappingError
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
@@ -97,6 +98,7 @@ class Take:
     findings : what commands found out so far
     pieces : for each split that this take went through, which of its pieces it is, from 1
     most_numbers : numbers that its motion may grow to
+    allowance : the work that the whole edit may still be
     """
 
     motion: Motion
@@ -106,6 +108,7 @@ class Take:
     findings: tuple[Finding, ...] = ()
     pieces: tuple[int, ...] = ()
     most_numbers: int = MOST_NUMBERS
+    allowance: Allowance = field(default_factory=Allowance)
 
     @property
     def skeleton(self) -> Skeleton:
@@ -116,6 +119,12 @@ class Take:
     def frame_count(self) -> int:
         """Frames of the motion."""
         return self.motion.frame_count
+
+    @property
+    def size(self) -> int:
+        """Numbers of the motion."""
+        motion = self.motion
+        return int(motion.root_translations.size + motion.rotations.size + motion.translations.size)
 
     def moved(self, motion: Motion) -> Take:
         """With another motion of the same body and frame rate."""
@@ -155,12 +164,14 @@ class Take:
 
     def require_room(self, frames: int) -> None:
         """Refuse to grow to so many frames where that is over the limit. Raises `EditError`."""
-        most = self.most_numbers // (3 + 4 * self.skeleton.joint_count + 3 * len(self.motion.translated_joints))
+        width = 3 + 4 * self.skeleton.joint_count + 3 * len(self.motion.translated_joints)
+        most = self.most_numbers // width
         if frames > most:
             raise EditError(
                 f"the result would have {frames:,} frames; of this skeleton {most:,} are possible",
                 code="edit-too-large",
             )
+        self.allowance.spend(PER_NUMBER * width * frames)
 
 
 def motion_of(clip: Clip) -> Motion:

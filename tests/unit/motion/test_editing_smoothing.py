@@ -8,6 +8,7 @@ import pytest
 from edited_takes import make_breathing_walk, make_walk, require_sound, same_poses
 from marey_motion import quaternions
 from marey_motion.clip import Clip
+from marey_motion.editing import smoothing
 from marey_motion.editing.registry import apply_edit
 from marey_motion.errors import EditError, UnknownJoint
 
@@ -123,3 +124,12 @@ def test_motions_shorter_than_the_window_are_smoothed_too(method: str, frames: i
 def test_an_unknown_joint_is_told_with_its_nearest_names() -> None:
     with pytest.raises(UnknownJoint, match="LeftArm"):
         apply_edit(make_walk(), [("smooth", {"joints": ["LeftArn"]})])
+
+
+@pytest.mark.parametrize("method", ["savitzky_golay", "gaussian"])
+def test_means_over_long_windows_are_those_of_short_ones(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    clip = make_walk(turn_rate_rad_s=0.3, seconds=12.0)
+    commands = [("smooth", {"method": method, "window_s": 10.0})]
+    quick = apply_edit(clip, commands)
+    monkeypatch.setattr(smoothing, "LONG_WINDOW", 1_000_000)
+    np.testing.assert_allclose(quick.poses, apply_edit(clip, commands).poses, atol=2e-6)

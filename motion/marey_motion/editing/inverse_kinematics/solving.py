@@ -135,7 +135,7 @@ def solve(
     ------
     EditError    naming the target that cannot be asked for, or why the solver does not fit
     """
-    asked = _limb_targets(targets, limb)
+    asked = limb_targets(targets, limb)
     if solver == "two_bone" or (solver == "auto" and asked is not None and not freedom.limits):
         if asked is None or limb is None:
             raise EditError(
@@ -236,7 +236,7 @@ def solve_two_bone(
     from marey_motion.editing.inverse_kinematics import two_bone_kernels
 
     targets: tuple[Target, ...] = (position,) if orientation is None else (position, orientation)
-    if _limb_targets(targets, limb) is None:
+    if limb_targets(targets, limb) is None:
         raise EditError("the targets must be of the limb's end, the position in all axes", where="targets")
     path = skeleton.path_to_root(limb.end)
     if not {limb.middle, limb.start} <= set(path) or not limb.start < limb.middle < limb.end:
@@ -324,7 +324,7 @@ def constraint_jacobian(
     return room.scaled_errors, room.jacobian, tuple(problem.joints[problem.body.movable].tolist())
 
 
-def _limb_targets(
+def limb_targets(
     targets: Sequence[Target], limb: Limb | None
 ) -> tuple[PositionTarget, OrientationTarget | None] | None:
     """The position and the orientation asked of a limb's end, None where something else is asked."""
