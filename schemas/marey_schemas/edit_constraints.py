@@ -148,7 +148,11 @@ class PlantFeet(Request):
     speed_m_s: float = Field(
         0.15, gt=0, le=100, allow_inf_nan=False, description="A toe or heel that stands is slower than this."
     )
-    blend_s: Seconds = Field(0.15, description="Time before and after a contact in which the foot is blended.")
+    blend_s: Seconds = Field(
+        0.15,
+        description="Time before and after a contact in which the foot is blended. Where a leg is too short, the body "
+        "comes down a little, within three times as long.",
+    )
     knee_damping_deg: float = Field(
         10.0, ge=0, le=90, allow_inf_nan=False, description="How long before straight a stretching knee is damped."
     )

@@ -1,8 +1,10 @@
 """Changes of a few frames spread over their surroundings: displacement maps that are cubic B-splines.
 
 A displacement is a rotation vector for each local rotation, q·exp(d), and a shift of the root (Lee and Shin 1999). Its
-control points lie on the frames: of all curves that meet the given frames, it is the one that bends least. Near a
-smooth end of the window the control points are zero, so that value, slope and curvature end there at exactly zero.
+control points lie on the frames: of all curves that meet what given frames in a row have in common, it is the one that
+bends least. It would carry the slope of the last two of them, noise above all, far over the surroundings; what single
+frames add is met by a second curve, which is so tense that it hardly goes beyond them. Near a smooth end of the window
+the control points are zero, so that value, slope and curvature end there at exactly zero.
 """
 
 from __future__ import annotations
@@ -23,8 +25,11 @@ Ints = NDArray[np.integer]
 # Values of a cubic B-spline at its control points' frames.
 WEIGHTS = np.array([1.0, 4.0, 1.0]) / 6.0
 BENDING, PULLING = (1.0, -2.0, 1.0), (1.0, -1.0)
-# Tension falls with the square of the window's length: it smooths out swings that take about this share of it.
+# Tension falls with the square of the frames that swings may take: for the curve that bends least, this share of all.
 SWING_SHARE = 1.0 / 6.0
+# As shares of the frames over which a change is blended: how far the tense curve swings, and what neighbours even out.
+SINGLE_SWING_SHARE = 1.0 / 60.0
+NEIGHBOURS_SHARE = 0.2
 # Weight of meeting the given frames beside bending; what is then still missed is fitted again, until nothing is.
 MEETING = 1e4
 MOST_REFINEMENTS = 40
@@ -110,7 +115,30 @@ def _check_windows(frames: Ints, windows: Sequence[Window]) -> None:
 def spread_displacements(frames: Ints, values: Floats, window: Window) -> Floats:
     """The displacement curve (stop - start, c) of a window through `values` (n, c) at `frames` (n,).
 
-    The curve of least bending that meets them; a little tension keeps it from swinging beyond them.
+    It is the curve of least bending through values that are evened out along given frames in a row, and a tense one
+    through the rest.
+    """
+    swing = SWING_SHARE * (window.stop - window.start)
+    blend = max(int(frames[0]) - window.start, window.stop - 1 - int(frames[-1]))
+    even = _evened(frames, values, NEIGHBOURS_SHARE * blend) if blend else values
+    if np.abs(values - even).max(initial=0.0) <= MISSED_SHARE * np.abs(values).max(initial=0.0):
+        return _curve(frames, values, window, swing)
+    spread = _curve(frames, even, window, swing)
+    return spread + _curve(frames, values - spread[frames - window.start], window, SINGLE_SWING_SHARE * blend)
+
+
+def _evened(frames: Ints, values: Floats, reach: float) -> Floats:
+    """Values (n, c) smoothed along frames (n,) in a row; constant ones stay, and slopes at the ends become less."""
+    from scipy.ndimage import gaussian_filter1d
+
+    rows = np.split(values, np.flatnonzero(np.diff(frames) > 1) + 1)
+    return np.concatenate([gaussian_filter1d(row, reach, axis=0, mode="nearest") for row in rows])
+
+
+def _curve(frames: Ints, values: Floats, window: Window, swing: float) -> Floats:
+    """The curve (stop - start, c) of least bending through `values` (n, c) at `frames` (n,).
+
+    Tension keeps it from swinging beyond them over more than about `swing` frames.
     """
     from scipy.linalg import cho_solve_banded, cholesky_banded
 
@@ -120,7 +148,7 @@ def spread_displacements(frames: Ints, values: Floats, window: Window) -> Floats
     columns = np.asarray(frames)[:, None] + np.arange(-1, 2) - first
     weights = np.where((columns >= 0) & (columns < count), WEIGHTS, 0.0)
     columns = np.clip(columns, 0, count - 1)
-    bands = _energy(count, window)
+    bands = _energy(count, window, swing)
     most_missed = MISSED_SHARE * np.abs(values).max(initial=0.0)
     for i in range(3):
         for j in range(i + 1):
@@ -142,13 +170,13 @@ def spread_displacements(frames: Ints, values: Floats, window: Window) -> Floats
     return spread
 
 
-def _energy(count: int, window: Window) -> Floats:
+def _energy(count: int, window: Window, swing: float) -> Floats:
     """Lower diagonals (4, count) of the form that measures bending and tension of control points (count,).
 
     Beyond a smooth end all control points are zero, beyond another there are none.
     """
     bands = np.zeros((4, count))
-    tension = (SWING_SHARE * (window.stop - window.start)) ** -2
+    tension = swing**-2
     for stencil, factor in ((BENDING, 1.0), (PULLING, tension)):
         reach = len(stencil) - 1
         rows = np.arange(0 if not window.smooth_start else -reach, count - (0 if window.smooth_stop else reach))

@@ -49,7 +49,8 @@ class PlantOptions:
 
     Parameters
     ----------
-    blend_s : seconds before and after a contact in which the foot goes over into its own motion
+    blend_s : seconds before and after a contact in which the foot goes over into its own motion; a root that has to
+        come down, and the legs with it, goes over within three times as long
     speed_m_s : joints slower than this touch the ground, where contacts are not given
     shortest_s : shorter contacts are noise
     knee_damping_rad : how long before straight a stretching knee is damped
@@ -244,7 +245,10 @@ def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], z
 
 
 def _enveloped(values: Floats, blend: int) -> Floats:
-    """A smooth curve (F,) that is nowhere below the values and goes over into them within `blend` frames."""
+    """A smooth curve (F,) that is nowhere below the values and zero farther than 2·`blend` frames from them.
+
+    Values are wanted up to `blend` frames beyond contacts; it is as slow as it is so that the body does not bob.
+    """
     weights = np.hanning(2 * blend + 3)[1:-1]
     highest = maximum_filter1d(values, 2 * blend + 1, mode="nearest")
     return np.asarray(convolve1d(highest, weights / weights.sum(), mode="nearest"), dtype=np.float64)

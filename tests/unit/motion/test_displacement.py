@@ -107,3 +107,35 @@ def test_a_thousand_given_frames_are_all_met() -> None:
     frames = np.arange(20, 1020)
     curve = spread_displacements(frames, values, Window(5, 1036))
     np.testing.assert_allclose(curve[15:1015], values, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("frames", "window"),
+    [
+        ((100, 101), Window(64, 138)),
+        ((0, 1), Window(0, 38, False, True)),
+        ((36, 37), Window(0, 38, True, False)),
+        ((100, 101), Window(64, 104, True, False)),
+        ((100, 101, 140, 141), Window(64, 178)),
+    ],
+)
+def test_a_step_between_two_given_frames_does_not_swing_out_over_their_surroundings(
+    frames: tuple[int, ...], window: Window
+) -> None:
+    values = np.resize([0.0, 1.0], (len(frames), 1))
+    curve = spread_displacements(np.array(frames), values, window)[:, 0]
+    np.testing.assert_allclose(curve[np.array(frames) - window.start], values[:, 0], atol=1e-12)
+    assert np.abs(curve).max() < 1.9
+
+
+def test_noise_in_given_frames_does_not_swing_out_over_their_surroundings() -> None:
+    values = 1.0 + 0.2 * np.random.default_rng(0).normal(size=(60, 1))
+    curve = spread_displacements(np.arange(100, 160), values, Window(64, 196))[:, 0]
+    np.testing.assert_allclose(curve[36:96], values[:, 0], atol=1e-11)
+    assert np.abs(curve).max() < 1.1 * np.abs(values).max()
+
+
+def test_a_ramp_goes_on_as_it_ends_and_turns_back_softly() -> None:
+    curve = spread_displacements(np.arange(100, 136), np.linspace(0.0, 1.0, 36)[:, None], Window(64, 172))[:, 0]
+    assert 1.0 <= curve.max() < 1.1
+    assert np.abs(np.diff(np.concatenate((np.zeros(3), curve, np.zeros(3))), 2)).max() < 0.5 / 36
