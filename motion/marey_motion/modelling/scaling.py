@@ -16,6 +16,9 @@ LEAST_ROOT_EXTENT_M = 1e-3
 LEAST_WEIGHT_M = 0.01
 """Of joints that carry nothing: how a hand is turned still counts a little."""
 
+MOST_DIFFERENCES = 1_000_000
+"""Of positions, held at once."""
+
 
 def root_max_weights(poses: Floats) -> Floats:
     """(D,) weights that bring each root axis of poses (m, N, D) to a maximum of 1, as the published code does.
@@ -40,8 +43,14 @@ def jacobian_weights(skeleton: Skeleton, poses: Floats) -> Floats:
     poses : (F, D) typical ones, as those of the mean motion
     """
     joints = kinematics.forward_kinematics(skeleton, poses)
-    away = joints[:, None, :, :] - joints[:, :, None, :]
-    squares = np.einsum("fjpc,fjpc,jp->j", away, away, _descent(skeleton)) / (len(joints) * skeleton.joint_count)
+    below = _descent(skeleton)
+    squares = np.zeros(skeleton.joint_count)
+    block = max(1, MOST_DIFFERENCES // skeleton.joint_count**2)
+    for start in range(0, len(joints), block):
+        some = joints[start : start + block]
+        away = some[:, None, :, :] - some[:, :, None, :]
+        squares += np.einsum("fjpc,fjpc,jp->j", away, away, below)
+    squares /= len(joints) * skeleton.joint_count
     weights = np.ones(poses.shape[1])
     weights[3:] = np.repeat(np.maximum(2.0 * np.sqrt(squares), LEAST_WEIGHT_M), 4)
     return weights

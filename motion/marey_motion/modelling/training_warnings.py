@@ -11,6 +11,8 @@ from marey_motion.modelling.training_report import ExampleReport, TrainingReport
 FEW_EXAMPLES_PER_DIMENSION = 2
 NAMES_SHOWN = 5
 DEEP_BELOW_FLOOR_CM = 2.0
+SLIDING_RATIO = 2.0
+SLIDING_M_S = 0.1
 MANY_OUTSIDE = 0.1
 OVERFITTED_RATIO = 2.0
 LEAST_ERROR_CM = 0.5
@@ -86,6 +88,18 @@ def _of_samples(report: TrainingReport) -> list[Warned]:
                 f"in {feet.below_floor_share:.0%} of their frames, samples have a foot below the floor, "
                 f"{feet.below_floor_mean_cm:.1f} cm on average (examples: {trained.below_floor_share:.0%}, "
                 f"{trained.below_floor_mean_cm:.1f} cm)",
+            )
+        )
+    if (
+        feet is not None
+        and trained is not None
+        and feet.slide_m_s > max(SLIDING_RATIO * trained.slide_m_s, SLIDING_M_S)
+    ):
+        found.append(
+            Warned(
+                "feet-slide",
+                f"where the examples' feet stand, those of samples slide at {feet.slide_m_s:.2f} m/s on average "
+                f"(examples: {trained.slide_m_s:.2f} m/s); finish samples with planted feet",
             )
         )
     durations = report.sample_durations

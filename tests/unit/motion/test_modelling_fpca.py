@@ -8,6 +8,7 @@ from sklearn.decomposition import PCA
 
 from marey_motion import quaternions
 from marey_motion.alignment.signs import consistent_signs
+from marey_motion.modelling import scaling
 from marey_motion.modelling.fpca import Keep, find_components
 from marey_motion.modelling.scaled_fpca import SMALLEST_WEIGHT, _logarithms, _Problem, optimised_weights
 from marey_motion.modelling.scaling import LEAST_WEIGHT_M, jacobian_weights, root_max_weights
@@ -179,6 +180,14 @@ def test_a_joint_weighs_what_a_step_of_it_moves_the_body():
         assert np.sqrt((moved**2).sum(axis=2).mean()) / step == pytest.approx(weights[3 + 4 * joint], rel=1e-4)
     assert weights[3 + 4 * 4] == LEAST_WEIGHT_M
     np.testing.assert_array_equal(weights[:3], 1.0)
+
+
+def test_weights_do_not_depend_on_how_many_frames_are_held_at_once(monkeypatch):
+    skeleton = chain(5)
+    poses = unit_poses(np.random.default_rng(2).normal(size=(17, 3 + 4 * 5)))
+    whole = jacobian_weights(skeleton, poses)
+    monkeypatch.setattr(scaling, "MOST_DIFFERENCES", 5 * 5 * 4)
+    np.testing.assert_allclose(jacobian_weights(skeleton, poses), whole, rtol=1e-12)
 
 
 @pytest.mark.parametrize("inner_product", ["coefficients", "l2"])

@@ -15,8 +15,10 @@ from marey_motion.modelling.fpca import Keep, find_components
 from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.primitive_documents import trained_to_tree
 from marey_motion.modelling.reconstruction import comparison_frames, reconstruction_errors
+from marey_motion.modelling.sample_quality import FootQuality
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.modelling.training import fit_examples, train_primitive
+from marey_motion.modelling.training_warnings import warnings_of
 from marey_motion.modelling.verdict import headline_of, verdict_of
 from marey_schemas.codecs import MSGPACK, encode_tree
 from modelling_examples import aligned_set, bending_chains, chain, unit_poses, walks, warps
@@ -262,6 +264,19 @@ def test_feet_below_the_floor_are_told():
     trained = train_primitive(aligned_set(aligned.skeleton, poses, aligned.time_functions))
     assert trained.report.sample_feet.below_floor_share > 0.9
     assert "feet-below-floor" in [warning.code for warning in trained.warnings]
+
+
+def test_feet_that_slide_in_samples_and_stand_in_examples_are_told():
+    trained = train_primitive(walks(16), QUICK)
+    standing, sliding, creeping = (FootQuality(0.0, 0.0, 1.0, speed) for speed in (0.04, 0.13, 0.07))
+
+    def codes(examples, samples):
+        report = dataclasses.replace(trained.report, training_feet=examples, sample_feet=samples)
+        return [warning.code for warning in warnings_of(trained.primitive, report, QUICK)]
+
+    assert "feet-slide" in codes(standing, sliding)
+    assert "feet-slide" not in codes(standing, creeping)
+    assert "feet-slide" not in codes(sliding, sliding)
 
 
 def test_few_examples_are_a_warning():
