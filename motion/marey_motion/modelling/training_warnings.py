@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.primitive import MotionPrimitive
+from marey_motion.modelling.sample_quality import FootQuality
 from marey_motion.modelling.training_report import ExampleReport, TrainingReport
 
 FEW_EXAMPLES_PER_DIMENSION = 2
@@ -80,8 +81,22 @@ def _of_mixture(report: TrainingReport) -> list[Warned]:
 
 def _of_samples(report: TrainingReport) -> list[Warned]:
     found = []
-    feet, trained = report.sample_feet, report.training_feet
-    if feet is not None and trained is not None and feet.below_floor_mean_cm > DEEP_BELOW_FLOOR_CM:
+    if report.sample_feet is not None and report.training_feet is not None:
+        found += _of_feet(report.sample_feet, report.training_feet)
+    durations = report.sample_durations
+    if durations is not None and durations.outside_share > MANY_OUTSIDE:
+        found.append(
+            Warned(
+                "odd-durations",
+                f"{durations.outside_share:.0%} of the samples last over 5% longer or shorter than any example",
+            )
+        )
+    return found
+
+
+def _of_feet(feet: FootQuality, trained: FootQuality) -> list[Warned]:
+    found = []
+    if feet.below_floor_mean_cm > DEEP_BELOW_FLOOR_CM:
         found.append(
             Warned(
                 "feet-below-floor",
@@ -90,24 +105,12 @@ def _of_samples(report: TrainingReport) -> list[Warned]:
                 f"{trained.below_floor_mean_cm:.1f} cm)",
             )
         )
-    if (
-        feet is not None
-        and trained is not None
-        and feet.slide_m_s > max(SLIDING_RATIO * trained.slide_m_s, SLIDING_M_S)
-    ):
+    if feet.slide_m_s > max(SLIDING_RATIO * trained.slide_m_s, SLIDING_M_S):
         found.append(
             Warned(
                 "feet-slide",
                 f"where the examples' feet stand, those of samples slide at {feet.slide_m_s:.2f} m/s on average "
                 f"(examples: {trained.slide_m_s:.2f} m/s); finish samples with planted feet",
-            )
-        )
-    durations = report.sample_durations
-    if durations is not None and durations.outside_share > MANY_OUTSIDE:
-        found.append(
-            Warned(
-                "odd-durations",
-                f"{durations.outside_share:.0%} of the samples last over 5% longer or shorter than any example",
             )
         )
     return found

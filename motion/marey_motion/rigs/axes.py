@@ -84,7 +84,7 @@ def guess_axes(skeleton: Skeleton, mapping: JointMapping, motion: Clip | None = 
 
     Raises
     ------
-    MappingError    where the mapping lacks the joints that tell left and up
+    MappingError    where the mapping lacks the joints that tell left and up, or those of an arm stand in one place
     UnknownJoint    where it names joints that the skeleton does not have
     ClipError    where the motion is of another skeleton
     """
@@ -141,6 +141,15 @@ class _Body:
         if start not in self.joints or end not in self.joints:
             return None
         return _unit(self.positions[:, self.joints[end]] - self.positions[:, self.joints[start]])
+
+    def coinciding(self, start: str, end: str) -> MappingError:
+        """What to raise where a direction is needed between joints that stand in one place."""
+        names = [self.skeleton.joint_names[self.joints[standard]] for standard in (start, end)]
+        return MappingError(
+            f"{names[0]} ({start}) and {names[1]} ({end}) stand in one place, so no axis can be told from the bone "
+            f"between them; map {end} to a joint further on, or give the bone a length",
+            where=end,
+        )
 
     def in_joint(self, standard: str, vectors: Vectors) -> Vectors:
         """Mean (3,) of global vectors (K, 3) seen from a joint."""
@@ -293,6 +302,9 @@ def _arm_hinge(side: str, joint: str, body: _Body) -> Vectors:
     bone = upper if joint == "shoulder" or fore is None else fore
     if bone is None:
         return body.shoulders_left
+    if not bone.any(axis=1).all():
+        start, end = ("shoulder", "elbow") if bone is upper else ("elbow", "wrist")
+        raise body.coinciding(f"{side}_{start}", f"{side}_{end}")
     forward = np.cross(body.hips_left, body.up)
     raised = quaternions.between_vectors(-body.up, bone, half_turn_axis=forward)
     return quaternions.rotate_vectors(raised, body.hips_left).astype(np.float64)

@@ -213,6 +213,15 @@ def test_axes_need_two_sides(body):
         guess_axes(body, mapping)
 
 
+@pytest.mark.parametrize(("joint", "parent"), [("LeftForeArm", "LeftArm"), ("LeftHand", "LeftForeArm")])
+def test_an_arm_without_length_is_refused_by_its_joints_and_what_to_do(body, joint, parent):
+    offsets = body.offsets.copy()
+    offsets[body.index_of(joint)] = 0.0
+    told = rf"{parent} \(.*{joint} \(.*in one place.*map left_\w+ to a joint further on"
+    with pytest.raises(MappingError, match=told):
+        guess_axes(replace(body, offsets=offsets), map_joints(body))
+
+
 def test_legs_alone_have_axes_too(body):
     legs = Skeleton(body.joint_names[:9], body.parents[:9], body.offsets[:9], body.rest_rotations[:9])
     axes = guess_axes(legs, map_joints(legs))
