@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address, find_item, require_item
+from marey_client.cli.command_texts import is_frame
 from marey_client.cli.failures import Refused, WrongUsage
 from marey_client.cli.given_files import read_json
 from marey_client.cli.invocation import AsJson, connect
@@ -354,14 +355,14 @@ def _of_one_project(sources: list[str]) -> list[Address]:
 def _segment(text: str) -> tuple[str, int, int]:
     label, _, frames = text.rpartition("=")
     first, colon, end = frames.partition(":")
-    if not (label and colon and first.isdecimal() and end.isdecimal()):
+    if not (label and colon and is_frame(first) and is_frame(end)):
         raise WrongUsage(f"{text!r}: write label=first:end, as in step_left=120:180")
     return label, int(first), int(end)
 
 
 def _keyframe(text: str) -> tuple[str, int]:
     label, _, frame = text.rpartition("=")
-    if not (label and frame.isdecimal()):
+    if not (label and is_frame(frame)):
         raise WrongUsage(f"{text!r}: write label=frame, as in contact=120")
     return label, int(frame)
 

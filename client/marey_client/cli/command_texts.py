@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 Schema = Mapping[str, Any]
 
+MOST_DIGITS = 18
+"""Of the number of a frame, which is sent as one of 64 bits."""
+
 
 def parse_command(text: str) -> dict[str, Any]:
     """A command with its parameters. Raises `WrongUsage`, and says what there is, for what no command has."""
@@ -36,6 +39,11 @@ def parse_command(text: str) -> dict[str, Any]:
             raise WrongUsage(f"{name} has no parameter {key!r}; it has {', '.join(parameters) or 'none'}")
         command[key] = _value(value, parameters[key])
     return command
+
+
+def is_frame(text: str) -> bool:
+    """Whether somebody has typed the number of a frame."""
+    return text.isdecimal() and len(text) <= MOST_DIGITS
 
 
 def parameters_of(model: type[BaseModel]) -> dict[str, Schema]:
@@ -81,7 +89,7 @@ def _value(text: str, schema: Schema) -> Any:
     if text.startswith("["):
         return json_or_text(text)
     bounds = text.split(":")
-    if len(bounds) == 2 and all(not bound or bound.isdecimal() for bound in bounds):
+    if len(bounds) == 2 and all(not bound or is_frame(bound) for bound in bounds):
         return [int(bounds[0] or 0), int(bounds[1]) if bounds[1] else None]
     of_text = any(one.get("items", {}).get("type") == "string" for one in _choices(schema))
     return [one if of_text else json_or_text(one) for one in text.split(",")]

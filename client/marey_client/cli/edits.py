@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address, require_item
-from marey_client.cli.command_texts import parameter_rows, parse_command
+from marey_client.cli.command_texts import is_frame, parameter_rows, parse_command
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.given_files import read_json
 from marey_client.cli.invocation import AsJson, connect
@@ -218,7 +218,7 @@ def _edit_at(marey: Marey, address: str) -> EditHandle:
 
 def _range(text: str) -> slice:
     start, colon, stop = text.partition(":")
-    if not colon or not all(not bound or bound.isdecimal() for bound in (start, stop)):
+    if not colon or not all(not bound or is_frame(bound) for bound in (start, stop)):
         raise WrongUsage(f"--frames {text!r}: write a range such as 100:200, 100: or :200")
     return slice(int(start or 0), int(stop) if stop else None)
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address, find_item, require_item
+from marey_client.cli.command_texts import is_frame
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import clips_at, follow
@@ -123,7 +124,7 @@ def _trim(marey: Marey, text: str) -> tuple[str, tuple[int, int]]:
 
     place, _, frames = text.rpartition("=")
     first, colon, stop = frames.partition(":")
-    if not (place and colon and first.isdecimal() and stop.isdecimal()):
+    if not (place and colon and is_frame(first) and is_frame(stop)):
         raise WrongUsage(f"{text!r}: write project/folder/clip=first:stop, as in lab/walks/take=120:900")
     return require_item(marey, Address.parse(place), [Kind.CLIP]).id, (int(first), int(stop))
 

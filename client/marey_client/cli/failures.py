@@ -54,11 +54,12 @@ def sentence(error: BaseException) -> str:
     text = " ".join(str(error).split()) or type(error).__name__
     if not isinstance(error, RequestFailed):
         return text
-    fields = "".join(f"; {field.pointer}: {field.detail}" for field in error.errors)
-    told = f"{text}{fields} ({error.code}, request {error.request_id})"
+    told = (f"{field.pointer}: {field.detail}" for field in error.errors)
+    fields = "".join(f"; {one}" for one in told if one not in text)
+    whole = f"{text}{fields} ({error.code}, request {error.request_id})"
     if error.anonymous and (isinstance(error, NotFound) or error.code == "unauthenticated"):
-        return f"{told}; no token was found here: marey login, or --token-file"
-    return told
+        return f"{whole}; no token was found here: marey login, or --token-file"
+    return whole
 
 
 def _exit(status: int, text: str, verbose: bool) -> None:

@@ -143,7 +143,7 @@ def _done(job: Job) -> str:
 
 def _remark(job: Job) -> str:
     if job.failure is not None:
-        return job.failure.detail
+        return " ".join(job.failure.detail.split())
     if job.progress is not None and not job.state.terminal:
         return job.progress.note
     result: Mapping[str, Any] = job.result or {}

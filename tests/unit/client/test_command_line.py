@@ -11,7 +11,7 @@ from marey_client.cli import with_global_options_first
 from marey_client.cli.addresses import Address
 from marey_client.cli.failures import WrongUsage, sentence
 from marey_client.cli.files import _items_in
-from marey_client.errors import NotFound
+from marey_client.errors import Invalid, NotFound
 from marey_client.marey import Marey
 from marey_schemas.kinds import Kind
 
@@ -100,6 +100,7 @@ BUILD = ("build-model", "lab/walks", "--name", "w")
         ([*BUILD, "--set", "align.window=5", "--set", "align.window.x=2"], "does not go with --set align.window=5"),
         ([*BUILD, "--set", "annotate.proposal=steps", "--propose", "steps"], "--propose steps does not go with --set"),
         (["evaluate", "lab/walks", "--speeds", "1:inf:1"], "'1:inf:1': all values must be finite"),
+        (["annotation", "add", "lab/a", "l", "0:" + "9" * 5000], "write label=first:end, as in step_left=120:180"),
         (["ls", "lab", "--server", "http://["], "'http://[' is no address of a server; write it as in http://"),
         (["ls", "lab", "--server", "http://127.0.0.1:99999"], "99999' is no address of a server"),
         (["ls", "lab", "--server", "nowhere"], "'nowhere' is no address of a server"),
@@ -189,6 +190,14 @@ def test_what_is_hidden_from_a_request_without_a_token_hints_at_that(script, mak
     ):
         anyone.project("lab").read()
     assert ("marey login" in sentence(raised.value)) is hinted
+
+
+def test_what_is_wrong_with_a_field_is_told_once(script, make_problem):
+    errors = [{"pointer": "/a", "code": "bad", "detail": "no"}, {"pointer": "/b", "code": "bad", "detail": "neither"}]
+    script.answers = [make_problem(422, "invalid", detail="/a: no", errors=errors)]
+    with pytest.raises(Invalid) as raised:
+        script.marey().project("lab").read()
+    assert sentence(raised.value) == "/a: no; /b: neither (invalid, request req-1)"
 
 
 def test_completion_is_offered_for_the_users_shell(nowhere):

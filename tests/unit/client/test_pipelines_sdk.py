@@ -7,6 +7,7 @@ import httpx
 import pytest
 
 from marey_client import errors
+from marey_client.cli.pipelines import follow_run
 from marey_client.explanations import explain
 from marey_schemas.jobs import Job
 from marey_schemas.pipelines import PipelineCreate
@@ -112,3 +113,12 @@ def test_why_a_job_waits_is_told_with_those_it_waits_for(script):
     )
     (told, *_) = explain(waiting, [], [], NOW)
     assert "job_a, which makes its inputs and job_c" in told
+
+
+def test_a_failed_step_is_told_in_one_line(script, capsys):
+    run = submitted(script, a="queued", b="waiting")
+    several = failed(detail="ValueError: crooked\n  in two places; the job's log tells where")
+    script.answers = [answer(job("a", **several)), answer(job("b", **failed("dependency_failed", "a is failed")))]
+    with pytest.raises(errors.JobUnsuccessful):
+        follow_run(run, "lab", wait=True, as_json=False)
+    assert "ValueError: crooked in two places; the job's log tells where" in capsys.readouterr().out
