@@ -141,6 +141,13 @@ def test_answers_that_come_too_late_do_not_reach_the_next_job(server, start_work
         assert server.ended(server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
 
 
+def test_a_job_that_needs_what_was_deleted_fails_for_good_and_says_what_is_missing(server, start_worker):
+    start_worker()
+    failed = server.ended(server.submit("misbehave", {"how": "miss"}))
+    assert (failed["code"], failed["retryable"]) == ("no-skeleton", False)
+    assert "Traceback" not in failed["detail"]
+
+
 def test_a_job_is_stopped_at_its_time_limit(server, start_worker):
     start_worker()
     failed = server.ended(server.submit("misbehave", {"how": "sleep", "seconds": 60}, time_limit_s=1))

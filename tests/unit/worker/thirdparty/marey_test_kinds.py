@@ -9,6 +9,7 @@ import time
 from marey_schemas.base import Request
 from marey_schemas.job_kinds import KindDeclaration
 from marey_schemas.jobs import PinnedInput
+from marey_schemas.kinds import Kind
 from marey_worker.context import JobRefused
 
 
@@ -34,6 +35,7 @@ def misbehave(context, params):
         "fork-and-raise": _fork_and_raise,
         "sleep": lambda: _sleep(params.seconds), "shout": _shout, "ignore-term": lambda: _ignore_term(params.seconds),
         "give-up-early": lambda: _give_up_early(context), "put": lambda: _put(context),
+        "miss": lambda: context.document(Kind.SKELETON, "skeleton_gone", 1, "hierarchy"),
     }[params.how]()  # fmt: skip
 
 
