@@ -123,6 +123,11 @@ def test_another_layout_and_a_changed_model_are_written_anew(lab: ProjectHandle,
     assert written["keyframes"] == {"contact": 12}
     with pytest.raises(RequestFailed, match="no tree"):
         model.export(tmp_path / "none", format="predecessor", part="tree")
+    with pytest.raises(RequestFailed, match="model has no part 'alignment'"):
+        model.export(tmp_path / "none", format="predecessor", part="alignment")
+    with pytest.raises(RequestFailed, match="/provenance/predecessor") as refused:
+        model.put_part("model", {**document, "provenance": {"predecessor": "x"}})
+    assert [error.pointer for error in refused.value.errors] == ["/model/provenance/predecessor"]
 
 
 def test_a_graph_finds_its_models_by_name_and_comes_out_as_it_was(lab: ProjectHandle, tmp_path: Path) -> None:

@@ -92,6 +92,16 @@ def test_joints_may_stand_in_another_order():
     np.testing.assert_array_equal(here, there[:, :, [0, 2, 1, 3]])
 
 
+def test_splines_whose_degree_is_not_told_are_cubic():
+    model = train_primitive(bending_chains()).primitive
+    tree = primitive_to_tree(model, SKELETON)
+    untold = {
+        name: {key: one for key, one in tree[name].items() if key != "degree"} for name in ("spatial", "temporal")
+    }
+    read = primitive_from_tree({**tree, **untold}, model.skeleton)
+    assert (read.spatial.basis.degree, read.temporal.basis.degree) == (3, 3)
+
+
 def test_a_model_of_other_joints_is_refused():
     tree = primitive_to_tree(train_primitive(bending_chains()).primitive, SKELETON)
     with pytest.raises(MotionError, match="not the skeleton's: bone_4"):
