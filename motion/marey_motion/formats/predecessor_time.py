@@ -12,7 +12,7 @@ g. Ours keeps ln(t(x + 1) - t(x)), linear in g. The predecessor has two forms:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -126,9 +126,13 @@ def as_increments(primitive: MotionPrimitive) -> PredecessorTime:
 
 
 def _drawn(primitive: MotionPrimitive) -> tuple[Floats, Floats]:
-    """Temporal parts (m, k) of latent vectors that the model draws, and their time functions (m, N)."""
-    latents = primitive.sample(DRAWN, SEED)
-    return latents[:, primitive.spatial.count :], primitive.time_functions(latents)
+    """Temporal parts (m, k) of latent vectors that the model draws, and their time functions (m, N).
+
+    What keeps a model's motions within its examples' range would bend the linear function that is fitted.
+    """
+    free = replace(primitive, duration_range_s=None, log_slope_range=None)
+    latents = free.sample(DRAWN, SEED)
+    return latents[:, free.spatial.count :], free.time_functions(latents)
 
 
 def _linear_fit(scores: Floats, values: Floats) -> tuple[Floats, Floats]:

@@ -157,8 +157,8 @@ def test_time_varies_as_much_after_writing(layout, most_frames):
     trained = train_primitive(model_examples.walks(24), QUICK).primitive
     again = read_predecessor_model(write_predecessor_model(trained, layout=layout), "again.json").primitive
     latents = trained.sample(50, 4)
-    # Files of the predecessor hold no range of durations: the motions of the first model are not held to it either.
-    free = dataclasses.replace(trained, duration_range_s=None)
+    # Files of the predecessor hold no ranges of time: the motions of the first model are not held to them either.
+    free = dataclasses.replace(trained, duration_range_s=None, log_slope_range=None)
     before, after = (one.time_functions(latents) for one in (free, again))
     assert np.ptp(before[:, -1]) > 50.0
     assert np.abs(after - before).max() < most_frames
