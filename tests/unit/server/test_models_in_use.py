@@ -64,6 +64,7 @@ def test_samples_that_would_be_too_large_are_refused_before_they_are_made(loaded
         model.primitive,
         temporal=dataclasses.replace(model.primitive.temporal, mean=model.primitive.temporal.mean + 14.0),
         duration_range_s=None,
+        log_slope_range=None,
     )
     with pytest.raises(Invalid, match="ask for fewer"):
         sample_document(FOUND, dataclasses.replace(model, primitive=slow), 2, 0)
