@@ -6,7 +6,6 @@ import asyncio
 import hashlib
 import json
 import logging
-import os
 import signal
 import sys
 import time
@@ -15,7 +14,6 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from tornado.httpserver import HTTPServer
@@ -26,6 +24,7 @@ from tornado.web import RequestHandler
 
 from marey_schemas.access import TokenCreate
 from marey_server.access.principal import SYSTEM
+from marey_server.administrators import TOKEN_FILE, make_first_administrator
 from marey_server.computing import compute_on_one_thread_each
 from marey_server.docs_page import render_page
 from marey_server.handlers.catalogue import RESOURCES
@@ -47,7 +46,6 @@ from marey_server.store.wakeups import wakeups
 
 log = logging.getLogger(__name__)
 
-ADMIN_TOKEN_FILE = "admin.token"  # noqa: S105 - the name of a file
 LOCAL_WORKER_TOKEN = "workers beside the server"  # noqa: S105 - the name of a token
 READ_CHUNK_BYTES = 256 * 1024
 READ_BUFFER_BYTES = 1024 * 1024
@@ -153,7 +151,7 @@ def open_database(settings: Settings) -> Database:
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     upgrade_schema(settings.resolved_database_url)
     database = connect_database(settings)
-    database.write(SYSTEM, make_first_administrator, settings.data / ADMIN_TOKEN_FILE)
+    database.write(SYSTEM, make_first_administrator, settings.data / TOKEN_FILE)
     return database
 
 
@@ -161,25 +159,6 @@ def connect_database(settings: Settings) -> Database:
     """The database as it stands."""
     blobs = DirectoryBlobs(settings.data / "blobs") if settings.blobs == "directory" else None
     return Database(settings.resolved_database_url, readers=settings.resolved_database_threads, blobs=blobs)
-
-
-def make_first_administrator(tx: Transaction, token_file: Path) -> None:
-    """The user `admin` of an empty database, with a token that is written to a file only its owner may read.
-
-    The file is written before the transaction commits: a server that dies in between makes both anew.
-    """
-    if users.ensure_first_administrator(tx) is None:
-        return
-    tx.principal = users.administrator_principal(tx)
-    wanted = TokenCreate(name="first start", scopes=tx.principal.scopes, expires_in_s=None)
-    secret = tokens.create_token(tx, wanted).secret
-    partial_file = token_file.with_suffix(".partial")
-    partial_file.unlink(missing_ok=True)
-    with open(os.open(partial_file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
-        file.write(f"{secret}\n")
-        file.flush()
-        os.fsync(file.fileno())
-    partial_file.replace(token_file)
 
 
 async def serve(settings: Settings) -> None:

@@ -10,6 +10,7 @@ import os
 import sqlite3
 import sys
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +108,28 @@ def fsck(*, as_json: bool = False, **settings: Any) -> None:
         _say(f"checked {', '.join(f'{count:,} {what}' for what, count in checked.items()) or 'nothing'}")
     if findings:
         raise CommandFailed(f"{len(findings)} things are wrong")
+
+
+def admin_token(*, user: str | None = None, **settings: Any) -> None:
+    """A new token of an administrator in place of the data folder's `admin.token`, when that one is lost."""
+    from marey_server.access.principal import SYSTEM
+    from marey_server.administrators import TOKEN_FILE, give_token
+    from marey_server.app import connect_database
+    from marey_server.errors import NotFound
+
+    chosen = read_settings(**settings)
+    if chosen.database_url is None:
+        _sqlite_file(chosen, must_exist=True)
+    chosen.data.mkdir(parents=True, exist_ok=True, mode=0o700)
+    file = chosen.data / TOKEN_FILE
+    database = connect_database(chosen)
+    try:
+        database.write(SYSTEM, partial(give_token, name="made where the server is"), user, file)
+    except NotFound:
+        raise CommandFailed(f"no administrator who is not disabled is called {user!r}; say who with --user") from None
+    finally:
+        database.close()
+    _say(f"{file} holds a new token; earlier ones still work, see `marey token ls` and `marey token revoke`")
 
 
 def _sqlite_file(settings: Settings, *, must_exist: bool) -> Path:

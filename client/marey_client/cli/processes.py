@@ -103,6 +103,16 @@ def check_database(data: DataFolder = None, database_url: DatabaseUrl = None, as
     _database("fsck", data, database_url, as_json=as_json)
 
 
+@db.command("admin-token")
+def make_admin_token(
+    user: Annotated[str | None, typer.Option(help="The administrator; default: the one who was made first.")] = None,
+    data: DataFolder = None,
+    database_url: DatabaseUrl = None,
+) -> None:
+    """Write a new administrator's token to admin.token in the data folder, when it is lost."""
+    _database("admin_token", data, database_url, user=user)
+
+
 def _database(action: str, data: Path | None, database_url: str | None, **options: Any) -> None:
     from marey_client import embedded
 

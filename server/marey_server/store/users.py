@@ -161,13 +161,17 @@ def ensure_first_administrator(tx: Transaction) -> User | None:
     return _insert(tx, FIRST_ADMINISTRATOR, "Administrator", True, None)
 
 
-def administrator_principal(tx: Transaction, name: str = FIRST_ADMINISTRATOR) -> Principal:
-    """An administrator, for who has the database in hands anyway. Raises `NotFound`."""
-    row = tx.execute(
-        select(user).where(user.c.name == name, user.c.administrator.is_(True), user.c.disabled.is_(False))
-    ).first()
+def administrator_principal(tx: Transaction, name: str | None = None) -> Principal:
+    """An administrator by name, or the one who was made first, for who has the database in hands anyway.
+
+    Raises `NotFound` where no such administrator is active; one always is.
+    """
+    administrators = select(user).where(user.c.administrator.is_(True), user.c.disabled.is_(False))
+    if name is not None:
+        administrators = administrators.where(user.c.name == name)
+    row = tx.execute(administrators.order_by(user.c.id).limit(1)).first()
     if row is None:
-        raise _no_user(name)
+        raise _no_user(name or FIRST_ADMINISTRATOR)
     return _principal(row)
 
 

@@ -1,11 +1,17 @@
 """What a server makes before it first serves."""
 
 import stat
+from functools import partial
 from pathlib import Path
 
+import pytest
+
+from marey_schemas.access import UserChange, UserCreate
 from marey_server.access.principal import SYSTEM
-from marey_server.app import make_first_administrator
-from marey_server.store import tokens
+from marey_server.administrators import give_token, make_first_administrator
+from marey_server.app import make_worker_token
+from marey_server.errors import NotFound
+from marey_server.store import tokens, users
 from marey_server.store.database import Database
 
 
@@ -17,3 +23,36 @@ def test_the_first_administrator_is_made_once_and_the_token_works(database: Data
     assert database.read(SYSTEM, tokens.resolve_token, secret).administrator
     database.write(SYSTEM, make_first_administrator, file)
     assert file.read_text().strip() == secret
+
+
+def test_a_lost_token_of_an_administrator_is_replaced_by_who_owns_the_machine(database: Database, tmp_path: Path):
+    file = tmp_path / "admin.token"
+    database.write(SYSTEM, make_first_administrator, file)
+    lost = file.read_text().strip()
+    file.unlink()
+    database.write(SYSTEM, partial(give_token, name="again"), None, file)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert file.read_text().strip() != lost
+    assert database.read(SYSTEM, tokens.resolve_token, file.read_text().strip()).administrator
+
+
+def test_a_token_is_given_to_administrators_alone_and_a_refusal_leaves_the_file(database: Database, tmp_path: Path):
+    file = tmp_path / "admin.token"
+    database.write(SYSTEM, make_first_administrator, file)
+    held = file.read_text()
+    admin = database.read(SYSTEM, users.administrator_principal)
+    database.write(admin, users.create_user, UserCreate(name="guest"))
+    for name in ("guest", "nobody"):
+        with pytest.raises(NotFound):
+            database.write(SYSTEM, partial(give_token, name="again"), name, file)
+    assert file.read_text() == held
+    assert not file.with_suffix(".partial").exists()
+
+
+def test_local_workers_get_a_token_though_the_first_administrator_is_disabled(database: Database, tmp_path: Path):
+    database.write(SYSTEM, make_first_administrator, tmp_path / "admin.token")
+    admin = database.read(SYSTEM, users.administrator_principal)
+    database.write(admin, users.create_user, UserCreate(name="ops", administrator=True))
+    ops = database.read(SYSTEM, users.administrator_principal, "ops")
+    database.write(ops, partial(users.change_user, expected_rev=None), "admin", UserChange(disabled=True))
+    assert database.read(SYSTEM, tokens.resolve_token, make_worker_token(database)).user_name == "ops"

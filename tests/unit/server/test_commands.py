@@ -58,3 +58,19 @@ def test_nothing_is_restored_over_or_beside_what_a_server_left(data, tmp_path, l
     with pytest.raises(commands.CommandFailed, match=left):
         commands.restore(source=tmp_path / "copy.db", data=target)
     assert [path.name for path in target.iterdir()] == [left]
+
+
+def test_a_new_administrators_token_is_written_for_who_lost_theirs(data, capsys):
+    lost = (data / "admin.token").read_text()
+    (data / "admin.token").unlink()
+    commands.admin_token(data=data)
+    assert (data / "admin.token").read_text() not in (lost, "")
+    said = capsys.readouterr().out
+    assert "marey token revoke" in said
+    assert (data / "admin.token").read_text().strip() not in said
+
+
+@pytest.mark.parametrize(("user", "folder", "why"), [("nobody", "data", "--user"), (None, "elsewhere", "--data")])
+def test_a_token_that_cannot_be_made_is_refused_in_a_sentence(data, tmp_path, user, folder, why):
+    with pytest.raises(commands.CommandFailed, match=why):
+        commands.admin_token(user=user, data=tmp_path / folder)

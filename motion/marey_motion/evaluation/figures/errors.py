@@ -119,7 +119,7 @@ def _draw(
     for fit, name, look in zip((errors.two, errors.one), ("two normals", "one normal"), looks, strict=True):
         curve = np.minimum(seconds * fit.density(fine), 1.3 * heights.max())  # a collapsed component has no scale
         moments = "; ".join(
-            f"{mean:+.2f} ± {deviation:.2f}" for mean, deviation in zip(fit.means, fit.deviations, strict=True)
+            f"{mean:+z.2f} ± {deviation:.2f}" for mean, deviation in zip(fit.means, fit.deviations, strict=True)
         )
         panel.plot(fine, curve, label=f"{name}: {moments} {unit}", **look)
     panel.axvline(0.0, color=REFERENCE, lw=0.8, zorder=1)
@@ -151,8 +151,8 @@ def _caption(trial: str, views: Sequence[TrialView], errors: Sequence[tuple[_Err
     parts = []
     for view, (speed, turn) in zip(views, errors, strict=True):
         parts.append(
-            f"{view.subject.prefix}speed {speed.one.means[0]:+.2f} ± {speed.one.deviations[0]:.2f} m/s, "
-            f"turn rate {turn.one.means[0]:+.1f} ± {turn.one.deviations[0]:.1f} deg/s"
+            f"{view.subject.prefix}speed {speed.one.means[0]:+z.2f} ± {speed.one.deviations[0]:.2f} m/s, "
+            f"turn rate {turn.one.means[0]:+z.1f} ± {turn.one.deviations[0]:.1f} deg/s"
         )
     text = f"Errors at every step of {trial}: the place of a peak is the static error, its width the dynamic one: "
     return f"{text}{'; '.join(parts)}."

@@ -1,0 +1,36 @@
+"""Administrators' tokens for whoever owns the server's own machine: at the first start, and when one was lost."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from marey_schemas.access import TokenCreate
+from marey_server.store import tokens, users
+from marey_server.store.transaction import Transaction
+
+TOKEN_FILE = "admin.token"  # noqa: S105 - the name of a file
+
+
+def make_first_administrator(tx: Transaction, token_file: Path) -> None:
+    """The user `admin` of an empty database, with a token in a file; nothing where there are users."""
+    if users.ensure_first_administrator(tx) is not None:
+        give_token(tx, users.FIRST_ADMINISTRATOR, token_file, name="first start")
+
+
+def give_token(tx: Transaction, administrator: str | None, token_file: Path, *, name: str) -> None:
+    """A new token of an administrator (None: who was made first), of every scope and without end, in a private file.
+
+    The file is written before the transaction commits: if the process dies in between, the next one makes both anew.
+    Raises `NotFound` where no active administrator has that name.
+    """
+    tx.principal = users.administrator_principal(tx, administrator)
+    wanted = TokenCreate(name=name, scopes=tx.principal.scopes, expires_in_s=None)
+    secret = tokens.create_token(tx, wanted).secret
+    partial_file = token_file.with_suffix(".partial")
+    partial_file.unlink(missing_ok=True)
+    with open(os.open(partial_file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
+        file.write(f"{secret}\n")
+        file.flush()
+        os.fsync(file.fileno())
+    partial_file.replace(token_file)
