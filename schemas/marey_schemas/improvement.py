@@ -39,7 +39,12 @@ class SuggestParams(Request):
     """Parameters of `suggest`."""
 
     objective: ObjectiveParams = ObjectiveParams()
-    removals: int = Field(10, ge=0, le=1000, description="How many removals to plan after one another; 0: none.")
+    removals: int = Field(
+        10,
+        ge=0,
+        le=1000,
+        description="How many removals to plan after one another, once unused clips are gone; 0: none.",
+    )
     consider: int | None = Field(
         50, ge=0, le=100_000, description="Leave out in turn only so many clips, those that fewest trials need."
     )

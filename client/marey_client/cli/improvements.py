@@ -261,7 +261,8 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
     sections = (
         (f"Can go without any change: {len(unused['clips'])} clips, {len(unused['ranges'])} stretches of others, "
          f"{unused['seconds']:.1f} s", [*unused["clips"], *unused["ranges"]]),
-        (f"Can go with little harm: one after another, {len(redundant['plan'])} planned; "
+        (f"Can go with little harm{' once those clips are gone' if unused['clips'] else ''}: one after another, "
+         f"{len(redundant['plan'])} planned; "
          f"{redundant['tried']} of {redundant['needed']} used clips tried", redundant["plan"]),
         (f"Is there twice: {len(document['near_duplicates']['pairs'])} pairs within "
          f"{document['near_duplicates']['threshold_cm']:g} cm", document["near_duplicates"]["spared"]),
