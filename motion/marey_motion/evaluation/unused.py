@@ -2,7 +2,8 @@
 
 Both can go without changing any trial, to the last bit, as long as the normaliser stays: `resimulation` says why for
 clips. Of a used clip those frames are unneeded that lie farther than `MARGIN_BEFORE_S` before and the look-ahead plus
-`MARGIN_AFTER_S` after every frame that a trial displayed or chose. Taking their rows out of the database
+`MARGIN_AFTER_S` after every frame that a trial displayed or chose, and beyond the window of frames that a search there
+may not choose. Taking their rows out of the database
 (`selection.without_rows`) leaves the rows that are needed, the ones that follow them and all their features as they
 are. The margins are as wide as filters and differences reach, so that they hold what the features of needed frames
 were made from, too; but a recording that is cut there is sampled and filtered anew, which rounds differently, and its
@@ -90,9 +91,10 @@ def find_unused(
     """
     needed = _needed(database, trials, records, options, index)
     rate = database.options.rate_hz
-    before = int(np.ceil(MARGIN_BEFORE_S * rate))
-    after = int(np.ceil((max(database.options.horizons_s) + MARGIN_AFTER_S) * rate))
-    after = max(after, int(np.ceil(options.controller.reselect_window_s * rate)) + 1)
+    # What may not be chosen near a frame must stay in one clip with it: only a clip's own frames are barred.
+    barred = int(np.ceil(options.controller.reselect_window_s * rate)) + 1
+    before = max(barred, int(np.ceil(MARGIN_BEFORE_S * rate)))
+    after = max(barred, int(np.ceil((max(database.options.horizons_s) + MARGIN_AFTER_S) * rate)))
     clips: list[UnusedClip] = []
     ranges: list[UnusedRange] = []
     rows = np.zeros(database.row_count, dtype=np.bool_)
