@@ -222,3 +222,13 @@ def test_a_loops_seam_is_no_switch():
     rows = np.concatenate((np.arange(60, 120), np.arange(60))).astype(np.int32)
 
     assert np.all(switched_rows(looping, rows) == -1)
+
+
+def test_a_switch_to_the_last_row_of_a_loop_shows_in_its_first_row():
+    clip = generate_along(arc(1.5, 0.0, 2.0))
+    body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
+    loops = [SourceClip(uid, uid, clip, loop=True) for uid in ("a", "b")]
+    looping = build_database(loops, body, DatabaseOptions(end_policy="loop"))
+    rows = np.array([10, 11, 120, 121, 30, 0, 1], np.int32)
+
+    assert switched_rows(looping, rows).tolist() == [-1, 239, -1, 29, 119, -1, -1]

@@ -103,6 +103,15 @@ def test_of_each_pair_the_clip_that_is_used_less_goes_and_no_pair_is_left():
     assert set(gone) == {"clip_000", "copy_2"}
 
 
+def test_of_two_clips_used_alike_the_shorter_goes_and_of_two_as_long_that_of_the_higher_uid():
+    track = named(wandering_tracks()[:1])[0]
+    cut = track._replace(positions=track.positions[1:], headings=track.headings[1:], pose=track.pose[1:])
+    for other, gone in ((track, "clip_001"), (cut, "clip_000")):
+        database = made_database([(track if other is track else cut), (track._replace(uid="clip_001"))])
+        found = find_near_duplicates(database, threshold_cm=20.0)
+        assert [uid for uid, _ in spared_sources(database, found, {})] == [gone]
+
+
 def test_the_search_can_be_stopped_and_tells_its_progress():
     database = made_database(named(wandering_tracks()[:4]))
     told = []

@@ -33,6 +33,12 @@ def test_popularity_counts_every_tick_that_a_frame_was_displayed():
     assert [own.clip for own in usage] == [0, 1, 2]
 
 
+def test_a_clip_that_a_trial_only_begins_with_is_one_that_it_displayed():
+    usage = measure_usage(CLIPS, [walked_record([3, 12, 13]), walked_record([12, 13])])
+
+    assert [own.trials for own in usage] == [1, 2, 0]
+
+
 def test_entries_count_jumps_into_a_clip_not_the_start_of_a_trial():
     usage = measure_usage(CLIPS, [walked_record([0, 1, 12, 13, 5, 6, 8, 9])])
 

@@ -268,6 +268,18 @@ class TestRootBone:
         np.testing.assert_allclose(database.root_headings, heading, atol=1e-6)
         np.testing.assert_allclose(stood(database)[:, 1:], global_positions(led)[:, 1:], atol=3e-6)
 
+    def test_a_root_heads_where_the_rest_pose_faces_turned_as_the_root_is_turned(self) -> None:
+        clip, body = game_walk()
+        rests = body.skeleton.rest_rotations.copy()
+        rests[0] = quaternions.multiply(about_vertical(np.array(0.8)), rests[0])
+        aside = replace(body, skeleton=replace(body.skeleton, rest_rotations=rests))
+        poses = clip.poses.astype(np.float64)
+        turned = 0.5 * np.arange(180) / 60.0
+        poses[:, 3:7] = quaternions.multiply(about_vertical(turned), rests[0])
+        led = replace(clip, skeleton=aside.skeleton, poses=poses.astype(np.float32))
+        database = built(led, DatabaseOptions(root_mode="bone"), aside)
+        np.testing.assert_allclose(database.root_headings, 0.8 + turned, atol=1e-6)
+
 
 class TestRefusals:
     def test_clips_of_another_skeleton_are_refused_by_name(self) -> None:

@@ -113,6 +113,17 @@ def test_a_jump_of_the_wished_speed_is_searched_for_at_once():
     assert record.status[136] == Status.REPLACING
 
 
+@pytest.mark.parametrize(("turn_deg", "at_once"), [(29.0, []), (31.0, [100])])
+def test_a_jump_of_the_wished_direction_is_searched_for_at_once_however_slow(turn_deg, at_once):
+    database = made_database([arc_track(0.3, 0.0, 60.0)])
+    path = reference(circle(0.3, 0.0, duration_s=1.0))
+    turned = path.headings + np.where(np.arange(len(path.headings)) >= 100, np.radians(turn_deg), 0.0)
+
+    record = play(database, replace(path, headings=turned), replace(EXACT, search_every_s=0.5))
+
+    assert searched(record) == sorted([*range(0, 240, 30), *at_once])
+
+
 def test_jumps_are_searched_for_at_most_once_in_a_period():
     database = made_database([arc_track(1.0, 0.0, 60.0), arc_track(4.0, 0.0, 60.0)])
     trial = Trial("switching", 1.0, 0.0, approach_s=1.0, duration_s=1.0, switch_every_s=5 / 60)
@@ -203,6 +214,25 @@ def test_rows_near_the_current_one_are_left_out_of_the_search_on_request():
         return int(np.abs(after - before)[same].min(initial=10**6))
 
     assert nearest_switch(free) <= 20 < nearest_switch(apart)
+
+
+@pytest.mark.parametrize(
+    ("choosable", "chosen"),
+    [((195, 196, 216, 217), 195), ((196, 216, 217), 217), ((196, 197, 401), 401), ((196, 217), 196)],
+    ids=["before", "after", "far away", "in the clip before"],
+)
+def test_the_window_bars_as_many_frames_on_either_side_and_none_of_another_clip(choosable, chosen):
+    """Ten frames are barred about the row 206. All rows are alike: of those not barred the lowest is chosen."""
+    first = 199 if chosen == 196 else 190
+    database = made_database([arc_track(2.0, 0.0, frames / 60) for frames in (first, 600 - first)])
+    features = np.ones_like(database.features)
+    features[200, 15:] = database.features[200, 15:]
+    selectable = np.isin(np.arange(600), [200, *choosable])
+    database = replace(database, features=features, selectable=selectable)
+
+    record = play(database, circle(2.0, 0.0), replace(EXACT, reselect_window_s=1 / 6, continuing_bias=1e9))
+
+    assert record.rows[:8].tolist() == [*range(200, 207), chosen + 1]
 
 
 def test_a_window_wider_than_the_whole_dataset_still_leaves_a_way_on():

@@ -102,6 +102,15 @@ def test_the_speed_goes_on_switching_in_the_second_looked_ahead():
     assert np.all(path.speeds_m_s[300:] == 4.0)
 
 
+def test_a_switch_on_a_tick_counts_from_that_tick_on_however_its_time_is_rounded():
+    trial = Trial("switching", 1.0, 0.0, approach_s=0.1, duration_s=4.9, switch_every_s=0.1)
+
+    path = reference(trial)
+
+    after_entry = np.maximum(np.arange(len(path.headings)) // 6 - 1, 0)
+    assert np.array_equal(path.speeds_m_s, np.where(after_entry % 2 == 1, 4.0, 1.0))
+
+
 def test_switches_between_ticks_lose_no_distance():
     trial = Trial("switching", 1.0, 0.0, approach_s=1.003, duration_s=10.0, switch_every_s=1.007)
 
