@@ -59,7 +59,8 @@ class FeatureLayout:
 def feature_layout(options: DatabaseOptions, body: MatchingBody) -> FeatureLayout:
     """The dimensions that these options ask for; 27 unless joints or horizons are added.
 
-    Raises `MotionError` for a joint that the body lacks, a weight below 0, and horizons that are not ahead.
+    Raises `MotionError` for a joint that the body lacks, a weight below 0, and horizons that are less than a frame
+    ahead or apart.
     """
     _check(options, body)
     weights = options.weights
@@ -94,6 +95,11 @@ def _check(options: DatabaseOptions, body: MatchingBody) -> None:
         raise MotionError(f"a rate of {options.rate_hz} must be a positive number", where="rate_hz")
     if not horizons.size or not np.all(np.isfinite(horizons)) or np.any(np.diff(horizons, prepend=0.0) <= 0.0):
         raise MotionError("horizons must be seconds ahead, in increasing order", where="horizons_s")
+    if np.any(np.diff(np.round(horizons * options.rate_hz), prepend=0.0) < 1.0):
+        raise MotionError(
+            f"horizons must be a frame (1/{options.rate_hz:g} s) or more ahead and apart, or they see the same",
+            where="horizons_s",
+        )
     missing = [name for name in options.extra_joints if name not in body.standard_joints]
     if missing:
         raise MotionError(

@@ -332,6 +332,22 @@ def test_following_the_path_a_slow_character_is_not_hurried_along():
     assert distance_to_path(by_time) > 3.0
 
 
+def test_the_path_is_looked_at_from_the_nearest_point_also_where_that_lies_between_two_ticks():
+    """At 0.9 m/s beside a straight path that is asked for at 2 m/s: every tick wishes for the same way ahead."""
+    database = made_database([arc_track(0.9, 0.0, 60.0)])
+    path = reference(circle(2.0, 0.0, duration_s=1.0))
+    beside = path.positions + np.array([0.25, 0.0])
+    beside[0] = path.positions[0]  # where the character begins
+    options = replace(EXACT, follow="path", search_every_s=1 / 60, continuing_bias=-1e9)
+
+    record = play(database, replace(path, positions=beside), options)
+
+    ahead = [[0.25, 2.0 * seconds] for seconds in (1 / 3, 2 / 3, 1.0)]
+    wanted = np.concatenate((np.ravel(ahead), [0.0, 1.0] * 3))
+    expected = (((database.features[0, 15:] - wanted) / database.normaliser.scale[15:]) ** 2).sum()
+    np.testing.assert_allclose(record.continuing_cost[30:], expected, rtol=1e-9)
+
+
 def test_a_character_faster_than_the_path_goes_on_round_it_past_its_end():
     database = made_database([arc_track(3.0, w, 60.0) for w in (0.0, 45.0, 90.0, 135.0)])
     trial = circle(1.5, 45.0, duration_s=20.0)
