@@ -21,6 +21,7 @@ from marey_motion.formats.text_lines import TextLines, decode_name
 
 ROOT = "root"
 _AXES = "xyz"
+_IN_DEGREES = {b"deg": True, b"degree": True, b"degrees": True, b"rad": False, b"radian": False, b"radians": False}
 _CHANNELS = {kind + axis for kind in "rt" for axis in _AXES}
 
 
@@ -51,12 +52,13 @@ class AsfSkeleton:
     """An ASF file: bones in depth-first order, the root first.
 
     `parents` are indices; `length_unit` is the file's `units length` (CMU: 0.45), None when it gives none;
-    `root_position` is where the root stands before any motion.
+    `degrees` is false where its angles are radians; `root_position` is where the root stands before any motion.
     """
 
     bones: list[Bone]
     parents: NDArray[np.int32]
     length_unit: float | None
+    degrees: bool
     root_position: NDArray[np.float64]
 
     def offsets(self) -> NDArray[np.float64]:
@@ -117,9 +119,10 @@ class _AsfReader:
             if self.length_unit <= 0:
                 raise self.lines.error(f"a unit of length of {self.length_unit}; a positive number is needed")
         elif words[0].lower() == b"angle":
-            if words[1:] not in ([b"deg"], [b"rad"]):
+            degrees = _IN_DEGREES.get(b" ".join(words[1:]).lower())
+            if degrees is None:
                 raise self.lines.error("angle must be deg or rad")
-            self.degrees = words[1] == b"deg"
+            self.degrees = degrees
 
     def _root(self, words: list[bytes]) -> None:
         keyword = words[0].lower()
@@ -170,7 +173,7 @@ class _AsfReader:
         self.bone = None
 
     def _hierarchy(self, words: list[bytes]) -> None:
-        if words in ([b"begin"], [b"end"]):
+        if len(words) == 1 and words[0].lower() in (b"begin", b"end"):
             return
         parent, *children = map(decode_name, words)
         for name in (parent, *children):
@@ -220,4 +223,6 @@ class _AsfReader:
         loose = next((name for name in self.bones if name not in placed), None)
         if loose is not None:
             raise self.lines.error("the hierarchy does not connect the bone to the root", joint=loose)
-        return AsfSkeleton(bones, np.array(parents, np.int32), self.length_unit, np.array(self.root_position))
+        return AsfSkeleton(
+            bones, np.array(parents, np.int32), self.length_unit, self.degrees, np.array(self.root_position)
+        )

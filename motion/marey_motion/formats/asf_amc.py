@@ -87,7 +87,7 @@ def read_asf_amc(
     skeleton = read_asf(asf, asf_file)
     source = skeleton_source(skeleton)
     lines = TextLines(amc, file)
-    degrees, declared_rate_hz = _read_amc_header(lines)
+    degrees, declared_rate_hz = _read_amc_header(lines, skeleton.degrees)
     values, gaps = scan_frames(lines, skeleton)
     if gaps:
         message = f"the frames' numbers jump {gaps} times; the frames are taken as they follow each other"
@@ -128,9 +128,12 @@ def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
     )
 
 
-def _read_amc_header(lines: TextLines) -> tuple[bool, float | None]:
-    """Whether angles are degrees, and the frame rate if one is given; leaves `lines` before the first frame."""
-    degrees, rate_hz = True, None
+def _read_amc_header(lines: TextLines, degrees: bool) -> tuple[bool, float | None]:
+    """Whether angles are degrees, and the frame rate if one is given; leaves `lines` before the first frame.
+
+    Where the AMC does not say, its angles are in the unit of its skeleton's, `degrees` or not.
+    """
+    rate_hz = None
     while True:
         position, number = lines.position, lines.number
         line = next(iter(lines), None)

@@ -85,6 +85,35 @@ def test_radians_are_read_as_radians() -> None:
     np.testing.assert_allclose(found, read().rotations[0, 2], atol=1e-6)  # type: ignore[index]
 
 
+def in_radians(text: str, *angles: str) -> str:
+    """The text with these ends of lines, each as it stands there, in radians."""
+    for angle in angles:
+        words = [word if word.isalpha() else repr(float(np.radians(float(word)))) for word in angle.split()]
+        text = text.replace(f" {angle}\n", f" {' '.join(words)}\n")
+    return text
+
+
+def test_an_amc_that_does_not_say_its_unit_of_angle_has_that_of_its_asf() -> None:
+    silent = in_radians(AMC.replace(":DEGREES\n", ""), "10 20 31", "10 20 30", "40 50 60", "40 50 61", "70", "71")
+    asf = in_radians(ASF, "0 0 20 XYZ", "0 30 0 XYZ").replace("angle deg", "angle rad")
+    np.testing.assert_allclose(read(silent, asf).rotations, read().rotations, atol=1e-6)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(read(AMC.replace(":DEGREES\n", "")).rotations, read().rotations)
+
+
+@pytest.mark.parametrize(
+    ("found", "written"),
+    [
+        ("angle deg", "ANGLE DEG"),
+        ("angle deg", "angle Degrees"),
+        (":hierarchy\n  begin", ":HIERARCHY\n  BEGIN"),
+        ("shin sole\n  end", "shin sole\n  END"),
+    ],
+)
+def test_keywords_of_an_asf_may_be_written_large_or_out(found: str, written: str) -> None:
+    assert found in ASF
+    np.testing.assert_array_equal(read(asf=ASF.replace(found, written)).rotations, read().rotations)
+
+
 def test_windows_line_ends_comments_and_tabs_change_nothing() -> None:
     noisy = (AMC + "# the end\n").replace(" ", "\t").replace("\n", " \r\n")
     np.testing.assert_array_equal(read(noisy, ASF.replace("\n", "\r\n")).rotations, read().rotations)
