@@ -23,6 +23,7 @@ CODES = {
     "frames-wrapped": "Frames run over several lines; they were joined by counting values.",
     "no-frames": "The file holds no motion; its skeleton was imported.",
     "frame-time-snapped": "The frame time is rounded; the known frame rate it stands for was taken.",
+    "frame-rate-unusual": "The frame rate is near a usual one, but not equal; it was taken as it stands.",
     "frame-rate-assumed": "The format carries no frame rate; the usual one of its source was assumed.",
     "frame-number-gap": "Frames are numbered with gaps; they were taken as they follow each other.",
     "mixed-rotation-orders": "Joints differ in the order of their Euler angles; each was read in its own.",

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from marey_motion.errors import FormatLimit
 from marey_motion.formats.joint_names import MAX_JOINTS, MAX_NAME_LENGTH
 from marey_motion.formats.numeric_text import excerpt
-from marey_motion.formats.text_lines import TextLines, decode_name
+from marey_motion.formats.text_lines import TextLines, decode_name, read_number
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 _CHANNEL_BY_KEY = {name.lower().encode(): name for name in CHANNELS}
@@ -27,7 +27,7 @@ class BvhHeader:
     """Everything in a BVH file before its numbers.
 
     `offsets[joint]`, `channels[joint]` follow the order of the joints in the file; `data_start` is the byte and
-    `data_line` the line where the numbers begin.
+    `data_line` the line where the numbers begin; `frame_time_s` is None where the file leaves it out.
     """
 
     names: list[str] = field(default_factory=list)
@@ -36,7 +36,7 @@ class BvhHeader:
     channels: list[tuple[str, ...] | None] = field(default_factory=list)
     end_sites: list[tuple[int, list[float]]] = field(default_factory=list)
     declared_frames: int = 0
-    frame_time_s: float = 0.0
+    frame_time_s: float | None = None
     data_start: int = 0
     data_line: int = 1
 
@@ -168,6 +168,7 @@ class _HierarchyReader:
 def _read_motion_header(lines: TextLines, header: BvhHeader) -> None:
     frames, frame_time = None, None
     while frames is None or frame_time is None:
+        position, number = lines.position, lines.number
         line = next(iter(lines), None)
         if line is None:
             raise lines.error("the file ends before 'Frames:' and 'Frame Time:'", code="file-truncated")
@@ -177,6 +178,9 @@ def _read_motion_header(lines: TextLines, header: BvhHeader) -> None:
             frames = match[1]
             if not frames.isdigit() or len(frames) > 18:
                 raise lines.error(f"Frames is {excerpt(frames)!r}, a count is needed")
+        elif frames is not None and read_number(line.split()[0]) is not None:
+            lines.position, lines.number = position, number  # the numbers begin without a Frame Time
+            break
         else:
             raise lines.error(f"'Frames:' and 'Frame Time:' must follow MOTION, not {excerpt(line)!r}")
     header.declared_frames = int(frames)

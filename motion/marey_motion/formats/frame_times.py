@@ -13,32 +13,48 @@ KNOWN_RATES_HZ = (
 SNAP_TOLERANCE = 1e-4
 # What six decimals of a frame time leave open needs no mention.
 NOTABLE_DEVIATION = 2e-5
+# Three decimals of a frame time can be this far from the rate they stand for.
+ROUNDED_DEVIATION = 0.02
 HIGHEST_RATE_HZ = 100_000.0
+# Nobody records a body less often; such a "time" is a rate, or milliseconds.
+LONGEST_FRAME_TIME_S = 1.0
 
 
-def frame_rate_of(frame_time_s: float, file: str, warnings: list[CheckWarning]) -> float:
-    """The rate of a file whose frames are `frame_time_s` apart.
+def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWarning]) -> float:
+    """The rate of a file whose frames are `frame_time_s` apart; None where the file does not say.
 
     Files round: .0083333 means 120 Hz. A known rate within a relative 1e-4 is taken instead of the reciprocal, and
-    where they differ beyond the last bits a warning says so.
+    where they differ beyond the last bits a warning says so. Farther from it, as .0333 is from 30 Hz, the reciprocal
+    is taken and a warning names the rate that may be meant.
+
+    Raises
+    ------
+    FormatError    where no rate of a motion follows, naming the option that sets it
     """
+    if frame_time_s is None:
+        raise _no_rate("no Frame Time tells the frame rate", file)
+    if LONGEST_FRAME_TIME_S < frame_time_s < float("inf"):
+        reason = f"a Frame Time of {frame_time_s:g} s gives no rate of a motion; it looks like a rate or milliseconds"
+        raise _no_rate(reason, file)
     if not 1.0 / HIGHEST_RATE_HZ <= frame_time_s < float("inf"):
-        raise FormatError(
-            f"a Frame Time of {frame_time_s} s gives no frame rate; set it with --fps (frame_rate_hz)",
-            code="frame-time",
-            file=file,
-        )
+        raise _no_rate(f"a Frame Time of {frame_time_s} s gives no frame rate", file)
     declared_hz = 1.0 / frame_time_s
     nearest_hz = min(KNOWN_RATES_HZ, key=lambda rate_hz: abs(rate_hz - declared_hz))
     deviation = abs(nearest_hz - declared_hz) / nearest_hz
-    if deviation > SNAP_TOLERANCE:
-        return declared_hz
-    if deviation > NOTABLE_DEVIATION:
-        warnings.append(
-            CheckWarning(
-                "frame-time-snapped",
-                f"a frame time of {frame_time_s} s is read as {nearest_hz:.6g} Hz, not {declared_hz:.6f} Hz",
-                values={"declared_hz": declared_hz, "used_hz": nearest_hz},
-            )
+    rate_hz = nearest_hz if deviation <= SNAP_TOLERANCE else declared_hz
+    if NOTABLE_DEVIATION < deviation <= SNAP_TOLERANCE:
+        message = f"a frame time of {frame_time_s} s is read as {nearest_hz:.6g} Hz, not {declared_hz:.6f} Hz"
+        values = {"declared_hz": declared_hz, "used_hz": nearest_hz}
+        warnings.append(CheckWarning("frame-time-snapped", message, values=values))
+    elif SNAP_TOLERANCE < deviation < ROUNDED_DEVIATION:
+        message = (
+            f"a frame time of {frame_time_s} s is read as {declared_hz:.6g} Hz; "
+            f"if {nearest_hz:.6g} Hz are meant, set the rate with --fps (frame_rate_hz)"
         )
-    return nearest_hz
+        values = {"used_hz": declared_hz, "nearest_hz": nearest_hz}
+        warnings.append(CheckWarning("frame-rate-unusual", message, values=values))
+    return rate_hz
+
+
+def _no_rate(reason: str, file: str) -> FormatError:
+    return FormatError(f"{reason}; set the rate with --fps (frame_rate_hz)", code="frame-time", file=file)

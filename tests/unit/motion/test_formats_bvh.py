@@ -181,8 +181,29 @@ class TestFrames:
     def test_frame_times_stand_for_the_known_rate_they_were_rounded_from(self, frame_time: str, rate_hz: float) -> None:
         assert read(bvh(frame_time=frame_time)).frame_rate_hz == rate_hz
 
+    @pytest.mark.parametrize(("frame_time", "rate"), [("0.0333", "30 Hz"), ("0.033", "30 Hz"), ("0.0083", "120 Hz")])
+    def test_a_rate_beside_a_known_one_is_kept_and_the_one_that_may_be_meant_is_named(
+        self, frame_time: str, rate: str
+    ) -> None:
+        source = read(bvh(frame_time=frame_time))
+        assert source.frame_rate_hz == 1 / float(frame_time)
+        (warning,) = source.warnings
+        assert warning.code == "frame-rate-unusual"
+        assert rate in warning.message
+        assert "--fps" in warning.message
+        assert codes(read(bvh(frame_time="0.0372"))) == []
+
     def test_a_rate_given_by_the_user_counts_more_than_the_file(self) -> None:
-        assert read(bvh(frame_time="0"), frame_rate_hz=25.0).frame_rate_hz == 25.0
+        for frame_time in ("0", "30"):
+            assert read(bvh(frame_time=frame_time), frame_rate_hz=25.0).frame_rate_hz == 25.0
+
+    def test_a_file_without_a_frame_time_is_read_at_the_rate_the_user_gives(self) -> None:
+        data = bvh([ROW, "", ROW]).replace(b"Frame Time: 0.01\n", b"\n")
+        source = read(data, frame_rate_hz=25.0)
+        assert (source.frame_rate_hz, source.declared_frame_time_s) == (25.0, None)
+        np.testing.assert_array_equal(source.rotations, read(bvh([ROW, ROW])).rotations)
+        assert "--fps" in str(refusal(data))
+        assert refusal(data.replace(b"50", b"fifty")).line == 19
 
 
 class TestRefusals:
@@ -224,7 +245,7 @@ class TestRefusals:
         assert words in str(error)
         assert (error.file, error.line, error.joint) == ("take.bvh", line, joint)
 
-    @pytest.mark.parametrize("frame_time", ["0", "-0.01", "1e-9"])
+    @pytest.mark.parametrize("frame_time", ["0", "-0.01", "1e-9", "30", "33.3333"])
     def test_frame_times_that_give_no_rate_name_the_option(self, frame_time: str) -> None:
         assert "--fps" in str(refusal(bvh(frame_time=frame_time)))
 
