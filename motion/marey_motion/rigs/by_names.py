@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -13,13 +14,18 @@ from marey_motion.skeleton import Skeleton
 
 # Common prefixes that are tried; a file has one, and a few joints may look as if they had others.
 MOST_PREFIXES = 8
+# What modellers write after the names of joints, in one file mostly after all of them.
+_ENDINGS = ("jnt", "joint", "bone", "bind", "jt")
 
 
 @dataclass(frozen=True)
 class NameMatch:
-    """How well a known rig's names fit a skeleton, and which joints (by index) they name."""
+    """How well a known rig's names fit a skeleton, and which joints (by index) they name.
 
-    rig: str
+    `rig` is None where the names are everyday words, of no tool in particular.
+    """
+
+    rig: str | None
     joints: dict[str, int]
     signature_share: float
 
@@ -34,19 +40,35 @@ class NameMatch:
         return self.essential_count / len(ESSENTIAL_JOINTS)
 
     @property
-    def rank(self) -> tuple[float, float, int]:
+    def rank(self) -> tuple[float, bool, float, int]:
         """Better matches have greater ranks."""
-        return self.essential_share, self.signature_share, len(self.joints)
+        return self.essential_share, self.rig is not None, self.signature_share, len(self.joints)
 
 
 def best_match(skeleton: Skeleton) -> NameMatch | None:
-    """The known rig whose names fit best; of equals, the one listed first. None when no rig's pelvis is found."""
+    """The known rig whose names fit best; of equals, the one listed first, and a tool's before everyday words.
+
+    None when no rig's pelvis is found.
+    """
     joints: dict[JointName, int] = {}
     # Of "UpLeg_L" and its helper "__UpLeg_L", the plainer name is the joint.
     for index in sorted(range(skeleton.joint_count), key=lambda joint: len(skeleton.display_names[joint])):
         joints.setdefault(parse_name(skeleton.display_names[index]), index)
-    matches = [match for rig in KNOWN_RIGS for match in _matches(rig, joints, skeleton)]
+    matches = [
+        match
+        for rig in KNOWN_RIGS
+        for match in _matches(rig, _without_ending(joints) if rig.everyday else joints, skeleton)
+    ]
     return max(matches, key=lambda match: match.rank, default=None)
+
+
+def _without_ending(joints: dict[JointName, int]) -> dict[JointName, int]:
+    """The joints by names without the ending that most of them have, as "jnt"."""
+    endings = Counter(ending for name in joints for ending in _ENDINGS if name.base.endswith(ending))
+    ending, count = max(endings.items(), key=lambda item: item[1], default=("", 0))
+    if 2 * count <= len(joints):
+        return joints
+    return {JointName(name.side, name.base.removesuffix(ending)): index for name, index in joints.items()}
 
 
 def _matches(rig: KnownRig, joints: dict[JointName, int], skeleton: Skeleton) -> Iterator[NameMatch]:
@@ -55,13 +77,21 @@ def _matches(rig: KnownRig, joints: dict[JointName, int], skeleton: Skeleton) ->
         signature = _signature_share(rig, prefix, joints, skeleton)
         if rig.signature and signature <= 0.5:
             continue
-        found = {
-            standard: index
-            for standard, alternatives in names
-            if (index := _first(alternatives, prefix, joints)) is not None
-        }
+        found = _found(names, prefix, joints)
         _drop_misplaced(found, skeleton)
-        yield NameMatch(rig.name, found, signature)
+        yield NameMatch(None if rig.everyday else rig.name, found, signature)
+
+
+def _found(
+    names: tuple[tuple[str, tuple[JointName, ...]], ...], prefix: str, joints: dict[JointName, int]
+) -> dict[str, int]:
+    """Joints by their standard names, none twice: of a word with two meanings the essential joint's counts first."""
+    found: dict[str, int] = {}
+    for standard, alternatives in sorted(names, key=lambda name: name[0] not in ESSENTIAL_JOINTS):
+        index = _first(alternatives, prefix, joints, frozenset(found.values()))
+        if index is not None:
+            found[standard] = index
+    return found
 
 
 @cache
@@ -80,10 +110,12 @@ def _prefixes(pelvis: tuple[JointName, ...], joints: dict[JointName, int]) -> li
     return sorted(prefixes, key=lambda prefix: (len(prefix), prefix))[:MOST_PREFIXES]
 
 
-def _first(alternatives: tuple[JointName, ...], prefix: str, joints: dict[JointName, int]) -> int | None:
+def _first(
+    alternatives: tuple[JointName, ...], prefix: str, joints: dict[JointName, int], taken: frozenset[int] = frozenset()
+) -> int | None:
     for name in alternatives:
         index = joints.get(JointName(name.side, prefix + name.base))
-        if index is not None:
+        if index is not None and index not in taken:
             return index
     return None
 

@@ -19,7 +19,8 @@ class KnownRig:
     """Names of one rig's joints; several names of a joint are alternatives, the first that is found counts.
 
     `signature` tells rigs apart that name the body alike: names of further joints, or what most names begin with,
-    written "prefix*". More than half of it must be there.
+    written "prefix*". More than half of it must be there. `everyday` marks words that are no tool's own: they count
+    where they name more of a body than the names of every tool.
     """
 
     name: str
@@ -37,6 +38,7 @@ class KnownRig:
     extremities: Mapping[str, Names] = field(default_factory=dict)
     signature: tuple[str, ...] = ()
     side_words: tuple[str, str] = ("Left", "Right")
+    everyday: bool = False
 
     def names(self) -> Iterator[tuple[str, tuple[str, ...]]]:
         """Each standard joint with the names it may have."""
@@ -66,6 +68,30 @@ def _fingers(pattern: str, fingers: tuple[str, ...], levels: tuple[str, ...]) ->
 def _finger_roots(pattern: str, fingers: tuple[str, ...]) -> dict[str, Names]:
     named = zip(FINGERS, fingers, strict=True)
     return {f"{standard}_finger_root": pattern.replace("<finger>", finger) for standard, finger in named}
+
+
+def _everyday_fingers() -> dict[str, Names]:
+    """Thumb and fingers numbered (Index1, HandIndex1, Index01) or by their bones, as Unity and VRM have them."""
+    bones = {"base": ("1", "Proximal"), "mid": ("2", "Intermediate", "Medial"), "tip": ("3", "Distal")}
+    thumb = {"base": ("1", "Metacarpal", "Proximal"), "mid": ("2", "Intermediate", "Proximal"), "tip": ("3", "Distal")}
+    words = {
+        "thumb": ("Thumb",),
+        "index_finger": ("Index",),
+        "middle_finger": ("Middle", "Mid"),
+        "ring_finger": ("Ring",),
+        "pinky_finger": ("Pinky", "Little"),
+    }
+    styles = ("{}<word><bone>", "{}Hand<word><bone>", "{}<word>0<bone>")
+    return {
+        f"{standard}_{part}": tuple(
+            style.replace("<word>", word).replace("<bone>", bone)
+            for bone in alternatives
+            for word in names
+            for style in styles
+        )
+        for standard, names in words.items()
+        for part, alternatives in (thumb if standard == "thumb" else bones).items()
+    }
 
 
 _FIVE = ("Thumb", "Index", "Middle", "Ring", "Pinky")
@@ -275,6 +301,17 @@ KNOWN_RIGS: tuple[KnownRig, ...] = (
         signature=("abdomen",),
     ),
     KnownRig(
+        "optitrack",
+        pelvis="Hip",
+        shoulder="{}UArm",
+        elbow="{}FArm",
+        hip="{}Thigh",
+        knee="{}Shin",
+        toe="{}Toe",
+        extremities=_fingers("{}<finger><level>", _FIVE, ("1", "2", "3")),
+        side_words=("L", "R"),
+    ),
+    KnownRig(
         "vrm",
         pelvis="J_Bip_C_Hips",
         neck="J_Bip_C_Neck",
@@ -306,5 +343,20 @@ KNOWN_RIGS: tuple[KnownRig, ...] = (
         toe="toe.{}",
         extremities={"heel": "heel.02.{}"},
         signature=("spine.001",),
+    ),
+    KnownRig(
+        "everyday words",
+        pelvis=("Hips", "Hip", "Pelvis"),
+        neck=("Neck", "LowerNeck", "NeckLower", "Neck1", "Neck01"),
+        clavicle=("{}Clavicle", "{}Collar", "{}CollarBone", "{}Shoulder"),
+        shoulder=("{}UpperArm", "{}UpArm", "{}UArm", "{}ShldrBend", "{}Shldr", "{}Humerus", "{}Arm", "{}Shoulder"),
+        elbow=("{}LowerArm", "{}ForeArm", "{}LoArm", "{}LArm", "{}FArm", "{}ForearmBend", "{}Elbow"),
+        wrist=("{}Wrist", "{}Hand"),
+        hip=("{}UpperLeg", "{}Thigh", "{}UpLeg", "{}ThighBend", "{}Hip", "{}Leg"),
+        knee=("{}LowerLeg", "{}LoLeg", "{}Shin", "{}Calf", "{}Shank", "{}Knee", "{}Leg"),
+        ankle=("{}Ankle", "{}Foot"),
+        toe=("{}ToeBase", "{}Toes", "{}Toe", "{}Ball", "{}ForeFoot", "{}Foot"),
+        extremities=_everyday_fingers(),
+        everyday=True,
     ),
 )

@@ -67,6 +67,8 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
     elif match is not None:
         rig, joints, confidence, notes = match.rig, dict(match.joints), match.essential_share, []
         method = "names"
+        if rig is None:
+            notes.append("the rig is not known: joints were found by everyday words for them")
         if match.essential_share < TRUSTED_SHARE:
             rig = None
     else:

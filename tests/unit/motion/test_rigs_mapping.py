@@ -68,6 +68,11 @@ RIGS = {
         "lThigh lShin lFoot lToe lCollar lShldr lForeArm lHand",
         ("l", "r"),
     ),
+    "optitrack": (
+        "Hip Ab Ab2 Chest Neck Head",
+        "LThigh LShin LFoot LToe LShoulder LUArm LFArm LHand",
+        ("L", "R"),
+    ),
     "vrm": (
         "J_Bip_C_Hips J_Bip_C_Spine J_Bip_C_Chest J_Bip_C_UpperChest J_Bip_C_Neck J_Bip_C_Head",
         "J_Bip_L_UpperLeg J_Bip_L_LowerLeg J_Bip_L_Foot J_Bip_L_ToeBase "
@@ -84,7 +89,7 @@ RIGS = {
 
 def renamed(body, rig):
     """The body under another rig's names, with the names expected of each standard joint."""
-    centre, limbs, (left, right) = RIGS[rig]
+    centre, limbs, (left, right) = rig
     limbs = limbs.split()
     names = dict(zip(("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"), centre.split(), strict=True))
     expected = dict(zip(("pelvis", "spine", "spine_1", "spine_2", "neck", "head"), centre.split(), strict=True))
@@ -98,11 +103,76 @@ def renamed(body, rig):
 
 @pytest.mark.parametrize("rig", RIGS)
 def test_a_known_rig_is_recognised_and_every_joint_gets_its_standard_name(body, rig):
-    skeleton, expected = renamed(body, rig)
+    skeleton, expected = renamed(body, RIGS[rig])
     mapping = map_joints(skeleton)
 
     assert (mapping.rig, mapping.method, mapping.confidence, mapping.notes) == (rig, "names", 1.0, ())
     assert dict(mapping.joints) == {"root": expected["pelvis"]} | expected
+
+
+EVERYDAY = {
+    "unity": (
+        "Hips Spine Chest UpperChest Neck Head",
+        "LeftUpperLeg LeftLowerLeg LeftFoot LeftToes LeftShoulder LeftUpperArm LeftLowerArm LeftHand",
+        ("Left", "Right"),
+    ),
+    "snake": (
+        "hips spine chest upper_chest neck head",
+        "left_upper_leg left_lower_leg left_foot left_toes left_shoulder left_upper_arm left_lower_arm left_hand",
+        ("left", "right"),
+    ),
+    "blender": (
+        "hips spine spine.001 chest neck head",
+        "thigh.L shin.L foot.L toe.L shoulder.L upper_arm.L forearm.L hand.L",
+        (".L", ".R"),
+    ),
+    "maya": (
+        "hips_JNT spine_JNT spine1_JNT spine2_JNT neck_JNT head_JNT",
+        "l_upleg_JNT l_leg_JNT l_foot_JNT l_toebase_JNT l_shoulder_JNT l_arm_JNT l_forearm_JNT l_hand_JNT",
+        ("l_", "r_"),
+    ),
+    "genesis": (
+        "hip abdomenLower abdomenUpper chestLower neckLower head",
+        "lThighBend lShin lFoot lToe lCollar lShldrBend lForearmBend lHand",
+        ("l", "r"),
+    ),
+}
+
+
+@pytest.mark.parametrize("style", EVERYDAY)
+def test_everyday_words_name_a_body_of_no_known_rig_whatever_one_hand_holds(body, style):
+    skeleton, expected = renamed(body, EVERYDAY[style])
+    hand = skeleton.index_of(expected["right_wrist"])
+    holding = replace(
+        skeleton,
+        joint_names=(*skeleton.joint_names, "grip", "blade"),
+        display_names=(*skeleton.display_names, "grip", "blade"),
+        parents=np.append(skeleton.parents, [hand, skeleton.joint_count]).astype(np.int32),
+        offsets=np.append(skeleton.offsets, [[0, 0, 0.1], [0, 0, 0.9]], axis=0),
+        rest_rotations=np.append(skeleton.rest_rotations, [[1, 0, 0, 0], [1, 0, 0, 0]], axis=0),
+    )
+    for rig in (skeleton, holding):
+        mapping = map_joints(rig)
+        assert (mapping.rig, mapping.method, mapping.confidence) == (None, "names", 1.0)
+        assert dict(mapping.joints) == {"root": expected["pelvis"]} | expected
+        assert "everyday words" in " ".join(mapping.notes)
+
+
+def test_a_word_with_two_meanings_names_the_joint_that_no_body_can_do_without(body):
+    words = {"Shoulder": "Clavus", "Arm": "Shoulder", "ForeArm": "Elbow", "UpLeg": "Thigh", "Leg": "Calf"}
+    names = tuple(
+        f"Left{words.get(name[4:], name[4:])}"
+        if name.startswith("Left")
+        else f"Right{words.get(name[5:], name[5:])}"
+        if name.startswith("Right")
+        else name
+        for name in body.joint_names
+    )
+    mapping = map_joints(replace(body, joint_names=names, display_names=names))
+
+    assert mapping.joints["left_shoulder"] == "LeftShoulder"
+    assert "left_clavicle" not in mapping.joints
+    assert mapping.confidence == 1.0
 
 
 def test_a_prefix_before_all_names_does_not_matter(body):
@@ -236,7 +306,8 @@ def test_dictionaries_speak_of_standard_joints_only_and_of_each_once(rig):
 
     assert set(ESSENTIAL_JOINTS) <= set(joints) <= set(STANDARD_JOINTS)
     assert max(Counter(joints).values()) == 1
-    assert max(Counter(name for _, names in rig.names() for name in names).values()) == 1
+    if not rig.everyday:
+        assert max(Counter(name for _, names in rig.names() for name in names).values()) == 1
 
 
 def read_skeleton(path):
