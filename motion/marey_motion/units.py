@@ -37,6 +37,9 @@ ANIMAL_LEG_LENGTH_M = (0.1, 1.5)
 _SAMPLED_FRAMES = 64
 _CLEAR_COSINE = 0.8
 _MIRRORED_COSINE = -0.2
+# Legs and trunk that point the same way: no pose of a body, but bones all put on one line.
+_FOLDED_COSINE = -0.9
+_FOLDED = "rest pose that is none of a body, with legs and trunk pointing the same way"
 _FLAT_GROUND = 0.1
 _CLEARLY_FLATTER = 3.0
 
@@ -143,8 +146,11 @@ def _choose_up_axis(source: SourceMotion, body: _Body, options: ImportOptions) -
 def _settle_up_axis(body: _Body, axis: UpAxis, cosine: float) -> UpAxis:
     """Decide where the body does not simply stand along y: it may lie or climb, or the file may have another axis."""
     rest_axis, rest_cosine = _body_axis(body.rest[None], body.landmarks)
-    standing = f"mean direction from feet to head is {axis} with cosine {cosine:.2f}"
-    resting = f"rest pose points along {rest_axis} with cosine {rest_cosine:.2f}"
+    standing, resting = f"mean direction from feet to head is {axis} with cosine {cosine:.2f}", _FOLDED
+    if rest_cosine > 0.0:
+        resting = f"rest pose points along {rest_axis} with cosine {rest_cosine:.2f}"
+    if cosine == 0.0:
+        standing = f"the motion keeps to a {_FOLDED}"
     flat = _flat_axis(body)
     if cosine >= _CLEAR_COSINE and rest_axis == axis and rest_cosine >= _CLEAR_COSINE:
         body.evidence.append(f"up axis {axis}: {standing}; {resting}")
@@ -160,22 +166,41 @@ def _settle_up_axis(body: _Body, axis: UpAxis, cosine: float) -> UpAxis:
             )
             return grounded[0]
     raise AmbiguousUnits(
-        f"which axis points up is not clear: {standing}; {resting}; name it with --up-axis (up_axis), "
-        f"one of {axis}" + (f" or {rest_axis}" if rest_axis != axis else ""),
+        f"which axis points up is not clear: {standing}; {resting}; name it with --up-axis (up_axis), one of "
+        f"{_likely_axes((axis, cosine), (rest_axis, rest_cosine))}",
         code="up-axis-ambiguous",
         file=body.file,
     )
 
 
+def _likely_axes(*axes: tuple[UpAxis, float]) -> str:
+    """The axes that something speaks for, in words, and the usual ones where those leave no choice."""
+    likely = list(dict.fromkeys(axis for axis, cosine in axes if cosine > 0.0))
+    return " or ".join(likely if len(likely) > 1 else dict.fromkeys((*likely, "y", "z")))
+
+
 def _body_axis(positions: NDArray[np.float64], landmarks: Landmarks) -> tuple[UpAxis, float]:
-    """The signed axis nearest to the mean direction from the feet to the head (or hips), and its cosine."""
+    """The signed axis nearest to the mean direction from the feet to the head (or hips), and its cosine.
+
+    The cosine is 0 where legs and trunk are folded onto each other, as by a rest pose with all bones on one line.
+    """
     assert landmarks.feet is not None
-    top = landmarks.head if landmarks.head is not None else landmarks.hips
-    upwards = positions[:, top] - positions[:, list(landmarks.feet)].mean(axis=1)
-    lengths = np.linalg.norm(upwards, axis=1)
-    mean = (upwards[lengths > 0] / lengths[lengths > 0, None]).sum(axis=0) / len(positions)
+    feet = positions[:, list(landmarks.feet)].mean(axis=1)
+    if landmarks.head is None:
+        mean, folded = _mean_direction(positions[:, landmarks.hips] - feet), False
+    else:
+        head, hips = positions[:, landmarks.head], positions[:, landmarks.hips]
+        mean = _mean_direction(head - feet)
+        folded = float(_mean_direction(head - hips) @ _mean_direction(hips - feet)) < _FOLDED_COSINE
     axis = int(np.argmax(np.abs(mean)))
-    return _axis_name(axis, mean[axis]), float(abs(mean[axis]))
+    return _axis_name(axis, mean[axis]), 0.0 if folded else float(abs(mean[axis]))
+
+
+def _mean_direction(ways: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean (3,) of the directions of (F, 3) vectors; those without length count as none."""
+    lengths = np.linalg.norm(ways, axis=1)
+    mean: NDArray[np.float64] = (ways[lengths > 0] / lengths[lengths > 0, None]).sum(axis=0) / len(ways)
+    return mean
 
 
 def _flat_axis(body: _Body) -> tuple[UpAxis, str] | None:

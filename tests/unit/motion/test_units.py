@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from marey_motion import quaternions
 from marey_motion.clip import Clip
 from marey_motion.errors import AmbiguousUnits, MotionError
 from marey_motion.formats import ImportedMotion, ImportOptions, read_motion, write_bvh
 from marey_motion.formats.npz import write_npz
 from marey_motion.gait import game_skeleton, generate_gait
-from marey_motion.kinematics import global_positions
+from marey_motion.kinematics import global_positions, global_rotations
 from marey_motion.skeleton import EndSite, Skeleton
 from marey_motion.units import UNITS_M, unit_in_metres
 from motion_files import bvh
@@ -95,6 +96,40 @@ def test_someone_lying_is_not_stood_up_silently(walk: Clip) -> None:
         imported(upright_rest)
     assert refused.value.code == "up-axis-ambiguous"
     assert imported(upright_rest, up_axis="y").source.up_axis == "y"
+
+
+def on_one_line(clip: Clip) -> Clip:
+    """The same motion of a skeleton whose bones all lie along x at rest, as those of some exporters do."""
+    skeleton = clip.skeleton
+    line = np.array([1.0, 0.0, 0.0])
+    bones = np.stack(
+        [
+            skeleton.offsets[skeleton.children[j][0]] if skeleton.children[j] else line
+            for j in range(len(skeleton.parents))
+        ]
+    )
+    bones /= np.linalg.norm(bones, axis=1, keepdims=True)
+    rests = quaternions.between_vectors(bones, np.tile(line, (len(bones), 1)))
+    offsets = skeleton.offsets.copy()
+    offsets[1:] = quaternions.rotate_vectors(rests[skeleton.parents[1:]], skeleton.offsets[1:])
+    turned = quaternions.multiply(global_rotations(clip).astype(np.float64), quaternions.conjugate(rests))
+    local = turned.copy()
+    local[:, 1:] = quaternions.multiply(quaternions.conjugate(turned[:, skeleton.parents[1:]]), turned[:, 1:])
+    laid = Skeleton(skeleton.joint_names, skeleton.parents, offsets, skeleton.rest_rotations, ())
+    poses = np.concatenate([clip.root_translations, local.reshape(clip.frame_count, -1)], axis=1)
+    return Clip(laid, clip.frame_rate_hz, poses.astype(np.float32))
+
+
+def test_a_rest_pose_on_one_line_tells_no_upward_axis_but_the_motion_does(walk: Clip) -> None:
+    laid = on_one_line(walk)
+    assert imported(laid).source.up_axis == "y"
+    poses = np.zeros((1, laid.poses.shape[1]), np.float32)
+    poses[:, 3::4] = 1.0
+    resting = Clip(laid.skeleton, 30.0, poses)
+    for data in (write_bvh(resting), write_bvh(resting).replace(b"Frames: 1", b"Frames: 0").rpartition(b"\n0.0")[0]):
+        with pytest.raises(AmbiguousUnits, match=r"--up-axis.* y or z") as refused:
+            read_motion(data, "rest.bvh")
+        assert refused.value.code == "up-axis-ambiguous"
 
 
 def _fallen(walk: Clip) -> np.ndarray:
