@@ -77,21 +77,13 @@ def _matches(rig: KnownRig, joints: dict[JointName, int], skeleton: Skeleton) ->
         signature = _signature_share(rig, prefix, joints, skeleton)
         if rig.signature and signature <= 0.5:
             continue
-        found = _found(names, prefix, joints)
+        found = {
+            standard: index
+            for standard, alternatives in names
+            if (index := _first(alternatives, prefix, joints)) is not None
+        }
         _drop_misplaced(found, skeleton)
         yield NameMatch(None if rig.everyday else rig.name, found, signature)
-
-
-def _found(
-    names: tuple[tuple[str, tuple[JointName, ...]], ...], prefix: str, joints: dict[JointName, int]
-) -> dict[str, int]:
-    """Joints by their standard names, none twice: of a word with two meanings the essential joint's counts first."""
-    found: dict[str, int] = {}
-    for standard, alternatives in sorted(names, key=lambda name: name[0] not in ESSENTIAL_JOINTS):
-        index = _first(alternatives, prefix, joints, frozenset(found.values()))
-        if index is not None:
-            found[standard] = index
-    return found
 
 
 @cache
@@ -110,12 +102,10 @@ def _prefixes(pelvis: tuple[JointName, ...], joints: dict[JointName, int]) -> li
     return sorted(prefixes, key=lambda prefix: (len(prefix), prefix))[:MOST_PREFIXES]
 
 
-def _first(
-    alternatives: tuple[JointName, ...], prefix: str, joints: dict[JointName, int], taken: frozenset[int] = frozenset()
-) -> int | None:
+def _first(alternatives: tuple[JointName, ...], prefix: str, joints: dict[JointName, int]) -> int | None:
     for name in alternatives:
         index = joints.get(JointName(name.side, prefix + name.base))
-        if index is not None and index not in taken:
+        if index is not None:
             return index
     return None
 

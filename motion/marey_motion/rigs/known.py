@@ -73,7 +73,7 @@ def _finger_roots(pattern: str, fingers: tuple[str, ...]) -> dict[str, Names]:
 def _everyday_fingers() -> dict[str, Names]:
     """Thumb and fingers numbered (Index1, HandIndex1, Index01) or by their bones, as Unity and VRM have them."""
     bones = {"base": ("1", "Proximal"), "mid": ("2", "Intermediate", "Medial"), "tip": ("3", "Distal")}
-    thumb = {"base": ("1", "Metacarpal", "Proximal"), "mid": ("2", "Intermediate", "Proximal"), "tip": ("3", "Distal")}
+    thumb = {"base": ("1", "Metacarpal", "Proximal"), "mid": ("2", "Intermediate"), "tip": ("3", "Distal")}
     words = {
         "thumb": ("Thumb",),
         "index_finger": ("Index",),
@@ -349,10 +349,10 @@ KNOWN_RIGS: tuple[KnownRig, ...] = (
         pelvis=("Hips", "Hip", "Pelvis"),
         neck=("Neck", "LowerNeck", "NeckLower", "Neck1", "Neck01"),
         clavicle=("{}Clavicle", "{}Collar", "{}CollarBone", "{}Shoulder"),
-        shoulder=("{}UpperArm", "{}UpArm", "{}UArm", "{}ShldrBend", "{}Shldr", "{}Humerus", "{}Arm", "{}Shoulder"),
+        shoulder=("{}UpperArm", "{}UpArm", "{}UArm", "{}ShldrBend", "{}Shldr", "{}Humerus", "{}Arm"),
         elbow=("{}LowerArm", "{}ForeArm", "{}LoArm", "{}LArm", "{}FArm", "{}ForearmBend", "{}Elbow"),
         wrist=("{}Wrist", "{}Hand"),
-        hip=("{}UpperLeg", "{}Thigh", "{}UpLeg", "{}ThighBend", "{}Hip", "{}Leg"),
+        hip=("{}UpperLeg", "{}Thigh", "{}UpLeg", "{}ThighBend", "{}Hip"),
         knee=("{}LowerLeg", "{}LoLeg", "{}Shin", "{}Calf", "{}Shank", "{}Knee", "{}Leg"),
         ankle=("{}Ankle", "{}Foot"),
         toe=("{}ToeBase", "{}Toes", "{}Toe", "{}Ball", "{}ForeFoot", "{}Foot"),

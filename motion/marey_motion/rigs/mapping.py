@@ -60,7 +60,9 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
     Never fails: what cannot be found is left out and said in the notes, and the confidence tells how much to trust it.
     """
     match = by_names.best_match(skeleton)
-    body = by_geometry.find_body(skeleton) if match is None or match.essential_share < TRUSTED_SHARE else None
+    # Everyday words are trusted only where they name a whole body.
+    trusted_share = 1.0 if match is not None and match.rig is None else TRUSTED_SHARE
+    body = by_geometry.find_body(skeleton) if match is None or match.essential_share < trusted_share else None
     if body is not None and (match is None or len(body.joints.keys() & set(ESSENTIAL_JOINTS)) > match.essential_count):
         rig, joints, confidence, notes = None, dict(body.joints), body.confidence, list(body.notes)
         method: Method = "geometry"

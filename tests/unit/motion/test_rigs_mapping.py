@@ -158,21 +158,13 @@ def test_everyday_words_name_a_body_of_no_known_rig_whatever_one_hand_holds(body
         assert "everyday words" in " ".join(mapping.notes)
 
 
-def test_a_word_with_two_meanings_names_the_joint_that_no_body_can_do_without(body):
-    words = {"Shoulder": "Clavus", "Arm": "Shoulder", "ForeArm": "Elbow", "UpLeg": "Thigh", "Leg": "Calf"}
-    names = tuple(
-        f"Left{words.get(name[4:], name[4:])}"
-        if name.startswith("Left")
-        else f"Right{words.get(name[5:], name[5:])}"
-        if name.startswith("Right")
-        else name
-        for name in body.joint_names
-    )
-    mapping = map_joints(replace(body, joint_names=names, display_names=names))
+def test_a_build_that_shows_more_than_everyday_words_counts(body):
+    skeleton, _ = renamed(body, EVERYDAY["snake"])
+    names = tuple(name.replace("upper_leg", "leg_top") for name in skeleton.joint_names)
+    mapping = map_joints(replace(skeleton, joint_names=names, display_names=names))
 
-    assert mapping.joints["left_shoulder"] == "LeftShoulder"
-    assert "left_clavicle" not in mapping.joints
-    assert mapping.confidence == 1.0
+    assert mapping.method == "geometry"
+    assert mapping.joints["left_hip"] == "left_leg_top"
 
 
 def test_a_prefix_before_all_names_does_not_matter(body):
