@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from marey_motion.clip import Clip
 from marey_motion.errors import FormatError, FormatLimit
 from marey_motion.formats.joint_names import MAX_JOINTS
+from marey_motion.formats.numeric_text import excerpt
 from marey_motion.formats.quaternion_rows import as_rotations
 from marey_motion.skeleton import Skeleton
 from marey_motion.source import SourceMotion
@@ -33,6 +34,7 @@ from marey_motion.source import SourceMotion
 FORMAT = "npz"
 MARK = "marey/clip-npz@1"
 MAX_BYTES = 1 << 29
+_MEMBERS_SHOWN = 12
 _FIXED_DATE = (1980, 1, 1, 0, 0, 0)
 _SKELETON_MEMBERS = (
     "joint_names",
@@ -93,12 +95,26 @@ def read_npz(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
     """
     arrays = _read_members(data, file)
     if "format" not in arrays or str(arrays["format"]) != MARK:
-        raise FormatError(f"member 'format' must say {MARK}", code="not-npz", file=file)
+        raise _foreign(data, file)
     needed = _SKELETON_MEMBERS + (_MOTION_MEMBERS if "poses" in arrays else ())
     missing = [name for name in needed if name not in arrays]
     if missing:
         raise FormatError(f"the archive has no member {missing[0]!r}", file=file)
     return _source(arrays, file, frame_rate_hz)
+
+
+def _foreign(data: bytes, file: str) -> FormatError:
+    """What to say of an archive of another kind: AMASS and its like are npz files, too."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = [excerpt(name.removesuffix(".npy").encode()) for name in archive.namelist()[:_MEMBERS_SHOWN]]
+    if {"poses", "trans"} <= set(members):
+        message = (
+            "the archive holds parameters of a body model (SMPL, as in AMASS): rotations without a skeleton's bones; "
+            "pose the model and export its joints as BVH, for instance with Blender's SMPL add-on"
+        )
+    else:
+        message = f"member 'format' must say {MARK}; the archive has {', '.join(members) or 'no members'}"
+    return FormatError(message, code="not-npz", file=file)
 
 
 def _source(arrays: dict[str, NDArray[Any]], file: str, frame_rate_hz: float | None) -> SourceMotion:

@@ -105,6 +105,20 @@ def test_a_wrong_member_is_named(archive: dict[str, bytes], name: str, content: 
     assert refused.value.file == "take.npz"
 
 
+@pytest.mark.parametrize(
+    ("members", "words"),
+    [
+        (("poses", "trans", "betas", "mocap_framerate"), "a skeleton's bones; pose the model"),
+        (("positions", "fps"), "the archive has positions, fps"),
+        ((), "the archive has no members"),
+    ],
+)
+def test_an_archive_of_another_kind_is_told_what_it_is(members: tuple[str, ...], words: str) -> None:
+    with pytest.raises(FormatError, match=words) as refused:
+        read_motion(packed({f"{name}.npy": member(np.zeros((5, 156))) for name in members}), "walk_poses.npz")
+    assert refused.value.code == "not-npz"
+
+
 def test_an_archive_that_unpacks_to_too_much_is_refused_unopened(
     archive: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
