@@ -21,6 +21,8 @@ Policy = Literal["pinned", "union"]
 CONFIDENCE = 0.95
 RESAMPLES = 9_999
 SEED = 0
+SAME_CHANGE = 1e-12
+"""Changes that differ by no more than this share are the same but for rounding."""
 
 LESS_IS_BETTER = (
     "abs_se_v",
@@ -153,9 +155,9 @@ def paired_change(metric: str, before: Sequence[float], after: Sequence[float]) 
 def _interval(change: NDArray[np.float64]) -> tuple[float, float]:
     from scipy.stats import bootstrap
 
-    mean = float(change.mean())
-    if np.all(change == change[0]):  # nothing to resample
-        return mean, mean
+    least, most = float(change.min()), float(change.max())
+    if most - least <= SAME_CHANGE * max(abs(least), abs(most)):  # nothing to resample; acceleration would be 0 / 0
+        return least, most
     found = bootstrap(
         (change,),
         np.mean,

@@ -98,6 +98,14 @@ def test_the_interval_is_the_same_every_time():
     assert paired_change("dse_v", before, after) == paired_change("dse_v", before, after)
 
 
+def test_changes_that_differ_by_rounding_alone_have_an_interval_around_them():
+    counts = np.arange(9, 15)  # switches in 30 s, five more in every trial
+    found = paired_change("transitions_per_s", counts / 30, (counts + 5) / 30)
+    assert found.low <= found.high
+    assert (found.low, found.high) == pytest.approx((5 / 30, 5 / 30), rel=1e-12)
+    assert paired_change("transitions_per_s", [2.0, 2.0], [2.0, 2.0]).verdict == "same"
+
+
 def test_a_verdict_needs_an_interval_without_zero_and_a_metric_with_a_direction():
     before = np.linspace(1.0, 2.0, 30)
     noise = np.random.default_rng(3).normal(size=30)
