@@ -9,9 +9,11 @@ from __future__ import annotations
 import io
 import re
 import threading
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import takewhile
+from os.path import commonprefix
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -114,9 +116,10 @@ def add_keys(axes: Axes, **options: Any) -> None:
         text.set_parse_math(False)
 
 
-def name_ticks(axes: Axes, places: Sequence[float], names: Sequence[str]) -> None:
-    """Names, as clips have, down the vertical axis."""
-    axes.set_yticks(list(places), [plain(shortened(name)) for name in without_shared_folder(names)], parse_math=False)
+def name_ticks(axes: Axes, places: Sequence[float], names: Sequence[str], others: Sequence[str] = ()) -> None:
+    """Names of clips down the vertical axis, `others` that are no clips below them."""
+    labels = [plain(label) for label in (*labels_of(names), *others)]
+    axes.set_yticks(list(places), labels, parse_math=False)
     axes.tick_params(axis="y", length=0, labelcolor=INK)
 
 
@@ -146,6 +149,23 @@ def told_apart(names: Sequence[str]) -> list[str]:
     words = [re.split(r"(?<=[ _-])", name) for name in within]
     shared = sum(1 for _ in takewhile(lambda each: len(set(each)) == 1, zip(*words, strict=False)))
     return ["".join(own[shared:]) for own in words] if all(len(own) > shared for own in words) else within
+
+
+def labels_of(names: Sequence[str], longest: int = LONGEST_NAME) -> list[str]:
+    """Names of clips as short as `longest` signs, by which those that differ can be told apart.
+
+    Where cutting the middle would make several alike, the beginning that they share is cut instead.
+    """
+    apart = told_apart(names)
+    labels = [shortened(name, longest) for name in apart]
+    for label in [label for label, count in Counter(labels).items() if count > 1]:
+        places = [place for place, other in enumerate(labels) if other == label]
+        shared = len(commonprefix([apart[place] for place in places]))
+        for place in places:
+            if len(apart[place]) > longest:
+                differing = apart[place][shared:]
+                labels[place] = f"…{differing}" if len(differing) < longest else f"…{differing[: longest - 2]}…"
+    return labels
 
 
 def shortened(name: str, longest: int = LONGEST_NAME) -> str:

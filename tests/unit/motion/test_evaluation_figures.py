@@ -13,7 +13,7 @@ import pytest
 
 from drawn_figures import is_sound, rows_of
 from evaluation_results import SMALL, evaluated, made_up, some_coverage, wandering
-from marey_motion.drawing.paper import nice_levels, shortened, without_shared_folder
+from marey_motion.drawing.paper import labels_of, nice_levels, shortened, without_shared_folder
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.figures import FIGURES, FigureOptions, draw_figure, draw_figures
 from marey_motion.evaluation.figures.clip_graph_layout import MOST_DOTS, arrange
@@ -419,3 +419,23 @@ def test_labels_leave_out_the_folder_that_all_clips_lie_in():
     assert without_shared_folder(["lab/walks/a", "lab/runs/a"]) == ["walks/a", "runs/a"]
     assert without_shared_folder(["walk", "wander"]) == ["walk", "wander"]
     assert without_shared_folder([]) == []
+
+
+def test_labels_tell_clips_apart_however_long_their_names_are():
+    takes = [f"set/walks/dataset-1_{action}_001" for action in ("walk-left_feminine", "walk-right_feminine", "run_sad")]
+    assert labels_of(takes) == ["walk-left_feminine_001", "walk-right_feminine_001", "run_sad_001"]
+    for longest in (13, 18, 30):
+        labels = labels_of([f"{'a' * 20}{number}{'b' * 20}" for number in range(9)], longest)
+        assert len(set(labels)) == 9
+        assert all(len(label) <= longest for label in labels)
+    assert labels_of(["take", "take"]) == ["take", "take"]
+    assert labels_of([]) == []
+
+
+def test_bars_of_usage_are_called_by_what_tells_their_clips_apart():
+    names = [f"set/walks/dataset-1_walk-{side}_feminine_{take:03d}" for side in ("left", "right") for take in range(5)]
+    drawn = draw_figure("usage", made_up(names=names)).svg
+    assert ">left_feminine_000<" in drawn
+    assert ">right_feminine_000<" in drawn
+    assert ">Transitions<" in drawn
+    assert "set/walks" not in drawn

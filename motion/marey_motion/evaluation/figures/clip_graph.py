@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -16,9 +16,8 @@ from marey_motion.drawing.paper import (
     REFERENCE,
     Place,
     add_panel,
+    labels_of,
     new_figure,
-    shortened,
-    without_shared_folder,
     write,
 )
 from marey_motion.evaluation.figures.clip_graph_layout import OPEN, Circle, arrange
@@ -64,9 +63,8 @@ def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: Fig
     width, height = (8.6, 6.6) if len(subjects) == 1 else (9.6, 4.7)
     figure = new_figure(width, height + 0.3 * (len(subjects) > 1))
     across = width / len(subjects)
-    names = [_labels(subject) for subject in subjects]
-    cut = LONGEST_NAMES[len(subjects) - 1]
-    longest = max([0, *(len(shortened(each.get(uid, ABSENT), cut)) for each in names for uid in uids)])
+    names = [_labels(subject, uids, LONGEST_NAMES[len(subjects) - 1]) for subject in subjects]
+    longest = max([0, *(len(each.get(uid, ABSENT)) for each in names for uid in uids)])
     for number, subject in enumerate(subjects):
         panel = add_panel(figure, Place(number * across, 0.0, across, height), grid=False)
         panel.axis("off")
@@ -74,7 +72,7 @@ def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: Fig
         _fit(panel, circles, longest, (across, height))
         _draw_lines(panel, circles, lines[number])
         _draw_dots(panel, circles, dots[number], most, options.logarithmic)
-        _draw_rings(panel, circles, names[number], cut)
+        _draw_rings(panel, circles, names[number])
     tables = {"frames": _frame_table(subjects, dots, circles), "transitions": _line_table(subjects, lines)}
     return Sketch(figure, tables, _caption(subjects, popularity, switches, circles, lines))
 
@@ -187,13 +185,13 @@ def _draw_dots(panel: Axes, circles: dict[str, Circle], dots: dict[str, Ints], m
             panel.scatter(place[mine, 0], place[mine, 1], s=area, c=look[mine], lw=0, alpha=0.9, zorder=3)
 
 
-def _labels(subject: Subject) -> dict[str, str]:
-    clips = subject.result.clips
-    names = without_shared_folder([clip.name for clip in clips])
+def _labels(subject: Subject, uids: Collection[str], longest: int) -> dict[str, str]:
+    clips = [clip for clip in subject.result.clips if clip.uid in uids]
+    names = labels_of([clip.name for clip in clips], longest)
     return {clip.uid: name for clip, name in zip(clips, names, strict=True)}
 
 
-def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str], cut: int) -> None:
+def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str]) -> None:
     """The outline of each clip, open above, and its name outside; dotted where this subject has no such clip."""
     from matplotlib.patches import Arc
 
@@ -214,7 +212,7 @@ def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str], 
         else:
             look["ha"] = "left" if away[0] > 0.3 else "right" if away[0] < -0.3 else "center"
             look["va"] = "bottom" if away[1] > 0.3 else "top" if away[1] < -0.3 else "center"
-        write(panel, (float(x), float(y)), shortened(names.get(uid, ABSENT), cut), **look)
+        write(panel, (float(x), float(y)), names.get(uid, ABSENT), **look)
 
 
 def _colours(circles: dict[str, Circle]) -> dict[str, str]:

@@ -58,8 +58,8 @@ def draw_usage(subjects: Sequence[Subject], trial: str | None, options: FigureOp
         _draw_bars(panel, places, values, use, number, 0.92 * thick, bool(others))
         largest = max(largest, use.transitions, *values, 0)
     names = [next(use.names[uid] for use in uses if uid in use.names) for uid in shown]
-    names += [f"{len(others)} other clip{'s' if len(others) > 1 else ''}"] * bool(others)
-    name_ticks(panel, range(rows), [*names, TRANSITIONS])
+    rest = [f"{len(others)} other clip{'s' if len(others) > 1 else ''}"] * bool(others)
+    name_ticks(panel, range(rows), names, [*rest, TRANSITIONS])
     if options.logarithmic:
         panel.set_xscale("log")
     panel.set_xlim(*((0.8, 5.0 * largest) if options.logarithmic else (0, 1.2 * largest)))

@@ -18,11 +18,10 @@ from marey_motion.drawing.paper import (
     Place,
     add_keys,
     add_panel,
+    labels_of,
     new_figure,
     plain,
     reach,
-    shortened,
-    without_shared_folder,
 )
 from marey_motion.evaluation.figures.axes import SPEED, TURN_RATE, mark_sides
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
@@ -117,11 +116,11 @@ def _draw_keys(panel: Axes, subjects: Sequence[Subject], chosen: Sequence[_Point
         for clip in points.named
     }
     keys, labels = [], []
-    names = dict(zip(names, without_shared_folder(list(names.values())), strict=True))
+    names = dict(zip(names, labels_of(list(names.values())), strict=True))
     for uid, style in styles.items():
         look = _look(style)
         keys.append(Line2D([], [], ls="", color=look["c"], marker=look["marker"], markersize=5, markeredgewidth=0))
-        labels.append(plain(shortened(names[uid])))
+        labels.append(plain(names[uid]))
     rest = max(_other_clips(subject, points) for subject, points in zip(subjects, chosen, strict=True))
     if rest:
         keys.append(Line2D([], [], ls="", color=REFERENCE, marker="o", markersize=3.5, markeredgewidth=0))
