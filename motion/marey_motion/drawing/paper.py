@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import takewhile
-from os.path import commonprefix
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -160,7 +159,8 @@ def labels_of(names: Sequence[str], longest: int = LONGEST_NAME) -> list[str]:
     labels = [shortened(name, longest) for name in apart]
     for label in [label for label, count in Counter(labels).items() if count > 1]:
         places = [place for place, other in enumerate(labels) if other == label]
-        shared = len(commonprefix([apart[place] for place in places]))
+        signs = zip(*(apart[place] for place in places), strict=False)
+        shared = sum(1 for _ in takewhile(lambda each: len(set(each)) == 1, signs))
         for place in places:
             if len(apart[place]) > longest:
                 differing = apart[place][shared:]
