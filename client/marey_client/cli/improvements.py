@@ -259,8 +259,9 @@ def _metres(value: float | None) -> str:
 def _print_suggestions(document: Mapping[str, Any]) -> None:
     unused, redundant = document["unused"], document["redundant"]
     sections = (
-        (f"Can go without any change: {len(unused['clips'])} clips, {len(unused['ranges'])} stretches of others, "
-         f"{unused['seconds']:.1f} s", [*unused["clips"], *unused["ranges"]]),
+        (f"Can go without any change: {len(unused['clips'])} clips, {_seconds(unused['clips'])}", unused["clips"]),
+        (f"Can be cut with hardly a change: {len(unused['ranges'])} stretches of clips, "
+         f"{_seconds(unused['ranges'])}", unused["ranges"]),
         (f"Can go with little harm{' once those clips are gone' if unused['clips'] else ''}: one after another, "
          f"{len(redundant['plan'])} planned; "
          f"{redundant['tried']} of {redundant['needed']} used clips tried", redundant["plan"]),
@@ -281,6 +282,10 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
         tell(f"{one['folder']}: {one['clips']} clips cannot be matched: {one['detail']} ({one['code']})")
     if not any(entries for _, entries in sections):
         typer.echo("Every clip is needed, and nothing was found that would fill a hole.")
+
+
+def _seconds(entries: Sequence[Mapping[str, Any]]) -> str:
+    return f"{sum(entry['seconds'] for entry in entries):.1f} s"
 
 
 def _print_steps(document: Mapping[str, Any]) -> None:

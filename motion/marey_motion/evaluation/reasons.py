@@ -17,10 +17,10 @@ def why_unused_clip(clip: UnusedClip) -> str:
 
 
 def why_unused_range(part: UnusedRange) -> str:
-    """Why a stretch of a clip can go."""
+    """Why a stretch of a clip can go; a recording that is cut there is filtered anew, so nothing exact is promised."""
     return (
         f"“{part.name}” is never needed from {part.start_s:.2f} s to {part.stop_s:.2f} s: "
-        f"without these {part.seconds:.1f} s every trial stays exactly the same."
+        f"when these {part.seconds:.1f} s are cut off, trials stay nearly the same."
     )
 
 

@@ -45,9 +45,10 @@ class UnusedClip:
 
 @dataclass(frozen=True)
 class UnusedRange:
-    """Frames [start, stop), at the database's rate from the clip's first one, that no trial needs of a source.
+    """Frames [start, stop), at the database's rate from the clip's first row, that no trial needs of a source.
 
-    They are unneeded in the clip and in its mirrored twin.
+    They are unneeded in the clip and in its mirrored twin. The times are those of the recording, whose beginning need
+    not be the first row.
     """
 
     source: str
@@ -109,7 +110,10 @@ def find_unused(
             continue
         else:
             spans = _gaps(shown, before, after, int(np.ceil(LEAST_RANGE_S * rate)))
-            ranges += [UnusedRange(source, name, *span, span[0] / rate, span[1] / rate) for span in spans]
+            first_s = own[0].first_s
+            ranges += [
+                UnusedRange(source, name, *span, first_s + span[0] / rate, first_s + span[1] / rate) for span in spans
+            ]
         for clip in own:
             for start, stop in spans:
                 rows[clip.start + start : clip.start + stop] = True

@@ -181,6 +181,7 @@ def _entry(clip: PreparedClip) -> DatabaseClip:
         mirrored_from=source.uid if clip.mirrored else None,
         tags=source.tags,
         in_place=clip.in_place,
+        first_s=clip.first_s,
     )
 
 

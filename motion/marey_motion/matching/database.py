@@ -42,7 +42,8 @@ class SourceClip:
 class DatabaseClip:
     """A clip in a database. Its rows are [start, stop); a mirrored one has the uid of its source plus "~mirrored".
 
-    `in_place` clips walk without travelling, as on a treadmill: their speeds say nothing.
+    `in_place` clips walk without travelling, as on a treadmill: their speeds say nothing. `first_s` is where in the
+    recording the first row is, in seconds: later than 0 when a range of frames was chosen or a rest pose left out.
     """
 
     uid: str
@@ -54,6 +55,7 @@ class DatabaseClip:
     mirrored_from: str | None = None
     tags: tuple[str, ...] = ()
     in_place: bool = False
+    first_s: float = 0.0
 
     @property
     def frame_count(self) -> int:

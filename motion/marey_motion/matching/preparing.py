@@ -41,6 +41,7 @@ class PreparedClip:
     ----------
     seam : how a round leads into the next one where rows look ahead through it, None where the clip ends
     mirrored : whether left and right are exchanged
+    first_s : how much of the recording lies before the motion, seconds
     """
 
     source: SourceClip
@@ -49,6 +50,7 @@ class PreparedClip:
     in_place: bool
     notes: tuple[DatabaseNote, ...]
     mirrored: bool = False
+    first_s: float = 0.0
 
     @property
     def uid(self) -> str:
@@ -68,14 +70,14 @@ def prepare_clip(
     def tell(code: str, message: str) -> None:
         notes.append(DatabaseNote(code, f"{source.name}: {message}", source.uid))
 
-    clip, in_place = _wanted_frames(source, body, options, landmarks, tell)
+    clip, first, in_place = _wanted_frames(source, body, options, landmarks, tell)
     motion, seam = Motion.of(clip), None
     if source.loop and options.end_policy == "loop":
         motion = _closed(motion, tell)
         bone = options.root_mode == "bone"
         seam = loop_seam(*(bone_root(motion, body) if bone else raw_root(motion.positions(body.skeleton), body)))
     motion = resample_motion(motion, clip.frame_rate_hz, options.rate_hz, seam=seam)
-    return PreparedClip(source, motion, seam, in_place, tuple(notes))
+    return PreparedClip(source, motion, seam, in_place, tuple(notes), first_s=first / clip.frame_rate_hz)
 
 
 def mirror_prepared(clip: PreparedClip, body: MatchingBody, *, keep_notes: bool) -> PreparedClip:
@@ -89,22 +91,23 @@ def mirror_prepared(clip: PreparedClip, body: MatchingBody, *, keep_notes: bool)
 
 def _wanted_frames(
     source: SourceClip, body: MatchingBody, options: DatabaseOptions, landmarks: Landmarks, tell: _Tell
-) -> tuple[Clip, bool]:
-    """The clip within its range and without rest poses at its ends, and whether it walks in place."""
-    clip = source.clip
+) -> tuple[Clip, int, bool]:
+    """The clip within its range and without rest poses at its ends, its first frame, and whether it walks in place."""
+    clip, first = source.clip, 0
     if not _moves(clip, body.skeleton):
         raise MotionError(
             "the clip moves another skeleton than the database's; retarget it first", code="skeleton-mismatch"
         )
     if source.frames is not None:
-        clip = clip.sliced(*source.frames)
+        clip, first = clip.sliced(*source.frames), source.frames[0]
     warnings = check_clip(clip, landmarks)
     if not options.keep_rest_poses:
-        clip = _without_rest_poses(clip, warnings, tell)
+        start, stop = _without_rest_poses(clip, warnings, tell)
+        clip, first = clip.sliced(start, stop), first + start
     in_place = [warning for warning in warnings if warning.code == "in-place-gait"]
     for warning in in_place:
         tell(warning.code, warning.message)
-    return clip, bool(in_place)
+    return clip, first, bool(in_place)
 
 
 def _moves(clip: Clip, skeleton: Skeleton) -> bool:
@@ -120,21 +123,22 @@ def _moves(clip: Clip, skeleton: Skeleton) -> bool:
     return same_hierarchy(alike, skeleton, tolerance_m=SAME_OFFSET_M)
 
 
-def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], tell: _Tell) -> Clip:
+def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], tell: _Tell) -> tuple[int, int]:
+    """The range of frames between the rest poses at a clip's ends."""
     start, stop = 0, clip.frame_count
     for warning in warnings:
         if warning.code == "rest-pose-frame" and warning.frames is not None:
             if warning.frames == (0, clip.frame_count):
                 tell("only-a-rest-pose", "all of it is a rest pose; it was kept")
-                return clip
+                return 0, clip.frame_count
             if warning.frames[0] == 0:
                 start = warning.frames[1]
             else:
                 stop = warning.frames[0]
-    if stop - start == clip.frame_count:
-        return clip
-    tell("rest-pose-dropped", f"{start} frames at its start and {clip.frame_count - stop} at its end are a rest pose")
-    return clip.sliced(start, stop)
+    if stop - start < clip.frame_count:
+        ending = clip.frame_count - stop
+        tell("rest-pose-dropped", f"{start} frames at its start and {ending} at its end are a rest pose")
+    return start, stop
 
 
 def _closed(motion: Motion, tell: _Tell) -> Motion:

@@ -91,6 +91,8 @@ def test_reasons_name_the_clip_and_what_it_does(found):
     tree = suggestions_to_tree(found)
     unused = {clip["source"]: clip["reason"] for clip in tree["unused"]["clips"]}
     assert "“fast_000”: without its 4.0 s every trial stays exactly the same" in unused["fast_000"]
+    assert tree["unused"]["ranges"]
+    assert not any("exactly" in part["reason"] for part in tree["unused"]["ranges"])  # it is filtered anew at the cut
     (spared,) = tree["near_duplicates"]["spared"]
     assert "nearly the same motion as “clip_000”" in spared["reason"]
     assert "turns has" in tree["fillings"][0]["reason"]

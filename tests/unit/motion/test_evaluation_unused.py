@@ -112,6 +112,19 @@ def test_ranges_keep_their_distance_from_every_frame_that_is_needed():
     )
 
 
+def test_the_times_of_a_range_are_those_of_the_recording_and_not_of_its_first_row():
+    database = made_database(wandering_tracks())
+    later = replace(database, clips=tuple(replace(clip, first_s=2.5) for clip in database.clips))
+    parts, moved = (
+        find_unused(one, suite_trials(OPTIONS), simulated(one), OPTIONS).ranges for one in (database, later)
+    )
+    assert parts
+    for part, other in zip(parts, moved, strict=True):
+        assert (other.source, other.start, other.stop) == (part.source, part.start, part.stop)
+        assert (other.start_s, other.stop_s) == (part.start_s + 2.5, part.stop_s + 2.5)
+        assert other.seconds == pytest.approx(part.seconds)
+
+
 def test_a_clip_of_which_only_the_mirrored_twin_is_used_stays_with_it():
     database = with_mirrored(wandering_tracks(3))
     records, unused = unused_of(database)

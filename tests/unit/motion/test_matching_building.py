@@ -223,6 +223,7 @@ class TestFrames:
     def test_a_range_of_frames_is_that_part_of_the_clip(self) -> None:
         part, whole = built(WALK, frames=(30, 100)), built(WALK.sliced(30, 100))
         assert part.features.tobytes() == whole.features.tobytes()
+        assert [one.clips[0].first_s for one in (part, whole)] == [30 / WALK.frame_rate_hz, 0.0]
 
     def test_rest_poses_at_the_ends_are_left_out_unless_wanted(self) -> None:
         rest = np.concatenate((WALK.skeleton.offsets[0], WALK.skeleton.rest_rotations.reshape(-1)))
@@ -230,6 +231,8 @@ class TestFrames:
         clip = replace(WALK, poses=poses)
         trimmed = built(clip)
         assert trimmed.features.tobytes() == built(WALK).features.tobytes()
+        assert trimmed.clips[0].first_s == 12 / WALK.frame_rate_hz
+        assert built(clip, frames=(4, 180)).clips[0].first_s == 12 / WALK.frame_rate_hz
         assert [str(note) for note in trimmed.notes] == ["one: 12 frames at its start and 5 at its end are a rest pose"]
         assert built(clip, DatabaseOptions(keep_rest_poses=True)).row_count == 197
 
