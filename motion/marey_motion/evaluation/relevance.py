@@ -126,6 +126,11 @@ def sum_by_source(clips: Sequence[DatabaseClip], usage: Sequence[ClipUsage]) -> 
     )
 
 
+def recorded_rows(clips: Sequence[DatabaseClip], usage: Sequence[ClipUsage]) -> int:
+    """Rows of the clips as recorded: a mirrored twin adds none."""
+    return sum(len(source.popularity) for source in sum_by_source(clips, usage))
+
+
 def unused_clips(usage: Sequence[ClipUsage]) -> tuple[int, ...]:
     """Indices of the clips that were never displayed."""
     return tuple(index for index, own in enumerate(usage) if own.ticks == 0)

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -15,6 +16,7 @@ from drawn_figures import is_sound, rows_of
 from evaluation_results import SMALL, evaluated, made_up, some_coverage, wandering
 from marey_motion.drawing.paper import labels_of, nice_levels, shortened, without_shared_folder
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.coverage import Windows, coverage_of
 from marey_motion.evaluation.figures import FIGURES, FigureOptions, draw_figure, draw_figures
 from marey_motion.evaluation.figures.clip_graph_layout import MOST_DOTS, arrange
 from marey_motion.evaluation.figures.mixtures import fit_one, fit_two
@@ -404,6 +406,27 @@ def test_evaluations_of_little_are_drawn(little):
 def test_evaluations_of_little_are_compared(little, other):
     for figure in draw_figures(other, other=LITTLE[little]()).values():
         is_sound(figure)
+
+
+def standing():
+    """A clip that stands but for rounding: its windows and what the trials recorded."""
+    made = tiny(
+        (DatabaseClip("only", "only", "", 0, 900),), EvaluationOptions(grid=Grid((1.0,), (0.0,)), duration_s=6.0)
+    )
+    sway, count = 1e-7 * np.random.default_rng(7).normal(size=(2, 840)), 840
+    windows = Windows(np.hypot(*sway), np.zeros(count), *sway)
+    names = ("positions", "headings", "pose_cost")
+    records = tuple(replace(one, **{name: 1e-9 * getattr(one, name) for name in names}) for one in made.records)
+    coverage = coverage_of(windows, np.zeros(count, np.int32), (), made.options, window_s=1 / 60)
+    return replace(made, records=records, coverage=coverage)
+
+
+def test_of_a_clip_that_stands_rounding_is_not_shown_as_motion():
+    figures = draw_figures(standing())
+    assert "0 % of the time backward, 0 % mainly sideways." in figures["directions"].caption
+    assert "840 windows from 1 clip, all" in figures["points"].caption
+    for figure in figures.values():
+        assert not re.search(r">1e", figure.svg.replace("\N{MINUS SIGN}", "-"))  # an axis in powers of ten
 
 
 def test_names_of_clips_are_drawn_as_they_are_but_for_signs_that_cannot_be():

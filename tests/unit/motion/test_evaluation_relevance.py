@@ -9,6 +9,7 @@ from marey_motion.evaluation.relevance import (
     count_switches,
     find_jumps,
     measure_usage,
+    recorded_rows,
     sum_by_source,
     treading_share,
     unused_clips,
@@ -49,6 +50,13 @@ def test_a_clip_no_trial_displayed_is_unused():
     usage = measure_usage(CLIPS, [walked_record([10, 11]), walked_record([12, 13])])
 
     assert unused_clips(usage) == (0, 2)
+
+
+def test_a_mirrored_twin_adds_nothing_to_what_was_recorded():
+    clips = clips_of(10, 20, 20)
+    twin = replace(clips[2], uid=f"{clips[1].uid}~mirrored", mirrored_from=clips[1].uid)
+    assert recorded_rows(clips, measure_usage(clips, [])) == 50
+    assert recorded_rows((*clips[:2], twin), measure_usage((*clips[:2], twin), [])) == 30
 
 
 def test_nothing_is_used_without_trials():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from marey_motion.evaluation.judgement import judge
-from marey_motion.evaluation.relevance import sum_by_source
+from marey_motion.evaluation.relevance import recorded_rows, sum_by_source
 from marey_motion.evaluation.result import EvaluationResult
 
 Headline = dict[str, float | int | None]
@@ -15,7 +15,7 @@ def headline_of(result: EvaluationResult) -> Headline:
     Clips count once, whether their mirrored twins were added or not.
     """
     sources = sum_by_source(result.clips, result.usage)
-    rows = sum(clip.frame_count for clip in result.clips)
+    rows = recorded_rows(result.clips, result.usage)
     return {
         "clips": len(sources),
         "unused_clips": sum(source.ticks == 0 for source in sources),

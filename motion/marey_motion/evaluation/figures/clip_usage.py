@@ -20,6 +20,7 @@ from marey_motion.drawing.paper import (
     name_ticks,
     new_figure,
 )
+from marey_motion.drawing.words import amount
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
 
 if TYPE_CHECKING:
@@ -128,6 +129,6 @@ def _caption(subjects: Sequence[Subject], uses: Sequence[_Use]) -> str:
         used = sum(1 for ticks in use.ticks.values() if ticks)
         parts.append(
             f"{subject.prefix}{used} of {len(use.ticks)} clips used over {sum(use.ticks.values()):,} displayed frames, "
-            f"{use.transitions:,} transitions between them."
+            f"{amount(use.transitions, 'transition')} between them."
         )
     return "How often frames of each clip were displayed. " + " ".join(parts)

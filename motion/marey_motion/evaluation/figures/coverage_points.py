@@ -23,6 +23,7 @@ from marey_motion.drawing.paper import (
     plain,
     reach,
 )
+from marey_motion.drawing.words import amount
 from marey_motion.evaluation.figures.axes import SPEED, TURN_RATE, mark_sides
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
 
@@ -160,5 +161,5 @@ def _caption(
         turn, speed = np.degrees(subject.result.coverage.turn_rate_rad_s), subject.result.coverage.speed_m_s
         beyond = int(np.count_nonzero((np.abs(turn) > limits[0][1]) | (speed > limits[1][1])))
         outside = f"; {beyond:,} lie beyond the axes" if beyond else ""
-        parts.append(f"{subject.prefix}{total:,} windows from {held} clips, {drawn} drawn{outside}.")
+        parts.append(f"{subject.prefix}{total:,} windows from {amount(held, 'clip')}, {drawn} drawn{outside}.")
     return "Each point is the mean speed and turn rate of one second of a clip. " + " ".join(parts)

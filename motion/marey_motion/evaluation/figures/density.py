@@ -33,6 +33,7 @@ Floats = NDArray[np.float64]
 
 FINE = 144  # cells of the drawn map per axis
 BANDWIDTH = 0.35  # standard deviation of the smoothing, in cells of the trial grid
+NOTICED_M_S = 0.1  # slower than this a body stands, whichever way it sways
 DIRECTION_CELL_M_S = 0.25
 
 
@@ -215,8 +216,9 @@ def _caption(subjects: Sequence[Subject], plane: _Plane) -> str:
                 f"left-right symmetry {coverage.symmetry:.2f}."
             )
         else:
-            backward = float(np.mean(coverage.forward_m_s < -0.1)) if len(coverage.clip) else 0.0
-            sideways = float(np.mean(np.abs(coverage.strafe_m_s) > np.abs(coverage.forward_m_s))) if held else 0.0
+            strafe, forward = np.abs(coverage.strafe_m_s), np.abs(coverage.forward_m_s)
+            backward = float(np.mean(coverage.forward_m_s < -NOTICED_M_S)) if held else 0.0
+            sideways = float(np.mean((strafe > forward) & (strafe > NOTICED_M_S))) if held else 0.0
             parts.append(
                 f"{subject.prefix}{100 * backward:.0f} % of the time backward, {100 * sideways:.0f} % mainly sideways."
             )

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.floating[Any]]
 
 BINS = 48
+LEAST_BIN = 0.001  # m/s or deg/s
 FINE = 400
 
 
@@ -100,11 +101,11 @@ def _errors(view: TrialView, negate: bool) -> tuple[_Errors, _Errors]:
 
 
 def _edges(values: Sequence[Floats]) -> Floats:
-    """Bins that hold all but the outermost thousandths, with zero on an edge; at least a little wide."""
+    """Bins that hold all but the outermost thousandths, with zero on an edge; wider than what is rounding."""
     together = np.concatenate(values)
     low, high = np.quantile(together, (0.001, 0.999))
     low, high = min(float(low), 0.0), max(float(high), 0.0)
-    width = max((high - low) / BINS, 1e-6)
+    width = max((high - low) / BINS, LEAST_BIN)
     first, last = int(np.floor(low / width)) - 1, int(np.ceil(high / width)) + 1
     return np.arange(first, last + 1) * width
 

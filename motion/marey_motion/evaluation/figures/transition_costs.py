@@ -19,6 +19,9 @@ from marey_motion.drawing.paper import (
 )
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject, TrialView, choose_trial, view_trial
 
+LEAST_TOP_M = 0.01
+"""How far the axis of costs goes at least: what is far below is rounding, of a character that stands."""
+
 
 def draw_transition_costs(subjects: Sequence[Subject], trial: str | None, _options: FigureOptions) -> Sketch:
     """Speeds above, cost below, one line per subject; a tick under the cost is a switch to another place."""
@@ -30,7 +33,7 @@ def draw_transition_costs(subjects: Sequence[Subject], trial: str | None, _optio
     below = add_panel(figure, Place(0.7, 0.55, 8.1, 2.2), x="time (s)", y="transition cost (m)")
     above.step(first.times_s, first.wanted_speeds_m_s, where="post", color=REFERENCE, lw=1.8, label="wished")
     costs = [view.record.pose_cost[1:] for view in views]
-    top = max([0.0, *(float(np.nanmax(cost, initial=0.0)) for cost in costs)]) or 1.0
+    top = max([LEAST_TOP_M, *(float(np.nanmax(cost, initial=0.0)) for cost in costs)])
     for number, (view, cost) in enumerate(zip(views, costs, strict=True)):
         look: dict[str, Any] = {"color": COLOURS[number], "lw": 0.9, "alpha": 0.85}
         above.plot(view.series.times_s, view.series.speeds_m_s, label=view.subject.label or "recorded", **look)

@@ -12,7 +12,7 @@ from marey_motion.drawing.tables import Cell, Number, facts, folded, number, sha
 from marey_motion.drawing.words import amount, duration
 from marey_motion.evaluation.figures import DrawnFigure
 from marey_motion.evaluation.judgement import is_followed, judge, strain
-from marey_motion.evaluation.relevance import SourceUsage, sum_by_source
+from marey_motion.evaluation.relevance import SourceUsage, recorded_rows, sum_by_source
 from marey_motion.evaluation.report.definitions import METRICS
 from marey_motion.evaluation.report.words import demand, find_holes
 from marey_motion.evaluation.result import EvaluationResult, TrialResult
@@ -32,7 +32,7 @@ def headline(result: EvaluationResult) -> Html:
     used = sum(1 for source in sources if source.ticks)
     base = result.baseline
     beside = "" if base is None else f"{_written(base, 'offset_mean')} with generated clips that cover everything"
-    held = sum(clip.frame_count for clip in result.clips) / result.options.database.rate_hz
+    held = recorded_rows(result.clips, result.usage) / result.options.database.rate_hz
     covered = int(np.count_nonzero(coverage.deficit_s <= 0.0))
     return facts(
         (
