@@ -153,9 +153,11 @@ def told_apart(names: Sequence[str]) -> list[str]:
 def labels_of(names: Sequence[str], longest: int = LONGEST_NAME) -> list[str]:
     """Names of clips as short as `longest` signs, by which those that differ can be told apart.
 
-    Where cutting the middle would make several alike, the beginning that they share is cut instead.
+    Folders are left out where the takes in them have names of their own. Where cutting the middle would make several
+    alike, the beginning that they share is cut instead.
     """
-    apart = told_apart(names)
+    takes = [name.rpartition("/")[2] for name in names]
+    apart = told_apart(takes if len(set(takes)) == len(set(names)) else names)
     labels = [shortened(name, longest) for name in apart]
     for label in [label for label, count in Counter(labels).items() if count > 1]:
         places = [place for place, other in enumerate(labels) if other == label]

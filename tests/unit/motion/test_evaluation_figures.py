@@ -451,6 +451,8 @@ def test_labels_tell_clips_apart_however_long_their_names_are():
         labels = labels_of([f"{'a' * 20}{number}{'b' * 20}" for number in range(9)], longest)
         assert len(set(labels)) == 9
         assert all(len(label) <= longest for label in labels)
+    assert labels_of(["set/walks/a_001", "other/runs/b_001"]) == ["a_001", "b_001"]
+    assert labels_of(["set/walks/a", "other/runs/a"]) == ["set/walks/a", "other/runs/a"]
     assert labels_of(["take", "take"]) == ["take", "take"]
     assert labels_of([]) == []
 

@@ -316,6 +316,42 @@ def test_a_comparison_with_intervals_shows_them_and_the_trials_that_changed(resu
     assert "+0.00 and +0.00" in page.text
 
 
+def test_a_comparison_writes_means_of_counts_with_decimals_and_no_minus_before_nothing(result):
+    trials = tuple(
+        replace(each, metrics={**each.metrics, "clip_ends": float(index % 2), "response_missed": -1e-9 * index})
+        for index, each in enumerate(result.trials)
+    )
+    comparison = compare_results(result, replace(result, trials=trials))
+    page = is_sound(
+        render_comparison(comparison.before, comparison.after, title="Change", comparison=comparison, figures={})
+    )
+
+    (ends,) = (one for one in comparison.metrics if one.metric == "clip_ends")
+    assert f"clip ends met {ends.before:.1f} {ends.after:.1f} {ends.change:+.1f}" in page.text
+    assert "-0.0 " not in page.text
+    assert "also of what each trial has as its largest distance" in page.text
+
+
+def test_trials_that_only_show_other_clips_went_the_same_way(result):
+    clips = tuple(replace(clip, uid=f"copy-{clip.uid}") for clip in result.clips)
+    comparison = compare_results(result, replace(result, clips=clips))
+    page = is_sound(
+        render_comparison(comparison.before, comparison.after, title="Change", comparison=comparison, figures={})
+    )
+    assert "0 trials of 30 went another way. 30 more went the same way with other clips." in page.text
+
+
+def test_a_comparison_counts_mirrored_twins_once_and_says_when_coverage_is_asked_for_otherwise(result):
+    first, second, *rest = result.clips
+    twin = replace(second, mirrored_from=first.uid)
+    usage = tuple(replace(one, popularity=np.ones(9)) if one.clip < 2 else one for one in result.usage)
+    options = replace(result.options, coverage_least_s=0.25)
+    after = replace(result, clips=(first, twin, *rest), usage=usage, options=options)
+    page = is_sound(render_comparison(result, after, title="Change", figures={}))
+    assert f"of {len(result.clips)} and {len(result.clips) - 1}" in page.text
+    assert "where 1 s and 0.25 s are enough: not comparable" in page.text
+
+
 def test_what_the_script_sorts_by_is_a_number(result, figures):
     source = render_report(result, title="Walks", figures=figures)
     for value in re.findall(r'data-value="([^"]*)"', source):

@@ -11,6 +11,7 @@ from marey_motion.drawing.words import amount
 from marey_motion.evaluation.compare import Comparison, MetricChange
 from marey_motion.evaluation.figures import DrawnFigure
 from marey_motion.evaluation.judgement import Judgement, is_followed, judge
+from marey_motion.evaluation.relevance import sum_by_source
 from marey_motion.evaluation.report.definitions import METRICS
 from marey_motion.evaluation.report.words import demand
 from marey_motion.evaluation.result import EvaluationResult, TrialResult
@@ -19,6 +20,7 @@ Figures = Mapping[str, DrawnFigure]
 
 MOST_TRIALS = 15
 MOST_NAMES = 40
+LEAST_SHIFT_M = 0.005  # what is written as 0.00 is neither good nor bad
 
 
 def compared(before: EvaluationResult, after: EvaluationResult) -> str:
@@ -50,13 +52,19 @@ def headline_of_two(before: EvaluationResult, after: EvaluationResult, labels: t
     """The numbers that answer most questions, old and new."""
     first, second = judge(before), judge(after)
     cells = before.coverage, after.coverage
-    used = [sum(1 for usage in each.usage if usage.ticks) for each in (before, after)]
+    sources = [sum_by_source(each.clips, each.usage) for each in (before, after)]
+    used = [sum(1 for source in own if source.ticks) for own in sources]
+    enough = [f"{each.options.coverage_least_s:g} s" for each in (before, after)]
     return facts(
         (
             ("trajectories followed", f"{first.followed} → {_share(second)}", " → ".join(labels)),
             ("distance from the path (m)", _arrow(*(_written(each, "offset_mean") for each in (before, after))), ""),
-            ("speeds and turns covered", _arrow(*(f"{100 * each.index:.0f} %" for each in cells)), ""),
-            ("clips used", _arrow(str(used[0]), str(used[1])), f"of {len(before.clips)} and {len(after.clips)}"),
+            (
+                "speeds and turns covered",
+                _arrow(*(f"{100 * each.index:.0f} %" for each in cells)),
+                "" if enough[0] == enough[1] else f"where {enough[0]} and {enough[1]} are enough: not comparable",
+            ),
+            ("clips used", _arrow(str(used[0]), str(used[1])), f"of {len(sources[0])} and {len(sources[1])}"),
         )
     )
 
@@ -74,14 +82,19 @@ def metric_chapter(
         if old is None and new is None:
             continue
         change = known.change if known else new - old if old is not None and new is not None else None
-        row: list[Cell] = [metric.label, *(number(value, metric.digits) for value in (old, new))]
-        row.append(number(change, metric.digits, signed=True, look=_look(known)))
+        digits = metric.digits if known is None else max(metric.digits, 1)  # the mean of a count is no whole number
+        row: list[Cell] = [metric.label, *(number(value, digits) for value in (old, new))]
+        row.append(number(change, digits, signed=True, look=_look(known)))
         if comparison is not None:
-            row += [_interval(known, metric.digits), known.verdict if known else ""]
+            row += [_interval(known, digits), known.verdict if known else ""]
         rows.append([*row, metric.unit])
-    text = "Means over the trials that both define."
+    text = "Of the whole suite."
     if comparison is not None:
-        text += " The mean change lies between the two bounds with 95 % confidence, by resampling the trials."
+        text = (
+            "Means over the trials that both define, also of what each trial has as its largest distance or counts; "
+            "the report of one evaluation has the largest and the sum of all trials there. The mean change lies "
+            "between the two bounds with 95 % confidence, by resampling the trials."
+        )
     listing = table(
         "The suite in numbers", heads, rows, numbers=(1, 2, 3, 4) if comparison else (1, 2, 3), sortable=False
     )
@@ -94,8 +107,10 @@ def trial_chapter(
     """Where it changed: trials gained and lost, the largest changes first."""
     pairs = [(old, new) for old, new in paired(before, after) if old.metrics != new.metrics]
     pairs.sort(key=lambda pair: (-abs(_shift(*pair)), pair[0].trial.name))
-    changed = len(comparison.changed) if comparison is not None else len(pairs)
+    changed = sum(not each.same_motion for each in comparison.changed) if comparison is not None else len(pairs)
     text = f"{amount(changed, 'trial')} of {len(before.trials)} went another way."
+    if comparison is not None and (others := len(comparison.changed) - changed):
+        text += f" {others} more went the same way with other clips."
     heads = ("trial", "distance before (m)", "after (m)", "change (m)", "followed before", "after")
     listing: Content = None
     if pairs:
@@ -139,7 +154,7 @@ def _names(title: str, uids: Sequence[str], names: Mapping[str, str]) -> Html:
 def _trial_row(old: TrialResult, new: TrialResult) -> list[Cell]:
     offsets = [each.metrics.get("offset_mean") for each in (old, new)]
     shift = _shift(old, new)
-    look = "good" if shift < 0.0 else "bad"
+    look = "" if abs(shift) < LEAST_SHIFT_M else "good" if shift < 0.0 else "bad"
     return [
         element("span", demand(old.trial), title=old.trial.name),
         *(number(offset) for offset in offsets),
@@ -157,7 +172,8 @@ def _shift(old: TrialResult, new: TrialResult) -> float:
 def _interval(change: MetricChange | None, digits: int) -> Number:
     if change is None:
         return Number(None, "–")
-    return Number(change.low, f"{change.low:+,.{digits}f} and {change.high:+,.{digits}f}")
+    low, high = (number(bound, digits, signed=True).written for bound in (change.low, change.high))
+    return Number(change.low, f"{low} and {high}")
 
 
 def _look(change: MetricChange | None) -> str:

@@ -9,13 +9,12 @@ from marey_motion.drawing.tables import table
 
 
 class Metric(NamedTuple):
-    """A metric of the suite as a report shows it: name, unit, decimals, what it means, and whether less is better."""
+    """A metric of the suite as a report shows it: name, unit, decimals, and what it means."""
 
     label: str
     unit: str
     digits: int
     meaning: str
-    less_is_better: bool = True
 
 
 METRICS = {
