@@ -118,6 +118,12 @@ def test_the_suite_s_numbers_stand_beside_the_baseline_s(result, figures):
     assert f"{base.suite['offset_mean']:.2f} m with generated clips" in page.text
 
 
+def test_the_suite_s_numbers_are_called_means_largest_and_sums_as_they_are(result, page):
+    largest = max(each.metrics["offset_max"] for each in result.trials)
+    assert "of largest distances the largest, of counts the sum" in page.text
+    assert f"largest distance {largest:.2f}" in page.text
+
+
 def test_clips_that_were_never_used_are_named(page, result):
     unused = [result.clips[usage.clip].name for usage in result.usage if not usage.ticks]
     start = page.text.index("were displayed in no trial")

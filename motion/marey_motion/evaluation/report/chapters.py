@@ -158,10 +158,10 @@ def baseline_chapter(result: EvaluationResult) -> Section:
             row.append(number(base.suite.get(name), metric.digits))
         rows.append([*row, metric.unit])
     about = (
-        "Means over all trials. The baseline is the same suite over generated clips, one for each speed and turn rate: "
+        f"{HOW_POOLED} The baseline is the same suite over generated clips, one for each speed and turn rate: "
         "what this way of following reaches when nothing is missing."
         if base is not None
-        else "Means over all trials. No baseline was evaluated beside them."
+        else f"{HOW_POOLED} No baseline was evaluated beside them."
     )
     listing = table("The suite in numbers", heads, rows, numbers=range(1, len(heads) - 1), sortable=False)
     return Section("numbers", "In numbers", (element("p", about), listing))
@@ -187,6 +187,7 @@ def appendix_chapter(result: EvaluationResult) -> Section:
     )
 
 
+HOW_POOLED = "Means over all trials; of largest distances the largest, of counts the sum."
 BEYOND = "bad"
 TRIAL_HEADS = (
     "trial",
