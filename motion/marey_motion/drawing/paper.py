@@ -153,11 +153,13 @@ def told_apart(names: Sequence[str]) -> list[str]:
 def labels_of(names: Sequence[str], longest: int = LONGEST_NAME) -> list[str]:
     """Names of clips as short as `longest` signs, by which those that differ can be told apart.
 
-    Folders are left out where the takes in them have names of their own. Where cutting the middle would make several
-    alike, the beginning that they share is cut instead.
+    Folders are left out where the takes in them have names of their own, and what all names begin with where one is
+    too long. Where cutting the middle would make several alike, the beginning that they share is cut instead.
     """
     takes = [name.rpartition("/")[2] for name in names]
-    apart = told_apart(takes if len(set(takes)) == len(set(names)) else names)
+    apart = takes if len(set(takes)) == len(set(names)) else without_shared_folder(names)
+    if any(len(name) > longest for name in apart):
+        apart = told_apart(apart)
     labels = [shortened(name, longest) for name in apart]
     for label in [label for label, count in Counter(labels).items() if count > 1]:
         places = [place for place, other in enumerate(labels) if other == label]

@@ -447,6 +447,7 @@ def test_labels_leave_out_the_folder_that_all_clips_lie_in():
 def test_labels_tell_clips_apart_however_long_their_names_are():
     takes = [f"set/walks/dataset-1_{action}_001" for action in ("walk-left_feminine", "walk-right_feminine", "run_sad")]
     assert labels_of(takes) == ["walk-left_feminine_001", "walk-right_feminine_001", "run_sad_001"]
+    assert labels_of(["cmu/16_15", "cmu/16_17"]) == ["16_15", "16_17"]
     for longest in (13, 18, 30):
         labels = labels_of([f"{'a' * 20}{number}{'b' * 20}" for number in range(9)], longest)
         assert len(set(labels)) == 9
@@ -458,9 +459,11 @@ def test_labels_tell_clips_apart_however_long_their_names_are():
 
 
 def test_bars_of_usage_are_called_by_what_tells_their_clips_apart():
-    names = [f"set/walks/dataset-1_walk-{side}_feminine_{take:03d}" for side in ("left", "right") for take in range(5)]
+    names = [
+        f"set/walks/walk-{side}_feminine_before_noon_{take:03d}" for side in ("left", "right") for take in range(5)
+    ]
     drawn = draw_figure("usage", made_up(names=names)).svg
-    assert ">left_feminine_000<" in drawn
-    assert ">right_feminine_000<" in drawn
+    assert ">left_feminine_before_noon_000<" in drawn
+    assert ">right_feminine_before_noon_000<" in drawn
     assert ">Transitions<" in drawn
     assert "set/walks" not in drawn
