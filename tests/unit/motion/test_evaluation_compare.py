@@ -1,6 +1,7 @@
 """Two evaluations of the same trials, told apart trial by trial."""
 
 from dataclasses import replace
+from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -90,6 +91,35 @@ def test_the_interval_holds_the_true_change_about_as_often_as_it_says():
         change = paired_change("offset_mean", before, after)
         held += change.low <= 0.3 <= change.high
     assert 51 <= held <= 60
+
+
+def test_the_interval_of_normal_changes_is_two_standard_errors_to_each_side():
+    changes = np.random.default_rng(4).normal(0.3, 1.0, 400)
+    found = paired_change("offset_mean", np.zeros(400), changes)
+    reach = 1.96 * changes.std() / np.sqrt(400)
+    assert (found.low, found.high) == pytest.approx((changes.mean() - reach, changes.mean() + reach), abs=0.05 * reach)
+
+
+def test_the_interval_of_skewed_changes_reaches_farther_to_the_long_side():
+    changes = np.sort(np.random.default_rng(5).exponential(size=25))
+    found = paired_change("offset_mean", np.zeros(25), changes)
+    low, high = efron_bounds(changes)
+    assert (found.low, found.high) == pytest.approx((low, high), abs=0.03 * (high - low))
+    assert high - changes.mean() > 1.25 * (changes.mean() - low)
+
+
+def efron_bounds(changes):
+    """Bias corrected and accelerated bounds of the mean as Efron (1987) writes them, of other resamples."""
+    normal, random, count = NormalDist(), np.random.default_rng(6), len(changes)
+    means = np.sort(random.choice(changes, (20_000, count)).mean(axis=1))
+    bias = normal.inv_cdf(np.mean(means < changes.mean()))
+    without = (changes.sum() - changes) / (count - 1)
+    apart = without.mean() - without
+    acceleration = np.sum(apart**3) / (6.0 * np.sum(apart**2) ** 1.5)
+    for tail in (0.025, 0.975):
+        shifted = bias + normal.inv_cdf(tail)
+        share = normal.cdf(bias + shifted / (1.0 - acceleration * shifted))
+        yield means[int(share * len(means))]
 
 
 def test_the_interval_is_the_same_every_time():
