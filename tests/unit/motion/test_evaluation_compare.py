@@ -54,6 +54,15 @@ def test_only_trials_that_went_another_way_are_told_and_from_where_on(database, 
             assert not change.same_motion
 
 
+@pytest.mark.parametrize("kept", ["positions", "headings", "status", "match_cost", "continuing_cost", "pose_cost"])
+def test_a_trial_that_differs_in_anything_at_one_tick_is_told_with_that_tick(result, kept):
+    values = getattr(result.records[1], kept).copy()
+    values[7] = 1 if np.isnan(values[7]).any() else values[7] + 1
+    records = (result.records[0], replace(result.records[1], **{kept: values}), *result.records[2:])
+    (change,) = compare_results(result, replace(result, records=records)).changed
+    assert (change.trial, change.first_tick, change.same_motion) == (result.trials[1].trial.name, 7, False)
+
+
 def test_a_copy_under_a_lower_uid_is_told_as_the_same_motion():
     tracks = named(wandering_tracks()[:4])
     database = made_database(tracks)
