@@ -332,6 +332,22 @@ def test_a_refused_sender_who_waits_for_a_go_is_told_at_once(server: Server):
     assert b"100 (Continue)" not in said
 
 
+@pytest.mark.parametrize("length", ["15, 15", "15\r\nContent-Length: 15", "0" * 50 + "15"])
+def test_a_length_that_is_said_twice_or_at_length_is_one_length(server: Server, length: str):
+    assert talk_of_a_project(server, length).startswith(b"HTTP/1.1 201")
+
+
+@pytest.mark.parametrize("length", ["\xb2", "15, 16", "+15", "-1", "9" * 5000])
+def test_a_length_that_is_no_number_is_refused(server: Server, length: str):
+    assert talk_of_a_project(server, length).startswith(b"HTTP/1.1 400")
+
+
+def talk_of_a_project(server: Server, length: str) -> bytes:
+    """What is answered to a body of 15 bytes whose Content-Length is `length`."""
+    head = f"POST /api/v1/projects HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {server.make_user('olga')}\r\n"
+    return talk(server, f'{head}Content-Length: {length}\r\n\r\n{{"name":"loft"}}'.encode("latin-1"))
+
+
 def test_a_head_without_end_is_cut_off(server: Server):
     said = talk(server, b"GET /healthz HTTP/1.1\r\n" + b"X-Filler: " + b"y" * 100_000)
     assert b"200 OK" not in said

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from marey_server.errors import BadRequest, PreconditionFailed, PreconditionRequired
 
 _TAG = re.compile(r'\s*(W/)?"([\x21\x23-\x7e\x80-\xff]*)"\s*')
+_REV = re.compile("[0-9]{1,9}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +84,7 @@ def write_precondition(if_match: str | None, if_none_match: str | None, *, may_c
     tags = parse_tags(if_match)
     if tags == ["*"]:
         return ANY_STATE
-    revs = tuple(sorted({int(rev) for tag in tags if (rev := tag.partition(".")[0]).isdigit() and len(rev) < 10}))
+    revs = tuple(sorted({int(rev) for tag in tags if _REV.fullmatch(rev := tag.partition(".")[0])}))
     if not revs:
         raise PreconditionFailed(f"{if_match[:200]} is no state of this; read it again.")
     if len(revs) > 1:

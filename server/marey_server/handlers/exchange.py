@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from typing import Any, ClassVar
 
 from tornado.iostream import StreamClosedError
@@ -17,6 +18,8 @@ from marey_server.services import Services
 
 LINGER_BYTES = 64 * 2**20
 """How much of a refused body is read and thrown away, so that its sender gets to read why."""
+_LENGTH = re.compile("[0-9]{1,4300}")
+"""What `int` takes: it refuses longer texts."""
 _SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -53,9 +56,9 @@ class Exchange(RequestHandler):
     # -- the body that comes ------------------------------------------------------------------------------------------
 
     def declared_length(self) -> int:
-        """The length of the body as its sender says; 0 where it does not."""
-        text = self.request.headers.get("Content-Length", "0")
-        return int(text) if text.isdigit() else 0
+        """The length of the body as its sender says; 0 where it does not, or says what Tornado refuses next."""
+        text = self.request.headers.get("Content-Length", "0").partition(",")[0].strip()  # the same may stand twice
+        return int(text) if _LENGTH.fullmatch(text) else 0
 
     def expects_body(self) -> bool:
         """Whether a body follows the headers."""

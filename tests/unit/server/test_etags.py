@@ -41,9 +41,10 @@ def test_creating_only_is_a_precondition_where_things_can_be_created():
         write_precondition(None, '"7.json"', may_create=True)
 
 
-def test_a_foreign_tag_can_never_match():
+@pytest.mark.parametrize("header", ['"33a64df5"', '"\xb2"', '"\xb2.json"', '"9999999999.json"'])
+def test_a_foreign_tag_can_never_match(header):
     with pytest.raises(PreconditionFailed):
-        write_precondition('"33a64df5"', None)
+        write_precondition(header, None)
 
 
 @pytest.mark.parametrize("header", ["7.json", '"7.json', '"7.json" "8.json"', '"\n"'])
