@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from sqlalchemy import ColumnElement, Row, func, literal, or_, select, update
@@ -154,14 +155,30 @@ def move_collection(
 
 
 def _move_contents(tx: Transaction, project_row: ProjectRow, old: str, new: str) -> None:
-    inside = (collection.c.project_id == project_row.id, _ALIVE, at_or_below(old), collection.c.path != old)
-    for path in tx.execute(select(collection.c.path).where(*inside)).scalars():
+    for path in _lock_inside(tx, project_row, old):
         check_length(new + path[len(old) :])
     tx.execute(
         update(collection)
-        .where(*inside)
+        .where(*_inside(project_row, old))
         .values(path=literal(new) + func.substr(collection.c.path, len(old) + 1), rev=collection.c.rev + 1)
     )
+
+
+def _inside(project_row: ProjectRow, path: str) -> tuple[ColumnElement[bool], ...]:
+    return collection.c.project_id == project_row.id, _ALIVE, at_or_below(path), collection.c.path != path
+
+
+def _lock_inside(tx: Transaction, project_row: ProjectRow, path: str) -> Sequence[str]:
+    """The paths of the folders in a locked one, at any depth; none changes, and none is added, before this write ends.
+
+    Whoever adds one holds the folder above it until it is there (`ensure`). One that was waited for may have got others
+    meanwhile, which only another look finds.
+    """
+    statement = select(collection.c.path).where(*_inside(project_row, path)).order_by(collection.c.path)
+    paths: Sequence[str] = []
+    while len(found := tx.execute(statement.with_for_update()).scalars().all()) > len(paths):
+        paths = found
+    return paths
 
 
 def delete_collection(tx: Transaction, project: str, collection_id: str, *, expected_rev: int | None) -> None:
@@ -174,6 +191,7 @@ def delete_collection(tx: Transaction, project: str, collection_id: str, *, expe
         {"deleted_us": tx.now_us, "updated_us": tx.now_us}, expected_rev=expected_rev,
         absent=_no_collection(collection_id),
     )  # fmt: skip
+    _lock_inside(tx, project_row, path)
     below = (collection.c.project_id == project_row.id, at_or_below(path))
     tx.execute(update(collection).where(*below, _ALIVE).values(deleted_us=tx.now_us, rev=collection.c.rev + 1))
     hidden = select(collection.c.id).where(*below, collection.c.deleted_us == tx.now_us)

@@ -1,0 +1,92 @@
+"""Folders that are moved, deleted and brought back while others put things into them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from interleaving import Step, interleave
+from marey_schemas.items import CollectionChange, CollectionCreate, ItemCreate
+from marey_schemas.kinds import Kind
+from marey_server.errors import MareyError
+from marey_server.store import collections, items
+from marey_server.store.database import Database
+from marey_server.store.items import ItemFilters
+from marey_server.store.transaction import Transaction
+from store_fixtures import Lab, skeleton_tree
+
+Folders = dict[str, str]
+
+
+@pytest.fixture
+def other(open_database: Callable[[], Database]) -> Database:
+    """The same database, as another server process opens it."""
+    return open_database()
+
+
+def make(lab: Lab, *paths: str) -> Folders:
+    """Folders; their ids by path."""
+    made = [lab.write(collections.create_collection, lab.name, CollectionCreate(path=path)) for path in paths]
+    return {one.path: one.id for one in made}
+
+
+def living(lab: Lab) -> list[str]:
+    """The paths of every folder that is there."""
+    return [one.path for one in lab.read(collections.list_collections, lab.name).items]
+
+
+def places(lab: Lab) -> list[str]:
+    """Where the skeletons are that are there."""
+    found = lab.read(items.list_items, lab.name, Kind.SKELETON, ItemFilters()).items
+    return sorted(f"{one.collection}/{one.name}" for one in found)
+
+
+def require_whole_trees(lab: Lab) -> None:
+    """Every folder is in a folder that is there, and every item in one."""
+    paths = {"", *living(lab)}
+    assert [path for path in paths if path.rpartition("/")[0] not in paths] == []
+    assert [place for place in places(lab) if place.rpartition("/")[0] not in paths] == []
+
+
+def puts(path: str) -> Callable[[Transaction], object]:
+    """Makes a skeleton in a folder, which is made for it."""
+    request = ItemCreate(name="rig", collection=path, parts={"hierarchy": skeleton_tree()})
+    return lambda tx: items.create_item(tx, "lab", Kind.SKELETON, request)
+
+
+@pytest.mark.parametrize("below", ["old/x/y/z", "old/x", "old"])
+@pytest.mark.parametrize("first", ["put", "delete"])
+def test_what_is_put_into_a_folder_while_it_is_deleted_goes_with_it_or_stands_in_a_new_one(
+    lab: Lab, other: Database, below: str, first: str
+):
+    folders = make(lab, "old", "old/x")
+
+    def delete(tx: Transaction) -> None:
+        collections.delete_collection(tx, "lab", folders["old"], expected_rev=None)
+
+    steps = [Step(lab.database, lab.owner, puts(below)), Step(other, lab.owner, delete)]
+    for outcome in interleave(*(steps if first == "put" else reversed(steps))):
+        assert not isinstance(outcome, MareyError), outcome
+    require_whole_trees(lab)
+    if first == "put":
+        assert living(lab) == []
+        assert places(lab) == []
+
+
+@pytest.mark.parametrize("below", ["old/x/y/z", "old/x", "old"])
+@pytest.mark.parametrize("first", ["put", "move"])
+def test_what_is_put_into_a_folder_while_it_moves_goes_along_or_stands_in_a_new_one(
+    lab: Lab, other: Database, below: str, first: str
+):
+    folders = make(lab, "old", "old/x")
+
+    def move(tx: Transaction) -> None:
+        collections.move_collection(tx, "lab", folders["old"], CollectionChange(path="new"), expected_rev=None)
+
+    steps = [Step(lab.database, lab.owner, puts(below)), Step(other, lab.owner, move)]
+    for outcome in interleave(*(steps if first == "put" else reversed(steps))):
+        assert not isinstance(outcome, MareyError), outcome
+    require_whole_trees(lab)
+    if first == "put":
+        assert places(lab) == [f"{below.replace('old', 'new')}/rig"]
