@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import threading
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from sqlalchemy import and_, select, tuple_, update
+from sqlalchemy import Row, and_, select, tuple_, update
+from sqlalchemy.exc import OperationalError
 
 from marey_schemas.jobs import ClaimRequest, Lease
 from marey_server.store import job_cache
@@ -17,6 +19,8 @@ from marey_server.store.settling import settle
 from marey_server.store.tables import job
 from marey_server.store.transaction import Transaction
 from marey_server.store.verdicts import ENDING_COLUMNS, carry_out, judge_expired
+
+log = logging.getLogger(__name__)
 
 PAGE = 256
 
@@ -64,7 +68,7 @@ def reap_page(
     """Take back up to `limit` jobs, longest overdue first, from `after` on.
 
     Each is moved by an update of its own that repeats fence and overdue lease, so that a heartbeat or a result which
-    comes at the same moment either wins or finds the lease gone.
+    comes at the same moment either wins or finds the lease gone. One that cannot be moved keeps no other from it.
     """
     overdue = and_(job.c.state == RUNNING, job.c.lease_expires_us <= tx.now_us)
     statement = (
@@ -77,13 +81,25 @@ def reap_page(
     if after is not None:
         statement = statement.where(tuple_(job.c.lease_expires_us, job.c.id) > after)
     rows = tx.execute(statement).all()
-    for row in rows:
-        verdict = judge_expired(row, policy)
-        condition = and_(held(row.id, row.fence), job.c.lease_expires_us <= tx.now_us)
-        end = AttemptEnd(row.id, row.fence, verdict.outcome, "The lease ran out.")
-        carry_out(tx, row, condition, verdict, end, fence=job.c.fence + 1)
+    taken = sum(_take_back(tx, row, policy) for row in rows)
     last = rows[-1] if len(rows) == limit else None
-    return ReapedPage(len(rows), None if last is None else (last.lease_expires_us, last.id))
+    return ReapedPage(taken, None if last is None else (last.lease_expires_us, last.id))
+
+
+def _take_back(tx: Transaction, row: Row[Any], policy: QueuePolicy) -> bool:
+    """Move one overdue job and all that follows from it; whether that worked."""
+    try:
+        with tx.connection.begin_nested():
+            verdict = judge_expired(row, policy)
+            condition = and_(held(row.id, row.fence), job.c.lease_expires_us <= tx.now_us)
+            end = AttemptEnd(row.id, row.fence, verdict.outcome, "The lease ran out.")
+            carry_out(tx, row, condition, verdict, end, fence=job.c.fence + 1)
+    except OperationalError:  # concerns the database, not this job: the whole page is tried again
+        raise
+    except Exception:
+        log.exception("%s cannot be taken back from a worker that is not heard of any more", row.id)
+        return False
+    return True
 
 
 def claim_after_reaping(

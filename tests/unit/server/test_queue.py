@@ -6,6 +6,9 @@ from marey_schemas.jobs import BatchCompletion, ClaimRequest, CompleteRequest, J
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import Forbidden, Invalid, LeaseLost, NotFound
 from marey_server.store import completion, queue
+from marey_server.store.job_ends import Ended
+from marey_server.store.settling import settle
+from marey_server.store.transaction import Transaction
 from queue_desk import Desk
 
 
@@ -113,6 +116,24 @@ def test_a_late_heartbeat_keeps_a_lease_that_nobody_took(desk: Desk) -> None:
     assert desk.heartbeat(lease).lease_ttl_s == pytest.approx(60, abs=5)
     assert desk.reap() == 0
     desk.complete(lease)
+
+
+def test_an_overdue_job_that_cannot_be_taken_back_keeps_no_other_from_it(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jobs = desk.submit_many(*[JobCreate(kind="errand", max_attempts=1)] * 3)
+    leases = {lease.job: lease for lease in desk.claim_many()}
+    desk.clock.advance(1000)
+
+    def settle_all_but_one(tx: Transaction, ended: list[Ended]) -> None:
+        if any(end.id == jobs[1] for end in ended):
+            raise ValueError("a fault of ours")
+        settle(tx, ended)
+
+    monkeypatch.setattr("marey_server.store.verdicts.settle", settle_all_but_one)
+    assert desk.reap() == 2
+    assert [desk.state(job) for job in jobs] == ["failed", "running", "failed"]
+    desk.complete(leases[jobs[1]])
 
 
 def test_progress_is_shown_while_the_job_runs(desk: Desk) -> None:
