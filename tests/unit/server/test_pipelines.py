@@ -102,6 +102,33 @@ def test_a_tree_may_wait_for_a_model_that_is_imported(desk: Desk) -> None:
     assert submit(desk, steps)["tree"].inputs["model"]
 
 
+def test_a_result_with_one_place_to_go_to_does_not_go_to_the_folder_of_the_pipeline(desk: Desk) -> None:
+    digest = desk.database.write(desk.user, blobs.put_blob, b"takes and a model of another program")
+    files = [{"name": "walk_quaternion_mm.json", "blob": digest}]
+    takes = {"step": "takes"}
+    trim = [{"command": "smooth"}]
+    steps = {
+        "takes": {"kind": "import", "params": {"files": files}},
+        "tree": {"kind": "tree", "inputs": {"model": takes}},
+        "there": {"kind": "edit", "inputs": {"clips": takes}, "params": {"commands": trim, "in_place": True}},
+        "aside": {"kind": "edit", "inputs": {"clips": takes}, "params": {"commands": trim, "suffix": "-smooth"}},
+    }
+    made = submit(desk, steps, into="game")
+    assert {name: job.into for name, job in made.items()} == {"takes": "game", "tree": "", "there": "", "aside": "game"}
+
+
+def test_a_step_that_asks_for_a_place_its_result_cannot_go_to_is_refused(desk: Desk) -> None:
+    digest = desk.database.write(desk.user, blobs.put_blob, b"a model of another program")
+    files = [{"name": "walk_quaternion_mm.json", "blob": digest}]
+    steps = {
+        "takes": {"kind": "import", "params": {"files": files}},
+        "tree": {"kind": "tree", "inputs": {"model": {"step": "takes"}}, "into": "trees"},
+    }
+    with pytest.raises(Invalid) as refused:
+        submit(desk, steps)
+    assert [(error.pointer, error.code) for error in refused.value.errors] == [("/steps/tree/into", "ambiguous-place")]
+
+
 def test_what_fails_in_a_pipeline_takes_only_those_along_that_need_it(desk: Desk) -> None:
     steps = chain() | {"aside": {"kind": "sum", "params": {"number": 9}}}
     made = submit(desk, steps)
