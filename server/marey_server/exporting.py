@@ -79,10 +79,13 @@ def find_unchanged_original(
     return None if original is None else OriginalFile(original.name or found.name, original.blob)
 
 
-def find_original(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> OriginalFile:
-    """The file that an item was imported from. Raises `NotFound` where it was made otherwise."""
+def find_original(
+    tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None, options: PredecessorOptions
+) -> OriginalFile:
+    """The file that an item, or a model's tree, was imported from. Raises `NotFound` where it was made otherwise."""
     if kind in (Kind.MODEL, Kind.GRAPH):
-        unchanged = find_unchanged_original(tx, project, kind, item_id, revision, PredecessorOptions())
+        asked = PredecessorOptions(part=options.part)  # in whatever layout it came
+        unchanged = find_unchanged_original(tx, project, kind, item_id, revision, asked)
         if unchanged is not None:
             return unchanged
     if kind is Kind.CLIP:

@@ -32,7 +32,8 @@ class ExportQuery(Request):
     part: Literal["model", "tree", "alignment"] | None = Field(
         None,
         description="For the predecessor: the tree of a model, or what is kept beside an aligned clip: its time "
-        "function and sections. Absent: the model, or the clip. Other items have none.",
+        "function and sections. The original of a tree is its file, too. Absent: the model, or the clip. Other items "
+        "have none.",
     )
     layout: Literal["2", "3"] | None = Field(
         None, description="Of a model of the predecessor; absent: as it was imported, else 3."
@@ -75,7 +76,7 @@ class Export(BlobSender):
         options = PredecessorOptions(query.end_index, query.form, query.part, query.layout)
         options.require_part_of(place[1])
         if query.format == "original":
-            original = await self.look_up(exporting.find_original, *place)
+            original = await self.look_up(exporting.find_original, *place, options)
             return await self.send_blob(original.digest, disposition=attachment(original.name))
         if query.format == "predecessor":
             unchanged = await self.look_up(exporting.find_unchanged_original, *place, options)

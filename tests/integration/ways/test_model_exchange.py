@@ -86,8 +86,9 @@ def test_every_layout_goes_in_and_comes_out_as_it_was(lab: ProjectHandle, tmp_pa
         for form in ("predecessor", "original"):
             written = model.export(tmp_path / form, format=form)
             assert (written.name, written.read_bytes()) == (name, files[name])
-    tree = found["walk_left"].export(tmp_path / "trees", format="predecessor", part="tree")
-    assert tree.read_bytes() == files["walk_left_quaternion_cluster_tree.json"]
+    for form in ("predecessor", "original"):
+        tree = found["walk_left"].export(tmp_path / "trees", format=form, part="tree")
+        assert tree.read_bytes() == files["walk_left_quaternion_cluster_tree.json"]
     assert len(list(lab.skeletons.list())) == 1
 
     again = upload(lab, tmp_path / "again", files)
@@ -123,6 +124,8 @@ def test_another_layout_and_a_changed_model_are_written_anew(lab: ProjectHandle,
     assert written["keyframes"] == {"contact": 12}
     with pytest.raises(RequestFailed, match="no tree"):
         model.export(tmp_path / "none", format="predecessor", part="tree")
+    with pytest.raises(RequestFailed, match="not made from a file"):
+        model.export(tmp_path / "none", format="original", part="tree")
     with pytest.raises(RequestFailed, match="model has no part 'alignment'"):
         model.export(tmp_path / "none", format="predecessor", part="alignment")
     with pytest.raises(RequestFailed, match="/provenance/predecessor") as refused:
