@@ -6,6 +6,7 @@ so that one bad file harms no other and memory holds one at a time.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import PurePosixPath
@@ -28,6 +29,7 @@ SKELETON_OUTPUT = "skeleton"
 """What a clip calls the skeleton of its own file until both are stored."""
 SAME_OFFSET_M = 1e-3
 _LONGEST_SEGMENT, _LONGEST_PATH = 255, 1024
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 Tree = dict[str, Any]
 
@@ -152,6 +154,10 @@ def _place(name: str, taken: set[tuple[str, str]]) -> PlannedFile:
     if not segments or any(len(part) > _LONGEST_SEGMENT for part in segments) or len(name) > _LONGEST_PATH:
         reason = f"a name has 1 to {_LONGEST_SEGMENT} characters, with its folders {_LONGEST_PATH}"
         return PlannedFile(name, "refused", code="name-invalid", reason=reason)
+    if any(_CONTROL.search(part) for part in segments):
+        return PlannedFile(
+            name, "refused", code="name-invalid", reason="a name has no line breaks or control characters"
+        )
     folder, stem = "/".join(segments[:-1]), PurePosixPath(segments[-1]).stem
     return PlannedFile(name, "motion", folder, segments[-1] if (folder, stem) in taken else stem)
 

@@ -123,6 +123,22 @@ def test_good_files_go_in_and_each_bad_one_is_refused_with_its_place(owner: http
     assert info["source"]["file_name"] == "take/walk.bvh"
 
 
+def test_file_names_with_control_characters_are_refused_and_harm_no_other(owner: httpx.Client):
+    def part(file_name: str) -> bytes:
+        head = f'--B\r\nContent-Disposition: form-data; name="files"; filename="{file_name}"\r\n\r\n'
+        return head.encode() + bvh() + b"\r\n"
+
+    names = [name.format(sign) for name in ("a{}b.bvh", "dir{}/a.bvh") for sign in ("%0D%0A", "\x07", "\x7f", "\0")]
+    answer = owner.post(
+        "/projects/lab/imports",
+        content=b"".join(map(part, [*names, "walk.bvh"])) + b"--B--\r\n",
+        headers={"Content-Type": "multipart/form-data; boundary=B"},
+    )
+    *refused, taken = answer.json()["entries"]
+    assert [entry["error"]["code"] for entry in refused] == ["name-invalid"] * len(names)
+    assert (taken["name"], taken["status"]) == ("walk.bvh", "created")
+
+
 def test_the_same_file_again_changes_nothing_and_a_new_take_makes_a_revision(owner: httpx.Client):
     first = send(owner, {"walk.bvh": bvh()}).json()["entries"][0]
     again = send(owner, {"walk.bvh": bvh()}).json()["entries"][0]
