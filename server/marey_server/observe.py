@@ -69,6 +69,12 @@ def configure_logging(form: Literal["json", "text"], level: str) -> None:
     root.handlers[:] = [handler]
     root.setLevel(level.upper())
     logging.getLogger("tornado.access").setLevel("ERROR")  # requests are logged by log_request
+    logging.getLogger("alembic.runtime.migration").addFilter(_tells_of_an_upgrade)
+
+
+def _tells_of_an_upgrade(record: logging.LogRecord) -> bool:
+    """Not of the look at the tables that each question for readiness begins with."""
+    return record.levelno > logging.INFO or record.getMessage().startswith("Running")
 
 
 class Metrics:

@@ -98,6 +98,16 @@ def test_requests_are_logged_as_json_with_who_what_and_how_long(process: Process
     assert not any("secret-name" in json.dumps(line) or process.token in json.dumps(line) for line in process.lines)
 
 
+def test_a_question_for_readiness_is_logged_in_one_line(process: Process):
+    before = len(process.lines)
+    for _ in range(3):
+        assert httpx.get(f"{process.address}/readyz").status_code == 200
+    process.end()
+    told = [line for line in process.lines[before:] if line["logger"] != "marey_server.app"]
+    assert [line.get("route") for line in told] == ["/readyz"] * 3
+    assert any(line["message"].startswith("Running upgrade") for line in process.lines)
+
+
 def test_a_stopping_server_finishes_what_it_began_and_takes_nothing_new(process: Process):
     host, port = process.address.removeprefix("http://").split(":")
     body = json.dumps({"name": "slow"}).encode()
