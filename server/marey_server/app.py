@@ -36,10 +36,11 @@ from marey_server.memory import keep_freed_memory
 from marey_server.observe import access_log, configure_logging
 from marey_server.openapi import build_document
 from marey_server.services import Description, Services
-from marey_server.settings import Settings
+from marey_server.settings import Settings, misspelt_variables
 from marey_server.store import tokens, users
 from marey_server.store.blob_backings import DirectoryBlobs
 from marey_server.store.database import Database
+from marey_server.store.opening import opening
 from marey_server.store.schema import upgrade_schema
 from marey_server.store.transaction import Transaction
 from marey_server.store.wakeups import wakeups
@@ -111,7 +112,10 @@ class Running:
 async def listening(app: Application) -> AsyncIterator[Running]:
     """Take requests until the block ends; then drain: refuse new ones, finish those under way, close."""
     settings = app.services.settings
-    sockets = bind_sockets(settings.port, settings.host)
+    try:
+        sockets = bind_sockets(settings.port, settings.host)
+    except OSError as error:
+        raise OSError(error.errno, f"cannot listen on {settings.host}:{settings.port}: {error.strerror}") from error
     server = HTTPServer(
         app,
         xheaders=settings.trust_proxy,
@@ -147,11 +151,15 @@ async def _drain(services: Services, server: HTTPServer) -> None:
 
 
 def open_database(settings: Settings) -> Database:
-    """The database of a server: its folder made, its schema current, its first administrator there."""
+    """The database of a server: its folder made, its schema current, its first administrator there.
+
+    Raises `DatabaseUnusable` where it cannot be opened.
+    """
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
-    upgrade_schema(settings.resolved_database_url)
-    database = connect_database(settings)
-    database.write(SYSTEM, make_first_administrator, settings.data / TOKEN_FILE)
+    with opening(settings.resolved_database_url):
+        upgrade_schema(settings.resolved_database_url)
+        database = connect_database(settings)
+        database.write(SYSTEM, make_first_administrator, settings.data / TOKEN_FILE)
     return database
 
 
@@ -164,6 +172,8 @@ def connect_database(settings: Settings) -> Database:
 async def serve(settings: Settings) -> None:
     """Run a server until SIGTERM or SIGINT."""
     configure_logging(settings.log_form, settings.log_level)
+    for variable, meant in misspelt_variables(os.environ).items():
+        log.warning("%s is no setting and changes nothing; is %s meant?", variable, meant)
     keep_freed_memory()
     compute_on_one_thread_each()
     stop = asyncio.Event()

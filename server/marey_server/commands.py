@@ -9,7 +9,8 @@ import asyncio
 import os
 import sqlite3
 import sys
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,11 +28,15 @@ def serve(**settings: Any) -> None:
     """Run a server, and the workers it is told to start, until SIGTERM or SIGINT."""
     from marey_server.app import serve as serve_until_stopped
     from marey_server.computing import leave
+    from marey_server.store.opening import DatabaseUnusable
 
     chosen = read_settings(**settings)
     comfort = {"local_workers": 1, "log_form": "text" if sys.stderr.isatty() else "json"}
     unset = {name: value for name, value in comfort.items() if name not in chosen.model_fields_set}
-    asyncio.run(serve_until_stopped(read_settings(**settings, **unset)))
+    try:
+        asyncio.run(serve_until_stopped(read_settings(**settings, **unset)))
+    except DatabaseUnusable as error:
+        raise CommandFailed(str(error)) from error
     leave()
 
 
@@ -50,7 +55,8 @@ def upgrade(**settings: Any) -> None:
 
     chosen = read_settings(**settings)
     chosen.data.mkdir(parents=True, exist_ok=True, mode=0o700)
-    upgrade_schema(chosen.resolved_database_url)
+    with _database_of(chosen) as url:
+        upgrade_schema(url)
     _say("the database's schema is up to date")
 
 
@@ -93,11 +99,8 @@ def fsck(*, as_json: bool = False, **settings: Any) -> None:
     if chosen.database_url is None:
         _sqlite_file(chosen, must_exist=True)
     checked: dict[str, int] = {}
-    database = connect_database(chosen)
-    try:
+    with _database_of(chosen), closing(connect_database(chosen)) as database:
         findings = list(check_store(database, progress=checked.__setitem__))
-    finally:
-        database.close()
     if as_json:
         import json
 
@@ -122,14 +125,25 @@ def admin_token(*, user: str | None = None, **settings: Any) -> None:
         _sqlite_file(chosen, must_exist=True)
     chosen.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     file = chosen.data / TOKEN_FILE
-    database = connect_database(chosen)
-    try:
-        database.write(SYSTEM, partial(give_token, name="made where the server is"), user, file)
-    except NotFound:
-        raise CommandFailed(f"no administrator who is not disabled is called {user!r}; say who with --user") from None
-    finally:
-        database.close()
+    with _database_of(chosen), closing(connect_database(chosen)) as database:
+        try:
+            database.write(SYSTEM, partial(give_token, name="made where the server is"), user, file)
+        except NotFound:
+            reason = f"no administrator who is not disabled is called {user!r}; say who with --user"
+            raise CommandFailed(reason) from None
     _say(f"{file} holds a new token; earlier ones still work, see `marey token ls` and `marey token revoke`")
+
+
+@contextmanager
+def _database_of(settings: Settings) -> Iterator[str]:
+    """The url of the database; what goes wrong with it inside the block is told in a sentence."""
+    from marey_server.store.opening import DatabaseUnusable, opening
+
+    try:
+        with opening(settings.resolved_database_url):
+            yield settings.resolved_database_url
+    except DatabaseUnusable as error:
+        raise CommandFailed(str(error)) from error
 
 
 def _sqlite_file(settings: Settings, *, must_exist: bool) -> Path:

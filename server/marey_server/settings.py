@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -11,10 +13,14 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 MIB = 1024 * 1024
 
 
+PREFIX = "MAREY_"
+"""Of the variables: MAREY_PORT is `port`. The client, the worker and the tests have variables of their own."""
+
+
 class Settings(BaseSettings):
     """Every setting, documented. The variable of `data` is MAREY_DATA, and so on."""
 
-    model_config = SettingsConfigDict(env_prefix="MAREY_", toml_file="marey.toml", extra="forbid", frozen=True)
+    model_config = SettingsConfigDict(env_prefix=PREFIX, toml_file="marey.toml", extra="forbid", frozen=True)
 
     data: Path = Field(
         Path("marey-data"), description="Folder of the database file, the administrator's token, and blobs."
@@ -81,3 +87,12 @@ class Settings(BaseSettings):
     def resolved_database_url(self) -> str:
         """The database that is used."""
         return self.database_url or f"sqlite:///{(self.data / 'marey.db').absolute()}"
+
+
+def misspelt_variables(environment: Mapping[str, str]) -> dict[str, str]:
+    """Variables that are no settings and look like one, with the one that was perhaps meant."""
+    known = [f"{PREFIX}{name.upper()}" for name in Settings.model_fields]
+    unknown = [name for name in environment if name.startswith(PREFIX) and name.upper() not in known]
+    own = [name for name in unknown if not name.startswith(f"{PREFIX}TEST_")]
+    alike = {name: difflib.get_close_matches(name.upper(), known, 1, 0.82) for name in own}
+    return {name: found[0] for name, found in alike.items() if found}

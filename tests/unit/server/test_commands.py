@@ -1,5 +1,6 @@
 """The care of a database from the shell: backup, restore, check."""
 
+import socket
 import sqlite3
 from contextlib import closing
 
@@ -74,3 +75,46 @@ def test_a_new_administrators_token_is_written_for_who_lost_theirs(data, capsys)
 def test_a_token_that_cannot_be_made_is_refused_in_a_sentence(data, tmp_path, user, folder, why):
     with pytest.raises(commands.CommandFailed, match=why):
         commands.admin_token(user=user, data=tmp_path / folder)
+
+
+@pytest.mark.parametrize(
+    ("url", "told"),
+    [
+        ("nonsense", "names no database"),
+        ("mysql://u:sekret@h/x", "names no database"),
+        ("postgresql://u:sekret@127.0.0.1:1/x", r"postgresql://u:\*\*\*@127.0.0.1:1/x does not answer: .*refused"),
+    ],
+)
+@pytest.mark.parametrize("command", [commands.serve, commands.upgrade, commands.fsck])
+def test_a_database_that_cannot_be_opened_is_told_in_a_sentence_without_its_password(tmp_path, command, url, told):
+    with pytest.raises(commands.CommandFailed, match=told) as failed:
+        command(data=tmp_path, port=0, database_url=url)
+    assert "sekret" not in str(failed.value)
+    assert len(str(failed.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", [commands.serve, commands.upgrade])
+def test_a_file_that_is_no_database_is_told_and_left_as_it_is(tmp_path, command):
+    (tmp_path / "marey.db").write_bytes(b"not a database " * 1000)
+    with pytest.raises(commands.CommandFailed, match="file is not a database"):
+        command(data=tmp_path, port=0)
+    assert (tmp_path / "marey.db").read_bytes() == b"not a database " * 1000
+
+
+@pytest.mark.parametrize("command", [commands.serve, commands.upgrade])
+def test_tables_of_a_newer_version_are_told_and_left_as_they_are(data, command):
+    with closing(sqlite3.connect(data / "marey.db")) as database, database:
+        database.execute("UPDATE alembic_version SET version_num = '9999'")
+    with pytest.raises(commands.CommandFailed, match="of another version of Marey"):
+        command(data=data, port=0)
+    with closing(sqlite3.connect(data / "marey.db")) as database:
+        assert database.execute("SELECT version_num FROM alembic_version").fetchall() == [("9999",)]
+
+
+def test_a_port_that_is_in_use_is_named(data):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(OSError, match=f"cannot listen on 127.0.0.1:{port}: Address already in use"):
+            commands.serve(data=data, port=port)

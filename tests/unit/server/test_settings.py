@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from marey_server.settings import Settings
+from marey_server.settings import Settings, misspelt_variables
 
 
 def test_flags_win_over_variables_and_variables_over_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -27,3 +27,13 @@ def test_a_misspelt_setting_in_the_file_is_refused(tmp_path: Path, monkeypatch: 
 def test_every_setting_is_documented():
     undocumented = {name for name, field in Settings.model_fields.items() if not field.description}
     assert undocumented <= {"log_level"}
+
+
+def test_a_misspelt_variable_is_told_with_the_one_that_was_meant():
+    given = {"MAREY_LEASE_TLL_S": "3", "MAREY_PROT": "1", "MAREY_DATA_DIR": "x", "MAREY_PORT": "1", "marey_host": "x"}
+    others = {"MAREY_URL": "x", "MAREY_TOKEN": "x", "MAREY_FAULT": "x", "MAREY_TEST_DATABASE_URL": "x", "PORT": "1"}
+    assert misspelt_variables(given | others) == {
+        "MAREY_LEASE_TLL_S": "MAREY_LEASE_TTL_S",
+        "MAREY_PROT": "MAREY_PORT",
+        "MAREY_DATA_DIR": "MAREY_DATA",
+    }

@@ -1,0 +1,45 @@
+"""Why a database cannot be opened, in a sentence for the person who starts the server."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from alembic.util import CommandError
+from sqlalchemy import exc, make_url
+
+from marey_server.errors import Unavailable
+
+
+class DatabaseUnusable(Exception):
+    """The database cannot be opened; the text says why and what to do, and holds no password."""
+
+
+@contextmanager
+def opening(url: str) -> Iterator[None]:
+    """Raise `DatabaseUnusable` for what goes wrong inside the block with the database at `url`."""
+    try:
+        yield
+    except (exc.ArgumentError, exc.NoSuchModuleError, ImportError):  # of a url no driver is known for
+        raise DatabaseUnusable(
+            "the database_url names no database that Marey knows; write sqlite:////folder/file.db, "
+            "or postgresql://user@host/name with the extra `postgres` installed"
+        ) from None
+    except Unavailable as error:
+        raise DatabaseUnusable(f"the database {_shown(url)} does not answer: {_reason(error.__cause__)}") from error
+    except exc.DBAPIError as error:
+        raise DatabaseUnusable(f"the database {_shown(url)} cannot be used: {_reason(error)}") from error
+    except CommandError as error:
+        raise DatabaseUnusable(
+            f"the tables of the database {_shown(url)} are of another version of Marey, a newer one perhaps: {error}"
+        ) from error
+
+
+def _shown(url: str) -> str:
+    return make_url(url).render_as_string(hide_password=True)
+
+
+def _reason(error: BaseException | None) -> str:
+    """The first line of what the driver says."""
+    said = str(getattr(error, "orig", None) or error).strip()
+    return said.splitlines()[0] if said else "no reason is given"
