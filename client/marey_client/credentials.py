@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 import httpx
 
-from marey_client.errors import BadAddress, BadCredentialFile
+from marey_client.errors import BadAddress, BadCredentialFile, BadToken
 
 DEFAULT_URL = "http://127.0.0.1:8460"
 DEFAULT_DATA = "marey-data"
@@ -39,14 +39,15 @@ def resolve(
     environment = os.environ if environment is None else environment
     stored = read_logins(logins_path(environment))
     chosen = (url or environment.get("MAREY_URL") or stored.default or DEFAULT_URL).rstrip("/")
-    _require_address(chosen)
+    require_address(chosen)
     if token_file is not None:
         return Credential(chosen, read_secret(token_file))
     token = environment.get("MAREY_TOKEN") or stored.tokens.get(chosen) or _local_token(chosen, environment)
     return Credential(chosen, token)
 
 
-def _require_address(url: str) -> None:
+def require_address(url: str) -> None:
+    """Raises `BadAddress` where `url` is no address of a server."""
     try:
         parts, _ = urlsplit(url), httpx.URL(url)
         fits = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
@@ -54,6 +55,14 @@ def _require_address(url: str) -> None:
         fits = False
     if not fits:
         raise BadAddress(f"{url!r} is no address of a server; write it as in {DEFAULT_URL}")
+
+
+def as_token(text: str) -> str:
+    """`text` without the ends of lines that files and variables bring along. Raises `BadToken`, without telling it."""
+    token = text.strip()
+    if not token or not token.isascii() or not token.isprintable() or " " in token:
+        raise BadToken("what was given as a token is none: a token is one word of letters, digits and _")
+    return token
 
 
 def read_secret(path: Path) -> str:

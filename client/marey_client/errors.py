@@ -33,6 +33,10 @@ class BadCredentialFile(MareyError):
     """A file that should hold a token does not, or others may read it."""
 
 
+class BadToken(MareyError):
+    """What was given as a token is none."""
+
+
 class BadAddress(MareyError):
     """The address of a server is none."""
 

@@ -15,6 +15,7 @@ from urllib.parse import quote
 import httpx
 from pydantic import BaseModel, ValidationError
 
+from marey_client.credentials import as_token, require_address
 from marey_client.errors import RequestFailed, UnexpectedAnswer, Unreachable, error_of
 from marey_client.retries import BUSY_STATUSES, NEVER_ARRIVED, Retries, retry_after_s
 from marey_schemas.codecs import CodecError, decode_tree, encode_tree
@@ -41,7 +42,7 @@ class BearerToken(httpx.Auth):
     """Adds the token to requests; shows it nowhere else."""
 
     def __init__(self, token: str) -> None:
-        self._token = token
+        self._token = as_token(token)
 
     def auth_flow(self, request: httpx.Request) -> Iterator[httpx.Request]:  # type: ignore[override]
         """Set the header."""
@@ -64,6 +65,7 @@ class Transport:
         timeout_s: float = 60.0,
         http: httpx.BaseTransport | None = None,
     ) -> None:
+        require_address(url)
         self.url = url.rstrip("/")
         self.retries = retries or Retries()
         self._reached = threading.Event()

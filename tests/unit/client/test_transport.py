@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from marey_client import errors
+from marey_client.marey import Marey
 from marey_client.retries import Retries
 from marey_schemas.access import Login, NewToken, ProjectCreate, TokenCreate
 from marey_schemas.codecs import encode_tree
@@ -191,6 +192,27 @@ def test_the_token_is_sent_and_shown_nowhere(script, caplog):
     shown = [repr(marey), repr(project), repr(vars(marey.transport)), repr(script.requests[0].headers), caplog.text]
     assert not any("marey_secret" in text for text in shown)
     assert "secret" not in str(script.requests[0].url)
+
+
+@pytest.mark.parametrize("token", ["marey_secret\n", " marey_secret\r\n"])
+def test_a_token_is_sent_without_the_end_of_its_line(script, token):
+    script.answers = [ok({"items": [], "next_cursor": None})]
+    list(Marey("http://server.test", token, http=httpx.MockTransport(script)).projects())
+    assert script.requests[0].headers["Authorization"] == "Bearer marey_secret"
+
+
+@pytest.mark.parametrize("token", ["marey_secret and more", "marey_secret\nmore", "m\u00e4rey_secret", "\x1b", "  "])
+def test_what_is_no_token_is_refused_before_it_is_sent_and_shown_nowhere(script, token):
+    with pytest.raises(errors.BadToken) as refused:
+        Marey("http://server.test", token, http=httpx.MockTransport(script))
+    assert "secret" not in str(refused.value)
+    assert script.requests == []
+
+
+@pytest.mark.parametrize("url", ["127.0.0.1:8460", "marey.example.org", "ftp://marey.example.org", "http://"])
+def test_what_is_no_address_is_refused_before_anything_is_sent(url):
+    with pytest.raises(errors.BadAddress, match="no address of a server"):
+        Marey(url, "marey_secret")
 
 
 def test_a_password_is_sent_though_it_hides_itself(script):
