@@ -53,6 +53,10 @@ class NothingToUpload(MareyError):
     """There are no motion files where some were expected."""
 
 
+class BadFileName(MareyError):
+    """A file has a name that cannot be sent."""
+
+
 class SameName(MareyError):
     """Two files would get the same name."""
 

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from pydantic import TypeAdapter, ValidationError
+
 from marey_client.blobs import Blobs, digest_of_file
-from marey_client.errors import NothingToUpload, SameName
+from marey_client.errors import BadFileName, NothingToUpload, SameName
 from marey_client.jobs import Jobs
 from marey_client.transport import Transport, as_json, read_model
-from marey_schemas.imports import ImportAnswer, ImportEntry, ImportFile, ImportOptions, ImportRequest, skeleton_output
+from marey_schemas.imports import (
+    FileName,
+    ImportAnswer,
+    ImportEntry,
+    ImportFile,
+    ImportOptions,
+    ImportRequest,
+    Refusal,
+    skeleton_output,
+)
 from marey_schemas.jobs import Job, JobOutput
 
 MOTION_SUFFIXES = (".amc", ".asf", ".bson", ".bson.bz2", ".bvh", ".c3d", ".json", ".npz")
@@ -21,6 +33,8 @@ NEEDS_COMPANION_SUFFIX = ".amc"
 FILES_PER_IMPORT = 50
 BYTES_PER_IMPORT = 64 << 20
 UPLOADS_AT_ONCE = 8
+
+_FILE_NAME: TypeAdapter[str] = TypeAdapter(FileName)
 
 Notice = Callable[[str, int, int], None]
 """Told what is going on: `hashing`, `sending` or `importing`, how many files are done, and of how many."""
@@ -43,12 +57,13 @@ class FoundFiles:
     left_out: tuple[Path, ...]
 
 
-def find_files(places: Iterable[Path]) -> FoundFiles:
+def find_files(places: Iterable[str | Path]) -> FoundFiles:
     """Motion files in folders and below, hidden ones left out; files named themselves are taken whatever they are.
 
     Raises `NothingToUpload` where a place does not exist or none holds a motion file, `SameName` where files of two
-    places would get one name.
+    places would get one name, `OSError` where a folder cannot be read.
     """
+    places = [Path(place) for place in places]
     files: dict[str, LocalFile] = {}
     left_out: list[Path] = []
     for place in places:
@@ -57,10 +72,8 @@ def find_files(places: Iterable[Path]) -> FoundFiles:
             continue
         if not place.is_dir():
             raise NothingToUpload(f"{place} does not exist")
-        for path in sorted(place.rglob("*")):
+        for path in _files_below(place):
             below = path.relative_to(place)
-            if not path.is_file() or any(part.startswith(".") for part in below.parts):
-                continue
             if path.name.lower().endswith(MOTION_SUFFIXES):
                 _add(files, below.as_posix(), path)
             else:
@@ -68,6 +81,19 @@ def find_files(places: Iterable[Path]) -> FoundFiles:
     if not files:
         raise NothingToUpload(f"no motion files ({', '.join(MOTION_SUFFIXES)}) in {_listed(places)}")
     return FoundFiles(tuple(files.values()), tuple(left_out))
+
+
+def _files_below(folder: Path) -> list[Path]:
+    """Files in a folder and below, in order; hidden ones and what lies in hidden folders left out."""
+    found: list[Path] = []
+    for parent, folders, names in os.walk(folder, onerror=_raise):
+        folders[:] = (name for name in folders if not name.startswith("."))
+        found += (Path(parent, name) for name in names if not name.startswith("."))
+    return sorted(path for path in found if path.is_file())
+
+
+def _raise(error: OSError) -> None:
+    raise error
 
 
 def _add(files: dict[str, LocalFile], name: str, path: Path) -> None:
@@ -128,9 +154,10 @@ class Imports:
     ) -> list[ImportEntry]:
         """Import files; one entry per file, in order. A file that is refused keeps no other from going in."""
         tell = notice or _say_nothing
-        sent = {file.name: file for file in self.send(files, notice=tell)}
-        entries: dict[str, ImportEntry] = {}
-        for portion in batches(files):
+        named = [file for file in files if _may_travel(file.name)]
+        entries = {file.name: _refused_name(file.name) for file in files if not _may_travel(file.name)}
+        sent = {file.name: file for file in self.send(named, notice=tell)}
+        for portion in batches(named):
             for entry in self.run(tuple(sent[file.name] for file in portion), options):
                 entries.setdefault(entry.name, entry)
             tell("importing", len(entries), len(files))
@@ -150,7 +177,13 @@ class Imports:
         return tuple(_with_item(entry, outputs) for entry in ImportAnswer.model_validate(job.result).entries)
 
     def send(self, files: Sequence[LocalFile], *, notice: Notice | None = None) -> tuple[ImportFile, ...]:
-        """Send what the server lacks of the files' bytes; the files as an import names them, in order."""
+        """Send what the server lacks of the files' bytes; the files as an import names them, in order.
+
+        Raises `BadFileName` where one has a name that cannot be sent.
+        """
+        for file in files:
+            if not _may_travel(file.name):
+                raise BadFileName(refusal_text(_refused_name(file.name)))
         tell = notice or _say_nothing
         digests: dict[str, str] = {}
         with ThreadPoolExecutor(UPLOADS_AT_ONCE, thread_name_prefix="marey-upload") as pool:
@@ -164,6 +197,22 @@ class Imports:
                 upload.result()
                 tell("sending", done, len(by_digest))
         return tuple(ImportFile(name=file.name, blob=digests[file.name]) for file in files)
+
+
+def _may_travel(name: str) -> bool:
+    """Whether a file's name is one that a request can hold; file systems allow more."""
+    try:
+        _FILE_NAME.validate_python(name)
+    except ValidationError:
+        return False
+    return True
+
+
+def _refused_name(name: str) -> ImportEntry:
+    """The entry of a file that is not sent because of its name."""
+    shown = "".join(one if one.isprintable() else ascii(one)[1:-1] for one in name)
+    detail = "its name is too long, no UTF-8, or holds line breaks or other control characters; rename it"
+    return ImportEntry(name=shown, status="failed", error=Refusal(code="file-name", detail=detail))
 
 
 def _with_item(entry: ImportEntry, outputs: Mapping[str, JobOutput]) -> ImportEntry:

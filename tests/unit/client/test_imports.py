@@ -1,12 +1,13 @@
 """Folders of files on their way to the server."""
 
 import json
+import os
 
 import httpx
 import pytest
 
 from marey_client import errors
-from marey_client.imports import FILES_PER_IMPORT, LocalFile, batches, find_files
+from marey_client.imports import FILES_PER_IMPORT, LocalFile, batches, find_files, refusal_text
 from marey_schemas.imports import ImportOptions
 
 
@@ -115,6 +116,56 @@ def test_only_bytes_the_server_lacks_are_sent_and_each_file_gets_its_entry(scrip
     assert imported[0]["unit"] == "cm"
     assert "up_axis" not in imported[0]
     assert told[-1] == ("importing", 4, 4)
+
+
+@pytest.mark.parametrize(("name", "shown"), [(b"caf\xe9.bvh", r"caf\udce9.bvh"), (b"new\nline.bvh", r"new\nline.bvh")])
+def test_a_file_whose_name_cannot_be_sent_is_refused_and_keeps_no_other_out(script, tmp_path, name, shown):
+    (tmp_path / "walk.bvh").write_text("x")
+    try:
+        (tmp_path / os.fsdecode(name)).write_text("y")
+    except OSError:
+        pytest.skip("this file system refuses the name itself")
+
+    def answer(request):
+        body = json.loads(request.content)
+        if request.url.path.endswith("/blobs/missing"):
+            return httpx.Response(200, json={"missing": []})
+        return httpx.Response(
+            200, json={"entries": [{"name": file["name"], "status": "created"} for file in body["files"]]}
+        )
+
+    script.answers = [answer] * 2
+    lab = script.marey().project("lab")
+    files = find_files([tmp_path]).files
+    entries = {entry.name: entry for entry in lab.imports.upload(files)}
+    assert {name: entry.status for name, entry in entries.items()} == {shown: "failed", "walk.bvh": "created"}
+    assert "rename it (file-name)" in refusal_text(entries[shown])
+    assert script.answers == []
+    with pytest.raises(errors.BadFileName, match="rename it"):
+        lab.imports.send(files)
+
+
+def test_a_folder_that_cannot_be_read_is_never_passed_over_in_silence(tmp_path, monkeypatch):
+    (tmp_path / "walk.bvh").write_text("x")
+    (tmp_path / "locked").mkdir()
+    scan = os.scandir
+
+    def scan_all_but_one(folder):
+        if os.fspath(folder).endswith("locked"):
+            raise PermissionError(13, "Permission denied", folder)
+        return scan(folder)
+
+    monkeypatch.setattr(os, "scandir", scan_all_but_one)
+    with pytest.raises(PermissionError, match="locked"):
+        find_files([tmp_path])
+
+
+def test_places_may_be_texts_and_are_named_where_they_hold_no_motion(tmp_path):
+    (tmp_path / "walk.bvh").write_text("x")
+    assert [file.name for file in find_files([str(tmp_path)]).files] == ["walk.bvh"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(errors.NothingToUpload, match="in .*empty"):
+        find_files(iter([str(tmp_path / "empty")]))
 
 
 def test_an_asf_never_travels_without_the_amc_files_that_need_it():
