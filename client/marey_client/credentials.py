@@ -30,6 +30,8 @@ class Credential:
 
     url: str
     token: str | None = field(repr=False)
+    origin: str = ""
+    """Where the token was found, for people."""
 
 
 def resolve(
@@ -41,9 +43,13 @@ def resolve(
     chosen = (url or environment.get("MAREY_URL") or stored.default or DEFAULT_URL).rstrip("/")
     require_address(chosen)
     if token_file is not None:
-        return Credential(chosen, read_secret(token_file))
-    token = environment.get("MAREY_TOKEN") or stored.tokens.get(chosen) or _local_token(chosen, environment)
-    return Credential(chosen, token)
+        return Credential(chosen, read_secret(token_file), str(token_file))
+    if token := environment.get("MAREY_TOKEN"):
+        return Credential(chosen, token, "the variable MAREY_TOKEN")
+    if token := stored.tokens.get(chosen):
+        return Credential(chosen, token, f"marey login, which keeps it in {logins_path(environment)}")
+    file = _local_token_file(chosen, environment)
+    return Credential(chosen, None) if file is None else Credential(chosen, read_secret(file), str(file))
 
 
 def require_address(url: str) -> None:
@@ -132,9 +138,9 @@ def _write_logins(path: Path, logins: Logins) -> None:
     Path(file.name).replace(path)
 
 
-def _local_token(url: str, environment: Mapping[str, str]) -> str | None:
+def _local_token_file(url: str, environment: Mapping[str, str]) -> Path | None:
     """The administrator's token of a server on this machine, where its data folder is known and readable."""
     if urlsplit(url).hostname not in LOOPBACK:
         return None
     path = Path(environment.get("MAREY_DATA") or DEFAULT_DATA) / ADMIN_TOKEN
-    return read_secret(path) if path.is_file() and os.access(path, os.R_OK) else None
+    return path if path.is_file() and os.access(path, os.R_OK) else None

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
+import shutil
+import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,6 +14,7 @@ from typing import Any
 import typer
 
 from marey_client.cli.output import print_rows, tell
+from marey_client.credentials import ADMIN_TOKEN
 from marey_client.demo_evaluation import DemoEvaluation
 from marey_client.imports import refusal_text
 from marey_schemas.imports import ImportEntry
@@ -100,7 +104,14 @@ def print_report(report: Report) -> None:
         tell(f"contact sheet     {report.sheet.absolute()}")
     if report.evaluation.report:
         tell(f"evaluation        {report.evaluation.report.absolute()}")
-    tell(f"look around       marey serve --data {report.data}   and then   marey ls demo")
+    marey, data = _command(), shlex.quote(str(report.data))
+    token = shlex.quote(str(report.data / ADMIN_TOKEN))
+    tell(f"look around       {marey} serve --data {data}   and then   {marey} ls demo --token-file {token}")
+
+
+def _command() -> str:
+    """How the `marey` command is called here: it need not be on the path."""
+    return "marey" if shutil.which("marey") else shlex.quote(sys.argv[0])
 
 
 def _rows(report: Report) -> Iterator[tuple[str, str, str]]:

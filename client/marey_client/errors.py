@@ -75,6 +75,9 @@ class JobUnsuccessful(MareyError):
         super().__init__(message)
         self.job = job
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (*self.args, self.job)
+
 
 class WaitedTooLong(MareyError):
     """A job had not ended when the time to wait was over; it goes on."""
@@ -93,6 +96,14 @@ class RequestFailed(MareyError):
         self.problem = problem
         self.retry_after_s = retry_after_s
         self.anonymous = anonymous
+
+    def __str__(self) -> str:
+        told = (f"{field.pointer}: {field.detail}" for field in self.errors)
+        return "; ".join([self.detail, *(one for one in told if one not in self.detail)])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # The other members come back as the instance's dictionary; so do notes.
+        return type(self), (self.problem,), self.__dict__
 
     @property
     def code(self) -> str:

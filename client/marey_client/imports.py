@@ -63,10 +63,10 @@ def find_files(places: Iterable[str | Path]) -> FoundFiles:
     Raises `NothingToUpload` where a place does not exist or none holds a motion file, `SameName` where files of two
     places would get one name, `OSError` where a folder cannot be read.
     """
-    places = [Path(place) for place in places]
+    searched = [Path(place) for place in places]
     files: dict[str, LocalFile] = {}
     left_out: list[Path] = []
-    for place in places:
+    for place in searched:
         if place.is_file():
             _add(files, place.name, place)
             continue
@@ -79,7 +79,7 @@ def find_files(places: Iterable[str | Path]) -> FoundFiles:
             else:
                 left_out.append(path)
     if not files:
-        raise NothingToUpload(f"no motion files ({', '.join(MOTION_SUFFIXES)}) in {_listed(places)}")
+        raise NothingToUpload(f"no motion files ({', '.join(MOTION_SUFFIXES)}) in {_listed(searched)}")
     return FoundFiles(tuple(files.values()), tuple(left_out))
 
 

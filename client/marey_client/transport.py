@@ -7,7 +7,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import copy
 from typing import Any, TypeVar
 from urllib.parse import quote
@@ -255,12 +255,14 @@ def raise_for_problem(response: httpx.Response) -> None:
         "retry_after_s": retry_after_s(response), "anonymous": "Authorization" not in response.request.headers,
     }  # fmt: skip
     if response.headers.get("Content-Type", "").startswith(PROBLEM) and response.content:
-        raise error_of(Problem.model_validate_json(response.content), **circumstances)
+        with suppress(ValidationError):  # others than Marey answer with problems, too
+            raise error_of(Problem.model_validate_json(response.content), **circumstances)
     problem = Problem(
         type="about:blank",
         title=response.reason_phrase,
         status=response.status_code,
-        detail=f"the server answered {response.status_code} {response.reason_phrase}".rstrip(),
+        detail=f"{response.request.url.copy_with(raw_path=b'/')} answered {response.status_code} "
+        f"{response.reason_phrase}, and not as a Marey server does; is it the right address?",
         instance=response.headers.get("X-Request-Id", "unknown"),
         code=f"http-{response.status_code}",
     )

@@ -19,7 +19,9 @@ def demo(folder, *arguments):
 
 
 def test_the_demonstration_tells_how_good_the_motion_is_and_does_nothing_twice(tmp_path):
-    told = demo(tmp_path).stdout
+    done = demo(tmp_path)
+    told = done.stdout
+    assert f"ls demo --token-file {tmp_path}/data/admin.token" in done.stderr
     sentence = told.splitlines()[0]
     assert "trajectories" in sentence
     assert "retargeted clips: those whose root gets 0.5 m away within 1 s" in told

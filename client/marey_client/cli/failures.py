@@ -10,6 +10,11 @@ FAILED, WRONG_USAGE = 1, 2
 MOST_SHOWN = 80
 """Characters of a text that cannot be used."""
 
+ANONYMOUS_HINT = (
+    "no token was found here: marey login, or --token-file; a server on this machine keeps one in admin.token "
+    "in its data folder, which MAREY_DATA names"
+)
+
 
 class Refused(Exception):
     """Something was refused that has been told already; only the exit status is left to say it."""
@@ -54,12 +59,10 @@ def sentence(error: BaseException) -> str:
     text = " ".join(str(error).split()) or type(error).__name__
     if not isinstance(error, RequestFailed):
         return text
-    told = (f"{field.pointer}: {field.detail}" for field in error.errors)
-    fields = "".join(f"; {one}" for one in told if one not in text)
-    whole = f"{text}{fields} ({error.code}, request {error.request_id})"
+    whole = f"{text} ({error.code}, request {error.request_id})"
     if error.anonymous and (isinstance(error, NotFound) or error.code == "unauthenticated"):
-        return f"{whole}; no token was found here: marey login, or --token-file"
-    return whole
+        return f"{whole}; {ANONYMOUS_HINT}"
+    return "; ".join([whole, *getattr(error, "__notes__", ())])
 
 
 def _exit(status: int, text: str, verbose: bool) -> None:

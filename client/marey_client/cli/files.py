@@ -69,8 +69,15 @@ def upload(
     found = find_files(places)
     if found.left_out:
         tell(f"left out {len(found.left_out)} files that are no motion, such as {found.left_out[0].name}")
-    with connect(context) as marey, progress() as advance:
-        entries = marey.project(project).imports.upload(found.files, options, notice=advance)
+    with connect(context) as marey:
+        to = marey.project(project)
+        to.read()  # a project that is not there is told before its bytes are sent
+        try:
+            with progress() as advance:
+                entries = to.imports.upload(found.files, options, notice=advance)
+        except KeyboardInterrupt:
+            tell("interrupted; what was imported stays, and the same command again sends only what is missing")
+            raise
     if as_json:
         print_json(entries)
     else:

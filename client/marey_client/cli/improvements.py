@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,11 +11,11 @@ from marey_client.cli.addresses import Address
 from marey_client.cli.evaluations import evaluation_at
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.jobs import clips_at, show_progress
-from marey_client.cli.output import print_json, print_table, progress, tell
+from marey_client.cli.jobs import clips_at, watching
+from marey_client.cli.output import print_json, print_table, tell
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from marey_client.evaluations import EvaluationHandle
     from marey_client.findings import Findings
@@ -58,7 +57,7 @@ def compare(
         first, second = evaluation_at(marey, before), evaluation_at(marey, after)
         if first.project != second.project:
             raise WrongUsage("both evaluations must be in one project")
-        with _following() as on_progress:
+        with watching() as on_progress:
             found = first.compare(second, on_progress=on_progress)
         document = found.document()
         if out is not None:
@@ -172,16 +171,9 @@ def sweep(
 # -- asking -----------------------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def _following() -> Iterator[Callable[[Job], None]]:
-    """A bar that follows a job."""
-    with progress() as advance:
-        yield lambda now: show_progress(now, advance)
-
-
 def _found(marey: Marey, place: str, ask: Callable[[EvaluationHandle, Callable[[Job], None]], Findings]) -> Findings:
     handle = evaluation_at(marey, place)
-    with _following() as on_progress:
+    with watching() as on_progress:
         return ask(handle, on_progress)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from marey_client.marey import Marey
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
@@ -23,9 +26,11 @@ class Invocation:
     verbose: bool
 
 
-def connect(context: typer.Context, *, anonymous: bool = False) -> Marey:
+@contextmanager
+def connect(context: typer.Context, *, anonymous: bool = False) -> Iterator[Marey]:
     """A session with the server that the options, the environment or `marey login` name."""
     from marey_client.credentials import resolve
+    from marey_client.errors import Unauthenticated
     from marey_client.marey import Marey
 
     given: Invocation = context.find_object(Invocation) or Invocation(None, None, False)
@@ -34,4 +39,10 @@ def connect(context: typer.Context, *, anonymous: bool = False) -> Marey:
 
         logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     found = resolve(given.server, given.token_file)
-    return Marey(found.url, None if anonymous else found.token)
+    with Marey(found.url, None if anonymous else found.token) as marey:
+        try:
+            yield marey
+        except Unauthenticated as error:
+            if found.origin and not anonymous:
+                error.add_note(f"the token comes from {found.origin}; marey login gets another")
+            raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,6 +14,8 @@ from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import Advance, print_json, print_pairs, print_table, progress, tell, tell_refused
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
     from marey_client.marey import Marey
     from marey_schemas.jobs import CollectionInput, InputSpec, ItemInput, Job, JobInput, JobKind
 
@@ -72,8 +75,27 @@ def clips_at(marey: Marey, address: Address) -> ItemInput | CollectionInput:
 
 def follow(marey: Marey, submitted: Job, *, count: int | None = None, unit: str = "") -> Job:
     """Wait until a job has ended, with a bar; of `count` units if it is spread over tasks and they are told."""
-    with progress() as advance:
-        return marey.jobs.wait(submitted.id, on_progress=lambda now: show_progress(now, advance, count, unit))
+    with watching(count, unit) as show:
+        show(submitted)
+        return marey.jobs.wait(submitted.id, on_progress=show)
+
+
+@contextmanager
+def watching(count: int | None = None, unit: str = "") -> Iterator[Callable[[Job], None]]:
+    """A bar that follows a job while the block runs; who interrupts it is told that the job goes on."""
+    seen: list[Job] = []
+    try:
+        with progress() as advance:
+
+            def show(now: Job) -> None:
+                seen[:] = [now]
+                show_progress(now, advance, count, unit)
+
+            yield show
+    except KeyboardInterrupt:
+        for job in seen:
+            tell(f"{job.id} goes on without you; marey job show {job.id} shows it, marey job cancel {job.id} stops it")
+        raise
 
 
 def show_progress(now: Job, advance: Advance, count: int | None = None, unit: str = "") -> None:

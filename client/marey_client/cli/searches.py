@@ -11,9 +11,9 @@ import typer
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.given_files import read_json
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.jobs import show_progress
+from marey_client.cli.jobs import watching
 from marey_client.cli.models import model_at
-from marey_client.cli.output import print_json, print_table, progress, tell
+from marey_client.cli.output import print_json, print_table, tell
 
 if TYPE_CHECKING:
     from marey_schemas.search import SearchAnswer
@@ -39,10 +39,10 @@ def tree(
 ) -> None:
     """Group samples of a model, so that searches for motions that meet constraints are quick."""
     given = {"samples": samples, "features": features}
-    with connect(context) as marey, progress() as advance:
+    with connect(context) as marey, watching() as show:
         job = model_at(marey, place).make_tree(
             seed=seed,
-            on_progress=lambda now: show_progress(now, advance),
+            on_progress=show,
             **{name: value for name, value in given.items() if value is not None},
         )
     if as_json:

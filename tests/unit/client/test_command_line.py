@@ -6,13 +6,18 @@ import sys
 
 import httpx
 import pytest
+import typer
 
-from marey_client.cli import with_global_options_first
+from marey_client.cli import files, with_global_options_first
 from marey_client.cli.addresses import Address
+from marey_client.cli.app import app
 from marey_client.cli.failures import WrongUsage, sentence
 from marey_client.cli.files import _items_in
-from marey_client.errors import Invalid, NotFound
+from marey_client.cli.invocation import connect
+from marey_client.cli.jobs import watching
+from marey_client.errors import Invalid, NotFound, Unauthenticated
 from marey_client.marey import Marey
+from marey_schemas.jobs import Job, JobState
 from marey_schemas.kinds import Kind
 
 
@@ -21,6 +26,13 @@ def marey(*arguments, env=None, stdin="", cwd=None):
     return subprocess.run(
         command, capture_output=True, text=True, input=stdin, env={**os.environ, **(env or {})}, cwd=cwd
     )
+
+
+NO_OPTIONS = typer.Context(typer.main.get_command(app))
+PROJECT = {
+    "id": "project_1", "name": "lab", "visibility": "private", "created_at": "2026-01-01T00:00:00Z",
+    "updated_at": "2026-01-01T00:00:00Z", "rev": 1,
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -198,6 +210,55 @@ def test_what_is_wrong_with_a_field_is_told_once(script, make_problem):
     with pytest.raises(Invalid) as raised:
         script.marey().project("lab").read()
     assert sentence(raised.value) == "/a: no; /b: neither (invalid, request req-1)"
+
+
+def test_a_token_that_is_refused_is_told_with_the_place_it_came_from(script, make_problem, monkeypatch):
+    answers = [make_problem(401, "bad-token", detail="The token is unknown, expired or revoked.")] * 2
+    monkeypatch.setattr("marey_client.marey.Marey", lambda url, token: answering(script, token))
+    monkeypatch.setenv("MAREY_TOKEN", "marey_old")
+    for anonymous, told in ((False, "the token comes from the variable MAREY_TOKEN; marey login"), (True, "unknown")):
+        script.answers = answers[:1]
+        with pytest.raises(Unauthenticated) as refused, connect(NO_OPTIONS, anonymous=anonymous) as marey:
+            marey.me()
+        assert told in sentence(refused.value)
+        assert ("MAREY_TOKEN" in sentence(refused.value)) is not anonymous
+
+
+def answering(script, token):
+    return Marey("http://server.test", token, http=httpx.MockTransport(script))
+
+
+def test_a_project_that_is_not_there_is_told_before_any_byte_is_sent(script, make_problem, monkeypatch, tmp_path):
+    (tmp_path / "walk.bvh").write_text("x")
+    monkeypatch.setattr(files, "connect", lambda context: script.marey())
+    script.answers = [make_problem(404, "no-project")]
+    with pytest.raises(NotFound):
+        files.upload(NO_OPTIONS, [tmp_path], project="nowhere")
+    assert [request.method for request in script.requests] == ["GET"]
+
+
+def test_who_interrupts_the_wait_for_a_job_is_told_that_it_goes_on(capsys):
+    def wait():
+        with watching() as show:
+            show(Job.model_construct(id="job_1", kind="retarget", state=JobState.RUNNING, progress=None))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        wait()
+    assert "job_1 goes on without you" in capsys.readouterr().err
+
+
+def test_who_interrupts_an_upload_is_told_how_to_go_on(script, monkeypatch, tmp_path, capsys):
+    (tmp_path / "walk.bvh").write_text("x")
+
+    def interrupt(_request):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(files, "connect", lambda context: script.marey())
+    script.answers = [httpx.Response(200, json=PROJECT), interrupt]
+    with pytest.raises(KeyboardInterrupt):
+        files.upload(NO_OPTIONS, [tmp_path], project="lab")
+    assert "the same command again sends only what is missing" in capsys.readouterr().err
 
 
 def test_completion_is_offered_for_the_users_shell(nowhere):

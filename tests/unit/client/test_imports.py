@@ -164,7 +164,7 @@ def test_places_may_be_texts_and_are_named_where_they_hold_no_motion(tmp_path):
     (tmp_path / "walk.bvh").write_text("x")
     assert [file.name for file in find_files([str(tmp_path)]).files] == ["walk.bvh"]
     (tmp_path / "empty").mkdir()
-    with pytest.raises(errors.NothingToUpload, match="in .*empty"):
+    with pytest.raises(errors.NothingToUpload, match=r"in .*empty"):
         find_files(iter([str(tmp_path / "empty")]))
 
 

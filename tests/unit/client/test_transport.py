@@ -1,6 +1,7 @@
 """What is sent again, what is not, and what becomes of answers."""
 
 import logging
+import pickle
 
 import httpx
 import numpy as np
@@ -137,6 +138,24 @@ def test_an_error_of_something_in_between_is_told_too(script):
     script.answers = [httpx.Response(413, text="<html>too large</html>")]
     with pytest.raises(errors.TooLarge, match="413"):
         script.marey().project("lab").read()
+
+
+@pytest.mark.parametrize("media_type", ["text/html", "application/problem+json"])
+def test_an_error_of_another_server_names_the_address_and_asks_about_it(script, media_type):
+    script.answers = [httpx.Response(404, content=b'{"title": "?"}', headers={"Content-Type": media_type})]
+    with pytest.raises(errors.NotFound, match=r"http://server\.test/ answered 404 .*is it the right address"):
+        script.marey().project("lab").read()
+
+
+def test_errors_survive_the_way_from_one_process_to_another(script, make_problem):
+    wrong = [{"pointer": "/name", "code": "bad", "detail": "too long"}]
+    script.answers = [make_problem(422, "invalid", detail="No.", errors=wrong)]
+    with pytest.raises(errors.Invalid) as refused:
+        script.marey().project("lab").read()
+    again = pickle.loads(pickle.dumps(refused.value))
+    assert (str(again), again.code, again.anonymous) == ("No.; /name: too long", "invalid", False)
+    ended = pickle.loads(pickle.dumps(errors.JobUnsuccessful("it failed", {"id": "job_1"})))
+    assert (str(ended), ended.job) == ("it failed", {"id": "job_1"})
 
 
 def test_an_answer_of_something_else_is_no_traceback(script):
