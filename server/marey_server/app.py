@@ -6,7 +6,9 @@ import asyncio
 import hashlib
 import json
 import logging
+import os
 import signal
+import socket
 import sys
 import time
 from collections.abc import AsyncIterator
@@ -47,9 +49,12 @@ from marey_server.store.wakeups import wakeups
 
 log = logging.getLogger(__name__)
 
-LOCAL_WORKER_TOKEN = "workers beside the server"  # noqa: S105 - the name of a token
 READ_CHUNK_BYTES = 256 * 1024
 READ_BUFFER_BYTES = 1024 * 1024
+
+
+class CannotListen(Exception):
+    """The address or the port that the settings name is not to be had; the text says which, and why."""
 
 
 class Application(TornadoApplication):
@@ -115,7 +120,7 @@ async def listening(app: Application) -> AsyncIterator[Running]:
     try:
         sockets = bind_sockets(settings.port, settings.host)
     except OSError as error:
-        raise OSError(error.errno, f"cannot listen on {settings.host}:{settings.port}: {error.strerror}") from error
+        raise CannotListen(f"cannot listen on {settings.host}, port {settings.port}: {error.strerror}") from error
     server = HTTPServer(
         app,
         xheaders=settings.trust_proxy,
@@ -207,20 +212,23 @@ async def serving(settings: Settings) -> AsyncIterator[Running]:
         local_workers(
             settings.local_workers,
             url=running.address,
-            token=make_worker_token(database) if settings.local_workers else "",
+            token=make_worker_token(database, settings.port) if settings.local_workers else "",
             cache=settings.data / "worker-cache",
         ),
     ):
         yield running
 
 
-def make_worker_token(database: Database) -> str:
-    """A token for the workers that this process starts; those of earlier starts stop working."""
-    return database.write(SYSTEM, _replace_worker_token)
+def make_worker_token(database: Database, port: int) -> str:
+    """A token for the workers that this process starts; those of earlier starts at this port stop working.
+
+    Other servers that share the database keep the tokens of theirs.
+    """
+    return database.write(SYSTEM, _replace_worker_token, f"workers beside {socket.gethostname()}:{port}")
 
 
-def _replace_worker_token(tx: Transaction) -> str:
+def _replace_worker_token(tx: Transaction, name: str) -> str:
     tx.principal = users.administrator_principal(tx)
-    tokens.revoke_named(tx, LOCAL_WORKER_TOKEN)
-    wanted = TokenCreate(name=LOCAL_WORKER_TOKEN, scopes=("read", "write", "work"), expires_in_s=None)
+    tokens.revoke_named(tx, name)
+    wanted = TokenCreate(name=name, scopes=("read", "write", "work"), expires_in_s=None)
     return tokens.create_token(tx, wanted).secret

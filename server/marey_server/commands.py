@@ -26,6 +26,7 @@ class CommandFailed(Exception):
 
 def serve(**settings: Any) -> None:
     """Run a server, and the workers it is told to start, until SIGTERM or SIGINT."""
+    from marey_server.app import CannotListen
     from marey_server.app import serve as serve_until_stopped
     from marey_server.computing import leave
     from marey_server.store.opening import DatabaseUnusable
@@ -37,6 +38,8 @@ def serve(**settings: Any) -> None:
         asyncio.run(serve_until_stopped(read_settings(**settings, **unset)))
     except DatabaseUnusable as error:
         raise CommandFailed(str(error)) from error
+    except CannotListen as error:
+        raise CommandFailed(f"{error}; name others with --host and --port, 0 for any free port") from error
     leave()
 
 

@@ -1,6 +1,9 @@
 """What a server makes before it first serves."""
 
+import socket
 import stat
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -10,7 +13,7 @@ from marey_schemas.access import UserChange, UserCreate
 from marey_server.access.principal import SYSTEM
 from marey_server.administrators import give_token, make_first_administrator
 from marey_server.app import make_worker_token
-from marey_server.errors import NotFound
+from marey_server.errors import NotFound, Unauthenticated
 from marey_server.store import tokens, users
 from marey_server.store.database import Database
 
@@ -55,4 +58,23 @@ def test_local_workers_get_a_token_though_the_first_administrator_is_disabled(da
     database.write(admin, users.create_user, UserCreate(name="ops", administrator=True))
     ops = database.read(SYSTEM, users.administrator_principal, "ops")
     database.write(ops, partial(users.change_user, expected_rev=None), "admin", UserChange(disabled=True))
-    assert database.read(SYSTEM, tokens.resolve_token, make_worker_token(database)).user_name == "ops"
+    assert database.read(SYSTEM, tokens.resolve_token, make_worker_token(database, 8460)).user_name == "ops"
+
+
+def test_a_server_that_starts_leaves_the_workers_of_others_on_its_database_alone(database: Database, tmp_path: Path):
+    database.write(SYSTEM, make_first_administrator, tmp_path / "admin.token")
+    first, second = (make_worker_token(database, port) for port in (8460, 8461))
+    again = make_worker_token(database, 8460)
+    for secret in (second, again):
+        assert database.read(SYSTEM, tokens.resolve_token, secret).user_name == "admin"
+    with pytest.raises(Unauthenticated):
+        database.read(SYSTEM, tokens.resolve_token, first)
+
+
+def test_a_port_that_is_taken_is_told_with_what_to_do(tmp_path: Path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        serve = [sys.executable, "-m", "marey_client.cli", "serve", "--data", str(tmp_path), "--workers", "0"]
+        done = subprocess.run([*serve, "--port", str(port)], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert f"port {port}: Address already in use; name others with --host and --port" in done.stderr.splitlines()[-1]
