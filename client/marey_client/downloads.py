@@ -18,8 +18,9 @@ _NOT_IN_A_NAME = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]+')
 
 
 @contextmanager
-def saved_atomically(target: Path) -> Iterator[BufferedRandom]:
+def saved_atomically(target: str | Path) -> Iterator[BufferedRandom]:
     """A file to write and read that becomes `target` at the end, and vanishes if the block fails."""
+    target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{target.name[:32]}.", delete=False) as file:
         temporary = Path(file.name)
@@ -39,12 +40,12 @@ def safe_file_name(name: str) -> str:
     return _NOT_IN_A_NAME.sub("_", name).strip(". ")[:200] or "unnamed"
 
 
-def download(transport: Transport, path: str, folder: Path, *, params: Params | None = None, name: str) -> Path:
+def download(transport: Transport, path: str, folder: str | Path, *, params: Params | None = None, name: str) -> Path:
     """Fetch a file into `folder` under the name the server gives it, or `name`; answer where it is."""
 
     def once() -> Path:
         with transport.stream(path, params=params) as response:
-            target = folder / safe_file_name(_offered_name(response.headers.get("Content-Disposition")) or name)
+            target = Path(folder) / safe_file_name(_offered_name(response.headers.get("Content-Disposition")) or name)
             with saved_atomically(target) as file:
                 for chunk in response.iter_bytes():
                     file.write(chunk)

@@ -37,9 +37,9 @@ class Findings:
         """The report, where there is one: one page of HTML that needs nothing else."""
         return Blobs(self.transport).fetch(self._blob("report"))
 
-    def save_report(self, path: Path) -> Path:
+    def save_report(self, path: str | Path) -> Path:
         """Write the report to a file."""
-        return Blobs(self.transport).fetch_to(self._blob("report"), path)
+        return Blobs(self.transport).fetch_to(self._blob("report"), Path(path))
 
     def _blob(self, name: str) -> str:
         result = self.job.result or {}

@@ -236,6 +236,12 @@ def refusal_text(entry: ImportEntry) -> str:
     return f"{entry.name}{line}{joint}: {detail} ({entry.error.code})"
 
 
+def left_out_text(paths: Sequence[Path]) -> str:
+    """What is said about files in folders that are no motion."""
+    others = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
+    return f"left out what is no motion: {paths[0].name}{others}"
+
+
 def _say_nothing(_stage: str, _done: int, _total: int) -> None:
     pass
 

@@ -91,7 +91,7 @@ class ItemHandle:
         """Whether something it was made from has changed."""
         return self.transport.get(Staleness, f"{self.url}/stale")
 
-    def export(self, folder: Path, *, format: str = "original", **options: str | None) -> Path:  # noqa: A002
+    def export(self, folder: str | Path, *, format: str = "original", **options: str | None) -> Path:  # noqa: A002
         """Write the item to `folder` as a file of `format`; answer where it is."""
         params = {"format": format, **options}
         return download(self.transport, f"{self.url}/export", folder, params=params, name=f"{self.name}.{format}")

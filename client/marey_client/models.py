@@ -73,7 +73,7 @@ class ModelHandle(SearchableHandle):
 
     def save_samples(
         self,
-        folder: Path,
+        folder: str | Path,
         format: str = "bvh",  # noqa: A002
         *,
         n: int = 1,
@@ -83,7 +83,7 @@ class ModelHandle(SearchableHandle):
     ) -> list[Path]:
         """Draw `n` motions and write each to a file: bvh, npz or predecessor; or all to one, as json."""
         if format == "json":
-            target = folder / safe_file_name(f"{self.name} {seed}.json")
+            target = Path(folder) / safe_file_name(f"{self.name} {seed}.json")
             return [_saved(target, encode_tree(self._samples(n, seed, revision), JSON))]
         params = {"n": str(n), "seed": str(seed), "format": format, "unit": unit, "revision": revision}
         if n == 1:
@@ -92,7 +92,7 @@ class ModelHandle(SearchableHandle):
         given = {name: str(value) for name, value in params.items() if value is not None}
         response = self.transport.send("GET", f"{self.url}/samples/export", params=given, headers={"Accept": "*/*"})
         with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
-            return [_saved(folder / safe_file_name(name), archive.read(name)) for name in archive.namelist()]
+            return [_saved(Path(folder) / safe_file_name(name), archive.read(name)) for name in archive.namelist()]
 
     def add_samples(
         self, n: int = 1, seed: int = 0, *, into: str, tags: tuple[str, ...] = (), names: str | None = None
@@ -131,7 +131,7 @@ def _as_input(place: Any) -> CollectionInput | ItemInput:
     return place.as_input() if isinstance(place, ProcessedHandle) else place
 
 
-def _saved(path: Path, data: bytes) -> Path:
+def _saved(path: str | Path, data: bytes) -> Path:
     with saved_atomically(path) as file:
         file.write(data)
-    return path
+    return Path(path)

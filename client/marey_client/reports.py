@@ -36,14 +36,14 @@ class ReportedHandle(ItemHandle):
         params = {"format": format, "trial": trial, "table": table}
         return self._fetch(f"{self.url}/figures/{name}", "*/*", params)
 
-    def save_report(self, path: Path) -> Path:
+    def save_report(self, path: str | Path) -> Path:
         """Write the report to a file."""
         return _saved(path, self.report())
 
-    def save_figures(self, folder: Path) -> list[Path]:
+    def save_figures(self, folder: str | Path) -> list[Path]:
         """Write every figure to a folder, in every form."""
         files = (file for figure in self.figures() for file in self._files_of(figure))
-        return [_saved(folder / safe_file_name(name), data) for name, data in files]
+        return [_saved(Path(folder) / safe_file_name(name), data) for name, data in files]
 
     def _files_of(self, figure: StoredFigure) -> Iterator[tuple[str, bytes]]:
         name = figure.name if figure.trial is None else f"{figure.name} {figure.trial}"
@@ -57,7 +57,7 @@ class ReportedHandle(ItemHandle):
         return self.transport.send("GET", path, params=given, headers={"Accept": accept}).content
 
 
-def _saved(path: Path, data: bytes) -> Path:
+def _saved(path: str | Path, data: bytes) -> Path:
     with saved_atomically(path) as file:
         file.write(data)
-    return path
+    return Path(path)

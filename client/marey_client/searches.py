@@ -38,7 +38,7 @@ class SearchableHandle(ReportedHandle):
 
     def save_search(
         self,
-        path: Path,
+        path: str | Path,
         constraints: Constraints = (),
         *,
         format: str = "bvh",  # noqa: A002
@@ -54,7 +54,9 @@ class SearchableHandle(ReportedHandle):
             headers={"Accept": "*/*"},
             repeatable=True,
         )
-        target = path / safe_file_name(f"{self.name} found.{format}") if path.is_dir() else path
+        target = Path(path)
+        if target.is_dir():
+            target /= safe_file_name(f"{self.name} found.{format}")
         with saved_atomically(target) as file:
             file.write(response.content)
         return target

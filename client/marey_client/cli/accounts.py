@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from marey_client.cli.failures import WrongUsage
-from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.invocation import AsJson, UserName, connect
 from marey_client.cli.output import print_json, print_pairs, print_table, tell
+
+if TYPE_CHECKING:
+    from marey_client.marey import Marey
+    from marey_schemas.access import NewToken, TokenCreate
 
 token = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Your tokens.")
 user = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Users, for administrators.")
@@ -44,8 +49,8 @@ def login(
         if with_token:
             secret = typer.get_text_stream("stdin").read().strip()
         else:
-            who = name or typer.prompt("User name", err=True)
-            password = typer.prompt(f"Password of {who} at {url}", hide_input=True, err=True)
+            who = name or _ask_name()
+            password = _ask_secret(f"Password of {who} at {url}")
             secret = marey.sign_in(Login(name=who, password=password, expires_in_s=days * SECONDS_PER_DAY)).secret
     with Marey(url, secret) as marey:
         me = marey.me()
@@ -76,7 +81,8 @@ def create_token(
     ] = None,
     days: Annotated[int, typer.Option(min=0, help="How long it lasts; 0 for ever.")] = 90,
     output: Annotated[
-        Path | None, typer.Option(help="Write the secret to this file (0600), not to the screen.")
+        Path | None,
+        typer.Option("--output", "--out", "-o", help="Write the secret to this file (0600), not to the screen."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -86,16 +92,26 @@ def create_token(
     lasting = days * SECONDS_PER_DAY or None
     wanted = TokenCreate(name=name, expires_in_s=lasting, **({"scopes": tuple(scope)} if scope else {}))
     with connect(context) as marey:
-        made = marey.tokens.create(wanted)
+        made = marey.tokens.create(wanted) if output is None else _token_in_file(marey, wanted, output)
     if output is not None:
-        with os.fdopen(os.open(output, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            file.write(made.secret + "\n")
         tell(f"token {made.id} is in {output}")
     elif as_json:
         print_json(made)
     else:
         tell(f"token {made.id}, scopes {', '.join(made.scopes)}; it is not shown again:")
         typer.echo(made.secret)
+
+
+def _token_in_file(marey: Marey, wanted: TokenCreate, path: Path) -> NewToken:
+    """Make a token and write its secret to a new file; where that cannot be made, no token is."""
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+        try:
+            made = marey.tokens.create(wanted)
+            file.write(made.secret + "\n")
+        except BaseException:
+            path.unlink()
+            raise
+    return made
 
 
 @token.command("ls")
@@ -110,7 +126,9 @@ def list_tokens(context: typer.Context, as_json: AsJson = False) -> None:
 
 
 @token.command("revoke")
-def revoke_token(context: typer.Context, token_id: str) -> None:
+def revoke_token(
+    context: typer.Context, token_id: Annotated[str, typer.Argument(help="The token's id; marey token ls shows them.")]
+) -> None:
     """Make a token useless, now."""
     with connect(context) as marey:
         marey.tokens.revoke(token_id)
@@ -123,7 +141,7 @@ def revoke_token(context: typer.Context, token_id: str) -> None:
 @user.command("create")
 def create_user(
     context: typer.Context,
-    name: str,
+    name: Annotated[str, typer.Argument(help="What the user signs in with.")],
     display_name: Annotated[str | None, typer.Option(help="Name shown to people.")] = None,
     administrator: Annotated[bool, typer.Option("--administrator", help="May do everything everywhere.")] = False,
     without_password: Annotated[
@@ -136,7 +154,7 @@ def create_user(
 
     password = None
     if not without_password:
-        password = typer.prompt(f"Password for {name}", hide_input=True, confirmation_prompt=True, err=True)
+        password = _ask_secret(f"Password for {name}", twice=True)
     wanted = UserCreate(name=name, display_name=display_name, password=password, administrator=administrator)
     with connect(context) as marey:
         made = marey.users.create(wanted)
@@ -187,19 +205,34 @@ def change_password(
         who = name or (me.name if me else None)
         if who is None:
             raise WrongUsage("the token belongs to no user; say whose password to change")
-        change = {"password": typer.prompt("New password", hide_input=True, confirmation_prompt=True, err=True)}
+        change = {"password": _ask_secret("New password", twice=True)}
         if me is not None and who == me.name:
-            change["current_password"] = typer.prompt("Current password", hide_input=True, err=True)
+            change["current_password"] = _ask_secret("Current password")
         marey.users.change(who, UserChange.model_validate(change))
     tell(f"the password of {who} is changed")
 
 
 @user.command("disable")
-def disable_user(context: typer.Context, name: str) -> None:
+def disable_user(context: typer.Context, name: UserName) -> None:
     """Take a user's access away; what they made stays."""
     with connect(context) as marey:
         marey.users.disable(name)
     tell(f"{name} is disabled")
+
+
+def _ask_name() -> str:
+    if not sys.stdin.isatty():
+        raise WrongUsage("there is no terminal to ask at: name the user with --name, or use --with-token")
+    return str(typer.prompt("User name", err=True))
+
+
+def _ask_secret(what: str, *, twice: bool = False) -> str:
+    """A password from the terminal, unseen; where there is none, the next line of standard input."""
+    if sys.stdin.isatty():
+        return str(typer.prompt(what, hide_input=True, confirmation_prompt=twice, err=True))
+    if secret := sys.stdin.readline().rstrip("\r\n"):
+        return secret
+    raise WrongUsage(f"{what}: there is no terminal to ask at, and no line on standard input")
 
 
 def _yes(value: bool) -> str:

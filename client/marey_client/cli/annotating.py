@@ -261,7 +261,7 @@ def import_annotation(
 def export_annotation(
     context: typer.Context,
     place: Place,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write to.")] = Path(),
+    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
     form: Annotated[
         Form, typer.Option(help="Sections by label, a list of sections, or frames by label.")
     ] = Form.LABELS,

@@ -57,7 +57,7 @@ def evaluate(
     ] = None,
     baseline: Annotated[bool, typer.Option("--baseline/--no-baseline", help="Measure generated clips, too.")] = True,
     tag: Annotated[list[str] | None, typer.Option(help="Tag of the result; may be repeated.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Write the report to this file.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
     priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = True,
     as_json: AsJson = False,

@@ -56,7 +56,7 @@ def upload(
     as_json: AsJson = False,
 ) -> None:
     """Import motion files. Each goes in or is refused with a reason; the same file again makes nothing new."""
-    from marey_client.imports import find_files
+    from marey_client.imports import find_files, left_out_text
     from marey_schemas.imports import ImportOptions
 
     given = {
@@ -68,7 +68,7 @@ def upload(
     options = ImportOptions.model_validate({key: value for key, value in given.items() if value is not None})
     found = find_files(places)
     if found.left_out:
-        tell(f"left out {len(found.left_out)} files that are no motion, such as {found.left_out[0].name}")
+        tell(left_out_text(found.left_out))
     with connect(context) as marey:
         to = marey.project(project)
         to.read()  # a project that is not there is told before its bytes are sent
@@ -246,7 +246,7 @@ def download(
     context: typer.Context,
     place: Annotated[str, typer.Argument(help="A clip, or a folder of them: project/folder[/name].")],
     format: Annotated[str, typer.Option(help="original, bvh, npz, predecessor or json.")] = "original",  # noqa: A002
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write to.")] = Path(),
+    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
     unit: Annotated[str | None, typer.Option(help="Unit of a BVH file: cm or m.")] = None,
     restored: Annotated[bool, typer.Option(help="Aligned clips in their own time, where they stood.")] = False,
     as_json: AsJson = False,

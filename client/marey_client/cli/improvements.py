@@ -49,7 +49,7 @@ def compare(
     context: typer.Context,
     before: Evaluation,
     after: Annotated[str, typer.Argument(help="One of the same trials, evaluated with --normaliser BEFORE.")],
-    out: Annotated[Path | None, typer.Option(help="Write the report to this file.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Tell what changed between two evaluations, trial by trial."""

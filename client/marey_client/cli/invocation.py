@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 
     from marey_client.marey import Marey
 
+ProjectName = Annotated[str, typer.Argument(help="The project; marey project ls shows them.")]
+UserName = Annotated[str, typer.Argument(help="The user; marey user ls shows them.")]
+JobId = Annotated[str, typer.Argument(help="The id of a job; marey job ls shows them.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
 
 

@@ -10,7 +10,7 @@ import typer
 
 from marey_client.cli.addresses import Address, find_item, require_item
 from marey_client.cli.failures import Refused, WrongUsage
-from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.invocation import AsJson, JobId, ProjectName, connect
 from marey_client.cli.output import Advance, print_json, print_pairs, print_table, progress, tell, tell_refused
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ def list_kinds(
 @job.command("submit")
 def submit_job(
     context: typer.Context,
-    project: str,
+    project: ProjectName,
     kind: Annotated[str, typer.Argument(help="What to do; marey job kinds shows what there is.")],
     inputs: Annotated[
         list[str] | None,
@@ -231,7 +231,7 @@ def json_or_text(text: str) -> Any:
 @job.command("ls")
 def list_jobs(
     context: typer.Context,
-    project: str,
+    project: ProjectName,
     state: Annotated[str | None, typer.Option(help="waiting, queued, running, succeeded, failed or cancelled.")] = None,
     limit: Annotated[int, typer.Option(min=1, help="How many, newest first.")] = 50,
     as_json: AsJson = False,
@@ -248,7 +248,7 @@ def list_jobs(
 
 
 @job.command("show")
-def show_job(context: typer.Context, job_id: str, as_json: AsJson = False) -> None:
+def show_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -> None:
     """Show how a job stands, and every try at it."""
     with connect(context) as marey:
         found = marey.jobs.get(job_id)
@@ -264,7 +264,7 @@ def show_job(context: typer.Context, job_id: str, as_json: AsJson = False) -> No
 @job.command("log")
 def show_log(
     context: typer.Context,
-    job_id: str,
+    job_id: JobId,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until the job has ended.")] = False,
 ) -> None:
     """Print what a job wrote."""
@@ -274,7 +274,7 @@ def show_log(
 
 
 @job.command("cancel")
-def cancel_job(context: typer.Context, job_id: str, as_json: AsJson = False) -> None:
+def cancel_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -> None:
     """Ask a job to stop; a queued one is cancelled at once."""
     with connect(context) as marey:
         found = marey.jobs.cancel(job_id)
@@ -286,7 +286,7 @@ def cancel_job(context: typer.Context, job_id: str, as_json: AsJson = False) -> 
 @job.command("retry")
 def retry_job(
     context: typer.Context,
-    job_id: str,
+    job_id: JobId,
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -129,12 +129,12 @@ def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[st
         if options:
             raise WrongUsage("import.… is for files of this machine; name the project they go to with --project")
         return addresses[0].project, {"takes": [clips_at(marey, address) for address in addresses]}
-    from marey_client.imports import find_files
+    from marey_client.imports import find_files, left_out_text
     from marey_schemas.imports import ImportOptions
 
     found = find_files(map(Path, takes))
     if found.left_out:
-        tell(f"left out {len(found.left_out)} files that are no motion, such as {found.left_out[0].name}")
+        tell(left_out_text(found.left_out))
     return project, {"takes": found.files, "options": ImportOptions.model_validate(options)}
 
 

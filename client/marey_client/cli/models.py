@@ -87,7 +87,9 @@ def sample(
     n: Annotated[int, typer.Option("-n", min=1, max=1000, help="How many motions.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same motions.")] = 0,
     format: Annotated[str, typer.Option(help="bvh, npz, predecessor or json.")] = "bvh",  # noqa: A002
-    out: Annotated[Path | None, typer.Option(help="Folder to write files to; default: this one.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "--output", "-o", help="Folder to write files to; default: this one.")
+    ] = None,
     into: Annotated[str | None, typer.Option(help="Make clips in this folder of the project, not files.")] = None,
     unit: Annotated[str | None, typer.Option(help="Unit of a BVH file: cm or m.")] = None,
     as_json: AsJson = False,

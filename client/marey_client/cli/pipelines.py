@@ -86,7 +86,8 @@ def _tell_shortfalls(run: PipelineRun) -> None:
             tell_refused(refused, most=REFUSED_SHOWN)
         result = job.result or {}
         if empty := result.get("empty"):
-            tell(f"{step} found nothing in {len(empty)} clips, such as {empty[0]}")
+            places = empty[0] if len(empty) == 1 else f"{len(empty)} clips, such as {empty[0]}"
+            tell(f"{step} found nothing in {places}")
         for note in result.get("notes", ()):
             tell(f"{step}: {note}")
 

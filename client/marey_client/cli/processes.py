@@ -86,13 +86,21 @@ def upgrade_database(data: DataFolder = None, database_url: DatabaseUrl = None) 
 
 
 @db.command("backup")
-def backup_database(target: Path, data: DataFolder = None, database_url: DatabaseUrl = None) -> None:
+def backup_database(
+    target: Annotated[Path, typer.Argument(help="The file to write; it must not be there yet.")],
+    data: DataFolder = None,
+    database_url: DatabaseUrl = None,
+) -> None:
     """Copy the database, consistently, while the server may be running."""
     _database("backup", data, database_url, target=target)
 
 
 @db.command("restore")
-def restore_database(source: Path, data: DataFolder = None, database_url: DatabaseUrl = None) -> None:
+def restore_database(
+    source: Annotated[Path, typer.Argument(help="A file that `marey db backup` wrote.")],
+    data: DataFolder = None,
+    database_url: DatabaseUrl = None,
+) -> None:
     """Put a backup in the place of a database that is not there yet."""
     _database("restore", data, database_url, source=source)
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.invocation import AsJson, ProjectName, UserName, connect
 from marey_client.cli.output import print_json, print_pairs, print_table, tell
 
 project = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Projects.")
@@ -52,7 +52,7 @@ def list_projects(context: typer.Context, as_json: AsJson = False) -> None:
 
 
 @project.command("show")
-def show_project(context: typer.Context, name: str, as_json: AsJson = False) -> None:
+def show_project(context: typer.Context, name: ProjectName, as_json: AsJson = False) -> None:
     """Show a project."""
     with connect(context) as marey:
         found = marey.project(name).read()
@@ -64,7 +64,7 @@ def show_project(context: typer.Context, name: str, as_json: AsJson = False) -> 
 @project.command("change")
 def change_project(
     context: typer.Context,
-    name: str,
+    name: ProjectName,
     title: Annotated[str | None, typer.Option(help="Name shown to people.")] = None,
     description: Annotated[str | None, typer.Option(help="What it is for.")] = None,
     visibility: Annotated[str | None, typer.Option(help="private or public.")] = None,
@@ -83,7 +83,7 @@ def change_project(
 
 
 @project.command("delete")
-def delete_project(context: typer.Context, name: str) -> None:
+def delete_project(context: typer.Context, name: ProjectName) -> None:
     """Hide a project; `marey project restore` brings it back."""
     with connect(context) as marey:
         marey.project(name).delete()
@@ -91,7 +91,7 @@ def delete_project(context: typer.Context, name: str) -> None:
 
 
 @project.command("restore")
-def restore_project(context: typer.Context, name: str) -> None:
+def restore_project(context: typer.Context, name: ProjectName) -> None:
     """Bring a deleted project back."""
     with connect(context) as marey:
         marey.project(name).restore()
@@ -99,7 +99,7 @@ def restore_project(context: typer.Context, name: str) -> None:
 
 
 @member.command("ls")
-def list_members(context: typer.Context, project_name: str, as_json: AsJson = False) -> None:
+def list_members(context: typer.Context, project_name: ProjectName, as_json: AsJson = False) -> None:
     """Show the members of a project."""
     with connect(context) as marey:
         members = list(marey.project(project_name).members.list())
@@ -111,8 +111,8 @@ def list_members(context: typer.Context, project_name: str, as_json: AsJson = Fa
 @member.command("put")
 def put_member(
     context: typer.Context,
-    project_name: str,
-    user: str,
+    project_name: ProjectName,
+    user: UserName,
     role: Annotated[str, typer.Argument(help="reader, contributor, maintainer or owner.")],
 ) -> None:
     """Give a user a role in a project."""
@@ -125,7 +125,7 @@ def put_member(
 
 
 @member.command("remove")
-def remove_member(context: typer.Context, project_name: str, user: str) -> None:
+def remove_member(context: typer.Context, project_name: ProjectName, user: UserName) -> None:
     """Take a user's role in a project away."""
     with connect(context) as marey:
         marey.project(project_name).members.remove(user)

@@ -20,7 +20,7 @@ def add_to(app: typer.Typer) -> None:
 def report(
     context: typer.Context,
     place: Annotated[str, typer.Argument(help="An evaluation or a model: project/folder/name, or project/id.")],
-    out: Annotated[Path, typer.Option(help="The file to write.")] = Path("report.html"),
+    out: Annotated[Path, typer.Option("--out", "--output", "-o", help="The file to write.")] = Path("report.html"),
     figures: Annotated[
         Path | None, typer.Option(help="Write every figure to this folder: PNG, SVG, JSON, CSV.")
     ] = None,

@@ -75,7 +75,9 @@ def search(
     request: Annotated[
         Path | None, typer.Option(help="File with the whole request as JSON, for several steps.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="File or folder to write the motion to.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "--output", "-o", help="File or folder to write the motion to.")
+    ] = None,
     format: Annotated[str, typer.Option(help="bvh, npz or predecessor.")] = "bvh",  # noqa: A002
     as_json: AsJson = False,
 ) -> None:

@@ -8,15 +8,17 @@ import httpx
 import pytest
 import typer
 
-from marey_client.cli import files, with_global_options_first
+from marey_client.cli import accounts, files, with_global_options_first
 from marey_client.cli.addresses import Address
 from marey_client.cli.app import app
 from marey_client.cli.failures import WrongUsage, sentence
 from marey_client.cli.files import _items_in
 from marey_client.cli.invocation import connect
 from marey_client.cli.jobs import watching
-from marey_client.errors import Invalid, NotFound, Unauthenticated
+from marey_client.cli.pipelines import _tell_shortfalls
+from marey_client.errors import Forbidden, Invalid, NotFound, Unauthenticated
 from marey_client.marey import Marey
+from marey_client.pipelines import PipelineRun
 from marey_schemas.jobs import Job, JobState
 from marey_schemas.kinds import Kind
 
@@ -259,6 +261,53 @@ def test_who_interrupts_an_upload_is_told_how_to_go_on(script, monkeypatch, tmp_
     with pytest.raises(KeyboardInterrupt):
         files.upload(NO_OPTIONS, [tmp_path], project="lab")
     assert "the same command again sends only what is missing" in capsys.readouterr().err
+
+
+def test_a_token_whose_file_cannot_be_written_is_never_made(script, make_problem, monkeypatch, tmp_path):
+    (tmp_path / "there").write_text("precious")
+    monkeypatch.setattr(accounts, "connect", lambda context: script.marey())
+    with pytest.raises(FileExistsError):
+        accounts.create_token(NO_OPTIONS, "ci", output=tmp_path / "there")
+    assert script.requests == []
+    assert (tmp_path / "there").read_text() == "precious"
+    script.answers = [make_problem(403, "insufficient-scope")]
+    with pytest.raises(Forbidden):
+        accounts.create_token(NO_OPTIONS, "ci", output=tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("login",), "--with-token"),
+        (("login", "--name", "ada"), "standard input"),
+        (("user", "create", "ada"), "standard"),
+    ],
+)
+def test_without_a_terminal_nobody_is_asked_and_one_line_says_what_to_do(arguments, told, nowhere):
+    done = marey(*arguments, env=nowhere)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert told in done.stderr
+
+
+def test_a_password_may_be_piped(nowhere):
+    done = marey("login", "--name", "ada", env=nowhere, stdin="correct horse battery\n")
+    assert done.returncode == 1
+    assert done.stderr.startswith("marey: http://127.0.0.1:9 does not answer")
+
+
+@pytest.mark.parametrize("command", ["download", "sample", "search", "report", "evaluate", "compare"])
+def test_where_files_go_is_called_the_same_by_every_command(command):
+    told = marey(command, "--help").stdout
+    assert all(name in told for name in ("--out", "--output", "-o"))
+
+
+def test_what_a_step_found_nothing_in_is_counted_as_people_count(capsys):
+    for empty, told in ((["raw/walk"], "in raw/walk"), (["raw/a", "raw/b"], "in 2 clips, such as raw/a")):
+        job = Job.model_construct(result={"empty": empty})
+        _tell_shortfalls(PipelineRun(None, {"annotate": job}))
+        assert capsys.readouterr().err == f"annotate found nothing {told}\n"
 
 
 def test_completion_is_offered_for_the_users_shell(nowhere):
