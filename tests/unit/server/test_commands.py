@@ -1,6 +1,5 @@
 """The care of a database from the shell: backup, restore, check."""
 
-import socket
 import sqlite3
 from contextlib import closing
 
@@ -109,12 +108,3 @@ def test_tables_of_a_newer_version_are_told_and_left_as_they_are(data, command):
         command(data=data, port=0)
     with closing(sqlite3.connect(data / "marey.db")) as database:
         assert database.execute("SELECT version_num FROM alembic_version").fetchall() == [("9999",)]
-
-
-def test_a_port_that_is_in_use_is_named(data):
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with pytest.raises(OSError, match=f"cannot listen on 127.0.0.1:{port}: Address already in use"):
-            commands.serve(data=data, port=port)
