@@ -56,7 +56,7 @@ def read_bvh(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
     header = read_header(lines)
     channels = tuple(names or () for names in header.channels)
     warnings: list[CheckWarning] = []
-    values = _read_frames(data, header, channel_columns(channels), lines, warnings)
+    values = _read_frames(header, channel_columns(channels), lines, warnings)
     offsets = np.array(header.offsets, np.float64)
     source = SourceMotion(
         format=FORMAT,
@@ -95,11 +95,11 @@ def channel_columns(channels: tuple[tuple[str, ...], ...]) -> ChannelColumns:
 
 
 def _read_frames(
-    data: bytes, header: BvhHeader, columns: ChannelColumns, lines: TextLines, warnings: list[CheckWarning]
+    header: BvhHeader, columns: ChannelColumns, lines: TextLines, warnings: list[CheckWarning]
 ) -> NDArray[np.float64]:
     """(F, C) channel values."""
     width = len(columns.labels)
-    text = np.frombuffer(data, np.uint8, offset=min(header.data_start, len(data)))
+    text = np.frombuffer(lines.data, np.uint8, offset=min(header.data_start, len(lines.data)))
     try:
         table = scan_numbers(text, width, header.data_line)
     except BadToken as bad:
@@ -149,6 +149,7 @@ def _fill_motion(source: SourceMotion, values: NDArray[np.float64], columns: Cha
     if moved:
         source.translated_joints = tuple(moved)
         source.translations = np.stack([_positions_of(j, values, columns, source.offsets) for j in moved], axis=1)
+        _take_bones_from_positions(source, source.translations)
         _resolve_displacements(source, source.translations)
         _drop_redundant_translations(source, source.translations)
 
@@ -162,6 +163,21 @@ def _positions_of(
         if column != NO_COLUMN:
             positions[:, axis] = values[:, column]
     return positions
+
+
+def _take_bones_from_positions(source: SourceMotion, translations: NDArray[np.float64]) -> None:
+    """Fill in offsets where a file has none at all below the root, and leaves its bones to the position channels."""
+    bones = np.median(translations, axis=0)
+    if source.offsets[1:].any() or not bones.any():
+        return
+    source.offsets[list(source.translated_joints)] = bones
+    source.warnings.append(
+        CheckWarning(
+            "offsets-from-positions",
+            f"every OFFSET below the root is zero; the position channels of {len(bones)} joints give the bones",
+            joints=tuple(source.joint_names[joint] for joint in source.translated_joints),
+        )
+    )
 
 
 def _resolve_displacements(source: SourceMotion, translations: NDArray[np.float64]) -> None:

@@ -11,6 +11,7 @@ from marey_motion.formats.numeric_text import excerpt
 _LINE_END = re.compile(rb"\r\n|\n|\r")
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")
+_EVERY_OTHER_ZERO = b"\0\0"
 
 
 class TextLines:
@@ -23,9 +24,10 @@ class TextLines:
     """
 
     def __init__(self, data: bytes, file: str) -> None:
-        if data.startswith(_WIDE_MARKS):
+        if data.startswith(_WIDE_MARKS) or _EVERY_OTHER_ZERO in (data[0:3:2], data[1:4:2]):
             raise FormatError("the text is UTF-16; save it as UTF-8", code="text-encoding", file=file, line=1)
-        self.data = data
+        # Editors of old ended a file with Ctrl-Z, and disks filled it up with zeros.
+        self.data = data.rstrip(b"\0\x1a")
         self.file = file
         self.number = 0
         self.position = len(_BYTE_ORDER_MARK) if data.startswith(_BYTE_ORDER_MARK) else 0

@@ -65,6 +65,12 @@ class TestLayout:
         np.testing.assert_array_equal(other.rotations, plain.rotations)
         np.testing.assert_array_equal(other.end_sites[0][1], [0, 5, 0])
 
+    @pytest.mark.parametrize("padding", [b"\x1a", b"\0" * 100, b"\n\x1a\0\0"])
+    def test_what_old_disks_put_after_the_end_is_no_number(self, padding: bytes) -> None:
+        source = read(bvh([ROW]) + padding)
+        assert len(source.rotations) == 1  # type: ignore[arg-type]
+        assert codes(source) == []
+
     def test_joints_without_end_sites_are_leaves(self) -> None:
         source = read(bvh(["0 0 0"], hierarchy=nested(["a", "b"], [ZXY, ""], tip=False)))
         assert source.end_sites == ()
@@ -135,6 +141,14 @@ class TestChannels:
         source = read(bvh([row], hierarchy=nested(["a", "b", "c"], channels)))
         np.testing.assert_array_equal(source.translations, [[[0.5, 10, 0], [0.5, 10, 0]]])
         assert "position-channels-relative" in codes(source)
+
+    def test_bones_without_offsets_are_taken_from_the_position_channels(self) -> None:
+        hierarchy = ARM.replace("OFFSET 0 10 0", "OFFSET 0 0 0").replace(f"3 {ZXY}", f"6 {POSITIONS} {ZXY}")
+        rows = [f"0 90 0 0 0 0 1 {height} 2 0 0 0" for height in (10, 10, 10.5)]
+        source = read(bvh(rows, hierarchy=hierarchy))
+        np.testing.assert_array_equal(source.offsets, [[0, 90, 0], [1, 10, 2]])
+        assert source.translations[:, 0, 1].tolist() == [10, 10, 10.5]  # type: ignore[index]
+        assert codes(source) == ["offsets-from-positions"]
 
     def test_rotations_do_not_change_sign_between_frames(self) -> None:
         angles = np.linspace(0, 1440, 97)
@@ -213,6 +227,8 @@ class TestRefusals:
             (b"", 1, None, "empty"),
             (b"\x00\x01\x02rubbish", 1, None, "HIERARCHY"),
             ("HIERARCHY".encode("utf-16"), 1, None, "UTF-16"),
+            ("HIERARCHY".encode("utf-16-le"), 1, None, "UTF-16"),
+            ("HIERARCHY".encode("utf-16-be"), 1, None, "UTF-16"),
             (bvh().replace(b"OFFSET 0 10 0", b"OFFSET 0 10"), 8, "Arm", "3 are needed"),
             (bvh().replace(b"OFFSET 0 10 0", b"OFFSET 0 1,5 0"), 8, "Arm", "decimal comma"),
             (bvh().replace(b"OFFSET 0 10 0", b"OFFSET 0 nan 0"), 8, "Arm", "not finite"),
