@@ -134,16 +134,19 @@ def _choose_up_axis(source: SourceMotion, body: _Body, options: ImportOptions) -
         body.evidence.append("up axis y: the usual one, assumed because no feet were found")
         body.warnings.append(CheckWarning("up-axis-assumed", "no feet tell which way is up; y is assumed"))
         return "y"
-    standing = _body_axis(body.positions, body.landmarks)
+    standing, flat = _body_axis(body.positions, body.landmarks), _flat_axis(body)
+    if flat is not None and flat[0] != standing[0] and _stands_on_all_fours(body, flat[0]):
+        body.evidence.append(f"up axis {flat[0]}: hands and feet stand below the hips; {flat[1]}")
+        return flat[0]
     if standing[0] == "y" and standing[1] >= _CLEAR_COSINE:
         body.evidence.append(
             f"up axis y: head above feet, mean cosine {standing[1]:.2f} over {len(body.positions)} frames"
         )
         return "y"
-    return _settle_up_axis(body, *standing)
+    return _settle_up_axis(body, *standing, flat)
 
 
-def _settle_up_axis(body: _Body, axis: UpAxis, cosine: float) -> UpAxis:
+def _settle_up_axis(body: _Body, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
     """Decide where the body does not simply stand along y: it may lie or climb, or the file may have another axis."""
     rest_axis, rest_cosine = _body_axis(body.rest[None], body.landmarks)
     standing, resting = f"mean direction from feet to head is {axis} with cosine {cosine:.2f}", _FOLDED
@@ -151,7 +154,6 @@ def _settle_up_axis(body: _Body, axis: UpAxis, cosine: float) -> UpAxis:
         resting = f"rest pose points along {rest_axis} with cosine {rest_cosine:.2f}"
     if cosine == 0.0:
         standing = f"the motion keeps to a {_FOLDED}"
-    flat = _flat_axis(body)
     if cosine >= _CLEAR_COSINE and rest_axis == axis and rest_cosine >= _CLEAR_COSINE:
         body.evidence.append(f"up axis {axis}: {standing}; {resting}")
         return axis
@@ -331,6 +333,12 @@ def _walks_on_hands(body: _Body, up_axis: UpAxis) -> bool:
     hands = heights[:, list(body.landmarks.hands)].min(axis=1)
     feet = heights[:, list(body.landmarks.ground_joints)].min(axis=1)
     return bool(np.median(hands - feet) < 0.25 * body.leg)
+
+
+def _stands_on_all_fours(body: _Body, up_axis: UpAxis) -> bool:
+    """Whether hands and feet stand on one ground well below the hips, as a body's sides never do."""
+    assert body.leg is not None
+    return _walks_on_hands(body, up_axis) and _hip_height(body, up_axis) > 0.5 * body.leg
 
 
 # Handedness

@@ -140,6 +140,44 @@ def _fallen(walk: Clip) -> np.ndarray:
     return poses
 
 
+def on_all_fours(facing: float) -> Clip:
+    """A body on hands and feet that crawls three metres along z, winding a little, towards +z or −z."""
+    places = {
+        "Hips": (None, (0, 0.6, 0)),
+        "Spine": ("Hips", (0, 0.6, 0.4)),
+        "Neck": ("Spine", (0, 0.65, 0.9)),
+        "Head": ("Neck", (0, 0.7, 1.2)),
+        **{
+            f"{side}{name}": (parent and side + parent if parent not in ("Hips", "Spine") else parent, (x * sign, y, z))
+            for side, sign in (("Left", 1), ("Right", -1))
+            for name, parent, (x, y, z) in (
+                ("UpLeg", "Hips", (0.1, 0.6, 0)),
+                ("Leg", "UpLeg", (0.1, 0.35, 0.3)),
+                ("Foot", "Leg", (0.1, 0.05, 0)),
+                ("Arm", "Spine", (0.2, 0.6, 0.7)),
+                ("ForeArm", "Arm", (0.2, 0.3, 0.7)),
+                ("Hand", "ForeArm", (0.2, 0.05, 0.7)),
+            )
+        },
+    }
+    names = list(places)
+    points = np.array([point for _, point in places.values()]) * [facing, 1.0, facing]
+    parents = np.array([-1 if parent is None else names.index(parent) for parent, _ in places.values()], np.int32)
+    offsets = points - np.where(parents[:, None] >= 0, points[parents], 0.0)
+    rests = np.tile([1.0, 0.0, 0.0, 0.0], (len(names), 1))
+    poses = np.tile(np.concatenate([points[0], rests.ravel()]), (30, 1))
+    poses[:, 0] += 0.3 * np.sin(np.linspace(0.0, 6.0, 30))
+    poses[:, 2] += facing * np.linspace(0.0, 3.0, 30)
+    return Clip(Skeleton(tuple(names), parents, offsets, rests, ()), 30.0, poses.astype(np.float32))
+
+
+@pytest.mark.parametrize("facing", [1.0, -1.0])
+@pytest.mark.parametrize("up_axis", ["y", "z"])
+def test_what_stands_on_all_fours_is_not_stood_on_its_feet(up_axis: str, facing: float) -> None:
+    motion = imported(in_axes(on_all_fours(facing), FILE_AXES[up_axis]), unit_scale_m=0.01)
+    assert motion.source.up_axis == up_axis
+
+
 def test_a_mirrored_file_is_noticed_and_mirrored_back_on_request(walk: Clip) -> None:
     mirrored = in_axes(walk, MIRROR)
     assert "left-handed" in codes(imported(mirrored))
