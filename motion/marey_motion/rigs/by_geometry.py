@@ -18,6 +18,8 @@ from marey_motion.skeleton import Skeleton
 
 # Two limbs belong together when their bones differ by less than this share of their length.
 ASYMMETRY_LIMIT = 0.15
+# Limbs of unequal ends are still a pair when they have this many bones in common: an arm to the wrist.
+LEAST_COMMON_BONES = 3
 # Limbs whose two long bones are shorter than this share of the longest pair's are fingers, ears or armour.
 SHORTEST_ARM = 0.3
 # Forearms have 0.7 to 1 of the longest bone of an arm, hands to the fingertips at most 0.62.
@@ -55,6 +57,10 @@ class Limb:
     def long_bones(self) -> float:
         """Length of the thigh and shank, or of the upper arm and forearm."""
         return sum(self.bones[self.upper : self.upper + 2])
+
+    def cut(self, bones: int) -> Limb:
+        """The limb up to the end of so many bones."""
+        return Limb(self.chain[: bones + 1], (*self.bones[:bones], 0.0))
 
     def joint(self, position: int) -> int | None:
         """The joint so many places after the one that carries the long bones."""
@@ -168,10 +174,7 @@ class _Tree:
             if len(long) < 2:
                 continue
             limbs = map(self.limb, sorted(long, key=lambda child: -self.reach[child])[:MOST_LIMBS])
-            for first, second in combinations(limbs, 2):
-                asymmetry = _asymmetry(first, second)
-                if asymmetry <= ASYMMETRY_LIMIT:
-                    pairs.append(LimbPair(parent, (first, second), asymmetry))
+            pairs += [pair for two in combinations(limbs, 2) if (pair := _paired(parent, *two)) is not None]
         return tuple(pairs)
 
     def are_apart(self, legs: LimbPair, arms: LimbPair) -> bool:
@@ -206,6 +209,16 @@ class _Tree:
         """Children without those that are small beside the largest."""
         extents = {child: float(self.lengths[child] + self.reach[child]) for child in self.skeleton.children[joint]}
         return [child for child, extent in extents.items() if extent >= SMALL_BRANCH * max(extents.values())]
+
+
+def _paired(parent: int, first: Limb, second: Limb) -> LimbPair | None:
+    """Two limbs of equal build, or what they have in common before one of them goes on into what it holds."""
+    shorter = min(len(first.chain), len(second.chain)) - 1
+    for a, b in ((first, second), *((first.cut(k), second.cut(k)) for k in range(shorter, LEAST_COMMON_BONES - 1, -1))):
+        asymmetry = _asymmetry(a, b)
+        if asymmetry <= ASYMMETRY_LIMIT:
+            return LimbPair(parent, (a, b), asymmetry)
+    return None
 
 
 def _asymmetry(first: Limb, second: Limb) -> float:

@@ -110,6 +110,18 @@ def test_a_known_rig_is_recognised_and_every_joint_gets_its_standard_name(body, 
     assert dict(mapping.joints) == {"root": expected["pelvis"]} | expected
 
 
+def with_a_sword(skeleton, hand):
+    """The skeleton with two joints more that hang from a hand and reach farther than its fingers."""
+    return replace(
+        skeleton,
+        joint_names=(*skeleton.joint_names, "grip", "blade"),
+        display_names=(*skeleton.display_names, "grip", "blade"),
+        parents=np.append(skeleton.parents, [hand, skeleton.joint_count]).astype(np.int32),
+        offsets=np.append(skeleton.offsets, [[0, 0, 0.1], [0, 0, 0.9]], axis=0),
+        rest_rotations=np.append(skeleton.rest_rotations, [[1, 0, 0, 0], [1, 0, 0, 0]], axis=0),
+    )
+
+
 EVERYDAY = {
     "unity": (
         "Hips Spine Chest UpperChest Neck Head",
@@ -142,15 +154,7 @@ EVERYDAY = {
 @pytest.mark.parametrize("style", EVERYDAY)
 def test_everyday_words_name_a_body_of_no_known_rig_whatever_one_hand_holds(body, style):
     skeleton, expected = renamed(body, EVERYDAY[style])
-    hand = skeleton.index_of(expected["right_wrist"])
-    holding = replace(
-        skeleton,
-        joint_names=(*skeleton.joint_names, "grip", "blade"),
-        display_names=(*skeleton.display_names, "grip", "blade"),
-        parents=np.append(skeleton.parents, [hand, skeleton.joint_count]).astype(np.int32),
-        offsets=np.append(skeleton.offsets, [[0, 0, 0.1], [0, 0, 0.9]], axis=0),
-        rest_rotations=np.append(skeleton.rest_rotations, [[1, 0, 0, 0], [1, 0, 0, 0]], axis=0),
-    )
+    holding = with_a_sword(skeleton, skeleton.index_of(expected["right_wrist"]))
     for rig in (skeleton, holding):
         mapping = map_joints(rig)
         assert (mapping.rig, mapping.method, mapping.confidence) == (None, "names", 1.0)
@@ -173,6 +177,16 @@ def test_a_prefix_before_all_names_does_not_matter(body):
 
     assert mapping.rig == "motionbuilder"
     assert mapping.joints["left_knee"] == "Character1_LeftLeg"
+
+
+def test_a_body_without_telling_names_is_found_whatever_one_hand_holds(body):
+    known = map_joints(body).joints
+    names = tuple(f"bone{index}" for index in range(body.joint_count))
+    anonymous = replace(body, joint_names=names, display_names=names)
+    mapping = map_joints(with_a_sword(anonymous, body.index_of("RightHand")))
+
+    assert mapping.method == "geometry"
+    assert dict(mapping.joints) == {joint: names[body.index_of(name)] for joint, name in known.items()}
 
 
 @pytest.mark.parametrize(("scale", "turn"), [(1.0, 0.0), (0.4, 2.0), (170.0, -1.0)])
