@@ -235,7 +235,7 @@ def _hip_height_ratio(
     known = np.isfinite(parts[0]) & np.isfinite(parts[1])
     heights = [float(np.sum(part[known])) for part in parts]
     if min(heights) <= 0.0:
-        raise MappingError("legs without length have no hip height; give the scale yourself", where="left_hip")
+        raise MappingError("legs without length give no scale; set it with --scale (scale)", where="left_hip")
     return heights[1] / heights[0]
 
 
@@ -250,7 +250,7 @@ def _heights(
     if missing:
         raise MappingError(
             f"the hip height needs both legs, but {', '.join(missing)} is not mapped on both sides; "
-            "map it or give the scale yourself",
+            "map it or set the scale with --scale (scale)",
             where=missing[0],
         )
     positions, pelvis = skeleton.rest_global_positions, joints["pelvis"]
