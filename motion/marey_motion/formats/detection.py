@@ -26,6 +26,14 @@ _ARCHIVES = {
     b"7z\xbc\xaf": "7z",
     b"Rar!": "rar",
 }
+# What is often uploaded and read by none of our readers, by how it begins.
+_FOREIGN = {
+    b"Kaydara FBX": "an FBX file",
+    b"; FBX": "an FBX file",
+    b"glTF": "a glTF file",
+    b"PathFileType": "a TRC file of markers",
+    b"\x93NUMPY": "a single numpy array",
+}
 _ZIP = b"PK\x03\x04"
 
 
@@ -47,6 +55,11 @@ def detect_format(data: bytes, name: str) -> str:
     if archive:
         raise UnknownFormat(
             f"a {archive} archive; unpack it and import the files inside", code="format-archive", file=name
+        )
+    foreign = next((kind for mark, kind in _FOREIGN.items() if data.startswith(mark)), None)
+    if foreign:
+        raise UnknownFormat(
+            f"{foreign}, for which there is no reader; export the motion as BVH", code="reader-absent", file=name
         )
     found = _by_content(data) or suffix
     if found is None:

@@ -50,6 +50,23 @@ def test_what_no_reader_knows_is_refused_with_a_reason(data: bytes, name: str, c
     assert (refused.value.code, refused.value.file) == (code, name)
 
 
+@pytest.mark.parametrize(
+    ("data", "name", "kind"),
+    [
+        (b"Kaydara FBX Binary  \0\x1a\0", "take.fbx", "FBX"),
+        (b"; FBX 7.4.0 project file", "take.fbx", "FBX"),
+        (b"Kaydara FBX Binary  \0\x1a\0", "take.bvh", "FBX"),
+        (b"glTF\x02\0\0\0", "take.glb", "glTF"),
+        (b"PathFileType\t4\t(X/Y/Z)", "take.trc", "TRC"),
+        (b"\x93NUMPY\x01\0", "poses.npy", "numpy"),
+    ],
+)
+def test_files_of_other_programs_are_named_with_what_to_do(data: bytes, name: str, kind: str) -> None:
+    with pytest.raises(UnknownFormat, match=f"{kind}.*BVH") as refused:
+        detect_format(data, name)
+    assert refused.value.code == "reader-absent"
+
+
 def test_marker_files_are_refused_as_what_they_are() -> None:
     with pytest.raises(FormatError, match="C3D") as refused:
         read_motion(b"\x02\x50" + bytes(510), "take.c3d")
