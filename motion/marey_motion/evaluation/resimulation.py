@@ -23,7 +23,7 @@ from marey_motion.evaluation.metrics import measure_trial
 from marey_motion.evaluation.result import EvaluationOptions, TrialResult
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials
 from marey_motion.evaluation.selection import clips_by_source, require_sources, rows_of_sources, source_of
-from marey_motion.evaluation.suite import CancelCallback, run_suite
+from marey_motion.evaluation.suite import CancelCallback, guide_for, run_suite
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.display import switched_rows
 from marey_motion.matching.record import TrialRecord
@@ -166,7 +166,7 @@ def needed_rows(
     rows = [record.rows.astype(np.int64), chosen[chosen >= 0]]
     # What the last search chose is not displayed any more when it was made at the last tick.
     if not np.isnan(record.match_cost[-1]):
-        asked, last = reference(trial, record.rate_hz), len(record.rows) - 1
+        asked, last = guide_for(trial, database), len(record.rows) - 1
         reason = explain_choice(database, index, asked, options.controller, record, last, count=1)
         rows.append(np.array([reason.chosen]))
     return np.unique(np.concatenate(rows))

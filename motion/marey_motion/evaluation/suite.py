@@ -18,7 +18,7 @@ from marey_motion.evaluation.metrics import measure_trial, offset_asymmetry, poo
 from marey_motion.evaluation.provenance import provenance_of
 from marey_motion.evaluation.relevance import count_switches, measure_usage, treading_share, unused_clips
 from marey_motion.evaluation.result import EvaluationOptions, EvaluationResult, TrialResult
-from marey_motion.evaluation.scenario import Trial, reference, suite_trials
+from marey_motion.evaluation.scenario import LOOK_AHEAD_S, Reference, Trial, reference, suite_trials
 from marey_motion.matching.controller import run_trial
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import TrialRecord
@@ -95,7 +95,13 @@ def _runner(
     database: MatchingDatabase, index: SearchIndex | None, options: EvaluationOptions
 ) -> Callable[[Trial], TrialRecord]:
     searched = index or build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
-    return lambda trial: run_trial(database, searched, reference(trial, database.options.rate_hz), options.controller)
+    return lambda trial: run_trial(database, searched, guide_for(trial, database), options.controller)
+
+
+def guide_for(trial: Trial, database: MatchingDatabase) -> Reference:
+    """A trial's trajectory as far beyond its end as the database looks ahead."""
+    horizon_s = max(LOOK_AHEAD_S, *database.options.horizons_s)
+    return reference(trial, database.options.rate_hz, horizon_s)
 
 
 def _run_ahead(

@@ -10,13 +10,15 @@ import pytest
 from marey_motion.evaluation import suite as suites
 from marey_motion.evaluation.coverage import coverage_holes, measure_coverage
 from marey_motion.evaluation.result import EvaluationOptions, Grid
-from marey_motion.evaluation.scenario import suite_trials
+from marey_motion.evaluation.scenario import reference, suite_trials
 from marey_motion.evaluation.suite import assemble, evaluate, evaluate_baseline, run_suite
 from marey_motion.gait import GaitStyle, generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
+from marey_motion.matching.controller import run_trial
 from marey_motion.matching.database import SourceClip
 from marey_motion.matching.options import DatabaseOptions
+from marey_motion.matching.search import build_index
 from marey_motion.rigs import map_joints
 
 TURN_RATES = (-100.0, -75.0, -50.0, -25.0, 0.0, 25.0, 50.0, 75.0, 100.0)
@@ -135,6 +137,20 @@ def test_removing_what_no_trial_used_changes_no_bit_with_a_pinned_normaliser():
     for before, after in zip(result.records, again.records, strict=True):
         for name in ("positions", "headings", "match_cost", "continuing_cost", "pose_cost"):
             assert getattr(before, name).tobytes() == getattr(after, name).tobytes()
+
+
+def test_a_database_that_looks_farther_than_a_second_ahead_sees_every_switch_that_comes():
+    looking_far = DatabaseOptions(horizons_s=(1.0, 2.0, 3.0))
+    database = database_of(gait_clips(product((1.0, 2.0, 4.0), (0.0, 50.0)), 6.0), looking_far)
+    options = replace(SMALL, grid=Grid((1.0,), (50.0,)), families=("switching",), switch_every_s=1.0)
+    (trial,) = suite_trials(options)
+    index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
+
+    (record,) = run_suite(database, options)
+
+    expected = run_trial(database, index, reference(trial, look_ahead_s=10.0), options.controller)
+    assert np.array_equal(record.match_cost, expected.match_cost, equal_nan=True)
+    assert record.rows.tolist() == expected.rows.tolist()
 
 
 # The baseline

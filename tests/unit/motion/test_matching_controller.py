@@ -314,6 +314,18 @@ def test_a_pull_towards_the_reference_and_a_clamp_keep_the_character_near():
     assert abs(clamped - 0.25) < 1e-9
 
 
+def test_a_pull_turns_the_character_the_short_way_round():
+    database = made_database([arc_track(1.0, 0.0, 60.0)])
+    path = reference(circle(1.0, 50.0))
+    rounds = replace(path, headings=path.headings + np.where(np.arange(len(path.headings)) > 0, 4 * np.pi, 0.0))
+    options = replace(EXACT, root_adjustment=1.0, continuing_bias=-1e9)
+
+    record, wound = play(database, path, options), play(database, rounds, options)
+
+    assert record.headings[-1] > np.radians(50.0) * 28.0
+    np.testing.assert_allclose(wound.headings, record.headings, atol=1e-9)
+
+
 # Following a path
 
 
