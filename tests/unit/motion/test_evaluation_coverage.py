@@ -125,6 +125,21 @@ def test_symmetry_lies_between_for_a_set_that_turns_more_to_one_side():
     assert measure_coverage(root_database(three, one), OPTIONS).symmetry == pytest.approx(1 - 120 / 242)
 
 
+def test_seconds_that_are_enough_to_the_frame_leave_no_hole():
+    enough = replace(OPTIONS, grid=Grid((1.0,), (0.0,)), coverage_least_s=1.85)
+    for windows, holes in ((110, 1), (111, 0)):
+        coverage = measure_coverage(root_database(arc(1.0, 0.0, (windows + 59) / RATE_HZ)), enough)
+        assert len(coverage.speed_m_s) == windows
+        assert len(coverage_holes(coverage, enough.grid)) == holes
+
+
+def test_what_goes_straight_or_nearly_so_counts_as_alike_on_both_sides():
+    left, straight, nearly = arc(2.0, 50.0, 4.0), arc(2.0, 0.0, 4.0), arc(2.0, 5.0, 4.0)
+
+    assert measure_coverage(root_database(left, straight), OPTIONS).symmetry == pytest.approx(0.5)
+    assert measure_coverage(root_database(left, nearly), OPTIONS).symmetry == pytest.approx(0.5)
+
+
 def test_turn_rates_on_the_edge_of_a_cell_mirror_each_other():
     on_the_edge = arc(2.0, 37.5, 4.0)
 

@@ -308,6 +308,10 @@ def test_regimes_are_pooled_under_their_names():
 def test_asymmetry_is_the_difference_between_left_and_right_turns():
     assert offset_asymmetry(results_of({"offset_mean": 0.5}, {"offset_mean": 0.2})) == pytest.approx(0.3)
     assert offset_asymmetry(results_of({"offset_mean": 0.5})) is None
+    straight = TrialResult(STRAIGHT, {"offset_mean": 0.1}, {})
+    assert offset_asymmetry((straight,)) is None
+    pair = results_of({"offset_mean": 0.5}, {"offset_mean": 0.2})
+    assert offset_asymmetry((*pair, straight)) == pytest.approx(0.3)
 
 
 def test_a_series_has_a_value_per_step_and_says_what_was_asked():

@@ -109,6 +109,7 @@ def test_a_last_frame_that_repeats_the_first_is_left_out() -> None:
     poses[-1, 3:] = poses[0, 3:]
     database = built(replace(walk, poses=poses))
     assert database.row_count == length
+    assert database.features.tobytes() == built(walk.sliced(120, 120 + length)).features.tobytes()
     assert "loop-end-repeated" in [note.code for note in database.notes]
 
 

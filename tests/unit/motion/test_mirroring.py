@@ -63,11 +63,17 @@ def raised_arm() -> Skeleton:
     plain = studio_skeleton()
     offsets = plain.offsets.copy()
     quarter = quaternions.from_axis_angle((0.0, 0.0, 1.0), 0.5 * np.pi)
-    for top in ("LeftArm", "RightUpLeg"):
-        for joint in range(plain.index_of(top) + 1, plain.joint_count):
-            if plain.index_of(top) in plain.path_to_root(joint):
-                offsets[joint] = quaternions.rotate_vectors(quarter, offsets[joint])
-    return replace(plain, offsets=offsets)
+    tops = {plain.index_of(top) for top in ("LeftArm", "RightUpLeg")}
+    for joint in range(plain.joint_count):
+        if joint not in tops and tops & set(plain.path_to_root(joint)):
+            offsets[joint] = quaternions.rotate_vectors(quarter, offsets[joint])
+    sites = tuple(
+        EndSite(s.joint, np.asarray(quaternions.rotate_vectors(quarter, s.offset)))
+        if tops & set(plain.path_to_root(s.joint))
+        else s
+        for s in plain.end_sites
+    )
+    return replace(plain, offsets=offsets, end_sites=sites)
 
 
 @pytest.mark.parametrize("make", [studio_skeleton, own_axes, raised_arm], ids=["plain", "own axes", "asymmetric rest"])
@@ -109,6 +115,36 @@ def test_joints_without_a_counterpart_go_with_their_parent() -> None:
     assert quaternions.angle_between(mirrored.rotations[:, weapon], clip.rotations[:, weapon]).max() < 1e-3
     assert skeleton.parents[weapon] == hand
     assert same_motion(mirror_clip(mirrored, partners), clip)
+
+
+def test_what_hangs_from_a_joint_without_a_counterpart_keeps_its_place_and_turn_in_it() -> None:
+    plain = game_skeleton()
+    weapon, count = plain.index_of("weapon_r"), plain.joint_count
+    skeleton = Skeleton(
+        (*plain.joint_names, "blade"),
+        np.append(plain.parents, weapon),
+        np.concatenate((plain.offsets, [[0.1, 0.3, 0.5]])),
+        np.concatenate((plain.rest_rotations, quaternions.identity(1))),
+    )
+    partners = np.append(partners_of(plain), count)
+    clip = wild(skeleton, 7, translated=(weapon, count))
+    mirrored = mirror_clip(clip, partners)
+    assert mirrored.translated_joints == (weapon, count)
+    np.testing.assert_array_equal(mirrored.translations, clip.translations)
+    turned = quaternions.angle_between(mirrored.rotations[:, [weapon, count]], clip.rotations[:, [weapon, count]])
+    assert turned.max() < 1e-3
+
+
+@pytest.mark.parametrize("make", [studio_skeleton, own_axes, raised_arm], ids=["plain", "own axes", "asymmetric rest"])
+def test_tips_are_where_the_mirror_shows_those_of_their_partners(make) -> None:
+    skeleton, partners = make(), partners_of(studio_skeleton())
+    clip, joints = wild(skeleton, 8), [site.joint for site in skeleton.end_sites]
+    mirrored, seen = (
+        global_positions(one, end_sites=True)[:, skeleton.joint_count :] for one in (mirror_clip(clip, partners), clip)
+    )
+    others = [joints.index(partners[joint]) for joint in joints]
+    assert len(joints) > 2
+    np.testing.assert_allclose(mirrored, seen[:, others] * REFLECTED, atol=2e-6)
 
 
 @pytest.mark.parametrize("make", [studio_skeleton, own_axes], ids=["plain", "own axes"])

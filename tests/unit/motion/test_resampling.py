@@ -1,3 +1,5 @@
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -8,7 +10,7 @@ from marey_motion.errors import ClipError
 from marey_motion.gait import generate_gait
 from marey_motion.kinematics import global_positions
 from marey_motion.looping import LoopSeam
-from marey_motion.resampling import resample_clip
+from marey_motion.resampling import count_samples, resample_clip
 from marey_motion.skeleton import Skeleton
 
 RATES_HZ = (24.0, 30.0, 50.0, 60.0, 119.88, 120.0)
@@ -49,6 +51,13 @@ def test_first_frames_coincide_and_none_lies_beyond_the_last(rate_hz: float) -> 
     last_s = (resampled.frame_count - 1) / 60.0
     assert last_s <= 100 / rate_hz + 1e-9
     assert last_s > 100 / rate_hz - 1 / 60.0
+
+
+@pytest.mark.parametrize("rate", ["24", "30", "48", "120", "240", "23.976", "29.97", "119.88"])
+def test_no_frame_is_lost_or_won_by_rounding(rate: str) -> None:
+    for frames in range(1, 3000):
+        exact = (frames - 1) * 60 // Fraction(rate) + 1
+        assert count_samples(frames, float(rate), 60.0) == exact
 
 
 def test_every_second_frame_is_taken_as_it_is_and_the_same_rate_changes_nothing() -> None:
