@@ -155,7 +155,15 @@ def test_what_only_the_last_search_chose_is_needed_too():
     index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
     trial = suite_trials(OPTIONS)[0]
     (record,) = run_suite(database, OPTIONS, trials=[trial])
-    tick = int(np.flatnonzero(record.status == Status.REPLACED)[-1])
+    ends = np.flatnonzero(record.status == Status.REPLACED)
+    chosen = record.rows[ends + 1] - 1
+    # One that was neither displayed nor chosen before.
+    new = [
+        at
+        for at, (end, row) in enumerate(zip(ends, chosen, strict=True))
+        if row not in record.rows[: end + 1] and row not in chosen[:at]
+    ]
+    tick = int(ends[new[-1]])
     short = replace(trial, duration_s=(tick + 1) / 60 - trial.approach_s)
     (cut,) = run_suite(database, OPTIONS, trials=[short])
     assert len(cut.rows) == tick + 1
