@@ -275,3 +275,5 @@ def run(index, playback, wish, rules, record):  # type: ignore[no-untyped-def]
         when = _moment(rules, wish, when, tick + 1, root[0], root[1])
         if rules.holds:
             _hold(rules, wish, when, root)
+            # What is wished next is seen from where the character was put.
+            when = _moment(rules, wish, before, tick + 1, root[0], root[1])

@@ -159,6 +159,19 @@ def test_what_is_left_of_a_switch_follows_the_closed_form(database):
         np.testing.assert_allclose(shown.root_translations[29 + ticks, 1], height[cut + ticks] + left, atol=1e-6)
 
 
+def test_a_clip_that_ends_is_left_with_the_velocity_that_it_ended_with(database):
+    last, after = int(database.starts[1]) - 1, int(database.starts[4]) + 47
+    shown = displayed_clip(database, jump(database, last - 29, after), OPTIONS)
+
+    height = database.poses[:, 1].astype(np.float64)
+    cut = after - 1
+    offset = height[last] - height[cut]
+    velocity = 60 * ((height[last] - height[last - 1]) - (height[cut + 1] - height[cut]))
+    for ticks in (1, 6, 20):
+        left = (decay_matrix(0.1, ticks / 60) @ (offset, velocity))[0]
+        np.testing.assert_allclose(shown.root_translations[29 + ticks, 1], height[cut + ticks] + left, atol=1e-6)
+
+
 def test_a_second_switch_takes_along_what_is_left_of_the_first(database):
     rows = np.concatenate((30 + np.arange(10), 780 + np.arange(4), 2000 + np.arange(20))).astype(np.int32)
     record = replace(undisturbed(database, 0, 34), rows=rows, positions=np.zeros((34, 2)), headings=np.zeros(34))

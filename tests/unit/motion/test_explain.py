@@ -30,7 +30,14 @@ def explained(made: tuple[ControllerOptions, TrialRecord], tick: int, **asked: o
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"follow": "path"}, {"follow": "open_loop"}, {"selection": "pose_distance"}, {"reselect_window_s": 0.3}],
+    [
+        {},
+        {"follow": "path"},
+        {"follow": "path", "root_adjustment": 1.0},
+        {"follow": "open_loop"},
+        {"selection": "pose_distance"},
+        {"reselect_window_s": 0.3},
+    ],
     ids=str,
 )
 def test_every_decision_of_a_trial_is_explained_as_it_was_made(options):
