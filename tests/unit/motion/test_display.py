@@ -159,6 +159,26 @@ def test_what_is_left_of_a_switch_follows_the_closed_form(database):
         np.testing.assert_allclose(shown.root_translations[29 + ticks, 1], height[cut + ticks] + left, atol=1e-6)
 
 
+def test_a_joint_that_moves_against_its_parent_is_blended_in_place_and_velocity():
+    clip = generate_along(arc(1.5, 0.0, 3.0))
+    body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
+    joint = body.standard_joints["left_wrist"]
+    swing = 0.05 * np.sin(5.0 * np.arange(clip.frame_count) / 60 + np.array([[0.0], [0.7], [1.4]])).T
+    places = (clip.skeleton.offsets[joint] + swing)[:, None].astype(np.float32)
+    moving = replace(clip, translations=places, translated_joints=(joint,))
+    database = build_database([SourceClip("clip", "clip", moving)], body)
+    before, after = 30, 110
+
+    shown = displayed_clip(database, jump(database, before, after), OPTIONS).translations[:, 0]
+
+    held, cut = before + 29, after - 1
+    place = places[:, 0].astype(np.float64)
+    velocity = 60 * ((place[held + 1] - place[held]) - (place[cut + 1] - place[cut]))
+    for ticks in (1, 6, 20):
+        left = (decay_matrix(0.1, ticks / 60) @ np.stack((place[held] - place[cut], velocity)))[0]
+        np.testing.assert_allclose(shown[29 + ticks], place[cut + ticks] + left, atol=1e-6)
+
+
 def test_a_clip_that_ends_is_left_with_the_velocity_that_it_ended_with(database):
     last, after = int(database.starts[1]) - 1, int(database.starts[4]) + 47
     shown = displayed_clip(database, jump(database, last - 29, after), OPTIONS)
