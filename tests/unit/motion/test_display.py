@@ -159,6 +159,19 @@ def test_what_is_left_of_a_switch_follows_the_closed_form(database):
         np.testing.assert_allclose(shown.root_translations[29 + ticks, 1], height[cut + ticks] + left, atol=1e-6)
 
 
+def test_rotations_are_blended_the_short_way_whatever_the_signs_of_their_quaternions():
+    clip = generate_along(arc(1.5, 0.0, 3.0))
+    body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
+    negated = clip.poses * np.where(np.arange(clip.poses.shape[1]) < 3, 1, -1).astype(np.float32)
+    takes = [SourceClip("a", "a", clip), SourceClip("b", "b", replace(clip, poses=negated))]
+    database = build_database(takes, body)
+
+    there = displayed_clip(database, jump(database, 30, int(database.starts[1]) + 60), OPTIONS)
+
+    throughout = displayed_clip(database, jump(database, 30, 60), OPTIONS)
+    np.testing.assert_allclose(global_positions(there), global_positions(throughout), atol=1e-6)
+
+
 def test_a_joint_that_moves_against_its_parent_is_blended_in_place_and_velocity():
     clip = generate_along(arc(1.5, 0.0, 3.0))
     body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
