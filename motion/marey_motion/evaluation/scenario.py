@@ -6,6 +6,7 @@ constant, or switches between two values at fixed intervals; the turn rate stays
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -68,8 +69,11 @@ class Reference:
 
 
 def suite_trials(options: EvaluationOptions) -> tuple[Trial, ...]:
-    """Every pair of the grid in every family, ordered by family, speed and turn rate as the options list them."""
-    return tuple(
+    """Every pair of the grid in every family, ordered by family, speed and turn rate as the options list them.
+
+    Raises `MotionError` for two trials of one name, such as speeds that differ by less than a millionth.
+    """
+    trials = tuple(
         Trial(
             family=family,
             speed_m_s=float(speed),
@@ -83,6 +87,19 @@ def suite_trials(options: EvaluationOptions) -> tuple[Trial, ...]:
         for speed in options.grid.speeds_m_s
         for turn_rate in options.grid.turn_rates_deg_s
     )
+    require_names(trials)
+    return trials
+
+
+def require_names(trials: Iterable[Trial]) -> None:
+    """Raise `MotionError` where two trials have one name: records are kept by it."""
+    seen: set[str] = set()
+    for trial in trials:
+        if trial.name in seen:
+            raise MotionError(
+                f"two trials are called {trial.name}; their records could not be told apart", where="grid"
+            )
+        seen.add(trial.name)
 
 
 def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float = LOOK_AHEAD_S) -> Reference:

@@ -18,7 +18,14 @@ from marey_motion.evaluation.metrics import measure_trial, offset_asymmetry, poo
 from marey_motion.evaluation.provenance import provenance_of
 from marey_motion.evaluation.relevance import count_switches, measure_usage, treading_share, unused_clips
 from marey_motion.evaluation.result import EvaluationOptions, EvaluationResult, TrialResult
-from marey_motion.evaluation.scenario import LOOK_AHEAD_S, Reference, Trial, reference, suite_trials
+from marey_motion.evaluation.scenario import (
+    LOOK_AHEAD_S,
+    Reference,
+    Trial,
+    reference,
+    require_names,
+    suite_trials,
+)
 from marey_motion.matching.controller import run_trial
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import TrialRecord
@@ -62,7 +69,7 @@ def run_suite(
     `MotionError` for two trials of one name, such as speeds that differ by less than a millionth.
     """
     wanted = suite_trials(options) if trials is None else tuple(trials)
-    _require_names(wanted)
+    require_names(wanted)
     records = dict(done or {})
     ahead = [trial for trial in wanted if trial.name not in records]
     tell = progress or (lambda _done, _total, _note: None)
@@ -79,16 +86,6 @@ def run_suite(
         run = _runner(database, index, options)
         _run_ahead(run, ahead, keep, threads or os.cpu_count() or 1, cancelled or (lambda: False))
     return [records[trial.name] for trial in wanted]
-
-
-def _require_names(trials: Sequence[Trial]) -> None:
-    seen: set[str] = set()
-    for trial in trials:
-        if trial.name in seen:
-            raise MotionError(
-                f"two trials are called {trial.name}; their records could not be told apart", where="grid"
-            )
-        seen.add(trial.name)
 
 
 def _runner(

@@ -64,6 +64,13 @@ def test_clips_of_several_skeletons_are_refused_with_their_names(project):
     assert refused.value.code == "several-skeletons"
 
 
+def test_trials_of_one_name_are_refused_although_other_tasks_have_them(project):
+    project.task = Task(0, 12)
+    with pytest.raises(JobRefused, match="two trials are called circle v=1 w=-50"):
+        evaluate.run(project, PARAMS.model_copy(update={"speeds_m_s": (1.0, 1.0 + 1e-9)}))
+    assert project.told == []
+
+
 def test_a_trial_that_is_not_in_the_suite_is_refused_before_anything_is_read(project):
     with pytest.raises(JobRefused, match="'circle v=9 w=0'; a name is like 'circle v=1 w=-50'"):
         evaluate.run(project, PARAMS.model_copy(update={"trial_figures": ("circle v=9 w=0",)}))
