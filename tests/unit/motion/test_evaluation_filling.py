@@ -57,6 +57,34 @@ def test_the_better_blendable_of_two_clips_that_fill_alike_comes_first():
     assert (alien.source, alien.blendable_share, alien.score) == ("alien", 0.0, 0.0)
 
 
+def test_a_cell_that_is_filled_to_the_last_frame_is_full_however_its_seconds_are_rounded():
+    turn = arc_track(1.0, 50.0, 4.0)
+    names = ("positions", "headings", "pose")
+    part, rest = (turn._replace(**{name: getattr(turn, name)[:frames] for name in names}) for frames in (80, 100))
+    assert 1.0 - 20 / 60 > 40 / 60
+    database = made_database(named([arc_track(1.0, 0.0, 6.0), arc_track(2.0, 0.0, 6.0), part]))
+    outside = others(rest=rest)
+    (filling,) = ranked(database, outside=outside)
+    coverage = measure_coverage(database, OPTIONS)
+    (step,) = plan_fillings([filling], coverage, {"outside": outside}, OPTIONS)
+    assert filling.coverage_index == step.coverage_index == measure_coverage(joined(database, outside), OPTIONS).index
+    assert filling.coverage_index == pytest.approx(coverage.index + 1 / 6)
+
+
+def test_only_the_frames_that_fill_holes_are_asked_whether_they_can_be_blended():
+    ahead, turn = arc_track(1.0, 0.0, 3.0), arc_track(1.0, 50.0, 3.0)
+    pose = np.concatenate((ahead.pose, turn.pose))
+    pose[:120] += 3.0  # like nothing in the set, where there is enough already
+    both = turn._replace(
+        positions=np.concatenate((ahead.positions, turn.positions + np.array((0.0, 3.0)))),
+        headings=np.concatenate((ahead.headings, turn.headings)),
+        pose=pose,
+    )
+    (filling,) = ranked(straight_set(), outside=others(both=both))
+    assert [(cell.speed_m_s, cell.turn_rate_deg_s) for cell in filling.cells] == [(1.0, 50.0)]
+    assert filling.blendable_share == 1.0
+
+
 def test_clips_of_another_skeleton_need_a_retarget_and_come_last():
     outside = others(left=arc_track(1.0, 50.0, 4.0))
     skeleton = replace(outside.body.skeleton, offsets=outside.body.skeleton.offsets * 1.2)
