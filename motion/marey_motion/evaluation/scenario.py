@@ -25,6 +25,7 @@ Floats = NDArray[np.float64]
 LOOK_AHEAD_S = 1.0
 # A boundary belongs to the tick that it falls on, however its time in seconds is rounded.
 TIME_TOLERANCE_S = 1e-9
+STRAIGHT_DEG_S = 1e-6
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,17 @@ class Trial:
     def name(self) -> str:
         """For example "circle v=1.25 w=-50": stable, and unique within a suite."""
         return f"{self.family} v={self.speed_m_s:g} w={np.degrees(self.turn_rate_rad_s):g}"
+
+
+def demand(trial: Trial) -> str:
+    """What a trial asks for, in words."""
+    turn = float(np.degrees(trial.turn_rate_rad_s))
+    speed = f"{trial.speed_m_s:g} m/s"
+    if trial.family == "switching":
+        speed = f"{trial.speed_m_s:g} m/s switching to {trial.switch_speed_m_s:g}"
+    if abs(turn) <= STRAIGHT_DEG_S:
+        return f"straight line at {speed}"
+    return f"{'left' if turn > 0 else 'right'} turn of {abs(turn):.4g} deg/s at {speed}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from marey_motion.evaluation.figures import FIGURES, FigureOptions, draw_figure,
 from marey_motion.evaluation.figures.clip_graph_layout import MOST_DOTS, arrange
 from marey_motion.evaluation.figures.mixtures import fit_one, fit_two
 from marey_motion.evaluation.result import EvaluationOptions, Grid
-from marey_motion.evaluation.scenario import suite_trials
+from marey_motion.evaluation.scenario import demand, suite_trials
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import Status
 
@@ -196,6 +196,13 @@ def test_one_normal_has_the_static_error_as_its_mean_and_the_sign_can_be_turned(
         assert one["turn_rate_deg_s"]["mean"] == pytest.approx(sign * metrics["se_omega_deg"], abs=1e-9)
 
 
+@pytest.mark.parametrize("name", ["errors", "transition-cost"])
+def test_the_title_says_in_words_and_units_what_the_trial_asks_for(name, result):
+    figure = draw_figure(name, result, trial=SWITCHING)
+    assert ">left turn of 50 deg/s at 2 m/s switching to 4<" in figure.svg
+    assert SWITCHING not in figure.svg + figure.caption
+
+
 def test_the_histogram_holds_the_evaluated_seconds(result):
     rows = rows_of(draw_figure("errors", result, trial=SWITCHING), "histogram")
     for quantity in ("speed_m_s", "turn_rate_deg_s"):
@@ -328,7 +335,7 @@ def test_without_a_name_the_trial_that_went_worst_is_shown(result):
         (each for each in result.trials if each.trial.family == "switching"),
         key=lambda each: each.metrics["offset_mean"],
     )
-    assert worst.trial.name in draw_figure("transition-cost", result).svg
+    assert demand(worst.trial) in draw_figure("transition-cost", result).svg
 
 
 def test_what_there_is_not_is_refused(result):

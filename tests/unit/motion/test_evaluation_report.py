@@ -15,9 +15,9 @@ from marey_motion.evaluation.figures import FIGURES, draw_figures
 from marey_motion.evaluation.judgement import is_followed, judge, mean_speed_m_s
 from marey_motion.evaluation.report import compared, render_comparison, render_report, verdict
 from marey_motion.evaluation.report.definitions import METRICS
-from marey_motion.evaluation.report.words import demand, find_holes
+from marey_motion.evaluation.report.words import find_holes
 from marey_motion.evaluation.result import EvaluationOptions, Grid, TrialResult
-from marey_motion.evaluation.scenario import Trial
+from marey_motion.evaluation.scenario import Trial, demand
 from marey_motion.evaluation.suite import evaluate
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody

@@ -21,6 +21,7 @@ from marey_motion.drawing.paper import (
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.figures.mixtures import Normals, fit_one, fit_two
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject, TrialView, choose_trial, view_trial
+from marey_motion.evaluation.scenario import demand
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,7 +66,7 @@ def draw_errors(subjects: Sequence[Subject], trial: str | None, options: FigureO
             panel = add_panel(
                 figure,
                 Place(0.65 + 4.65 * column, bottom, 4.2, height),
-                title=(view.subject.label or chosen.name) if column == 0 else "",
+                title=(view.subject.label or demand(chosen)) if column == 0 else "",
                 x=label if last else "",
                 y="seconds" if column == 0 else "",
             )
@@ -78,7 +79,7 @@ def draw_errors(subjects: Sequence[Subject], trial: str | None, options: FigureO
         top = max(panel.get_ylim()[1] for panel in panels)
         for panel in panels:
             panel.set_ylim(0.0, 1.25 * top)
-    return Sketch(figure, tables, _caption(chosen.name, views, errors))
+    return Sketch(figure, tables, _caption(demand(chosen), views, errors))
 
 
 def _errors(view: TrialView, negate: bool) -> tuple[_Errors, _Errors]:
@@ -155,5 +156,5 @@ def _caption(trial: str, views: Sequence[TrialView], errors: Sequence[tuple[_Err
             f"{view.subject.prefix}speed {speed.one.means[0]:+z.2f} ± {speed.one.deviations[0]:.2f} m/s, "
             f"turn rate {turn.one.means[0]:+z.1f} ± {turn.one.deviations[0]:.1f} deg/s"
         )
-    text = f"Errors at every step of {trial}: the place of a peak is the static error, its width the dynamic one: "
+    text = f"Errors at every step of a {trial}: the place of a peak is the static error, its width the dynamic one: "
     return f"{text}{'; '.join(parts)}."

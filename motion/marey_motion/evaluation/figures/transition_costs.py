@@ -18,6 +18,7 @@ from marey_motion.drawing.paper import (
     write,
 )
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject, TrialView, choose_trial, view_trial
+from marey_motion.evaluation.scenario import demand
 
 LEAST_TOP_M = 0.01
 """How far the axis of costs goes at least: what is far below is rounding, of a character that stands."""
@@ -29,7 +30,7 @@ def draw_transition_costs(subjects: Sequence[Subject], trial: str | None, _optio
     views = [view_trial(subject, chosen) for subject in subjects]
     first = views[0].series
     figure = new_figure(9.0, 4.6)
-    above = add_panel(figure, Place(0.7, 3.05, 8.1, 1.2), title=chosen.name, y="speed (m/s)")
+    above = add_panel(figure, Place(0.7, 3.05, 8.1, 1.2), title=demand(chosen), y="speed (m/s)")
     below = add_panel(figure, Place(0.7, 0.55, 8.1, 2.2), x="time (s)", y="transition cost (m)")
     above.step(first.times_s, first.wanted_speeds_m_s, where="post", color=REFERENCE, lw=1.8, label="wished")
     costs = [view.record.pose_cost[1:] for view in views]

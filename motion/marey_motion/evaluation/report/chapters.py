@@ -14,8 +14,9 @@ from marey_motion.evaluation.figures import DrawnFigure
 from marey_motion.evaluation.judgement import is_followed, judge, strain
 from marey_motion.evaluation.relevance import SourceUsage, recorded_rows, sum_by_source
 from marey_motion.evaluation.report.definitions import METRICS
-from marey_motion.evaluation.report.words import demand, find_holes
+from marey_motion.evaluation.report.words import find_holes
 from marey_motion.evaluation.result import EvaluationResult, TrialResult
+from marey_motion.evaluation.scenario import demand
 
 Figures = Mapping[str, DrawnFigure]
 

@@ -13,8 +13,8 @@ from marey_motion.evaluation.figures import DrawnFigure
 from marey_motion.evaluation.judgement import Judgement, is_followed, judge
 from marey_motion.evaluation.relevance import sum_by_source
 from marey_motion.evaluation.report.definitions import METRICS
-from marey_motion.evaluation.report.words import demand
 from marey_motion.evaluation.result import EvaluationResult, TrialResult
+from marey_motion.evaluation.scenario import demand
 
 Figures = Mapping[str, DrawnFigure]
 

@@ -9,8 +9,8 @@ import numpy as np
 from marey_motion.drawing.words import amount
 from marey_motion.evaluation.judgement import judge, strain
 from marey_motion.evaluation.relevance import sum_by_source
-from marey_motion.evaluation.report.words import demand
 from marey_motion.evaluation.result import EvaluationResult, TrialResult
+from marey_motion.evaluation.scenario import demand
 
 
 def verdict(result: EvaluationResult) -> str:

@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 
 from marey_motion.drawing.words import span
 from marey_motion.evaluation.result import Coverage
-from marey_motion.evaluation.scenario import Trial
+from marey_motion.evaluation.scenario import STRAIGHT_DEG_S
 
 Floats = NDArray[np.float64]
-
-STRAIGHT_DEG_S = 1e-6
 
 
 class Hole(NamedTuple):
@@ -70,17 +68,6 @@ def turning(low_deg_s: float, high_deg_s: float) -> str:
         return "straight ahead"
     side = "left" if low_deg_s + high_deg_s > 0.0 else "right"
     return f"{side} turns of {span(least, most)} degrees a second"
-
-
-def demand(trial: Trial) -> str:
-    """What a trial asks for."""
-    turn = float(np.degrees(trial.turn_rate_rad_s))
-    speed = f"{trial.speed_m_s:g} m/s"
-    if trial.family == "switching":
-        speed = f"{trial.speed_m_s:g} m/s switching to {trial.switch_speed_m_s:g}"
-    if abs(turn) <= STRAIGHT_DEG_S:
-        return f"straight line at {speed}"
-    return f"{'left' if turn > 0 else 'right'} turn of {abs(turn):.4g} deg/s at {speed}"
 
 
 def _centres(edges: Floats) -> Floats:
