@@ -89,7 +89,8 @@ def test_a_clip_that_helps_is_added_where_the_budget_of_data_allows(pool):
 
 
 def test_it_ends_when_nothing_gains_or_the_budget_is_spent(simulation):
-    assert optimise(simulation, replace(AIM, least_gain=1e6)).ended == "no gain"
+    greedy = optimise(simulation, replace(AIM, least_gain=1e6))
+    assert (greedy.ended, len(greedy.steps)) == ("no gain", 1)
     assert optimise(simulation, replace(AIM, max_steps=1)).ended == "steps"
     spent = optimise(simulation, replace(AIM, max_evaluations=3))
     assert spent.ended == "evaluations"
