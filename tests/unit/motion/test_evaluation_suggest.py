@@ -9,7 +9,10 @@ import pytest
 from made_databases import arc_track, made_database
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.compare import compare_results
+from marey_motion.evaluation.filling import FilledCell, Filling
 from marey_motion.evaluation.objective import headline_means
+from marey_motion.evaluation.reasons import why_filling, why_redundant
+from marey_motion.evaluation.redundancy import Removal
 from marey_motion.evaluation.result import EvaluationOptions
 from marey_motion.evaluation.selection import joined, without_rows, without_sources
 from marey_motion.evaluation.similarity import accepted_distance
@@ -96,6 +99,32 @@ def test_reasons_name_the_clip_and_what_it_does(found):
     (spared,) = tree["near_duplicates"]["spared"]
     assert "nearly the same motion as “clip_000”" in spared["reason"]
     assert "turns has" in tree["fillings"][0]["reason"]
+
+
+@pytest.mark.parametrize(
+    ("change_m", "said"),
+    [
+        (0.081, "the mean distance from the path grows by 8.1 cm."),
+        (-0.081, "the mean distance from the path shrinks by 8.1 cm."),
+        (0.0004, "the mean distance from the path stays the same to the millimetre."),
+    ],
+)
+def test_the_reason_for_a_removal_says_which_way_the_distance_goes_and_how_far(change_m, said):
+    removal = Removal("walk@1", "walk", 2.0, 3, {"offset_mean": change_m}, 0.0, 0.0)
+    assert why_redundant(removal, 9) == f"Without “walk” (2.0 s, needed in 3 of 9 trials) {said}"
+
+
+@pytest.mark.parametrize(
+    ("turn_rate_deg_s", "where"),
+    [(50.0, "turning left at 50°/s"), (-25.0, "turning right at 25°/s"), (0.0, "straight ahead")],
+)
+def test_the_reason_for_a_filling_says_where_most_of_it_is_missing(turn_rate_deg_s, where):
+    cells = (FilledCell(1.5, turn_rate_deg_s, 0.9, 1.0), FilledCell(1.0, 0.0, 0.1, 0.5))
+    filling = Filling("runs", "a@1", "a", 4.0, cells, 1.0, 0.25, 40, False, 0.25, 0.5)
+    assert why_filling(filling) == (
+        f"“a” from runs has 1.0 s of what is missing, most of it at 1.5 m/s {where}; 25 % of it can be blended with "
+        "the set."
+    )
 
 
 def test_suggesting_twice_says_the_same(database, outside, found):
