@@ -77,6 +77,10 @@ def test_frames_within_the_threshold_are_counted_as_blendable():
     cell = np.unravel_index(np.argmax(coverage.seconds), coverage.seconds.shape)
     assert measure_similarity(database, coverage, threshold_m=1e3).blendable_share[cell] == 1.0
     assert measure_similarity(database, coverage, threshold_m=1e-9).blendable_share[cell] == 0.0
+    middle = measure_similarity(database, coverage, threshold_m=1.0).distance_m[cell]
+    assert measure_similarity(database, coverage, threshold_m=middle).blendable_share[cell] == pytest.approx(
+        0.5, abs=0.02
+    )
 
 
 def test_a_cell_with_one_clip_has_nothing_to_blend_with_and_neither_has_its_mirrored_twin():
