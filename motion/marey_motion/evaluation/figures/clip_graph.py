@@ -63,7 +63,7 @@ def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: Fig
     width, height = (8.6, 6.6) if len(subjects) == 1 else (9.6, 4.7)
     figure = new_figure(width, height + 0.3 * (len(subjects) > 1))
     across = width / len(subjects)
-    names = [_labels(subject, uids, LONGEST_NAMES[len(subjects) - 1]) for subject in subjects]
+    names = _labels(subjects, uids, LONGEST_NAMES[len(subjects) - 1])
     longest = max([0, *(len(each.get(uid, ABSENT)) for each in names for uid in uids)])
     for number, subject in enumerate(subjects):
         panel = add_panel(figure, Place(number * across, 0.0, across, height), grid=False)
@@ -185,10 +185,12 @@ def _draw_dots(panel: Axes, circles: dict[str, Circle], dots: dict[str, Ints], m
             panel.scatter(place[mine, 0], place[mine, 1], s=area, c=look[mine], lw=0, alpha=0.9, zorder=3)
 
 
-def _labels(subject: Subject, uids: Collection[str], longest: int) -> dict[str, str]:
-    clips = [clip for clip in subject.result.clips if clip.uid in uids]
-    names = labels_of([clip.name for clip in clips], longest)
-    return {clip.uid: name for clip, name in zip(clips, names, strict=True)}
+def _labels(subjects: Sequence[Subject], uids: Collection[str], longest: int) -> list[dict[str, str]]:
+    """Per subject the labels of its clips; a clip has the same one everywhere."""
+    held = [{clip.uid: clip.name for clip in subject.result.clips if clip.uid in uids} for subject in subjects]
+    names = {uid: name for each in reversed(held) for uid, name in each.items()}
+    labels = dict(zip(names, labels_of(list(names.values()), longest), strict=True))
+    return [{uid: labels[uid] for uid in each} for each in held]
 
 
 def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str]) -> None:
