@@ -98,7 +98,7 @@ def _lock(tx: Transaction, project_name: str) -> ProjectRow:
     """Members of a project change one after another, so that two owners cannot remove each other."""
     project_row = projects.require(tx, project_name, Role.OWNER, "write")
     tx.execute(select(project.c.id).where(project.c.id == project_row.id).with_for_update(key_share=True))
-    return project_row
+    return projects.require(tx, project_name, Role.OWNER, "write")  # the one before may have ended the caller's role
 
 
 def _require_owner(tx: Transaction, project_row: ProjectRow) -> None:
