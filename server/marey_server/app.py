@@ -25,6 +25,7 @@ from tornado.web import Application as TornadoApplication
 from tornado.web import RequestHandler
 
 from marey_schemas.access import TokenCreate
+from marey_schemas.names import MAX_NAME_LENGTH
 from marey_server.access.principal import SYSTEM
 from marey_server.administrators import TOKEN_FILE, make_first_administrator
 from marey_server.computing import compute_on_one_thread_each
@@ -212,19 +213,20 @@ async def serving(settings: Settings) -> AsyncIterator[Running]:
         local_workers(
             settings.local_workers,
             url=running.address,
-            token=make_worker_token(database, settings.port) if settings.local_workers else "",
+            token=make_worker_token(database, settings) if settings.local_workers else "",
             cache=settings.data / "worker-cache",
         ),
     ):
         yield running
 
 
-def make_worker_token(database: Database, port: int) -> str:
-    """A token for the workers that this process starts; those of earlier starts at this port stop working.
+def make_worker_token(database: Database, settings: Settings) -> str:
+    """A token for the workers that this process starts.
 
-    Other servers that share the database keep the tokens of theirs.
+    Those of earlier starts at this address stop working; servers that share the database keep theirs.
     """
-    return database.write(SYSTEM, _replace_worker_token, f"workers beside {socket.gethostname()}:{port}")
+    address = f"{settings.host}:{settings.port} on {socket.gethostname()}"
+    return database.write(SYSTEM, _replace_worker_token, f"workers beside the server at {address}"[:MAX_NAME_LENGTH])
 
 
 def _replace_worker_token(tx: Transaction, name: str) -> str:

@@ -49,7 +49,15 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+        await _give_up_lead(services, holder)
+
+
+async def _give_up_lead(services: Services, holder: str) -> None:
+    """Let another process lead at once; without a database it does when the lease has run out."""
+    try:
         await _write(services, leader.give_up_lead, LEAD, holder)
+    except MareyError as error:
+        log.warning("another process leads only in %d s: %s", LEAD_TTL_US / 1_000_000, error.detail)
 
 
 async def _repeat(services: Services, holder: str, every_s: float, chore: Chore) -> None:

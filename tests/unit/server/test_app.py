@@ -13,9 +13,11 @@ from marey_schemas.access import UserChange, UserCreate
 from marey_server.access.principal import SYSTEM
 from marey_server.administrators import give_token, make_first_administrator
 from marey_server.app import make_worker_token
-from marey_server.errors import NotFound, Unauthenticated
-from marey_server.store import tokens, users
+from marey_server.errors import NotFound, Unauthenticated, Unavailable
+from marey_server.settings import Settings
+from marey_server.store import leader, tokens, users
 from marey_server.store.database import Database
+from rest_server import running
 
 
 def test_the_first_administrator_is_made_once_and_the_token_works(database: Database, tmp_path: Path):
@@ -58,15 +60,17 @@ def test_local_workers_get_a_token_though_the_first_administrator_is_disabled(da
     database.write(admin, users.create_user, UserCreate(name="ops", administrator=True))
     ops = database.read(SYSTEM, users.administrator_principal, "ops")
     database.write(ops, partial(users.change_user, expected_rev=None), "admin", UserChange(disabled=True))
-    assert database.read(SYSTEM, tokens.resolve_token, make_worker_token(database, 8460)).user_name == "ops"
+    assert database.read(SYSTEM, tokens.resolve_token, make_worker_token(database, Settings())).user_name == "ops"
 
 
-def test_a_server_that_starts_leaves_the_workers_of_others_on_its_database_alone(database: Database, tmp_path: Path):
-    database.write(SYSTEM, make_first_administrator, tmp_path / "admin.token")
-    first, second = (make_worker_token(database, port) for port in (8460, 8461))
-    again = make_worker_token(database, 8460)
-    for secret in (second, again):
-        assert database.read(SYSTEM, tokens.resolve_token, secret).user_name == "admin"
+def test_a_server_that_starts_again_replaces_its_workers_token_and_no_other_servers(database: Database):
+    database.write(SYSTEM, users.ensure_first_administrator)
+    one, other = Settings(port=8460), Settings(port=8461)
+    first = make_worker_token(database, one)
+    beside = make_worker_token(database, other)
+    again = make_worker_token(database, one)
+    for secret in (beside, again):
+        assert "work" in database.read(SYSTEM, tokens.resolve_token, secret).scopes
     with pytest.raises(Unauthenticated):
         database.read(SYSTEM, tokens.resolve_token, first)
 
@@ -78,3 +82,14 @@ def test_a_port_that_is_taken_is_told_with_what_to_do(tmp_path: Path):
         done = subprocess.run([*serve, "--port", str(port)], capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
     assert f"port {port}: Address already in use; name others with --host and --port" in done.stderr.splitlines()[-1]
+
+
+def test_a_server_whose_database_is_away_stops_all_the_same(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    def without_database(*_: object) -> None:
+        raise Unavailable("The database does not answer.")
+
+    with running(database, tmp_path):
+        monkeypatch.setattr(leader, "give_up_lead", without_database)
+    assert "another process leads only in 30 s: The database does not answer." in caplog.text
