@@ -1,5 +1,6 @@
 """How the server speaks HTTP: forms of answers, states and preconditions, pages, bytes, errors."""
 
+import errno
 import gzip
 import hashlib
 import json
@@ -15,6 +16,7 @@ import pytest
 
 from marey_schemas.arrays import EncodedArray
 from marey_schemas.codecs import MEDIA_TYPES, decode_tree
+from marey_server.store.blobs import Spool
 from rest_server import Server
 
 JOINTS = ("hips", "knee", "foot")
@@ -393,6 +395,20 @@ def test_bytes_under_a_wrong_name_are_refused_and_not_kept(owner: httpx.Client):
     path = f"/blobs/sha256:{'0' * 64}"
     assert owner.put(path, content=b"other bytes").json()["code"] == "digest-mismatch"
     assert owner.get(path).status_code == 404
+
+
+@pytest.mark.parametrize("size", [10, 70_000])
+def test_a_disk_that_is_full_while_bytes_come_in_says_so(owner: httpx.Client, monkeypatch, size: int):
+    whole = hashlib.sha256(bytes(size)).hexdigest()
+
+    def full(_spool: Spool, _data: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Spool, "write", full)
+    refused = owner.put(f"/blobs/sha256:{whole}", content=bytes(size))
+    assert (refused.status_code, refused.json()["code"]) == (507, "storage-full")
+    monkeypatch.undo()
+    assert owner.head(f"/blobs/sha256:{whole}").status_code == 404
 
 
 def test_an_upload_goes_on_where_it_broke_off(owner: httpx.Client, server: Server):

@@ -29,7 +29,7 @@ class Receiver:
     async def finish(self) -> Spool:
         """Everything that came, hashed. The caller closes it."""
         if len(self._pending) <= INLINE_BYTES:
-            self.spool.write(bytes(self._pending))
+            self._write(bytes(self._pending))
             self._pending.clear()
         else:
             await self._flush()
@@ -37,7 +37,10 @@ class Receiver:
 
     async def _flush(self) -> None:
         batch, self._pending = bytes(self._pending), bytearray()
+        await asyncio.wrap_future(self._services.compute_threads.submit(self._write, batch))
+
+    def _write(self, batch: bytes) -> None:
         try:
-            await asyncio.wrap_future(self._services.compute_threads.submit(self.spool.write, batch))
+            self.spool.write(batch)
         except OSError as error:
             raise StorageFull(f"There is no room to take this in: {error.strerror}.") from error

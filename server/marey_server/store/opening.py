@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from alembic.util import CommandError
 from sqlalchemy import exc, make_url
 
-from marey_server.errors import Unavailable
+from marey_server.errors import StorageFull, Unavailable
 
 
 class DatabaseUnusable(Exception):
@@ -27,6 +27,8 @@ def opening(url: str) -> Iterator[None]:
         ) from None
     except Unavailable as error:
         raise DatabaseUnusable(f"the database {_shown(url)} does not answer: {_reason(error.__cause__)}") from error
+    except StorageFull as error:
+        raise DatabaseUnusable(f"the database {_shown(url)} cannot be opened for writing: {error.detail}") from error
     except exc.DBAPIError as error:
         raise DatabaseUnusable(f"the database {_shown(url)} cannot be used: {_reason(error)}") from error
     except CommandError as error:

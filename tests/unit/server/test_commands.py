@@ -7,7 +7,9 @@ import pytest
 
 from marey_server import commands
 from marey_server.app import open_database
+from marey_server.errors import StorageFull
 from marey_server.settings import Settings
+from marey_server.store.opening import DatabaseUnusable
 
 
 @pytest.fixture
@@ -76,6 +78,11 @@ def test_a_token_that_cannot_be_made_is_refused_in_a_sentence(data, tmp_path, us
         commands.admin_token(user=user, data=tmp_path / folder)
 
 
+def start(**settings):
+    """What `serve` begins with."""
+    open_database(Settings(**settings)).close()
+
+
 @pytest.mark.parametrize(
     ("url", "told"),
     [
@@ -84,27 +91,46 @@ def test_a_token_that_cannot_be_made_is_refused_in_a_sentence(data, tmp_path, us
         ("postgresql://u:sekret@127.0.0.1:1/x", r"postgresql://u:\*\*\*@127.0.0.1:1/x does not answer: .*refused"),
     ],
 )
-@pytest.mark.parametrize("command", [commands.serve, commands.upgrade, commands.fsck])
+@pytest.mark.parametrize("command", [start, commands.upgrade, commands.fsck])
 def test_a_database_that_cannot_be_opened_is_told_in_a_sentence_without_its_password(tmp_path, command, url, told):
-    with pytest.raises(commands.CommandFailed, match=told) as failed:
-        command(data=tmp_path, port=0, database_url=url)
+    with pytest.raises((commands.CommandFailed, DatabaseUnusable), match=told) as failed:
+        command(data=tmp_path, database_url=url)
     assert "sekret" not in str(failed.value)
     assert len(str(failed.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize("command", [commands.serve, commands.upgrade])
+@pytest.mark.parametrize("command", [start, commands.upgrade])
 def test_a_file_that_is_no_database_is_told_and_left_as_it_is(tmp_path, command):
     (tmp_path / "marey.db").write_bytes(b"not a database " * 1000)
-    with pytest.raises(commands.CommandFailed, match="file is not a database"):
-        command(data=tmp_path, port=0)
+    with pytest.raises((commands.CommandFailed, DatabaseUnusable), match="file is not a database"):
+        command(data=tmp_path)
     assert (tmp_path / "marey.db").read_bytes() == b"not a database " * 1000
 
 
-@pytest.mark.parametrize("command", [commands.serve, commands.upgrade])
+@pytest.mark.parametrize("command", [start, commands.upgrade])
+def test_a_disk_without_room_for_the_tables_is_told(tmp_path, command, monkeypatch):
+    def full(_tx):
+        raise StorageFull("The disk has no room left.")
+
+    monkeypatch.setattr("marey_server.store.schema.make_cursor_key", full)
+    with pytest.raises((commands.CommandFailed, DatabaseUnusable), match="for writing: The disk has no room"):
+        command(data=tmp_path)
+
+
+@pytest.mark.parametrize("command", [start, commands.upgrade])
 def test_tables_of_a_newer_version_are_told_and_left_as_they_are(data, command):
     with closing(sqlite3.connect(data / "marey.db")) as database, database:
         database.execute("UPDATE alembic_version SET version_num = '9999'")
-    with pytest.raises(commands.CommandFailed, match="of another version of Marey"):
-        command(data=data, port=0)
+    with pytest.raises((commands.CommandFailed, DatabaseUnusable), match="of another version of Marey"):
+        command(data=data)
     with closing(sqlite3.connect(data / "marey.db")) as database:
         assert database.execute("SELECT version_num FROM alembic_version").fetchall() == [("9999",)]
+
+
+def test_serve_tells_what_is_wrong_with_its_database(tmp_path, monkeypatch):
+    async def unusable(_settings):
+        raise DatabaseUnusable("the database is a teapot")
+
+    monkeypatch.setattr("marey_server.app.serve", unusable)
+    with pytest.raises(commands.CommandFailed, match="is a teapot"):
+        commands.serve(data=tmp_path)
