@@ -350,6 +350,17 @@ def talk_of_a_project(server: Server, length: str) -> bytes:
     return talk(server, f'{head}Content-Length: {length}\r\n\r\n{{"name":"loft"}}'.encode("latin-1"))
 
 
+def test_the_headers_of_a_stream_of_events_come_without_its_body(server: Server):
+    token = server.make_project()
+    asked = f"Host: x\r\nAuthorization: Bearer {token}\r\nAccept: text/event-stream\r\n\r\n"
+    said = talk(
+        server, f"HEAD /api/v1/projects/lab/events HTTP/1.1\r\n{asked}GET /healthz HTTP/1.1\r\n{asked}".encode()
+    )
+    head, _, following = said.partition(b"\r\n\r\n")
+    assert b"Content-Type: text/event-stream" in head
+    assert following.startswith(b"HTTP/1.1 406")  # what was asked next over the same connection
+
+
 def test_a_head_without_end_is_cut_off(server: Server):
     said = talk(server, b"GET /healthz HTTP/1.1\r\n" + b"X-Filler: " + b"y" * 100_000)
     assert b"200 OK" not in said

@@ -118,6 +118,21 @@ def test_a_late_heartbeat_keeps_a_lease_that_nobody_took(desk: Desk) -> None:
     desk.complete(lease)
 
 
+def test_the_token_of_an_attempt_ends_when_another_takes_its_place(desk: Desk) -> None:
+    desk.submit()
+    slept = desk.claim()
+    assert desk.attempt(slept).project_id is not None
+    desk.clock.advance(slept.lease_ttl_s + 1)
+    assert desk.attempt(slept).project_id is not None
+    desk.reap()
+    with pytest.raises(LeaseLost):
+        desk.attempt(slept)
+    awake = desk.claim()
+    with pytest.raises(LeaseLost):
+        desk.attempt(slept)
+    assert desk.attempt(awake).fence == awake.fence
+
+
 def test_an_overdue_job_that_cannot_be_taken_back_keeps_no_other_from_it(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
