@@ -47,6 +47,7 @@ class Services:
         self.searchables = SearchableCache()
         self.draining = asyncio.Event()
         self.in_flight: set[Any] = set()
+        self.metrics.in_flight.set_function(lambda: len(self.in_flight))
         self.sign_in_places = asyncio.Semaphore(SIGN_INS_AT_ONCE)
         self.compute_threads = ComputeThreads()
         self._tries_by_name = TryLimit(settings.login_tries_per_minute)

@@ -159,6 +159,13 @@ def test_metrics_count_requests_by_route_template(server: Server, owner: httpx.C
     assert "private-name" not in text
 
 
+def test_metrics_tell_how_many_requests_are_under_way(server: Server):
+    asked = {"Authorization": f"Bearer {server.make_project()}", "Accept": "text/event-stream"}
+    assert "marey_http_in_flight 1.0" in httpx.get(f"{server.address}/metrics").text  # this one
+    with httpx.stream("GET", f"{server.api}/projects/lab/events", headers=asked):
+        assert "marey_http_in_flight 2.0" in httpx.get(f"{server.address}/metrics").text
+
+
 def test_guessing_passwords_is_slowed_down(database: Database, tmp_path: Path):
     stored = hash_password("correct horse battery")
     database.write(SYSTEM, users.create_user, UserCreate(name="ann"), password_hash=stored)
