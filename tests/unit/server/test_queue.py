@@ -5,7 +5,7 @@ import pytest
 from marey_schemas.jobs import BatchCompletion, ClaimRequest, CompleteRequest, JobCreate, Progress
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import Forbidden, Invalid, LeaseLost, NotFound
-from marey_server.store import completion, queue
+from marey_server.store import completion, projects, queue
 from marey_server.store.job_ends import Ended
 from marey_server.store.settling import settle
 from marey_server.store.transaction import Transaction
@@ -131,6 +131,21 @@ def test_the_token_of_an_attempt_ends_when_another_takes_its_place(desk: Desk) -
     with pytest.raises(LeaseLost):
         desk.attempt(slept)
     assert desk.attempt(awake).fence == awake.fence
+
+
+def test_jobs_of_a_deleted_project_rest_until_it_is_restored(desk: Desk) -> None:
+    begun, queued = desk.submit(), desk.submit()
+    lease = desk.claim(job=begun)
+    desk.stage(lease, "made")
+    desk.database.write(desk.user, projects.delete_project, "lab", expected_rev=None)
+    assert desk.claim_many() == []
+    assert desk.claim_many(job=queued) == []
+    request = CompleteRequest(write_id=desk.write_id())
+    attempt = desk.attempt(lease)
+    desk.database.write(attempt, completion.complete, begun, lease.fence, request)
+    desk.database.write(desk.user, projects.restore_project, "lab")
+    assert [one.name for one in desk.outputs(begun)] == ["made"]
+    assert [one.job for one in desk.claim_many()] == [queued]
 
 
 def test_an_overdue_job_that_cannot_be_taken_back_keeps_no_other_from_it(
