@@ -208,6 +208,7 @@ def _sqlite_engine(url: URL, connections: int, echo: bool, *, begin: str, query_
         pool_size=connections,
         max_overflow=4,
         echo=echo,
+        hide_parameters=True,  # they hold hashes of secrets, and what fails is logged
         json_serializer=_dumps,
         connect_args={"timeout": BUSY_TIMEOUT_MS / 1000, "check_same_thread": False, "isolation_level": None},
         poolclass=sqlalchemy.QueuePool,
@@ -242,6 +243,7 @@ def _postgres_engine(url: URL, connections: int, echo: bool) -> Engine:
         max_overflow=4,
         pool_timeout=30,
         echo=echo,
+        hide_parameters=True,  # they hold hashes of secrets, and what fails is logged
         isolation_level="READ COMMITTED",
         json_serializer=_dumps,
         connect_args=connect_args,

@@ -37,6 +37,18 @@ def test_a_write_that_fails_leaves_nothing(database):
     assert database.read(SYSTEM, user_names) == []
 
 
+def test_a_failure_says_nothing_of_what_was_to_be_written(database):
+    def add_twice(tx):
+        add_user(tx)
+        row = {"id": "user_u", "name": "ann", "password_hash": "scrypt$canary", "created_us": 0}
+        tx.execute(sqlalchemy.insert(user), row)
+
+    with pytest.raises(sqlalchemy.exc.IntegrityError) as failed:
+        database.write(SYSTEM, add_twice)
+    assert "INSERT INTO" in str(failed.value)
+    assert "canary" not in str(failed.value)
+
+
 def test_a_read_cannot_write(database):
     with pytest.raises((sqlalchemy.exc.DBAPIError, Unavailable)):
         database.read(SYSTEM, add_user)
