@@ -1,7 +1,10 @@
 """How jobs get a worker, keep it, and end."""
 
+from dataclasses import replace
+
 import pytest
 
+from marey_schemas.access import ProjectCreate
 from marey_schemas.jobs import BatchCompletion, ClaimRequest, CompleteRequest, JobCreate, Progress
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import Forbidden, Invalid, LeaseLost, NotFound
@@ -131,6 +134,24 @@ def test_the_token_of_an_attempt_ends_when_another_takes_its_place(desk: Desk) -
     with pytest.raises(LeaseLost):
         desk.attempt(slept)
     assert desk.attempt(awake).fence == awake.fence
+
+
+def test_a_job_reads_nothing_of_another_project(desk: Desk) -> None:
+    elsewhere = replace(desk, project="elsewhere")
+    desk.database.write(desk.user, projects.create_project, ProjectCreate(name="elsewhere"))
+    (theirs,) = elsewhere.things(1)
+    made = elsewhere.submit("sum")
+    for choice, code in (({"item": theirs}, "unknown-item"), ({"job": made}, "unknown-job")):
+        with pytest.raises(Invalid) as refused:
+            desk.submit("square", inputs={"things": [choice]})
+        assert [error.code for error in refused.value.errors] == [code]
+    with pytest.raises(Invalid) as refused:
+        desk.submit(after=[made])
+    assert [error.code for error in refused.value.errors] == ["unknown-job"]
+    with pytest.raises(Invalid) as refused:
+        desk.submit("square", inputs={"things": {"collection": "raw"}})
+    assert [error.code for error in refused.value.errors] == ["empty-collection"]
+    assert elsewhere.submit("square", inputs={"things": [{"item": theirs}, {"job": made}]})
 
 
 def test_jobs_of_a_deleted_project_rest_until_it_is_restored(desk: Desk) -> None:
