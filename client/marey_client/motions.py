@@ -60,6 +60,10 @@ class ClipHandle(ItemHandle):
         """Make a revision with another description; the poses are shared."""
         return self.put_part("info", info.model_dump(mode="json", by_alias=True))
 
+    def put_motion(self, motion: Motion, *, message: str | None = None) -> Item:
+        """Make a revision with other poses; `PreconditionFailed` if the clip was changed since it was read."""
+        return self.put_part("motion", motion.model_dump(by_alias=True, exclude_none=True), message=message)
+
     def annotations(self) -> Iterator[AnnotationHandle]:
         """What is said about any revision of the clip, oldest first."""
         found = Items(self.transport, self.project, Kind.ANNOTATION, AnnotationHandle)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -15,7 +15,7 @@ from marey_client.blobs import Blobs
 from marey_client.coverage_streams import CoverageStreams
 from marey_client.edit_jobs import edit_request
 from marey_client.edits import Commands, EditHandle, Edits
-from marey_client.evaluations import EvaluationHandle, Places, evaluate_request, items_at
+from marey_client.evaluations import EvaluationHandle, Places, as_input, as_places, evaluate_request, items_at
 from marey_client.imports import Imports
 from marey_client.items import ItemHandle, Items
 from marey_client.jobs import Jobs
@@ -30,7 +30,7 @@ from marey_schemas.alignment import AlignParams
 from marey_schemas.annotations import AnnotateParams, CutParams
 from marey_schemas.evaluation import EvaluateParams
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
-from marey_schemas.jobs import CollectionInput, ItemInput, Job, JobCreate, RetargetParams
+from marey_schemas.jobs import ItemInput, Job, JobCreate, RetargetParams
 from marey_schemas.kinds import Kind
 from marey_schemas.model_pipelines import model_pipeline
 from marey_schemas.modelling import ModelParams
@@ -171,19 +171,20 @@ class ProjectHandle:
 
     def retarget(
         self,
-        clips: Sequence[ItemInput | CollectionInput],
+        clips: Places,
         skeleton: str,
         *,
         into: str,
         params: RetargetParams | None = None,
         priority: int = 0,
     ) -> Job:
-        """Hand in the retargeting of clips and folders of clips to the skeleton with this id.
+        """Hand in the retargeting of clips, a folder by its path, or folders and clips, to the skeleton with this id.
 
         Mappings of the clips' skeletons that were edited since the clips were imported are gone by.
         """
-        inputs: dict[str, Any] = {"clips": tuple(clips), "skeleton": ItemInput(item=skeleton)}
-        if edited := self.edited_rigs(item for place in clips for item in items_at(self, place)):
+        places = as_places(clips)
+        inputs: dict[str, Any] = {"clips": tuple(map(as_input, places)), "skeleton": ItemInput(item=skeleton)}
+        if edited := self.edited_rigs(item for place in places for item in items_at(self, place)):
             inputs["rigs"] = edited
         given = (params or RetargetParams()).model_dump(exclude_unset=True)
         return self.submit(JobCreate(kind="retarget", inputs=inputs, params=given, into=into, priority=priority))

@@ -1,0 +1,62 @@
+"""What the SDK takes from people who write a few lines in a notebook."""
+
+import json
+
+import httpx
+import numpy as np
+
+from marey_client.motions import MotionArrays
+from marey_client.transport import BLOCKS
+from marey_schemas.codecs import decode_tree, encode_tree
+
+NOW = "2026-01-01T00:00:00Z"
+CLIP = {
+    "id": "clip_1", "kind": "clip", "name": "walk", "collection": "raw", "revision": 1, "rev": 4, "created_at": NOW,
+    "updated_at": NOW, "summary": {"skeleton": "skeleton_1"},
+}  # fmt: skip
+SKELETON = {**CLIP, "id": "skeleton_1", "kind": "skeleton", "summary": {}}
+JOB = {
+    "id": "job_1", "project": "lab", "kind": "retarget", "state": "queued", "params": {}, "inputs": {}, "into": "",
+    "priority": 0, "seed": 0, "attempt": 0, "fence": 0, "max_attempts": 3, "author": "ada", "created_at": NOW,
+    "run_at": NOW, "rev": 1,
+}  # fmt: skip
+
+
+def test_folders_and_files_may_be_named_by_texts(script, tmp_path):
+    script.answers = [httpx.Response(200, json=CLIP), httpx.Response(200, content=b"motion")]
+    clip = script.marey().project("lab").clips.get("clip_1")
+    written = clip.export(f"{tmp_path}/out", format="bvh")
+    assert written == tmp_path / "out" / "walk.bvh"
+    assert written.read_bytes() == b"motion"
+
+
+def test_poses_that_were_read_are_put_back_as_the_next_revision(script):
+    motion = {
+        "schema": "marey/motion@1", "skeleton": {"item": "skeleton_1", "revision": 1}, "frame_rate_hz": 30.0,
+        "joints": ["Hips"], "poses": np.tile(np.float32([0, 1, 0, 1, 0, 0, 0]), (3, 1)),
+    }  # fmt: skip
+    stored = encode_tree(motion, "application/msgpack", arrays="blocks")
+    script.answers = [
+        httpx.Response(200, json=CLIP),
+        httpx.Response(200, content=stored, headers={"Content-Type": BLOCKS}),
+        httpx.Response(200, json={**CLIP, "revision": 2, "rev": 5}),
+    ]
+    clip = script.marey().project("lab").clips.get("clip_1")
+    read: MotionArrays = clip.motion()
+    moved = read.model_copy(update={"poses": read.poses + np.float32([1, 0, 0, 0, 0, 0, 0])})
+    assert clip.put_motion(moved, message="to the left").revision == 2
+    sent = decode_tree(script.requests[-1].content, "application/msgpack", max_bytes=1 << 20)
+    assert sent["poses"][:, 0].tolist() == [1, 1, 1]
+    assert {name: sent[name] for name in motion if name != "poses"} == {
+        name: value for name, value in motion.items() if name != "poses"
+    }
+    assert script.requests[-1].headers["If-Match"] == '"4.json"'
+
+
+def test_a_folder_is_retargeted_by_its_path_as_it_is_edited_and_evaluated(script):
+    page = {"items": [CLIP], "next_cursor": None}
+    answers = [httpx.Response(200, json=answer) for answer in (page, SKELETON)]
+    script.answers = [*answers, httpx.Response(202, json=JOB)]
+    script.marey().project("lab").retarget("raw", "skeleton_2", into="walks")
+    asked = json.loads(script.requests[-1].content)
+    assert asked["inputs"] == {"clips": [{"collection": "raw"}], "skeleton": {"item": "skeleton_2"}}
