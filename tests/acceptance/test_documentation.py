@@ -1,10 +1,15 @@
 """The documentation says what the code does, and its links lead somewhere."""
 
 import re
+import shlex
 from pathlib import Path
+from typing import Any
 
 import pytest
 from docs.generate import REFERENCE, ROOT, pages
+from typer.main import get_command
+
+from marey_client.cli.app import app
 
 WRITTEN = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
 
@@ -25,3 +30,26 @@ def test_every_decision_is_listed() -> None:
     listed = (ROOT / "docs" / "decisions" / "README.md").read_text(encoding="utf-8")
     numbered = [file.name for file in (ROOT / "docs" / "decisions").glob("0*.md")]
     assert [name for name in numbered if name not in listed] == []
+
+
+def told_commands() -> list[tuple[str, str]]:
+    """Every `marey` command of the pages, with the page it stands on."""
+    found = []
+    for page in WRITTEN:
+        for block in re.findall(r"```sh\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
+            lines = block.replace("\\\n", " ").splitlines()
+            found += [(page.name, line) for line in lines if line.startswith("marey ")]
+    return found
+
+
+@pytest.mark.parametrize(("page", "line"), told_commands())
+def test_every_command_that_a_page_tells_exists_with_these_options(page: str, line: str) -> None:
+    words = shlex.split(line.rstrip("&").replace("…", ""), comments=True)[1:]
+    command: Any = get_command(app)
+    known = {option for parameter in command.params for option in parameter.opts}
+    while words and words[0] in getattr(command, "commands", {}):
+        command = command.commands[words.pop(0)]
+    assert not hasattr(command, "commands"), f"{page}: {line}"
+    known |= {option for one in command.params for option in (*one.opts, *one.secondary_opts)}
+    given = {word.partition("=")[0] for word in words if re.match(r"--[a-z]|-[a-z]$", word)}
+    assert given <= known, f"{page}: {line}"
