@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import ssl
 import threading
 import time
 import uuid
@@ -53,6 +54,13 @@ class BearerToken(httpx.Auth):
         return "BearerToken(...)"
 
 
+def trusted_authorities() -> ssl.SSLContext:
+    """Who may vouch for servers: the public authorities, this machine's, and those that `SSL_CERT_FILE` names."""
+    context = httpx.create_ssl_context(trust_env=False)
+    context.load_default_certs()
+    return context
+
+
 class Transport:
     """One server as HTTP sees it. May be used by several threads."""
 
@@ -75,8 +83,9 @@ class Transport:
             timeout=httpx.Timeout(timeout_s, connect=10.0),
             limits=httpx.Limits(max_connections=32, max_keepalive_connections=16),
             headers={"User-Agent": "marey-client"},
+            verify=trusted_authorities() if self.url.startswith("https:") else True,
             transport=http,
-            trust_env=False,
+            trust_env=False,  # no proxy and no .netrc comes between a token and its server
         )
 
     def with_token(self, token: str, *, retries: Retries | None = None) -> Transport:
