@@ -28,8 +28,10 @@ def saved_atomically(target: str | Path) -> Iterator[BufferedRandom]:
             yield cast(BufferedRandom, file)
             file.flush()
             os.fsync(file.fileno())
-        except BaseException:
+        except BaseException as error:
             temporary.unlink()
+            if isinstance(error, OSError) and error.filename is None:
+                error.filename = str(target)  # a disk that is full does not say where
             raise
     temporary.chmod(0o666 & ~_umask())
     temporary.replace(target)

@@ -251,7 +251,10 @@ def download(
     restored: Annotated[bool, typer.Option(help="Aligned clips in their own time, where they stood.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write clips to files. A folder comes with the folders below it; one without clips with its aligned clips."""
+    """Write clips to files. A folder comes with the folders below it; one without clips with its aligned clips.
+
+    A file that is there already is replaced.
+    """
     if format not in FORMATS:
         raise WrongUsage(f"{format!r} is no format; there are {', '.join(FORMATS)}")
     address = Address.parse(place)

@@ -1,10 +1,14 @@
 """What the SDK takes from people who write a few lines in a notebook."""
 
+import errno
 import json
+import os
 
 import httpx
 import numpy as np
+import pytest
 
+from marey_client.downloads import saved_atomically
 from marey_client.motions import MotionArrays
 from marey_client.transport import BLOCKS
 from marey_schemas.codecs import decode_tree, encode_tree
@@ -60,3 +64,12 @@ def test_a_folder_is_retargeted_by_its_path_as_it_is_edited_and_evaluated(script
     script.marey().project("lab").retarget("raw", "skeleton_2", into="walks")
     asked = json.loads(script.requests[-1].content)
     assert asked["inputs"] == {"clips": [{"collection": "raw"}], "skeleton": {"item": "skeleton_2"}}
+
+
+def test_a_disk_that_is_full_is_told_with_the_file_that_did_not_fit(tmp_path):
+    with (
+        pytest.raises(OSError, match=r"No space left on device: '.*walk\.bvh'"),
+        saved_atomically(tmp_path / "walk.bvh"),
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert list(tmp_path.iterdir()) == []
