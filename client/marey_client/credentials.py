@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,7 @@ from marey_client.errors import BadAddress, BadCredentialFile, BadToken
 
 DEFAULT_URL = "http://127.0.0.1:8460"
 DEFAULT_DATA = "marey-data"
+SETTINGS_FILE = "marey.toml"
 ADMIN_TOKEN = "admin.token"  # noqa: S105 - the name of a file
 LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
 
@@ -142,5 +144,14 @@ def _local_token_file(url: str, environment: Mapping[str, str]) -> Path | None:
     """The administrator's token of a server on this machine, where its data folder is known and readable."""
     if urlsplit(url).hostname not in LOOPBACK:
         return None
-    path = Path(environment.get("MAREY_DATA") or DEFAULT_DATA) / ADMIN_TOKEN
+    path = Path(environment.get("MAREY_DATA") or _configured_data() or DEFAULT_DATA) / ADMIN_TOKEN
     return path if path.is_file() and os.access(path, os.R_OK) else None
+
+
+def _configured_data() -> str | None:
+    """The data folder that `marey.toml` in the working directory names, as a server started here would read it."""
+    try:
+        data = tomllib.loads(Path(SETTINGS_FILE).read_text(encoding="utf-8")).get("data")
+    except (OSError, ValueError):  # a server would tell what is wrong with it
+        return None
+    return data if isinstance(data, str) else None

@@ -61,6 +61,19 @@ def test_the_administrators_token_serves_only_for_a_server_on_this_machine(envir
     assert credentials.resolve(SERVER, None, environment).token is None
 
 
+@pytest.mark.parametrize(
+    ("settings", "found"), [("data = 'kept'", "marey_local"), ("data = [", None), ("data = 3", None)]
+)
+def test_the_data_folder_that_settings_name_is_known_here_too(environment, tmp_path, monkeypatch, settings, found):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "admin.token").write_text("marey_local\n")
+    (tmp_path / "kept" / "admin.token").chmod(0o600)
+    (tmp_path / "marey.toml").write_text(settings)
+    without_data = {name: text for name, text in environment.items() if name != "MAREY_DATA"}
+    assert credentials.resolve("http://localhost:8460", None, without_data).token == found
+
+
 def test_logins_are_readable_by_their_owner_alone_and_can_be_forgotten(environment):
     path = credentials.logins_path(environment)
     credentials.store_login(path, SERVER, "secret")
