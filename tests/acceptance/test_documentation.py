@@ -11,6 +11,7 @@ from typer.main import get_command
 
 from marey_client.cli.app import app
 
+COMMANDS = get_command(app)
 WRITTEN = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
 
 
@@ -45,7 +46,7 @@ def told_commands() -> list[tuple[str, str]]:
 @pytest.mark.parametrize(("page", "line"), told_commands())
 def test_every_command_that_a_page_tells_exists_with_these_options(page: str, line: str) -> None:
     words = shlex.split(line.rstrip("&").replace("…", ""), comments=True)[1:]
-    command: Any = get_command(app)
+    command: Any = COMMANDS
     known = {option for parameter in command.params for option in parameter.opts}
     while words and words[0] in getattr(command, "commands", {}):
         command = command.commands[words.pop(0)]
