@@ -28,7 +28,7 @@ class Retries:
     sleep, uniform : replaceable in tests
     """
 
-    tries: int = 6
+    tries: int = 10
     first_s: float = 0.25
     longest_s: float = 15.0
     total_s: float = 90.0
