@@ -150,13 +150,14 @@ def _match(clip: Clip) -> None:
 
 def _compare(points: NDArray[np.float32]) -> None:
     """Align a motion with itself in every way, and look for its poses among themselves."""
-    from marey_motion.alignment.dtw import align, distances, warped_distance
+    from marey_motion.alignment.dtw import RangeBounds, align, distances, warped_distance
     from marey_motion.evaluation.similarity import nearest_poses
 
     groups = np.arange(len(points))
     align(distances(points, points))
     align(distances(points, points), max_run=2)
     warped_distance(points, points)
+    RangeBounds(points, np.array([0]), np.array([len(points)])).between(0, np.array([0]))
     nearest_poses(points, groups, points, groups)
 
 

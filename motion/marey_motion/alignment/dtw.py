@@ -106,14 +106,12 @@ def warped_distance(a: NDArray[np.floating], b: NDArray[np.floating], *, limit: 
     return float(kernels.total_within(one, other, rest, limit * longer) / longer)
 
 
-def distance_bound(
-    a: NDArray[np.floating], b: NDArray[np.floating], *, frames_per_box: int | None = FRAMES_PER_BOX
-) -> float:
+def distance_bound(a: NDArray[np.floating], b: NDArray[np.floating], *, frames_per_box: int = FRAMES_PER_BOX) -> float:
     """A number that `warped_distance(a, b)` is never below, found much faster.
 
     Every frame of either motion lies on the way at least once, and costs no less than its distance from the nearest of
-    the boxes about `frames_per_box` consecutive frames of the other motion (about all of them when None, which takes a
-    time that grows with n + m only). The first and the last cell are on every way.
+    the boxes about `frames_per_box` consecutive frames of the other motion. The first and the last cell are on every
+    way.
     """
     one, other = _points(a, b)[0], _points(b, a)[0]
     boxes = _box_costs(one, other, frames_per_box).sum(), _box_costs(other, one, frames_per_box).sum()
@@ -121,11 +119,40 @@ def distance_bound(
     return float(max(*boxes, *ends) * _ROUNDING_SLACK / max(len(a), len(b)))
 
 
-def _box_costs(a: Floats, b: NDArray[np.floating], frames_per_box: int | None) -> Floats:
+class RangeBounds:
+    """Coarser bounds than `distance_bound`'s, with one box about each motion, of one motion with many others at once.
+
+    Parameters
+    ----------
+    points : (N, P, 3) of all motions
+    starts, stops : (R,) of each motion's frames, [start, stop) and not empty
+    """
+
+    def __init__(self, points: NDArray[np.floating], starts: NDArray[np.int64], stops: NDArray[np.int64]) -> None:
+        self._points = np.ascontiguousarray(points, dtype=np.float64)
+        self._starts, self._stops = starts, stops
+        ranges = [self._points[start:stop] for start, stop in zip(starts, stops, strict=True)]
+        self._low, self._high = (np.stack([edge(part, axis=0) for part in ranges]) for edge in (np.min, np.max))
+
+    def between(self, one: int, others: NDArray[np.int64], *, limit: float = np.inf) -> Floats:
+        """Numbers (K,) that the `warped_distance` of a motion from each of K others is never below.
+
+        Bounds above `limit` are above it, and no more is known of them.
+        """
+        from marey_motion.alignment import dtw_kernels as kernels
+
+        bounds = np.empty(len(others))
+        kernels.range_bounds(
+            self._points, self._starts, self._stops, self._low, self._high, one, others, limit / _ROUNDING_SLACK, bounds
+        )
+        return bounds * _ROUNDING_SLACK
+
+
+def _box_costs(a: Floats, b: NDArray[np.floating], frames_per_box: int) -> Floats:
     """Mean distance (n,) of the points of each frame of `a` from the nearest box about frames of `b`."""
     from marey_motion.alignment import dtw_kernels as kernels
 
-    starts = np.arange(0, len(b), frames_per_box or len(b))
+    starts = np.arange(0, len(b), frames_per_box)
     low, high = (
         np.ascontiguousarray(edge.reduceat(b, starts, axis=0).transpose(1, 2, 0), dtype=np.float64)
         for edge in (np.minimum, np.maximum)

@@ -259,3 +259,49 @@ def box_costs(a, low, high, out):  # type: ignore[no-untyped-def]
         for box in range(1, boxes):
             least = min(least, costs[box])
         out[i] = least / points
+
+
+@_compiled
+def range_bounds(points, starts, stops, low, high, one, others, limit, out):  # type: ignore[no-untyped-def]
+    """Fill out (K,) with what aligning a range of frames with each of K others costs at least, or more than `limit`.
+
+    points (N, P, 3); range r is [starts[r], stops[r]); low, high (R, P, 3) are the boxes about the frames of each;
+    costs are means per frame of the longer range.
+    """
+    for k in range(others.shape[0]):
+        other = others[k]
+        longer = max(stops[one] - starts[one], stops[other] - starts[other])
+        most = limit * longer
+        first = _mean_distance(points[starts[one]], points[starts[other]])
+        last = _mean_distance(points[stops[one] - 1], points[stops[other] - 1])
+        total = max(first, last)
+        if total <= most:
+            total = max(total, _cost_from_box(points, starts[one], stops[one], low[other], high[other], most))
+        if total <= most:
+            total = max(total, _cost_from_box(points, starts[other], stops[other], low[one], high[one], most))
+        out[k] = total / longer
+
+
+@_compiled
+def _mean_distance(a, b):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for p in range(a.shape[0]):
+        total += np.sqrt((a[p, 0] - b[p, 0]) ** 2 + (a[p, 1] - b[p, 1]) ** 2 + (a[p, 2] - b[p, 2]) ** 2)
+    return total / a.shape[0]
+
+
+@_compiled
+def _cost_from_box(points, start, stop, low, high, most):  # type: ignore[no-untyped-def]
+    """Sum over frames of the mean distance of their points from a box; ends where it is more than `most`."""
+    total = 0.0
+    for i in range(start, stop):
+        cost = 0.0
+        for p in range(points.shape[1]):
+            dx = max(low[p, 0] - points[i, p, 0], points[i, p, 0] - high[p, 0], 0.0)
+            dy = max(low[p, 1] - points[i, p, 1], points[i, p, 1] - high[p, 1], 0.0)
+            dz = max(low[p, 2] - points[i, p, 2], points[i, p, 2] - high[p, 2], 0.0)
+            cost += np.sqrt(dx * dx + dy * dy + dz * dz)
+        total += cost / points.shape[1]
+        if total > most:
+            break
+    return total

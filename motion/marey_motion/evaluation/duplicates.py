@@ -9,14 +9,14 @@ of clips with equal content.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.alignment.dtw import distance_bound, warped_distance
+from marey_motion.alignment.dtw import RangeBounds, distance_bound, warped_distance
 from marey_motion.evaluation.selection import clips_by_source, source_of
 from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
@@ -67,50 +67,69 @@ def find_near_duplicates(
 
     Most pairs are settled by bounds that are never above their distance. Progress counts sources.
     """
-    points = frame_points(database)
-    families = [[database.clips[index] for index in own] for own in clips_by_source(database.clips).values()]
+    families = _Families(database)
     found: list[NearDuplicate] = []
     aligned = compared = 0
 
     def compare(number: int) -> tuple[list[NearDuplicate], int, int]:
-        return _compared(points, families[number][0], families[number + 1 :], threshold_cm)
+        return families.compared(number, threshold_cm / 100.0)
 
     with ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1, thread_name_prefix="pairs") as pool:
-        for number, (pairs, own_aligned, own_compared) in enumerate(pool.map(compare, range(len(families)))):
+        for number, (pairs, own_aligned, own_compared) in enumerate(pool.map(compare, range(families.count))):
             found += pairs
             aligned, compared = aligned + own_aligned, compared + own_compared
             if progress is not None:
-                progress(number + 1, len(families), source_of(families[number][0]))
+                progress(number + 1, families.count, families.source(number))
             if cancelled is not None and cancelled():
                 pool.shutdown(cancel_futures=True)
-                raise EvaluationCancelled(f"stopped with {number + 1} of {len(families)} clips compared")
+                raise EvaluationCancelled(f"stopped with {number + 1} of {families.count} clips compared")
     found.sort(key=lambda pair: (pair.distance_cm, pair.first, pair.second))
     return NearDuplicates(tuple(found), threshold_cm, aligned, compared)
 
 
-def _compared(
-    points: NDArray[np.float64], one: DatabaseClip, families: Sequence[Sequence[DatabaseClip]], threshold_cm: float
-) -> tuple[list[NearDuplicate], int, int]:
-    """Near-duplicates of a clip among other sources, how many clips were aligned with it, and how many there are.
+class _Families:
+    """The clips of a database, those of one source one after another."""
 
-    That both are mirrored changes no distance, so one side is taken as it is.
-    """
-    own, limit = points[one.start : one.stop], threshold_cm / 100.0
-    found: list[NearDuplicate] = []
-    aligned = compared = 0
-    for family in families:
-        near: list[NearDuplicate] = []
-        for other in family:
-            compared += 1
-            theirs = points[other.start : other.stop]
-            if distance_bound(own, theirs, frames_per_box=None) > limit or distance_bound(own, theirs) > limit:
+    def __init__(self, database: MatchingDatabase) -> None:
+        families = clips_by_source(database.clips).values()
+        self._clips = [database.clips[index] for own in families for index in own]
+        self._family = np.repeat(np.arange(len(families)), [len(own) for own in families])
+        self._first = np.append(np.flatnonzero(np.diff(self._family, prepend=-1)), len(self._clips))
+        self._points = frame_points(database)
+        starts, stops = (np.array([getattr(clip, end) for clip in self._clips]) for end in ("start", "stop"))
+        self._bounds = RangeBounds(self._points, starts, stops)
+
+    @property
+    def count(self) -> int:
+        return len(self._first) - 1
+
+    def source(self, number: int) -> str:
+        return source_of(self._clips[self._first[number]])
+
+    def compared(self, number: int, limit_m: float) -> tuple[list[NearDuplicate], int, int]:
+        """Near-duplicates of a source's clip among later sources, how many clips were aligned with it, and how many
+        there are.
+
+        That both are mirrored changes no distance, so one side is taken as it is.
+        """
+        one, others = self._first[number], np.arange(self._first[number + 1], len(self._clips))
+        near: dict[int, list[NearDuplicate]] = {}
+        aligned = 0
+        for place in others[self._bounds.between(one, others, limit=limit_m) <= limit_m]:
+            own, theirs = self._frames(one), self._frames(place)
+            if distance_bound(own, theirs) > limit_m:
                 continue
             aligned += 1
-            distance = warped_distance(own, theirs, limit=limit)
-            if distance <= limit:
-                near.append(_pair(one, other, distance))
-        found += sorted(near, key=lambda pair: pair.distance_cm)[:1]
-    return found, aligned, compared
+            distance = warped_distance(own, theirs, limit=limit_m)
+            if distance <= limit_m:
+                pair = _pair(self._clips[one], self._clips[place], distance)
+                near.setdefault(self._family[place], []).append(pair)
+        nearest = [min(pairs, key=lambda pair: pair.distance_cm) for pairs in near.values()]
+        return nearest, aligned, len(others)
+
+    def _frames(self, place: int) -> NDArray[np.float64]:
+        clip = self._clips[place]
+        return self._points[clip.start : clip.stop]
 
 
 def frame_points(database: MatchingDatabase) -> NDArray[np.float64]:

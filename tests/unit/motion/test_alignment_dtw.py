@@ -7,7 +7,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from marey_motion.alignment.dtw import align, distance_bound, distances, least_total, warped_distance
+from marey_motion.alignment.dtw import RangeBounds, align, distance_bound, distances, least_total, warped_distance
 from marey_motion.errors import MotionError
 
 STEPS = ((1, 1), (1, 0), (0, 1))
@@ -188,10 +188,28 @@ def test_the_bound_is_never_above_the_distance_and_tells_distant_motions_apart()
     for seed in range(30):
         a = walking_points(20 + seed, 1.0 + 0.05 * seed, seed=seed)
         b = walking_points(45 - seed, 1.4, 0.1 * seed, seed=seed + seed % 2)
-        one_box, many = distance_bound(a, b, frames_per_box=None), distance_bound(a, b, frames_per_box=5)
+        one_box, many = distance_bound(a, b, frames_per_box=1000), distance_bound(a, b, frames_per_box=5)
         assert 0.0 <= one_box <= many <= warped_distance(a, b)
     apart = walking_points(30) + 10.0
-    assert distance_bound(walking_points(30), apart, frames_per_box=None) > 5.0
+    assert distance_bound(walking_points(30), apart, frames_per_box=1000) > 5.0
+
+
+def test_bounds_of_many_motions_at_once_are_those_of_one_box_about_each():
+    motions = [walking_points(10 + 7 * seed, 1.0 + 0.1 * seed, 0.2 * seed, seed=seed) for seed in range(8)]
+    stops = np.cumsum([len(motion) for motion in motions])
+    ranges = RangeBounds(np.concatenate(motions), stops - [len(motion) for motion in motions], stops)
+    for one in range(8):
+        others = np.arange(one, 8)
+        bounds = ranges.between(one, others)
+        exact = [distance_bound(motions[one], motions[other], frames_per_box=1000) for other in others]
+        np.testing.assert_allclose(bounds, exact, rtol=1e-9, atol=1e-12)
+        assert all(
+            bound <= warped_distance(motions[one], motions[other]) for bound, other in zip(bounds, others, strict=True)
+        )
+        limit = float(np.median(bounds))
+        limited = ranges.between(one, others, limit=limit)
+        np.testing.assert_array_equal(limited <= limit, bounds <= limit)
+        np.testing.assert_array_equal(limited[limited <= limit], bounds[bounds <= limit])
 
 
 def test_what_cannot_be_aligned_is_refused():
