@@ -11,7 +11,7 @@ from marey_server.store import uploads
 from marey_server.store.transaction import Transaction
 
 PIECE_BYTES = MIB
-"""What a piece that is cut off has kept is a multiple of this."""
+"""Of a piece that is cut off, less than this is lost."""
 
 
 def upload_reply(upload: uploads.Upload) -> Reply:

@@ -81,7 +81,8 @@ def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> Upload:
 def finish(tx: Transaction, upload_id: str) -> str:
     """Make a blob of a complete upload and return its digest; the same again once it is finished.
 
-    Raises `Conflict` where bytes are lacking. Bytes that are not the announced ones are dropped: `Invalid`.
+    Raises `Conflict` where bytes are lacking, and `Invalid` for bytes that are not the announced ones; they stay until
+    the upload is abandoned or given up.
     """
     found = _find(tx, upload_id)
     if found.finished_digest is not None:
