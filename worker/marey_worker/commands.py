@@ -12,11 +12,14 @@ from pathlib import Path
 
 from marey_client.credentials import Credential, resolve
 from marey_client.errors import MareyError, NoCredential
+from marey_client.retries import Retries
 from marey_client.transport import Transport
 from marey_schemas.job_kinds import UnknownKindError, find_kind, job_kinds
 from marey_worker.supervisor import Supervisor, WorkerOptions, default_cache
 
 MIB = 1 << 20
+BRIEF = Retries(tries=6)
+"""Of what an attempt asks for: a worker that shall stop does not wait long for a server that is away."""
 
 
 def work(
@@ -44,7 +47,7 @@ def work(
         slots=slots, kinds=_known_kinds(kinds), labels=_parsed_labels(labels),
         cache=cache or default_cache(os.environ), cache_bytes=cache_mb * MIB, **given,  # type: ignore[arg-type]
     )  # fmt: skip
-    supervisor = Supervisor(Transport(credential.url, credential.token), options)
+    supervisor = Supervisor(Transport(credential.url, credential.token, retries=BRIEF), options)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: threading.Thread(target=supervisor.stop).start())
     if attached:

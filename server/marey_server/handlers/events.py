@@ -50,7 +50,8 @@ class Events(Resource):
             return Reply(Page(items=tuple(found)))
         self.set_header("Content-Type", "text/event-stream")
         self.set_header("Cache-Control", "no-store")
-        await self._follow(project, after, found)
+        if self.request.method != "HEAD":
+            await self._follow(project, after, found)
         return None
 
     def _last_received(self, query: EventsQuery) -> int:
