@@ -173,7 +173,7 @@ class Transport:
             except RequestFailed as error:
                 self._reached.set()
                 failure: Exception = error
-                again, wait_s = error.problem.status in BUSY_STATUSES or error.code == "in-flight", error.retry_after_s
+                again, wait_s = error.problem.status in BUSY_STATUSES, error.retry_after_s
             except httpx.TransportError as error:
                 failure = Unreachable(f"{self.url} does not answer: {_sentence(error)}")
                 failure.__cause__ = error

@@ -1,6 +1,6 @@
 """Idempotency keys: a request that is sent again gets the answer it got before (docs/reference).
 
-The key is written in the transaction of the work it stands for, so that both are there or neither is.
+Key, answer and work are written in one transaction: all are there or none is, and whoever asks meanwhile waits for it.
 """
 
 from __future__ import annotations
@@ -11,13 +11,11 @@ from dataclasses import dataclass
 from sqlalchemy import ColumnElement, delete, select, update
 
 from marey_server.access.principal import Principal
-from marey_server.errors import Conflict, Invalid
+from marey_server.errors import Invalid
 from marey_server.store.tables import idempotency_key
 from marey_server.store.transaction import Transaction
 
 LIFETIME_US = 7 * 86400 * 1_000_000
-IN_FLIGHT_US = 600 * 1_000_000
-"""A first request that has not ended after so long has died; another may try."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +30,8 @@ class StoredAnswer:
 def begin(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
     """Claim `key` for a request (None), or tell what the same request was answered.
 
-    `fingerprint` tells requests apart. Raises `Invalid` where the key stands for another request, `Conflict` where the
-    first one is still under way.
+    `fingerprint` tells requests apart. Raises `Invalid` where the key stands for another request. The caller says
+    `finish` in the same transaction.
     """
     mine = _mine(tx.principal, key)
     tx.execute(delete(idempotency_key).where(*mine, idempotency_key.c.created_us < tx.now_us - LIFETIME_US))
@@ -46,24 +44,13 @@ def begin(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
     stored = tx.execute(select(idempotency_key).where(*mine)).one()
     if stored.fingerprint != fingerprint:
         raise Invalid("This Idempotency-Key was used for another request.", code="idempotency-key-reused")
-    if stored.status is not None:
-        return StoredAnswer(stored.status, dict(stored.headers or {}), bytes(stored.body or b""))
-    dead = idempotency_key.c.created_us < tx.now_us - IN_FLIGHT_US
-    taken_over = update(idempotency_key).where(*mine, idempotency_key.c.status.is_(None), dead)
-    if tx.execute(taken_over.values(created_us=tx.now_us)).rowcount:
-        return None
-    raise Conflict("The first request with this Idempotency-Key is still under way.", code="idempotency-in-flight")
+    return StoredAnswer(stored.status, dict(stored.headers), bytes(stored.body))
 
 
 def finish(tx: Transaction, key: str, status: int, headers: Mapping[str, str], body: bytes) -> None:
     """Keep the answer of the request that `begin` claimed the key for."""
     answer = {"status": status, "headers": dict(headers), "body": body}
     tx.execute(update(idempotency_key).where(*_mine(tx.principal, key)).values(**answer))
-
-
-def release(tx: Transaction, key: str) -> None:
-    """Give a key up whose request failed, where `begin` was committed before the work: it may be tried again."""
-    tx.execute(delete(idempotency_key).where(*_mine(tx.principal, key), idempotency_key.c.status.is_(None)))
 
 
 def principal_key(principal: Principal) -> str:

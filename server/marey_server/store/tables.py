@@ -398,7 +398,7 @@ idempotency_key = Table(
     Column("principal", String(64), primary_key=True),
     Column("key", String(255), primary_key=True),
     Column("fingerprint", String(71), nullable=False),
-    Column("status", Integer),  # null while the first request is under way
+    Column("status", Integer),  # null only within the transaction of the first request
     Column("headers", Document),
     Column("body", LargeBinary),
     Column("created_us", Micros, nullable=False, index=True),

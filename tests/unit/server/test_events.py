@@ -9,7 +9,7 @@ from marey_schemas.kinds import Kind
 from marey_server.access.principal import Principal
 from marey_server.errors import Conflict, Forbidden, Invalid, NotFound, Unauthenticated
 from marey_server.store import events, idempotency, items, projects
-from marey_server.store.idempotency import IN_FLIGHT_US, LIFETIME_US, StoredAnswer
+from marey_server.store.idempotency import LIFETIME_US, StoredAnswer
 
 
 def feed(lab, after=0, **kwargs):
@@ -144,19 +144,6 @@ def test_a_key_expires(lab, clock):
     clock.advance(LIFETIME_US / 1e6 + 1)
     assert lab.write(once, fingerprint="other") is None
     assert count(lab) == 2
-
-
-def test_a_long_request_blocks_its_key_until_it_ends_or_has_died(lab, clock):
-    lab.write(idempotency.begin, "long", "f")
-    with pytest.raises(Conflict) as refused:
-        lab.write(idempotency.begin, "long", "f")
-    assert refused.value.error_code == "idempotency-in-flight"
-    lab.write(idempotency.release, "long")
-    assert lab.write(idempotency.begin, "long", "f") is None
-    clock.advance(IN_FLIGHT_US / 1e6 + 1)
-    assert lab.write(idempotency.begin, "long", "f") is None
-    with pytest.raises(Conflict):
-        lab.write(idempotency.begin, "long", "f")
 
 
 def test_hidden_projects_have_no_feed(lab):
