@@ -23,6 +23,7 @@ from marey_worker.attempt_api import AttemptApi
 from marey_worker.cache import InputCache
 from marey_worker.child_process import ChildProcess
 from marey_worker.environment import environment
+from marey_worker.job_log import JobLog
 from marey_worker.keeper import LeaseKeeper
 from marey_worker.messages import (
     Done,
@@ -67,7 +68,7 @@ class Watch:
     lease: Lease
     keeper: LeaseKeeper
     stopping: threading.Event
-    log_path: Path
+    job_log: JobLog
     started: float
     weighed: float = 0.0
 
@@ -85,7 +86,7 @@ class Watch:
             self.weighed = time.monotonic()
             if child.resident_bytes > self.lease.resources.memory_limit_mb * MIB:
                 return Stop.MEMORY
-        if self.log_path.stat().st_size > LOG_LIMIT_BYTES:
+        if self.job_log.size_bytes > LOG_LIMIT_BYTES:
             return Stop.LOG
         return None
 
@@ -121,12 +122,9 @@ class Attempt:
         self._server = server
         self._threads = threads
         self._scratch = Path(tempfile.mkdtemp(prefix="marey-job-"))
-        self._log_path = self._scratch / "log"
-        self._log_path.touch(mode=0o600)
-        self._log_sent = 0
-        self._sending_log = threading.Lock()
+        self._job_log = JobLog(api, self._scratch / "log")
         self._keeper = LeaseKeeper(api, lease)
-        self._watch = Watch(lease, self._keeper, stopping, self._log_path, time.monotonic())
+        self._watch = Watch(lease, self._keeper, stopping, self._job_log, time.monotonic())
         self._transfers = ThreadPoolExecutor(TRANSFERS_AT_ONCE, thread_name_prefix="marey-transfer")
 
     def run(self, child: ChildProcess) -> Done | Failed | Stop | None:
@@ -152,7 +150,7 @@ class Attempt:
         lease = self._lease
         return Run(
             lease.job, lease.kind, lease.params, lease.inputs, lease.seed,
-            lease.resources.memory_limit_mb * MIB, self._log_path, self._scratch, self._threads,
+            lease.resources.memory_limit_mb * MIB, self._job_log.path, self._scratch, self._threads,
             lease.position, lease.size, lease.into,
         )  # fmt: skip
 
@@ -251,14 +249,9 @@ class Attempt:
         )  # fmt: skip
 
     def _try_to_send_log(self) -> None:
-        """Append what is new. A log that cannot be sent is no reason to lose a result."""
+        """Send what is new. A log that cannot be sent is no reason to lose a result."""
         try:
-            with self._sending_log, self._log_path.open("rb") as file:
-                file.seek(self._log_sent)
-                data = file.read(LOG_LIMIT_BYTES)
-                if data:
-                    self._api.append_log(data)
-                    self._log_sent += len(data)
+            self._job_log.send()
         except LeaseLost:
             self._keeper.lost.set()
         except (MareyError, OSError) as error:

@@ -23,6 +23,7 @@ from marey_schemas.jobs import (
     HeartbeatAnswer,
     Lease,
     LeaseList,
+    LogAnswer,
     Progress,
     TaskResult,
 )
@@ -31,7 +32,7 @@ from marey_schemas.kinds import Kind
 PATIENT = Retries(tries=100, longest_s=10.0, total_s=600.0)
 """For the last word of an attempt: computed results are worth waiting for."""
 
-LOG_PIECE_BYTES = 256 << 10
+PLAIN_TEXT = "text/plain; charset=utf-8"
 
 
 def claim(transport: Transport, request: ClaimRequest) -> tuple[Lease, ...]:
@@ -51,24 +52,20 @@ class AttemptApi:
         self._project = lease.project
         self._job = lease.job
         self._url = f"/jobs/{lease.job}/attempts/{lease.fence}"
-        self._log_offset = 0
 
     def heartbeat(self, progress: Progress | None) -> HeartbeatAnswer:
         """Say that the worker is alive."""
         return read_model(HeartbeatAnswer, self._post("heartbeat", as_json(Heartbeat(progress=progress))))
 
-    def append_log(self, data: bytes) -> None:
-        """Append to the attempt's log; where an earlier try arrived after all, go on behind it."""
-        for start in range(0, len(data), LOG_PIECE_BYTES):
-            piece = data[start : start + LOG_PIECE_BYTES]
-            try:
-                offset = {"Upload-Offset": str(self._log_offset)}
-                self._post("log", piece, media_type="text/plain; charset=utf-8", headers=offset)
-                self._log_offset += len(piece)
-            except LeaseLost:
-                raise
-            except Conflict as error:
-                self._log_offset = int(error.context["offset"])
+    def append_log(self, offset: int, piece: bytes) -> LogAnswer:
+        """Append to the attempt's log; how long that is now, or was already where it does not end at `offset`."""
+        headers = {"Upload-Offset": str(offset)}
+        try:
+            return read_model(LogAnswer, self._post("log", piece, media_type=PLAIN_TEXT, headers=headers))
+        except LeaseLost:
+            raise
+        except Conflict as error:
+            return LogAnswer(offset=error.context["offset"])
 
     def stage(self, body: bytes) -> None:
         """Stage outputs: an encoded `StageRequest`."""

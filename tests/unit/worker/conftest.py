@@ -143,7 +143,7 @@ def _handler(server):
             if int(self.headers["Upload-Offset"]) != len(server.logs[job]):
                 return self.problem(409, "offset", offset=len(server.logs[job]))
             server.logs[job] += body
-            return self.reply(204)
+            return self.reply(200, json.dumps({"offset": len(server.logs[job])}).encode())
 
         def on_outputs(self, job, body):
             server.staged[job] += decode_tree(body, MSGPACK)["outputs"]
