@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import tempfile
 import threading
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 
@@ -42,8 +42,10 @@ class InputCache:
         return data
 
     def _read(self, path: Path) -> bytes | None:
+        """What is kept, or None; another worker may remove it at any moment."""
         try:
             sealed = path.read_bytes()
+            os.utime(path)
         except FileNotFoundError:
             return None
         seal, data = sealed[:SEAL_BYTES], sealed[SEAL_BYTES:]
@@ -51,22 +53,23 @@ class InputCache:
             log.warning("%s is damaged; fetching it again", path)
             path.unlink(missing_ok=True)
             return None
-        os.utime(path)
         return data
 
     def _keep(self, path: Path, data: bytes) -> None:
+        """Keep bytes if that can be done: a folder that is full or gone is no reason to fail a job."""
         size = SEAL_BYTES + len(data)
         if size > self.max_bytes:
             return
-        with tempfile.NamedTemporaryFile(dir=self.folder, prefix=TEMPORARY, delete=False) as file:
-            try:
+        temporary = path.with_name(f"{TEMPORARY}{uuid.uuid4().hex}")
+        try:
+            with open(temporary, "xb", opener=_private) as file:
                 file.write(hashlib.sha256(data).digest())
                 file.write(data)
-            except OSError as error:
-                Path(file.name).unlink()
-                log.warning("cannot keep an input in %s: %s", self.folder, error)
-                return
-        Path(file.name).replace(path)
+            temporary.replace(path)
+        except OSError as error:
+            log.warning("cannot keep an input in %s: %s", self.folder, error)
+            temporary.unlink(missing_ok=True)
+            return
         with self._lock:
             self._bytes += size
             if self._bytes > self.max_bytes:
@@ -92,3 +95,7 @@ class InputCache:
                 continue
             found.append((status.st_mtime, status.st_size, Path(entry.path)))
         return found
+
+
+def _private(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)

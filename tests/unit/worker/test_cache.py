@@ -1,6 +1,8 @@
 """Inputs kept on disk."""
 
 import os
+import resource
+import shutil
 import threading
 
 import pytest
@@ -75,6 +77,50 @@ def test_a_failed_fetch_leaves_nothing(tmp_path):
     with pytest.raises(ConnectionError):
         cache.get("a", fail)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_another_worker_removes_while_it_is_read_is_fetched_again(tmp_path, source, monkeypatch):
+    cache = InputCache(tmp_path, 1000)
+    cache.get("a", source.of("a"))
+    (file,) = tmp_path.iterdir()
+    read_bytes = type(file).read_bytes
+
+    def read_and_lose(path):
+        data = read_bytes(path)
+        path.unlink()
+        return data
+
+    monkeypatch.setattr(type(file), "read_bytes", read_and_lose)
+    assert cache.get("a", source.of("a")) == b"a" * 100
+
+
+def test_an_input_is_handed_on_though_the_folder_has_gone(tmp_path, source):
+    cache = InputCache(tmp_path / "cache", 1000)
+    shutil.rmtree(tmp_path / "cache")
+    assert cache.get("a", source.of("a")) == b"a" * 100
+
+
+def test_an_input_is_handed_on_though_there_is_no_room_for_it(tmp_path, source):
+    cache = InputCache(tmp_path, 1000)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50, limits[1]))
+    try:
+        assert cache.get("a", source.of("a")) == b"a" * 100
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_input_is_handed_on_though_another_worker_cleans_up_while_it_is_written(tmp_path, source, monkeypatch):
+    cache = InputCache(tmp_path, 1000)
+    replace = type(tmp_path).replace
+
+    def lose_and_replace(path, target):
+        path.unlink()
+        return replace(path, target)
+
+    monkeypatch.setattr(type(tmp_path), "replace", lose_and_replace)
+    assert cache.get("a", source.of("a")) == b"a" * 100
 
 
 def test_many_threads_may_ask_for_the_same(tmp_path, source):
