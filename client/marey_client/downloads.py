@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-import tempfile
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from email.message import Message
 from io import BufferedRandom
 from pathlib import Path
-from typing import cast
 
 from marey_client.transport import Params, Transport
 
@@ -22,19 +21,18 @@ def saved_atomically(target: str | Path) -> Iterator[BufferedRandom]:
     """A file to write and read that becomes `target` at the end, and vanishes if the block fails."""
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{target.name[:32]}.", delete=False) as file:
-        temporary = Path(file.name)
-        try:
-            yield cast(BufferedRandom, file)
+    temporary = target.with_name(f".{target.name[:32]}.{uuid.uuid4().hex}")
+    try:
+        with temporary.open("x+b") as file:
+            yield file
             file.flush()
             os.fsync(file.fileno())
-        except BaseException as error:
-            temporary.unlink()
-            if isinstance(error, OSError) and error.filename is None:
-                error.filename = str(target)  # a disk that is full does not say where
-            raise
-    temporary.chmod(0o666 & ~_umask())
-    temporary.replace(target)
+        temporary.replace(target)
+    except BaseException as error:
+        temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(target)  # a disk that is full does not say where
+        raise
 
 
 def safe_file_name(name: str) -> str:
@@ -62,9 +60,3 @@ def _offered_name(disposition: str | None) -> str | None:
     header = Message()
     header["Content-Disposition"] = disposition
     return header.get_filename()
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -73,3 +73,24 @@ def test_a_disk_that_is_full_is_told_with_the_file_that_did_not_fit(tmp_path):
     ):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_arrives_has_the_mode_that_the_process_gives_without_the_mask_being_changed_meanwhile(
+    tmp_path, monkeypatch
+):
+    mask = os.umask(0o027)
+    monkeypatch.setattr(os, "umask", None)  # it is the whole process's: other threads would get it
+    try:
+        with saved_atomically(tmp_path / "walk.bvh") as file:
+            file.write(b"HIERARCHY")
+    finally:
+        monkeypatch.undo()
+        os.umask(mask)
+    assert (tmp_path / "walk.bvh").stat().st_mode & 0o777 == 0o640
+
+
+def test_a_folder_in_the_place_of_a_file_that_arrives_is_told_and_nothing_is_left_beside_it(tmp_path):
+    (tmp_path / "walk.bvh").mkdir()
+    with pytest.raises(OSError, match=r"walk\.bvh"), saved_atomically(tmp_path / "walk.bvh"):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["walk.bvh"]
