@@ -10,7 +10,7 @@ from pathlib import Path
 import httpx
 
 from marey_client.downloads import saved_atomically
-from marey_client.errors import DigestMismatch
+from marey_client.errors import DigestMismatch, FileChanged
 from marey_client.transport import OCTETS, Transport
 from marey_client.uploads import send_in_pieces
 from marey_schemas.items import BlobsMissing, BlobsQuery
@@ -54,12 +54,21 @@ class Blobs:
         return name
 
     def put_file(self, path: Path, *, digest: str | None = None) -> str:
-        """Stream a file to the server; its digest. A large one goes in pieces, and no piece twice."""
+        """Stream a file to the server; its digest. A large one goes in pieces, and no piece twice.
+
+        Raises `FileChanged` where its length changes meanwhile.
+        """
         name = digest or digest_of_file(path)
-        if path.stat().st_size > RESUMABLE_FROM_BYTES:
+        size_bytes = path.stat().st_size
+        if size_bytes > RESUMABLE_FROM_BYTES:
             return send_in_pieces(self.transport, path, name)
-        size = {"Content-Length": str(path.stat().st_size)}
-        self.transport.send("PUT", f"/blobs/{name}", content=lambda: _chunks(path), media_type=OCTETS, headers=size)
+        self.transport.send(
+            "PUT",
+            f"/blobs/{name}",
+            content=lambda: _chunks(path, size_bytes),
+            media_type=OCTETS,
+            headers={"Content-Length": str(size_bytes)},
+        )
         return name
 
     def fetch(self, digest: str) -> bytes:
@@ -91,7 +100,13 @@ class Blobs:
         return target
 
 
-def _chunks(path: Path) -> Iterator[bytes]:
+def _chunks(path: Path, size_bytes: int) -> Iterator[bytes]:
+    left = size_bytes
     with path.open("rb") as file:
         while chunk := file.read(CHUNK_BYTES):
+            left -= len(chunk)
+            if left < 0:
+                raise FileChanged(f"{path} has become longer while it was being sent")
             yield chunk
+    if left > 0:
+        raise FileChanged(f"{path} has become shorter while it was being sent")

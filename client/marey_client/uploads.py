@@ -16,7 +16,8 @@ TRIES_PER_PIECE = 5
 def send_in_pieces(transport: Transport, path: Path, digest: str) -> str:
     """Send a file as a resumable upload; the digest of the blob it became.
 
-    Raises `Unreachable` where the server stays away, `FileChanged` where the file is not what `digest` says.
+    Raises `Unreachable` where the server stays away, `FileChanged` where the file becomes shorter, `Invalid` where the
+    bytes that arrived are not what `digest` says.
     """
     announced = UploadCreate(length=path.stat().st_size, digest=digest)
     upload = read_model(Upload, transport.send("POST", "/uploads", content=as_json(announced)))

@@ -34,6 +34,20 @@ def test_a_file_is_streamed_with_its_length(script, tmp_path):
     assert script.requests[0].url.path.endswith(digest)
 
 
+@pytest.mark.parametrize(("became", "told"), [(DATA[:1000], "shorter"), (DATA * 3, "longer")])
+def test_a_file_whose_length_changes_while_it_is_sent_is_told(script, tmp_path, became, told):
+    path = tmp_path / "walk.bvh"
+    path.write_bytes(DATA)
+
+    def change_and_lose(_request):
+        path.write_bytes(became)
+        raise httpx.ReadError("lost")
+
+    script.answers = [change_and_lose]
+    with pytest.raises(errors.FileChanged, match=rf"walk\.bvh has become {told}"):
+        script.marey().blobs.put_file(path)
+
+
 def test_a_download_goes_on_where_the_connection_broke(script, tmp_path):
     def rest(request):
         start = int(request.headers["Range"].removeprefix("bytes=").rstrip("-"))
