@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
 MIB = 1024 * 1024
@@ -60,11 +60,21 @@ class Settings(BaseSettings):
     import_files_now: int = Field(64, ge=0, description="Imports of more files become a job.")
     import_bytes_now: int = Field(64 * MIB, ge=0, description="Imports of more bytes become a job.")
     lease_ttl_s: float = Field(60.0, ge=1, le=3600, description="How long a worker keeps a job without a sign of life.")
-    heartbeat_s: float = Field(15.0, ge=0.1, le=600, description="How often workers give a sign of life.")
+    heartbeat_s: float = Field(
+        15.0, ge=0.1, le=600, description="How often workers give a sign of life; at least twice in a lease."
+    )
     cancel_grace_s: float = Field(
         30.0, ge=0, le=3600, description="How long a worker may take to stop, once a job is cancelled or its time over."
     )
     local_workers: int = Field(0, ge=0, le=256, description="Worker processes to start beside the server.")
+
+    @field_validator("heartbeat_s")
+    @classmethod
+    def _check_heartbeat(cls, heartbeat_s: float, others: ValidationInfo) -> float:
+        lease_ttl_s = others.data.get("lease_ttl_s")  # absent where it was refused itself
+        if lease_ttl_s is not None and heartbeat_s > lease_ttl_s / 2:
+            raise ValueError(f"at most half of lease_ttl_s, which is {lease_ttl_s:g}: jobs would be lost as they run")
+        return heartbeat_s
 
     @classmethod
     def settings_customise_sources(

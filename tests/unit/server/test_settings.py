@@ -24,6 +24,16 @@ def test_a_misspelt_setting_in_the_file_is_refused(tmp_path: Path, monkeypatch: 
         Settings()
 
 
+@pytest.mark.parametrize("given", [{"lease_ttl_s": 20}, {"heartbeat_s": 31}, {"lease_ttl_s": 1, "heartbeat_s": 0.6}])
+def test_leases_that_would_run_out_between_two_heartbeats_are_refused(given):
+    with pytest.raises(ValidationError, match=r"heartbeat_s\n.* at most half of lease_ttl_s, which is"):
+        Settings(**given)
+
+
+def test_leases_of_two_heartbeats_are_taken():
+    assert Settings(lease_ttl_s=30).heartbeat_s == 15
+
+
 def test_every_setting_is_documented():
     undocumented = {name for name, field in Settings.model_fields.items() if not field.description}
     assert undocumented <= {"log_level"}
