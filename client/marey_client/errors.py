@@ -165,12 +165,6 @@ class LeaseLost(Conflict):
     """The lease is held by somebody else or has ended; stop working on the job."""
 
 
-class Gone(RequestFailed):
-    """This was deleted."""
-
-    status = 410
-
-
 class PreconditionFailed(RequestFailed):
     """The resource has changed since it was read."""
 
@@ -187,12 +181,6 @@ class Invalid(RequestFailed):
     """What was asked for makes no sense."""
 
     status = 422
-
-
-class Locked(RequestFailed):
-    """The resource is read-only."""
-
-    status = 423
 
 
 class TooManyRequests(RequestFailed):
@@ -227,11 +215,9 @@ _BY_STATUS: dict[int, type[RequestFailed]] = {
         Forbidden,
         NotFound,
         Conflict,
-        Gone,
         PreconditionFailed,
         TooLarge,
         Invalid,
-        Locked,
         TooManyRequests,
         ServerFailed,
         Unavailable,

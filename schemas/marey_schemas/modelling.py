@@ -25,7 +25,6 @@ MOST_BASIS_NUMBERS = 20_000_000
 """Canonical frames times spline coefficients, whose products are kept while a model is in use."""
 MOST_SAMPLES = 1000
 MOST_SEED = 2**63 - 1
-LONGEST_SAMPLE_S = 120.0
 
 Vector = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=1)]
 Matrix = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=2)]

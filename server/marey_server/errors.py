@@ -49,7 +49,7 @@ class BadRequest(MareyError):
     code = "bad-request"
 
 
-# 401, 403, 404, 410: who may know what
+# 401, 403, 404: who may know what
 
 
 class Unauthenticated(MareyError):
@@ -71,13 +71,6 @@ class NotFound(MareyError):
 
     status = 404
     code = "not-found"
-
-
-class Gone(MareyError):
-    """This was deleted."""
-
-    status = 410
-    code = "gone"
 
 
 # 405 to 415: how the request is made
@@ -118,7 +111,7 @@ class RangeNotSatisfiable(MareyError):
     code = "range-not-satisfiable"
 
 
-# 409, 412, 423, 428: the state of things
+# 409, 412, 428: the state of things
 
 
 class Conflict(MareyError):
@@ -139,13 +132,6 @@ class PreconditionFailed(MareyError):
 
     status = 412
     code = "precondition-failed"
-
-
-class Locked(MareyError):
-    """The resource is read-only."""
-
-    status = 423
-    code = "locked"
 
 
 class PreconditionRequired(MareyError):

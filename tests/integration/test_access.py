@@ -174,7 +174,7 @@ def expected(access: Access, scope: str | None, role: str, public: bool) -> set[
         return None if access in (Access.SIGNED_IN, Access.READER) else {403, 404}
     if access is Access.WORKER or access is Access.ADMINISTRATOR:
         return None if role == "admin" else {403}
-    if not access.is_role or role == "admin":
+    if access.value not in RANK or role == "admin":
         return None
     if role == "stranger":
         return {404}

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 NO_COLUMN = -1
 
@@ -154,8 +153,3 @@ def _nearest_solution(first, middle, third, last0, last1, last2):  # type: ignor
     if cost_b < cost_a:
         return b0, b1, b2
     return a0, a1, a2
-
-
-def euler_order(axes: NDArray[np.int64]) -> str:
-    """The order of turns as letters, such as "zxy"."""
-    return "".join("xyz"[axis] for axis in axes)

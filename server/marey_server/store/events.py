@@ -49,12 +49,6 @@ def _behind(tx: Transaction, after: int) -> ColumnElement[bool]:
     return or_(event.c.xid > last.xid, and_(event.c.xid == last.xid, event.c.seq > last.seq))
 
 
-def newest_seq(tx: Transaction) -> int:
-    """Number to start after for who wants only what happens from now on."""
-    last = select(event.c.seq).order_by(event.c.xid.desc(), event.c.seq.desc()).limit(1)
-    return int(tx.execute(last).scalar() or 0)
-
-
 def _shown(row: Row[Any]) -> Event:
     return Event(
         seq=row.seq, at=datetime_of(row.at_us), project=row.project, kind=row.kind, subject=row.subject,

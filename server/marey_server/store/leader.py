@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sqlalchemy import and_, case, or_, select, update
+from sqlalchemy import case, or_, update
 
 from marey_server.store.tables import leader
 from marey_server.store.transaction import Transaction
@@ -26,13 +26,6 @@ def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | Non
     first = {"name": name, "holder": holder, "fence": 1, "expires_us": tx.now_us + ttl_us}
     made = tx.execute(tx.insert_or_ignore(leader, first).returning(leader.c.fence)).scalar_one_or_none()
     return None if made is None else int(made)
-
-
-def still_leads(tx: Transaction, name: str, holder: str, fence: int) -> bool:
-    """Whether the leadership still stands; it cannot change hands before the transaction ends."""
-    mine = and_(leader.c.name == name, leader.c.holder == holder, leader.c.fence == fence)
-    statement = select(leader.c.fence).where(mine, leader.c.expires_us > tx.now_us).with_for_update(read=True)
-    return tx.execute(statement).scalar_one_or_none() is not None
 
 
 def give_up_lead(tx: Transaction, name: str, holder: str) -> None:
