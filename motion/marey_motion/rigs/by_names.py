@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
 from marey_motion.rigs.known import KNOWN_RIGS, KnownRig
 from marey_motion.rigs.names import JointName, parse_name
+from marey_motion.rigs.plain_names import Names, readings
 from marey_motion.rigs.standard import CHAINS, ESSENTIAL_JOINTS
 from marey_motion.skeleton import Skeleton
 
 # Common prefixes that are tried; a file has one, and a few joints may look as if they had others.
 MOST_PREFIXES = 8
-# What modellers write after the names of joints, in one file mostly after all of them.
-_ENDINGS = ("jnt", "joint", "bone", "bind", "jt")
 
 
 @dataclass(frozen=True)
@@ -50,36 +48,33 @@ def best_match(skeleton: Skeleton) -> NameMatch | None:
 
     None when no rig's pelvis is found.
     """
-    joints: dict[JointName, int] = {}
-    # Of "UpLeg_L" and its helper "__UpLeg_L", the plainer name is the joint.
-    for index in sorted(range(skeleton.joint_count), key=lambda joint: len(skeleton.display_names[joint])):
-        joints.setdefault(parse_name(skeleton.display_names[index]), index)
     matches = [
         match
+        for names in readings(skeleton.display_names)
+        for joints in (_by_name(names),)
         for rig in KNOWN_RIGS
-        for match in _matches(rig, _without_ending(joints) if rig.everyday else joints, skeleton)
+        for match in _matches(rig, names, joints, skeleton)
     ]
     return max(matches, key=lambda match: match.rank, default=None)
 
 
-def _without_ending(joints: dict[JointName, int]) -> dict[JointName, int]:
-    """The joints by names without the ending that most of them have, as "jnt"."""
-    endings = Counter(ending for name in joints for ending in _ENDINGS if name.base.endswith(ending))
-    ending, count = max(endings.items(), key=lambda item: item[1], default=("", 0))
-    if 2 * count <= len(joints):
-        return joints
-    return {JointName(name.side, name.base.removesuffix(ending)): index for name, index in joints.items()}
+def _by_name(names: Names) -> dict[JointName, int]:
+    """Joints by what their names say; of "UpLeg_L" and its helper "__UpLeg_L", the plainer name is the joint."""
+    joints: dict[JointName, int] = {}
+    for index in sorted(range(len(names)), key=lambda joint: len(names[joint])):
+        joints.setdefault(parse_name(names[index]), index)
+    return joints
 
 
-def _matches(rig: KnownRig, joints: dict[JointName, int], skeleton: Skeleton) -> Iterator[NameMatch]:
-    names = _parsed_names(rig)
-    for prefix in _prefixes(dict(names)["pelvis"], joints):
-        signature = _signature_share(rig, prefix, joints, skeleton)
+def _matches(rig: KnownRig, names: Names, joints: dict[JointName, int], skeleton: Skeleton) -> Iterator[NameMatch]:
+    templates = _parsed_names(rig)
+    for prefix in _prefixes(dict(templates)["pelvis"], joints):
+        signature = _signature_share(rig, prefix, names, joints)
         if rig.signature and signature <= 0.5:
             continue
         found = {
             standard: index
-            for standard, alternatives in names
+            for standard, alternatives in templates
             if (index := _first(alternatives, prefix, joints)) is not None
         }
         _drop_misplaced(found, skeleton)
@@ -110,13 +105,13 @@ def _first(alternatives: tuple[JointName, ...], prefix: str, joints: dict[JointN
     return None
 
 
-def _signature_share(rig: KnownRig, prefix: str, joints: dict[JointName, int], skeleton: Skeleton) -> float:
+def _signature_share(rig: KnownRig, prefix: str, names: Names, joints: dict[JointName, int]) -> float:
     """Share of the signature that is there; 0 for rigs without one."""
     there = 0
     for mark in rig.signature:
         if mark.endswith("*"):
-            begun = sum(name.lower().startswith(mark[:-1]) for name in skeleton.display_names)
-            there += 2 * begun > skeleton.joint_count
+            begun = sum(name.lower().startswith(mark[:-1]) for name in names)
+            there += 2 * begun > len(names)
         else:
             there += _first((parse_name(mark),), prefix, joints) is not None
     return there / max(1, len(rig.signature))

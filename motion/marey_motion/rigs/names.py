@@ -34,8 +34,8 @@ def parse_name(name: str) -> JointName:
         rest = words[:at] + words[at + 1 :]
         if word in _SIDE_WORDS and any(part.isalpha() for part in rest):
             return JointName(_SIDE_WORDS[word], "".join(rest))
-    if words:
+    for at, word in enumerate(words):
         for side in ("left", "right"):
-            if words[0].startswith(side) and len(words[0]) > len(side):
-                return JointName(side, "".join(words)[len(side) :])
+            if word.startswith(side) and len(word) > len(side):
+                return JointName(side, "".join((*words[:at], word[len(side) :], *words[at + 1 :])))
     return JointName("", "".join(words))

@@ -10,6 +10,7 @@ from marey_motion import quaternions
 from marey_motion.errors import MappingError
 from marey_motion.rigs import ESSENTIAL_JOINTS, STANDARD_JOINTS, map_joints, mirrored, symmetric_joints
 from marey_motion.rigs.known import KNOWN_RIGS
+from marey_motion.rigs.plain_names import readings
 from marey_motion.skeleton import Skeleton
 
 LIMBS = ("UpLeg", "Leg", "Foot", "ToeBase", "Shoulder", "Arm", "ForeArm", "Hand")
@@ -140,7 +141,7 @@ EVERYDAY = {
     ),
     "maya": (
         "hips_JNT spine_JNT spine1_JNT spine2_JNT neck_JNT head_JNT",
-        "l_upleg_JNT l_leg_JNT l_foot_JNT l_toebase_JNT l_shoulder_JNT l_arm_JNT l_forearm_JNT l_hand_JNT",
+        "l_thigh_JNT l_leg_JNT l_foot_JNT l_toebase_JNT l_collar_JNT l_shldr_JNT l_forearm_JNT l_hand_JNT",
         ("l_", "r_"),
     ),
     "genesis": (
@@ -177,6 +178,75 @@ def test_a_prefix_before_all_names_does_not_matter(body):
 
     assert mapping.rig == "motionbuilder"
     assert mapping.joints["left_knee"] == "Character1_LeftLeg"
+
+
+# What exporters, copies and scenes put on the name of every joint.
+MARKS = {
+    "copied in Blender": lambda name, joint: f"{name}.001",
+    "copied, but the root": lambda name, joint: f"{name}.001" if joint else name,
+    "copied twice": lambda name, joint: f"{name}_1.002",
+    "numbered after": lambda name, joint: f"{name}_{joint:02d}",
+    "numbered before": lambda name, joint: f"{joint}_{name}",
+    "joined with a scene": lambda name, joint: f"Armature|hero:{name}",
+    "of a modeller": lambda name, joint: f"{name}_jnt",
+    "a modeller's, copied": lambda name, joint: f"{name}Joint.001",
+    "of a figure called left": lambda name, joint: f"LeftHero_{name}",
+}
+
+
+def marked(skeleton, mark):
+    names = tuple(mark(name, joint) for joint, name in enumerate(skeleton.joint_names))
+    return replace(skeleton, joint_names=names, display_names=names)
+
+
+def with_index_fingers(body):
+    """The body with three joints of an index finger on each hand, as most rigs call them."""
+    names, parents = list(body.joint_names), list(body.parents)
+    for side in ("Left", "Right"):
+        for level in (1, 2, 3):
+            parents.append(names.index(f"{side}Hand" if level == 1 else f"{side}HandIndex{level - 1}"))
+            names.append(f"{side}HandIndex{level}")
+    offsets = np.concatenate((body.offsets, np.full((6, 3), 0.02)))
+    return Skeleton(tuple(names), np.array(parents), offsets, quaternions.identity(len(names)))
+
+
+@pytest.mark.parametrize("mark", MARKS.values(), ids=MARKS)
+def test_a_mark_on_every_name_hides_neither_the_body_nor_its_fingers(body, mark):
+    plain = with_index_fingers(body)
+    known = map_joints(plain)
+    skeleton = marked(plain, mark)
+    mapping = map_joints(skeleton)
+
+    assert known.joints["right_index_finger_tip"] == "RightHandIndex3"
+    assert (mapping.rig, mapping.method, mapping.confidence) == (known.rig, "names", 1.0)
+    assert {joint: skeleton.index_of(name) for joint, name in mapping.joints.items()} == {
+        joint: plain.index_of(name) for joint, name in known.joints.items()
+    }
+
+
+@pytest.mark.parametrize("mark", MARKS.values(), ids=MARKS)
+def test_a_mark_on_every_name_hides_no_real_rig(mocap, mark):
+    plain = read_skeleton(mocap / "rigs/misc/test_freebvh.bvh")
+    known = map_joints(plain)
+    skeleton = marked(plain, mark)
+
+    assert len(known.joints) == 53
+    assert [skeleton.index_of(name) for name in map_joints(skeleton).joints.values()] == [
+        plain.index_of(name) for name in known.joints.values()
+    ]
+
+
+def test_numbers_that_tell_joints_apart_are_no_marks(body):
+    names = tuple(f"bone_{joint}" for joint in range(body.joint_count))
+
+    assert readings(names)[-1] == tuple(map(str, range(body.joint_count)))
+    assert map_joints(replace(body, joint_names=names, display_names=names)).method == "geometry"
+
+
+def test_a_mark_that_some_names_lack_is_part_of_the_others():
+    names = ("Hips", "Spine", "Spine.001", "Head.001")
+
+    assert readings(names) == (names,)
 
 
 def test_a_body_without_telling_names_is_found_whatever_one_hand_holds(body):

@@ -35,6 +35,7 @@ def test_every_style_of_a_left_thigh_is_one_name(name):
         ("rShldr", "right", "shldr"),
         ("thigh_l", "left", "thigh"),
         ("lefthand", "left", "hand"),
+        ("CHARACTER1_LEFTHANDINDEX1", "left", "character1handindex1"),
         ("finger1-2.L", "left", "finger12"),
         ("L5", "", "l5"),
         ("Left", "", "left"),

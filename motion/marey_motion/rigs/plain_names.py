@@ -1,0 +1,82 @@
+"""Joint names without what an exporter put before or after all of them.
+
+Duplicating an armature, joining scenes and converting files leave marks on every joint: "Hips.001", "hero_Hips",
+"Hips_jnt", "Hips_07". None of them says anything of a body, but together they hide the names of every known rig.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+
+Names = tuple[str, ...]
+
+# Marks of each kind that are looked for: a namespace within a namespace, a duplicate of a duplicate.
+MOST_MARKS = 2
+_SEPARATORS = re.compile(r"[^A-Za-z0-9]+")
+# What modellers write after the names of joints, in one file mostly after all of them.
+_ENDING = re.compile(r"[^A-Za-z0-9]*(jnt|joint|bone|bind|jt)$", re.IGNORECASE)
+_NUMBER_AFTER = re.compile(r"[^A-Za-z0-9]+\d+$")
+_NUMBER_BEFORE = re.compile(r"^\d+[^A-Za-z0-9]")
+
+
+def readings(names: Sequence[str]) -> tuple[Names, ...]:
+    """The names as they are, then each time with one more mark taken off that they share.
+
+    >>> readings(("Hips.001", "Spine.001", "Head.001"))
+    (('Hips.001', 'Spine.001', 'Head.001'), ('Hips', 'Spine', 'Head'))
+    """
+    found = [tuple(names)]
+    for strip in (_without_ending, _without_common_end, _without_numbers, _without_common_start) * MOST_MARKS:
+        plainer = strip(found[-1])
+        if plainer != found[-1] and all(plainer):
+            found.append(plainer)
+    return tuple(found)
+
+
+def _marked(names: Names) -> Names:
+    """The names that must share a mark: all but the root's, which exporters often make themselves."""
+    return names[1:]
+
+
+def _shared_start(names: Sequence[str]) -> str:
+    # What the first and the last in order share, all between them share.
+    first, last = min(names, default=""), max(names, default="")
+    length = next(
+        (at for at, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), min(len(first), len(last))
+    )
+    return first[:length]
+
+
+def _without_common_end(names: Names) -> Names:
+    """Without what follows the last separator and that with it, where it is the same for all."""
+    shared = _shared_start([name[::-1] for name in _marked(names)])[::-1]
+    at = max((found.start() for found in _SEPARATORS.finditer(shared)), default=None)
+    return names if at is None else tuple(name.removesuffix(shared[at:]) for name in names)
+
+
+def _without_common_start(names: Names) -> Names:
+    """Without what precedes the first separator and that with it, where it is the same for all."""
+    shared = _shared_start(_marked(names))
+    found = _SEPARATORS.search(shared)
+    return names if found is None else tuple(name.removeprefix(shared[: found.end()]) for name in names)
+
+
+def _without_numbers(names: Names) -> Names:
+    """Without running numbers before or after all names, unless they are what tells joints apart."""
+    for number in (_NUMBER_AFTER, _NUMBER_BEFORE):
+        plainer = tuple(number.sub("", name) for name in names)
+        if all(map(number.search, _marked(names))) and len(set(plainer)) == len(set(names)):
+            return plainer
+    return names
+
+
+def _without_ending(names: Names) -> Names:
+    """Without a modeller's word for a joint, where most names end in the same one."""
+    endings = Counter(found[1].lower() for name in names if (found := _ENDING.search(name)))
+    ending, count = endings.most_common(1)[0] if endings else ("", 0)
+    if 2 * count <= len(names):
+        return names
+    marked = re.compile(rf"[^A-Za-z0-9]*{ending}$", re.IGNORECASE)
+    return tuple(marked.sub("", name) for name in names)
