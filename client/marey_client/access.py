@@ -51,6 +51,10 @@ class Users:
         """Take a user's access away; what they made stays."""
         self.transport.send("DELETE", f"/users/{name}", headers=ANY_STATE)
 
+    def enable(self, name: str) -> User:
+        """Let a user who was disabled in again, with the password and the tokens they had."""
+        return self.change(name, UserChange(disabled=False))
+
 
 @dataclass(frozen=True)
 class Tokens:

@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar
 from marey_client.downloads import download
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
-from marey_schemas.items import Item, ItemChange, ItemCreate, Lineage, Revision, Staleness
+from marey_schemas.items import Item, ItemChange, ItemCreate, Lineage, Page, Revision, Staleness
 from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import Kind
 
@@ -128,23 +128,34 @@ class Items(Generic[Handle]):
         directly_in: str | None = None,
         path: str | None = None,
         sort: str | None = None,
+        deleted: bool = False,
         filters: Params | None = None,
         page_size: int = 500,
     ) -> Iterator[Handle]:
         """Items in order, fetched page by page.
 
         `collection` names a folder, with everything below it; `directly_in` one without, of which "" is the root;
-        `path` one item; `filters` are the server's, such as `{"frames.gte": 120, "tag.in": "walk,run"}`.
+        `path` one item; `deleted` those that `restore` brings back; `filters` are the server's, such as
+        `{"frames.gte": 120, "tag.in": "walk,run"}`.
         """
         params = {
             "collection": collection or None, "directly_in": directly_in, "path": path, "sort": sort,
-            "limit": page_size, **(filters or {}),
+            "deleted": "true" if deleted else None, "limit": page_size, **(filters or {}),
         }  # fmt: skip
         return (self._handle(item) for item in pages(self.transport, Item, self.url, params))
 
     def get(self, item_id: str) -> Handle:
         """One item by its id."""
         return self._handle(self.transport.get(Item, f"{self.url}/{item_id}"))
+
+    def count(self, *, collection: str | None = None, filters: Params | None = None) -> int:
+        """How many there are, in a folder and below it; of the whole project without one."""
+        params = {"collection": collection or None, "count": "exact", "limit": 1, **(filters or {})}
+        return self.transport.get(Page, self.url, params).count or 0
+
+    def restore(self, item_id: str) -> Handle:
+        """Bring a deleted item back by its id."""
+        return self._handle(self.transport.post(Item, f"{self.url}/{item_id}/restore"))
 
     def create(
         self,

@@ -217,7 +217,37 @@ def disable_user(context: typer.Context, name: UserName) -> None:
     """Take a user's access away; what they made stays."""
     with connect(context) as marey:
         marey.users.disable(name)
-    tell(f"{name} is disabled")
+    tell(f"{name} is disabled; marey user enable {name} undoes it")
+
+
+@user.command("enable")
+def enable_user(context: typer.Context, name: UserName) -> None:
+    """Let a user who was disabled in again, with the password and tokens they had."""
+    with connect(context) as marey:
+        marey.users.enable(name)
+    tell(f"{name} is enabled")
+
+
+@user.command("change")
+def change_user(
+    context: typer.Context,
+    name: UserName,
+    display_name: Annotated[str | None, typer.Option(help="Name shown to people.")] = None,
+    administrator: Annotated[bool | None, typer.Option(help="May do everything everywhere, or not any more.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Change what a user is called, and whether they are an administrator."""
+    from marey_schemas.access import UserChange
+
+    given = {"display_name": display_name, "administrator": administrator}
+    change = UserChange.model_validate({key: value for key, value in given.items() if value is not None})
+    if not change.model_fields_set:
+        raise WrongUsage("say what changes: --display-name or --administrator")
+    with connect(context) as marey:
+        changed = marey.users.change(name, change)
+    if as_json:
+        return print_json(changed)
+    return tell(f"user {changed.name} is changed")
 
 
 def _ask_name() -> str:

@@ -13,6 +13,7 @@ from marey_client.cli.addresses import Address, find_item, require_item
 from marey_client.cli.failures import Refused, WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, print_pairs, print_table, progress, tell
+from marey_client.cli.standing import kind_named
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -114,6 +115,7 @@ def ls(
     recursive: Annotated[bool, typer.Option("--recursive", "-r", help="Folders below, too.")] = False,
     kind: Annotated[list[str] | None, typer.Option(help="Only items of this kind; may be repeated.")] = None,
     tag: Annotated[str | None, typer.Option(help="Only items with one of these tags, separated by commas.")] = None,
+    deleted: Annotated[bool, typer.Option("--deleted", help="What was removed, here and below.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Show what a folder holds."""
@@ -122,6 +124,8 @@ def ls(
 
         return list_projects(context, as_json)
     address = Address.parse(place)
+    if deleted:
+        return _show_deleted(context, address, kind, tag, as_json)
     with connect(context) as marey:
         folders = [] if recursive else _folders_in(marey, address)
         items = _items_in(marey, address, recursive=recursive, kinds=kind, tag=tag)
@@ -145,37 +149,49 @@ def ls(
     return print_table(("name", "kind", *figures, "tags"), rows, right=figures)
 
 
+def _show_deleted(
+    context: typer.Context, address: Address, kinds: Sequence[str] | None, tag: str | None, as_json: bool
+) -> None:
+    with connect(context) as marey:
+        folders = list(marey.project(address.project).collections.list(path=address.path, deleted=True))
+        items = _items_in(marey, address, recursive=True, kinds=kinds, tag=tag, deleted=True)
+    if as_json:
+        return print_json({"collections": folders, "items": [one.item for one in items]})
+    rows = [(f"{one.path}/", "collection", one.deleted_at, one.id) for one in folders]
+    rows += [(one.path, one.item.kind, one.item.deleted_at, one.id) for one in items]
+    print_table(("name", "kind", "deleted", "id"), rows)
+    return tell(f"marey restore {address.project}/NAME brings one back; an id where a name stands twice")
+
+
 def _folders_in(marey: Marey, address: Address) -> list[str]:
     """Names of the folders directly in the folder an address names."""
-    below = marey.project(address.project).collections.list(filters={"path": address.path or None})
+    below = marey.project(address.project).collections.list(path=address.path)
     names = (one.path.removeprefix(address.path).strip("/").partition("/")[0] for one in below)
     return sorted({name for name in names if name})
 
 
 def _items_in(
-    marey: Marey, address: Address, *, recursive: bool, kinds: Sequence[str] | None, tag: str | None
+    marey: Marey,
+    address: Address,
+    *,
+    recursive: bool,
+    kinds: Sequence[str] | None,
+    tag: str | None,
+    deleted: bool = False,
 ) -> list[ItemHandle]:
     from marey_schemas.kinds import Kind
 
-    wanted = [_kind_named(name) for name in kinds] if kinds else list(Kind)
+    wanted = [kind_named(name) for name in kinds] if kinds else list(Kind)
     project = marey.project(address.project)
 
     def of_kind(kind: Kind) -> list[ItemHandle]:
         folder = "collection" if recursive else "directly_in"
-        found: list[ItemHandle] = list(project.items(kind).list(filters={folder: address.path, "tag.in": tag}))
+        filters = {folder: address.path, "tag.in": tag}
+        found: list[ItemHandle] = list(project.items(kind).list(filters=filters, deleted=deleted))
         return sorted(found, key=lambda item: item.path)
 
     with ThreadPoolExecutor(4) as pool:
         return [item for items in pool.map(of_kind, wanted) for item in items]
-
-
-def _kind_named(name: str) -> Kind:
-    from marey_schemas.kinds import Kind
-
-    try:
-        return Kind(name)
-    except ValueError:
-        raise WrongUsage(f"{name!r} is no kind; there are {', '.join(Kind)}") from None
 
 
 def show(

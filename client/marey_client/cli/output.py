@@ -30,9 +30,18 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
     for column in columns:
         table.add_column(column, justify="right" if column in right else "left", overflow="fold")
     for row in rows:
-        table.add_row(*(Text("" if cell is None else str(cell)) for cell in row))
+        table.add_row(*(Text(_shown(cell)) for cell in row))
     width = None if sys.stdout.isatty() else 200
     Console(width=width, highlight=False).print(table)
+
+
+def _shown(cell: object) -> str:
+    """A cell as text; moments to the second, as the server's clock of UTC has them."""
+    from datetime import datetime
+
+    if isinstance(cell, datetime):
+        return cell.strftime("%Y-%m-%d %H:%M:%SZ")
+    return "" if cell is None else str(cell)
 
 
 def print_rows(rows: Iterable[tuple[str, str, str]]) -> None:

@@ -1,0 +1,191 @@
+"""A project is put in order: moved, renamed, tagged, removed and brought back, by the command line on a real server."""
+
+import io
+import itertools
+import json
+import re
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from marey_client.cli import main
+from marey_client.imports import find_files
+from marey_motion.formats import write_bvh
+from marey_motion.gait import generate_gait
+from marey_schemas.access import ProjectCreate
+from marey_schemas.imports import ImportOptions
+from marey_schemas.items import ItemChange
+from server_process import ServerProcess
+
+NAMES = (f"lab{number}" for number in itertools.count(1))
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    process = ServerProcess(tmp_path_factory.mktemp("server")).start()
+    yield process
+    assert process.stop() == 0
+
+
+@pytest.fixture(scope="module")
+def marey(server):
+    with server.client() as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def takes(tmp_path_factory):
+    """Three short walks."""
+    folder = tmp_path_factory.mktemp("takes")
+    for name, speed_m_s in (("a", 1.0), ("b", 1.2), ("c", 1.4)):
+        (folder / f"{name}.bvh").write_bytes(write_bvh(generate_gait(speed_m_s, 0.0, 0.5)))
+    return folder
+
+
+@pytest.fixture
+def lab(marey, takes):
+    """A project with three clips: `raw/a`, `raw/b` and `raw/c`."""
+    project = marey.create_project(ProjectCreate(name=next(NAMES)))
+    project.imports.upload(find_files([takes]).files, ImportOptions(collection="raw"))
+    return project
+
+
+@pytest.fixture
+def run(server, lab, monkeypatch, capsys, tmp_path):
+    """Runs a command, in which `lab` stands for the test's project; what it printed, with the same name for that."""
+    monkeypatch.setenv("MAREY_URL", server.url)
+    monkeypatch.setenv("MAREY_DATA", str(server.data))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+
+    def command(*arguments, status=0, terminal=None):
+        words = [re.sub(r"^lab\b", lab.name, word) for word in arguments]
+        monkeypatch.setattr(sys, "argv", ["marey", *words])
+        stdin = io.StringIO(terminal or "")
+        monkeypatch.setattr(stdin, "isatty", lambda: terminal is not None)
+        monkeypatch.setattr(sys, "stdin", stdin)
+        with pytest.raises(SystemExit) as ended:
+            main()
+        out, err = (text.replace(lab.name, "lab") for text in capsys.readouterr())
+        assert (ended.value.code or 0) == status, out + err
+        return SimpleNamespace(stdout=out, stderr=err)
+
+    return command
+
+
+def clips(lab):
+    return sorted(clip.path for clip in lab.clips.list())
+
+
+def test_items_and_folders_are_renamed_and_moved_with_their_ids(run, lab):
+    ids = {clip.name: clip.id for clip in lab.clips.list()}
+    assert "lab/raw/a is lab/raw/walk now" in run("mv", "lab/raw/a", "lab/raw/walk").stderr
+    assert lab.clips.get(ids["a"]).path == "raw/walk"
+    run("mv", "lab/raw/b", f"lab/{ids['c']}", "lab/takes/day-1/")  # made, as it is not there
+    assert clips(lab) == ["raw/walk", "takes/day-1/b", "takes/day-1/c"]
+    run("mv", "lab/takes", "lab/raw")  # a folder that is there: into it
+    run("mv", "lab/raw/takes/day-1", "lab/raw/first")
+    assert clips(lab) == ["raw/first/b", "raw/first/c", "raw/walk"]
+    moved = json.loads(run("mv", "lab/raw/walk", "lab/", "--json").stdout)
+    assert [(one["id"], one["name"], one["collection"]) for one in moved["moved"]] == [(ids["a"], "walk", "")]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "told"),
+    [
+        (["mv", "lab/raw/a", "lab/raw/b"], 1, "lab/raw/a: There is a clip of that name there already."),
+        (["mv", "lab/raw/a", "studio/a"], 2, "lab/raw/a cannot move to another project"),
+        (["mv", "lab/raw/nobody", "lab/raw/b"], 2, "there is nothing at lab/raw/nobody"),
+        (["mv", "lab/raw/a"], 2, "say what moves, and where to"),
+        (["mv", "lab", "lab/b"], 2, "'lab' is a whole project"),
+        (["mv", "lab/raw", "lab/raw/below/"], 1, "'raw' cannot move into itself"),
+        (["mv", "lab/raw/a", "lab/nobody", "lab/other/"], 2, "there is nothing at lab/nobody"),
+        (["rm", "lab/raw"], 2, "remove 3 items (lab/raw/)? there is no terminal to ask at: say --yes"),
+        (["rm", "lab/raw/a", "lab/raw", "--yes"], 2, "lab/raw/a is in lab/raw, which is named, too"),
+        (["rm", "lab/raw/a", "lab/raw/a", "--yes"], 2, "lab/raw/a is named twice"),
+        (["rm", "lab/raw/a/", "--yes"], 2, "there is nothing at lab/raw/a"),
+        (["restore", "lab/raw/a"], 2, "there is nothing deleted at lab/raw/a; marey ls --deleted lab shows"),
+        (["tag", "lab/raw/a"], 2, "say which tags"),
+        (["tag", "lab/raw", "--add", "x"], 2, "lab/raw is a folder; folders have no tags"),
+        (["rm", "lab/raw/a", "--kind", "stone"], 2, "'stone' is no kind"),
+    ],
+)
+def test_what_cannot_be_is_told_and_changes_nothing(run, lab, arguments, status, told):
+    assert told in run(*arguments, status=status).stderr
+    assert clips(lab) == ["raw/a", "raw/b", "raw/c"]
+
+
+def test_what_was_removed_is_listed_and_comes_back(run, lab):
+    assert "marey restore lab/raw/a brings it back" in run("rm", "lab/raw/a").stderr
+    run("rm", "lab/raw", "--yes")
+    assert clips(lab) == []
+    assert "raw/a" not in run("ls", "-r", "lab").stdout
+    deleted = json.loads(run("ls", "--deleted", "lab", "--json").stdout)
+    assert sorted(f"{one['collection']}/{one['name']}" for one in deleted["items"]) == ["raw/a", "raw/b", "raw/c"]
+    assert [one["path"] for one in deleted["collections"]] == ["raw"]
+    run("restore", "lab/raw/")
+    assert clips(lab) == ["raw/b", "raw/c"]  # what went with the folder, and not what went before
+    run("restore", "lab/raw/a")
+    assert clips(lab) == ["raw/a", "raw/b", "raw/c"]
+
+
+def test_of_several_that_were_removed_at_one_place_the_last_comes_back_and_each_by_its_id(run, lab):
+    first = next(lab.clips.list(path="raw/a")).id
+    run("rm", "lab/raw/a")
+    run("mv", "lab/raw/b", "lab/raw/a")
+    second = next(lab.clips.list(path="raw/a")).id
+    run("rm", "lab/raw/a")
+    run("restore", "lab/raw/a")
+    assert next(lab.clips.list(path="raw/a")).id == second
+    told = run("restore", f"lab/{first}", status=1).stderr
+    assert "There is another clip 'a' in its place now." in told
+    assert "move what stands there away first, with marey mv" in told
+    run("mv", "lab/raw/a", "lab/raw/b")
+    run("restore", f"lab/{first}")
+    assert next(lab.clips.list(path="raw/a")).id == first
+
+
+def test_of_things_of_one_name_the_kind_says_which(run, lab):
+    skeleton = next(lab.skeletons.list())
+    skeleton.change(ItemChange(collection="raw", name="a"))
+    assert "lab/raw/a is the name of a skeleton and of a clip" in run("rm", "lab/raw/a", status=2).stderr
+    run("mv", "lab/raw/a", "lab/raw/rig", "--kind", "skeleton")
+    assert lab.skeletons.get(skeleton.id).path == "raw/rig"
+    assert clips(lab) == ["raw/a", "raw/b", "raw/c"]
+
+
+def test_what_the_server_refuses_of_several_keeps_the_others_from_nothing(run, lab):
+    run("mv", "lab/raw/a", "lab/other/c")
+    done = run("mv", "lab/raw/b", "lab/raw/c", "lab/other/", "--json", status=1)
+    report = json.loads(done.stdout)
+    assert [one["name"] for one in report["moved"]] == ["b"]
+    assert list(report["refused"]) == ["lab/raw/c"]
+    assert clips(lab) == ["other/b", "other/c", "raw/c"]
+
+
+def test_tags_are_added_and_taken_away(run, lab):
+    run("tag", "lab/raw/a", "lab/raw/b", "--add", "slow", "--add", "straight")
+    assert "lab/raw/a: straight" in run("tag", "lab/raw/a", "--remove", "slow").stderr
+    assert {clip.name: clip.item.tags for clip in lab.clips.list()} == {
+        "a": ("straight",), "b": ("slow", "straight"), "c": (),
+    }  # fmt: skip
+    assert "tags.0" in run("tag", "lab/raw/a", "--add", "a,b", status=2).stderr
+
+
+@pytest.mark.parametrize(("answer", "status", "left"), [("n\n", 1, ["raw/a", "raw/b", "raw/c"]), ("y\n", 0, [])])
+def test_at_a_terminal_many_items_are_removed_after_a_yes(run, lab, answer, status, left):
+    assert "remove 3 items (lab/raw/)?" in run("rm", "lab/raw", terminal=answer, status=status).stderr
+    assert clips(lab) == left
+
+
+def test_a_disabled_user_is_let_in_again_and_an_administrator_made(run, marey, lab):
+    run("user", "create", "ada", "--without-password")
+    assert "marey user enable ada" in run("user", "disable", "ada").stderr
+    assert marey.users.get("ada").disabled
+    run("user", "enable", "ada")
+    assert not marey.users.get("ada").disabled
+    run("user", "change", "ada", "--administrator", "--display-name", "Ada L.")
+    assert (marey.users.get("ada").administrator, marey.users.get("ada").display_name) == (True, "Ada L.")
+    run("user", "change", "ada", "--no-administrator")
+    assert not marey.users.get("ada").administrator
+    assert "say what changes" in run("user", "change", "ada", status=2).stderr
