@@ -117,6 +117,18 @@ def _params_schema(params: type[Request]) -> dict[str, Any]:
     return params.model_json_schema()
 
 
+_RIG = InputSpec(
+    kind=Kind.SKELETON,
+    required=False,
+    description="The clips' skeleton at the revision whose mapping to go by, where that was edited since.",
+)
+_RIGS = InputSpec(
+    kind=Kind.SKELETON,
+    many=True,
+    required=False,
+    description="Skeletons of the clips whose mapping was edited since, at the revision to go by.",
+)
+
 IMPORT = KindDeclaration(
     name="import",
     description="Reads files the server already has and makes clips, skeletons and models of them.",
@@ -136,12 +148,7 @@ RETARGET = KindDeclaration(
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to carry over."),
         "skeleton": InputSpec(kind=Kind.SKELETON, description="The skeleton that shall move."),
-        "rigs": InputSpec(
-            kind=Kind.SKELETON,
-            many=True,
-            required=False,
-            description="Skeletons of the clips whose mapping was edited since, at the revision to go by.",
-        ),
+        "rigs": _RIGS,
     },
     outputs={"clips": Kind.CLIP},
     fan_out="clips",
@@ -170,11 +177,7 @@ EVALUATE = KindDeclaration(
     version=2,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to evaluate, all of one skeleton."),
-        "rig": InputSpec(
-            kind=Kind.SKELETON,
-            required=False,
-            description="The clips' skeleton at the revision whose mapping to go by, where that was edited since.",
-        ),
+        "rig": _RIG,
         "normaliser": InputSpec(
             kind=Kind.EVALUATION,
             required=False,
@@ -248,12 +251,7 @@ EDIT = KindDeclaration(
         "sources": InputSpec(
             kind=Kind.CLIP, many=True, required=False, description="Other clips that the commands name by their ids."
         ),
-        "rigs": InputSpec(
-            kind=Kind.SKELETON,
-            many=True,
-            required=False,
-            description="Skeletons of the clips whose mapping was edited since, at the revision to go by.",
-        ),
+        "rigs": _RIGS,
     },
     outputs={"clips": Kind.CLIP},
     fan_out="clips",
@@ -272,12 +270,7 @@ ANNOTATE = KindDeclaration(
     version=1,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to annotate."),
-        "rigs": InputSpec(
-            kind=Kind.SKELETON,
-            many=True,
-            required=False,
-            description="Skeletons of the clips whose mapping was edited since, at the revision to go by.",
-        ),
+        "rigs": _RIGS,
     },
     outputs={"annotations": Kind.ANNOTATION},
     fan_out="clips",
@@ -321,11 +314,7 @@ ALIGN = KindDeclaration(
             required=False,
             description="Annotations of these clips: what they cut apart is aligned part by part.",
         ),
-        "rig": InputSpec(
-            kind=Kind.SKELETON,
-            required=False,
-            description="The clips' skeleton at the revision whose mapping to go by, where that was edited since.",
-        ),
+        "rig": _RIG,
     },
     outputs={"processed": Kind.PROCESSED},
     named_after="clips",

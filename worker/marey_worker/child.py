@@ -72,7 +72,7 @@ def run_job(run: Run, pipe: Connection) -> End:
     except NoSuchThing as error:  # inputs are pinned: what is not there now will not be there at the next try
         return Failed(error.code, str(error), None, retryable=False)
     except ValidationError as error:
-        return Failed("bad-params", str(error), None, retryable=False)
+        return Failed("invalid-params", str(error), None, retryable=False)
     except MemoryError:
         limit_mb = run.memory_limit_bytes >> 20
         return Failed("memory-limit", f"the job needs more than its {limit_mb} MB of memory", "memory-limit", True)
