@@ -219,7 +219,7 @@ class Attempt:
         if end is Stop.LEASE_LOST:
             log.warning("%s: %s", self._lease.job, self._watch.explain(end))
             return
-        self._keeper.confirm()
+        self._keeper.confirm(patiently=isinstance(end, Done))
         self._try_to_send_log()
         if isinstance(end, Done):
             self._complete(end)

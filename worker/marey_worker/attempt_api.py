@@ -53,9 +53,10 @@ class AttemptApi:
         self._job = lease.job
         self._url = f"/jobs/{lease.job}/attempts/{lease.fence}"
 
-    def heartbeat(self, progress: Progress | None) -> HeartbeatAnswer:
+    def heartbeat(self, progress: Progress | None, *, patiently: bool = False) -> HeartbeatAnswer:
         """Say that the worker is alive."""
-        return read_model(HeartbeatAnswer, self._post("heartbeat", as_json(Heartbeat(progress=progress))))
+        sender = self._patient if patiently else self._transport
+        return read_model(HeartbeatAnswer, self._post("heartbeat", as_json(Heartbeat(progress=progress)), sender))
 
     def append_log(self, offset: int, piece: bytes) -> LogAnswer:
         """Append to the attempt's log; how long that is now, or was already where it does not end at `offset`."""

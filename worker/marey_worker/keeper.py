@@ -52,11 +52,14 @@ class LeaseKeeper:
         """Send no more heartbeats."""
         self._stopped.set()
 
-    def confirm(self) -> None:
-        """Make sure that the lease is held before publishing. Raises `LeaseLost`, or why the server does not answer."""
+    def confirm(self, *, patiently: bool) -> None:
+        """Make sure that the lease is held before the last word; `patiently` where there is a result to lose.
+
+        Raises `LeaseLost`, or why the server does not answer.
+        """
         self._saying_last_word = True
         if self.lost.is_set() or time.monotonic() - self._heard > CONFIRM_AFTER * self._ttl_s:
-            self._beat()
+            self._beat(patiently=patiently)
 
     def _run(self) -> None:
         wait_s = self._jittered(self._interval_s)
@@ -79,11 +82,11 @@ class LeaseKeeper:
             return False
         return True
 
-    def _beat(self) -> None:
+    def _beat(self, *, patiently: bool = False) -> None:
         with self._beating:
             progress = self._progress
             self._tried = time.monotonic()
-            answer: HeartbeatAnswer = self._api.heartbeat(progress)
+            answer: HeartbeatAnswer = self._api.heartbeat(progress, patiently=patiently)
             self._heard = time.monotonic()
             self._told = progress
             self._ttl_s = answer.lease_ttl_s

@@ -3,12 +3,15 @@
 import threading
 import time
 
+import httpx
 import pytest
 
-from marey_client.errors import LeaseLost, Unreachable
+from marey_client.errors import LeaseLost, Unavailable, Unreachable
+from marey_client.retries import Retries
+from marey_client.transport import Transport
 from marey_schemas.jobs import HeartbeatAnswer, Lease, Progress, Resources
 from marey_schemas.problems import Problem
-from marey_worker import keeper
+from marey_worker import attempt_api, keeper
 from marey_worker.keeper import LeaseKeeper
 
 LOST = LeaseLost(Problem(type="", title="", status=409, detail="lost", instance="r", code="lease-lost"))
@@ -23,7 +26,7 @@ class Api:
         self.cancel = False
         self.beat = threading.Event()
 
-    def heartbeat(self, progress):
+    def heartbeat(self, progress, *, patiently=False):
         self.heard.append(progress)
         self.beat.set()
         if self.error is not None:
@@ -84,7 +87,7 @@ def test_a_lost_lease_ends_the_heartbeats(api, keep):
     time.sleep(0.1)
     assert len(api.heard) == heard
     with pytest.raises(LeaseLost):
-        one.confirm()
+        one.confirm(patiently=False)
 
 
 def test_a_request_to_cancel_is_heard(api, keep):
@@ -99,13 +102,40 @@ def test_a_server_that_is_away_is_asked_again_and_the_lease_is_not_given_up(api,
         time.sleep(0.005)
     assert not one.lost.is_set()
     api.error = None
-    one.confirm()
+    one.confirm(patiently=False)
 
 
 def test_nothing_is_confirmed_after_a_long_silence_without_asking(api, keep):
     one = keep(heartbeat_s=1000, ttl_s=0.03)
     time.sleep(0.05)
-    one.confirm()
+    one.confirm(patiently=False)
     assert len(api.heard) == 1
-    one.confirm()
+    one.confirm(patiently=False)
     assert len(api.heard) == 1
+
+
+@pytest.mark.parametrize("patiently", [True, False])
+def test_a_result_waits_longer_for_a_server_that_is_away_than_a_failure_does(monkeypatch, patiently):
+    asked = []
+
+    def server(request):
+        asked.append(request.url.path)
+        if len(asked) < 20:
+            return httpx.Response(503)
+        return httpx.Response(200, json={"lease_ttl_s": 60.0, "cancel_requested": False})
+
+    monkeypatch.setattr(attempt_api, "PATIENT", Retries(tries=100, sleep=lambda _: None))
+    hasty = Retries(tries=3, sleep=lambda _: None)
+    held = lease(heartbeat_s=1000, ttl_s=0)
+    with_server = Transport("http://server.test", "t", retries=hasty, http=httpx.MockTransport(server))
+    one = LeaseKeeper(attempt_api.AttemptApi(with_server, held), held)
+    try:
+        if patiently:
+            one.confirm(patiently=True)
+            assert len(asked) == 20
+        else:
+            with pytest.raises(Unavailable):
+                one.confirm(patiently=False)
+            assert len(asked) == 3
+    finally:
+        one.stop()
