@@ -14,6 +14,7 @@ from marey_schemas.editing import EditDocument
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
 from marey_server.errors import Invalid, NotFound, TooLarge
+from marey_server.field_errors import field_errors
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
 
@@ -57,7 +58,7 @@ def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, reques
         source.sources[name] = items.read_part(tx, project, Kind.CLIP, name, "motion").tree
         numbers += _size(source.sources[name])
     if numbers > MOST_NUMBERS:
-        raise TooLarge("The motions are too long for a preview; hand in a job", code="preview-too-large")
+        raise TooLarge("The motions are too long for a preview; hand in a job.", code="preview-too-large")
     for one in (motion, *source.sources.values()):
         skeleton, revision = one["skeleton"]["item"], one["skeleton"]["revision"]
         hierarchy = items.read_part(tx, project, Kind.SKELETON, skeleton, "hierarchy", revision=revision)
@@ -81,7 +82,7 @@ def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
         made = edit_clip(clip, commands, body=body, sources=sources, most_numbers=MOST_NUMBERS, most_work=MOST_WORK)
     except MotionError as error:
         if error.code in ("edit-too-large", "edit-too-long"):
-            raise TooLarge(f"{error}; hand in a job", code="preview-too-large") from error
+            raise TooLarge(f"{error}; hand in a job.", code="preview-too-large") from error
         raise _invalid("/commands", error.code, str(error)) from error
     if request.piece >= len(made):
         raise _invalid("/piece", "no-piece", f"The edit makes {len(made)} clips, counted from 0.")
@@ -93,7 +94,7 @@ def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
     shown = wanted.clip.sliced(start, stop)
     if shown.poses.size > MOST_SHOWN:
         raise TooLarge(
-            f"{stop - start} frames are too many for one preview; ask for some of them", code="preview-too-large"
+            f"{stop - start} frames are too many for one preview; ask for some of them.", code="preview-too-large"
         )
     skeleton = Motion.model_validate(source.motion).skeleton
     return EditPreview(
@@ -116,7 +117,9 @@ def _read_edit(tx: Transaction, project: str, request: EditPreviewRequest) -> Ed
     try:
         return EditDocument.model_validate(tree)
     except ValidationError as error:
-        raise _invalid("/edit", "bad-document", f"The edit cannot be applied: {error}") from error
+        first = field_errors(error, tree)[0]
+        detail = f"The edit cannot be applied: {first.pointer}: {first.detail}"
+        raise _invalid("/edit", "bad-document", detail) from error
 
 
 def _size(motion: Tree) -> int:

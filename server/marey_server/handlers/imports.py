@@ -13,13 +13,14 @@ from marey_schemas.imports import ImportAnswer, ImportEntry, ImportOptions, Impo
 from marey_schemas.jobs import Job, JobCreate
 from marey_server import importing
 from marey_server.errors import BadRequest, Invalid, MareyError, TooLarge
+from marey_server.field_errors import field_errors
 from marey_server.handlers.declarations import MIB, Access, Body, Files, writes
 from marey_server.handlers.multipart import MultipartReader, PartHead, Piece, boundary_of
 from marey_server.handlers.negotiation import body_type
 from marey_server.handlers.receiving import Receiver
 from marey_server.handlers.reply import Reply
 from marey_server.handlers.resource import Resource
-from marey_server.handlers.validation import decode_body, field_errors, json_pointer, validate_body
+from marey_server.handlers.validation import decode_body, validate_body
 from marey_server.importing import PreparedImport, SourceFile
 from marey_server.store import blobs, submission
 from marey_server.store.transaction import Transaction
@@ -219,7 +220,7 @@ def _form_options(form: dict[str, bytearray]) -> ImportOptions:
     try:
         return ImportOptions.model_validate(values)
     except ValidationError as error:
-        faults = field_errors(error, values, json_pointer)
+        faults = field_errors(error, values)
         raise Invalid(f"{faults[0].pointer}: {faults[0].detail}", code="invalid-form", errors=faults) from None
 
 

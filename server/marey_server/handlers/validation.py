@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,10 +12,9 @@ from marey_schemas import codecs
 from marey_schemas.canonical import canonical_json
 from marey_schemas.problems import FieldError
 from marey_server.errors import BadRequest, Invalid, TooLarge
+from marey_server.field_errors import MAX_ERRORS, field_errors, json_pointer
 
 Model = TypeVar("Model", bound=BaseModel)
-
-MAX_ERRORS = 50
 
 
 def parse_query(model: type[Model] | None, arguments: Mapping[str, Sequence[bytes]]) -> Model | None:
@@ -75,7 +74,7 @@ def validate_body(model: type[Model], tree: Any) -> Model:
             return model.model_validate(tree)
         return model.model_validate_json(canonical_json(tree), strict=True)  # in which 1.0 is the integer 1
     except ValidationError as error:
-        faults = field_errors(error, tree, json_pointer)
+        faults = field_errors(error, tree)
         first = f"{faults[0].pointer or 'the body'}: {faults[0].detail}"
         raise Invalid(f"The body does not fit: {first}", code="invalid-body", errors=faults) from None
 
@@ -90,33 +89,3 @@ def survey(tree: Any, steps: tuple[str, ...] = ()) -> bool:
         fault = FieldError(pointer=json_pointer(steps), code="bad-text", detail="A text may not contain NUL.")
         raise Invalid(f"{fault.pointer}: {fault.detail}", code="bad-text", errors=[fault])
     return isinstance(tree, np.ndarray)
-
-
-def json_pointer(steps: Sequence[str]) -> str:
-    """The JSON Pointer (RFC 6901) of a path of steps."""
-    return "".join("/" + step.replace("~", "~0").replace("/", "~1") for step in steps)
-
-
-def field_errors(error: ValidationError, tree: Any, pointer: Callable[[list[str]], str]) -> list[FieldError]:
-    entries = error.errors(include_url=False, include_context=False, include_input=False)
-    return [
-        FieldError(
-            pointer=pointer(_existing_steps(entry["loc"], tree)),
-            code=entry["type"].replace("_", "-"),
-            detail=entry["msg"].removeprefix("Value error, "),
-        )
-        for entry in entries[:MAX_ERRORS]
-    ]
-
-
-def _existing_steps(location: tuple[int | str, ...], tree: Any) -> list[str]:
-    """The steps of a location that the tree has, and a missing last one: pydantic names union members in between."""
-    steps = []
-    for index, step in enumerate(location):
-        try:
-            tree = tree[step]
-        except (KeyError, IndexError, TypeError):
-            if index < len(location) - 1 or not isinstance(tree, Mapping):
-                continue
-        steps.append(str(step))
-    return steps

@@ -21,6 +21,7 @@ from marey_schemas.canonical import canonical_json, detach_arrays
 from marey_schemas.documents import SCHEMAS
 from marey_schemas.problems import FieldError
 from marey_server.errors import Invalid, NotFound
+from marey_server.field_errors import field_errors
 from marey_server.store import blobs
 from marey_server.store.tables import blob, document, document_blob
 from marey_server.store.transaction import Transaction
@@ -109,10 +110,7 @@ def _check(tree: Any, schema: str | None) -> str:
     try:
         model.model_validate(tree)
     except ValidationError as error:
-        errors = [
-            FieldError(pointer="/" + "/".join(map(str, found["loc"])), code=found["type"], detail=found["msg"])
-            for found in error.errors(include_url=False, include_context=False, include_input=False)[:100]
-        ]
+        errors = field_errors(error, tree)
         raise Invalid(f"This is no valid {named}: {errors[0].pointer}: {errors[0].detail}", errors=errors) from error
     return str(named or OPEN_SCHEMA)
 

@@ -16,6 +16,7 @@ from marey_schemas.jobs import Job, JobCreate, JobState
 from marey_schemas.problems import FieldError
 from marey_server import faults
 from marey_server.errors import Invalid
+from marey_server.field_errors import field_errors, json_pointer
 from marey_server.store import job_cache, staging
 from marey_server.store.binding import bind
 from marey_server.store.job_documents import job_documents
@@ -113,10 +114,7 @@ def _check(
     try:
         params = kind.params.model_validate(request.params)
     except ValidationError as error:
-        found = [
-            FieldError(pointer=f"{at}/params/" + "/".join(map(str, one["loc"])), code=one["type"], detail=one["msg"])
-            for one in error.errors(include_url=False, include_context=False, include_input=False)[:100]
-        ]
+        found = field_errors(error, request.params, lambda steps: f"{at}/params{json_pointer(steps)}")
         detail = f"These are no parameters of {kind.name}: {found[0].pointer}: {found[0].detail}"
         raise Invalid(detail, errors=found) from error
     pins = pin_inputs(tx, project, kind, request, known, at)

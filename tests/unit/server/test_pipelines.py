@@ -75,7 +75,12 @@ def test_two_that_are_handed_in_at_once_are_computed_once(desk: Desk) -> None:
     ("changes", "pointer", "code"),
     [
         ({"square": {"kind": "cube"}}, "/steps/square/kind", "unknown-kind"),
-        ({"sum": {"params": {"numbre": 1}}}, "/steps/sum/params/numbre", "extra_forbidden"),
+        ({"sum": {"params": {"numbre": 1}}}, "/steps/sum/params/numbre", "extra-forbidden"),
+        (
+            {"sum": {"kind": "annotate", "params": {"proposal": {"method": "steps", "longest_s": 0.1}}}},
+            "/steps/sum/params/proposal",
+            "value-error",
+        ),
         ({"sum": {"after": ["survey"]}}, "/steps/sum/after/0", "cycle"),
         ({"sum": {"kind": "errand"}}, "/steps/square/inputs/things/step", "wrong-kind"),
         ({"square": {"inputs": {"things": {"step": "none"}}}}, "/steps/square/inputs/things/step", "unknown-step"),

@@ -11,7 +11,7 @@ from marey_schemas.items import ItemCreate, UploadCreate
 from marey_schemas.jobs import JobCreate
 from marey_server.errors import BadRequest, Invalid
 from marey_server.handlers.queries import CommaSeparated, PageQuery
-from marey_server.handlers.validation import decode_body, json_pointer, parse_query, validate_body
+from marey_server.handlers.validation import decode_body, parse_query, validate_body
 
 
 class Query(PageQuery):
@@ -93,7 +93,3 @@ def test_nul_is_found_however_deep():
     with pytest.raises(Invalid) as refusal:
         validate_body(ItemCreate, {"name": "n", "parts": {"a/b": {"c": ["ok", "no\0"]}}})
     assert pointers(refusal) == {"/parts/a~1b/c/1"}
-
-
-def test_pointers_escape_as_rfc_6901_says():
-    assert json_pointer(["a/b", "m~n", "0"]) == "/a~1b/m~0n/0"

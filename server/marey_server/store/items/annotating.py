@@ -89,7 +89,7 @@ def _changed(found: FoundAnnotation, change: AnnotationChange) -> PreparedDocume
         if work > MOST_WORK:
             raise TooLarge(
                 f"{len(change.commands)} commands are too many at once for {len(layer.segments)} segments and "
-                f"{len(layer.keyframes)} keyframes; send at most {index} at a time",
+                f"{len(layer.keyframes)} keyframes; send at most {index} at a time.",
                 code="too-many-commands",
             )
         try:

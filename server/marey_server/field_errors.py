@@ -1,0 +1,47 @@
+"""What pydantic finds wrong, as every answer tells it: a pointer into what was sent, a code, a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from marey_schemas.problems import FieldError
+
+MAX_ERRORS = 50
+
+
+def json_pointer(steps: Sequence[str]) -> str:
+    """The JSON Pointer (RFC 6901) of a path of steps."""
+    return "".join("/" + step.replace("~", "~0").replace("/", "~1") for step in steps)
+
+
+def field_errors(
+    error: ValidationError, tree: Any, pointer: Callable[[list[str]], str] = json_pointer
+) -> list[FieldError]:
+    """The first `MAX_ERRORS` faults of `tree`, which was validated; `pointer` writes down where each is."""
+    entries = error.errors(include_url=False, include_context=False, include_input=False)
+    return [
+        FieldError(
+            pointer=pointer(_steps(entry["loc"], tree, may_lack_last=entry["type"] == "missing")),
+            code=entry["type"].replace("_", "-"),
+            detail=entry["msg"].removeprefix("Value error, "),
+        )
+        for entry in entries[:MAX_ERRORS]
+    ]
+
+
+def _steps(location: tuple[int | str, ...], tree: Any, *, may_lack_last: bool) -> list[str]:
+    """The steps of a location that the tree has, and of a missing field its name: pydantic puts the names of the
+    alternatives it tried in between.
+    """
+    steps = []
+    for index, step in enumerate(location):
+        try:
+            tree = tree[step]
+        except (KeyError, IndexError, TypeError):
+            if not (may_lack_last and index == len(location) - 1 and isinstance(tree, Mapping)):
+                continue
+        steps.append(str(step))
+    return steps
