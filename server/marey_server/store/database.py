@@ -38,6 +38,8 @@ PAGE_BYTES = 16_384
 CACHE_KIB = 4096
 WAL_LIMIT_BYTES = 64 * 2**20
 WAL_CHECK_EVERY_S = 5.0
+WAL_PATIENCE_MS = 250
+"""How long a write waits for readers to let the log be written back: most reads are shorter, but a backup is not."""
 WRITE_TRIES = 5
 READ_TRIES = 3
 
@@ -154,7 +156,10 @@ class Database:
         return answer
 
     def _keep_wal_short(self, connection: Connection) -> None:
-        """Write a long log back to the file: under steady reads SQLite itself never finds a moment to start it anew."""
+        """Write a long log back to the file: under steady reads SQLite itself never finds a moment to start it anew.
+
+        Where somebody reads for long, it is tried again later.
+        """
         now_s = time.monotonic()
         if now_s - self._wal_checked_s < WAL_CHECK_EVERY_S:
             return
@@ -162,7 +167,9 @@ class Database:
         wal = Path(f"{self.url.database}-wal")
         if wal.exists() and wal.stat().st_size > WAL_LIMIT_BYTES:
             driver: sqlite3.Connection = connection.connection.driver_connection  # type: ignore[assignment]
-            driver.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            driver.execute(f"PRAGMA busy_timeout = {WAL_PATIENCE_MS}")
+            driver.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # answers that it could not, and raises nothing
+            driver.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
 
     def submit_read(
         self,

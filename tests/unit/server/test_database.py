@@ -1,7 +1,9 @@
 """Transactions: what is retried, what is translated, what the clock says."""
 
+import sqlite3
 import threading
 import time
+from contextlib import closing
 
 import psycopg
 import pytest
@@ -221,6 +223,24 @@ def test_a_long_log_is_written_back_under_steady_reads(tmp_path, database, monke
         stop.set()
         for reader in readers:
             reader.join(30)
+
+
+@on_sqlite
+def test_writes_go_on_while_somebody_reads_for_long(tmp_path, database, monkeypatch):
+    """As `marey db backup` does."""
+    monkeypatch.setattr(database_module, "WAL_LIMIT_BYTES", 2**20)
+    monkeypatch.setattr(database_module, "WAL_CHECK_EVERY_S", 0.0)
+    with closing(sqlite3.connect(tmp_path / "marey.db", isolation_level=None)) as reading:
+        reading.execute("BEGIN")
+        reading.execute("SELECT count(*) FROM server_state").fetchall()
+        for number in range(8):
+            row = {"key": f"k{number}", "value": "x" * 300_000}
+            written = database.submit_write(
+                SYSTEM, lambda tx, row=row: tx.execute(tx.insert_or_ignore(server_state, row))
+            )
+            written.result(database_module.BUSY_TIMEOUT_MS / 2000)
+    database.write(SYSTEM, user_names)
+    assert (tmp_path / "marey.db-wal").stat().st_size == 0
 
 
 @on_postgres
