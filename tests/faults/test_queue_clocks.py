@@ -101,15 +101,33 @@ def test_after_an_outage_workers_have_a_whole_lease_to_come_back_before_anything
         desk.complete(leases[dead])
 
 
+def test_a_job_is_not_taken_from_a_worker_whose_heartbeat_waits_behind_a_long_write(desk: Desk) -> None:
+    grace = StartGrace(desk.policy)
+    request = ClaimRequest(worker="v", kinds=("errand",))
+    desk.submit(resources={"time_limit_s": 86_400})
+    lease = desk.claim()
+    for _ in range(15):
+        assert desk.database.write(SYSTEM, claim_after_reaping, request, grace, desk.policy) == []
+        desk.heartbeat(lease)
+        desk.clock.advance(5)
+    desk.clock.advance(desk.policy.heartbeat_s - 5 - 1)  # the next one is about to be sent
+    assert desk.database.write(SYSTEM, claim_after_reaping, request, grace, desk.policy) == []
+    desk.clock.advance(50)
+    assert desk.database.write(SYSTEM, claim_after_reaping, request, grace, desk.policy) == []
+    desk.heartbeat(lease)
+
+
 def test_the_grace_begins_anew_when_the_database_was_away(desk: Desk) -> None:
     grace = StartGrace(desk.policy)
     second_us = 1_000_000
     assert not grace.over(0)
+    assert not grace.over(40 * second_us)
     assert not grace.over(59 * second_us)
     assert grace.over(60 * second_us)
-    assert grace.over(110 * second_us)
+    assert grace.over(105 * second_us)
     grace.restart()
     assert not grace.over(111 * second_us)
+    assert not grace.over(140 * second_us)
     assert not grace.over(170 * second_us)
     assert grace.over(171 * second_us)
     assert not grace.over(171 * second_us - 1), "the clock went back"

@@ -29,11 +29,12 @@ class StartGrace:
     """Holds the reaper back for a whole lease after this process has started or the database has been away.
 
     Leases run out while nobody can renew them; those who live renew them in this time. A jump of the clock counts as an
-    absence too.
+    absence too, and so does a long write that all others waited for: a lease has what a heartbeat leaves of it.
     """
 
     def __init__(self, policy: QueuePolicy = DEFAULT_POLICY) -> None:
         self._ttl_us = policy.lease_ttl_us
+        self._longest_silence_us = policy.lease_ttl_us - round(policy.heartbeat_s * SECOND_US)
         self._lock = threading.Lock()
         self._since_us: int | None = None
         self._seen_us = 0
@@ -41,7 +42,7 @@ class StartGrace:
     def over(self, now_us: int) -> bool:
         """Whether leases may be taken back; `now_us` is the database's time."""
         with self._lock:
-            if self._since_us is None or not 0 <= now_us - self._seen_us <= self._ttl_us:
+            if self._since_us is None or not 0 <= now_us - self._seen_us <= self._longest_silence_us:
                 self._since_us = now_us
             self._seen_us = now_us
             return now_us - self._since_us >= self._ttl_us
