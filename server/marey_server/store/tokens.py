@@ -18,9 +18,10 @@ from marey_server.access.secret_tokens import (
     secret_matches,
     split_user_token,
 )
-from marey_server.errors import Forbidden, LeaseLost, NotFound, Unauthenticated
+from marey_server.errors import Forbidden, NotFound, Unauthenticated
 from marey_server.store import listing
 from marey_server.store.clock import datetime_of
+from marey_server.store.fencing import lease_lost
 from marey_server.store.ids import new_id
 from marey_server.store.tables import attempt, job, token, user
 from marey_server.store.transaction import Transaction
@@ -75,7 +76,7 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
     if row is None:
         raise _unknown()
     if row.fence != row.current_fence:
-        raise LeaseLost(f"Attempt {row.fence} does not hold {row.id} any more. Stop working on it.")
+        raise lease_lost(row.id, row.fence)
     running = row.state == JobState.RUNNING
     return Principal(
         "attempt",

@@ -8,8 +8,8 @@ from typing import Any
 from sqlalchemy import ColumnElement, Row, update
 
 from marey_schemas.jobs import FailRequest, FailureReason
-from marey_server.errors import LeaseLost
 from marey_server.store import staging
+from marey_server.store.fencing import lease_lost
 from marey_server.store.job_ends import AttemptEnd, end_attempts, end_jobs, failure_document
 from marey_server.store.job_events import emit_job_events, wake_workers
 from marey_server.store.queue_policy import QueuePolicy
@@ -112,7 +112,7 @@ def carry_out(
         ended = []
         moved = _queue_again(tx, row, condition, verdict, values)
     if not moved:
-        raise LeaseLost(f"Attempt {end.fence} does not hold {end.job_id} any more.")
+        raise lease_lost(end.job_id, end.fence)
     end_attempts(tx, [end])
     staging.drop_staged(tx, [(end.job_id, end.fence)])
     settle(tx, ended)
