@@ -23,7 +23,6 @@ ROOT Hips
   }}
 }}
 """
-ARM_WIDTH = 9
 
 
 def rows_of(values: Sequence[Sequence[float]]) -> list[str]:

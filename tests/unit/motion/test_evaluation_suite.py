@@ -1,5 +1,5 @@
 import threading
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -12,7 +12,6 @@ from marey_motion.evaluation.result_documents import records_to_tree
 from marey_motion.evaluation.scenario import reference, suite_trials
 from marey_motion.evaluation.suite import EvaluationCancelled, assemble, run_suite
 from marey_motion.matching.options import ControllerOptions
-from marey_motion.matching.record import TrialRecord
 from marey_schemas.codecs import encode_tree
 
 OPTIONS = EvaluationOptions(grid=Grid((1.0, 2.0), (-50.0, 0.0, 50.0)), duration_s=6.0, switch_every_s=2.0)
@@ -31,13 +30,6 @@ def records(database):
 
 def stored(trials, records):
     return encode_tree(records_to_tree(trials, records), "application/msgpack", arrays="blocks")
-
-
-def same_records(left, right):
-    return all(
-        np.array_equal(getattr(left, field.name), getattr(right, field.name), equal_nan=True)
-        for field in fields(TrialRecord)
-    )
 
 
 # Running

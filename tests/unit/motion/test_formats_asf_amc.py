@@ -8,12 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from marey_motion.errors import FormatError
 from marey_motion.formats import pair_companions, read_motion
-from marey_motion.formats.asf_amc import INCH_M, read_asf_amc
+from marey_motion.formats.asf_amc import read_asf_amc
 from marey_motion.kinematics import global_positions
 from marey_motion.source import ImportOptions, SourceMotion
 from motion_files import AMC, ASF
-
-CMU_UNIT_M = INCH_M / 0.45
 
 
 def read(amc: str = AMC, asf: str = ASF, **options: float) -> SourceMotion:
