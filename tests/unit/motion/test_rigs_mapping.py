@@ -8,7 +8,7 @@ import pytest
 
 from marey_motion import quaternions
 from marey_motion.errors import MappingError
-from marey_motion.rigs import ESSENTIAL_JOINTS, STANDARD_JOINTS, map_joints, mirrored, symmetric_joints
+from marey_motion.rigs import ESSENTIAL_JOINTS, STANDARD_JOINTS, map_joints, mirrored, require_trust, symmetric_joints
 from marey_motion.rigs.known import KNOWN_RIGS
 from marey_motion.rigs.plain_names import readings
 from marey_motion.skeleton import Skeleton
@@ -257,6 +257,119 @@ def test_a_body_without_telling_names_is_found_whatever_one_hand_holds(body):
 
     assert mapping.method == "geometry"
     assert dict(mapping.joints) == {joint: names[body.index_of(name)] for joint, name in known.items()}
+
+
+def anonymous(skeleton):
+    names = tuple(f"bone{index}" for index in range(skeleton.joint_count))
+    return replace(skeleton, joint_names=names, display_names=names)
+
+
+def with_chains(skeleton, *chains):
+    """The skeleton with more joints: chains of (name of the joint it hangs on, offset, and the offsets below it)."""
+    parents, offsets = list(skeleton.parents), [*skeleton.offsets]
+    for parent, *bones in chains:
+        for place, bone in enumerate(bones):
+            parents.append(len(parents) - 1 if place else skeleton.index_of(parent))
+            offsets.append(np.array(bone))
+    names = (*skeleton.joint_names, *(f"more{joint}" for joint in range(len(parents) - skeleton.joint_count)))
+    return Skeleton(names, np.array(parents), np.array(offsets), quaternions.identity(len(names)))
+
+
+def with_twist_joints(skeleton, *names):
+    """The skeleton with a joint more in the middle of the bones that lead to these joints."""
+    parents, offsets, order = list(skeleton.parents), [*skeleton.offsets], list(range(skeleton.joint_count))
+    for name in names:
+        joint = skeleton.index_of(name)
+        offsets[joint] = offsets[joint] / 2
+        order.insert(order.index(joint), len(parents))
+        parents.append(parents[joint])
+        offsets.append(offsets[joint])
+        parents[joint] = len(parents) - 1
+    place = {joint: at for at, joint in enumerate(order)}
+    all_names = (*skeleton.joint_names, *(f"{name}Twist" for name in names))
+    return Skeleton(
+        tuple(all_names[joint] for joint in order),
+        np.array([place.get(parents[joint], -1) for joint in order]),
+        np.array([offsets[joint] for joint in order]),
+        quaternions.identity(len(order)),
+    )
+
+
+def both(parent, first, *others):
+    """A chain on the left and its mirror image on the right."""
+    return [(parent, *((side * x, y, z) for x, y, z in (first, *others))) for side in (1, -1)]
+
+
+DRESSED = {
+    "a cape": [("Spine2", (0, 0, -0.12), *[(0, -0.28, -0.05)] * 4)],
+    "a cape of three": [("Spine2", (x, 0, -0.12), *[(0, -0.22, -0.05)] * 5) for x in (-0.1, 0, 0.1)],
+    "short wings": both("Spine2", (0.08, 0.05, -0.1), *[(0.18, 0.05, -0.03)] * 4),
+    "wings": both("Spine2", (0.08, 0.05, -0.1), *[(0.38, 0.1, -0.06)] * 4),
+    "great wings": both("Spine2", (0.08, 0.05, -0.1), *[(0.6, 0.2, -0.1)] * 3),
+    "a long appendix": [("Hips", (0, 0, -0.1), *[(0, -0.1, -0.15)] * 7)],
+    "a pony tail": [("Head", (0, 0.08, -0.12), *[(0, -0.15, 0)] * 4)],
+    "two plaits": both("Head", (0.08, 0.08, -0.05), *[(0, -0.2, 0)] * 4),
+    "a skirt": [
+        ("Hips", (0.15 * np.cos(a), 0, 0.15 * np.sin(a)), *[(0.03 * np.cos(a), -0.22, 0.03 * np.sin(a))] * 3)
+        for a in np.arange(8) * np.pi / 4 + np.pi / 8
+    ],
+    "ears and pouches": [*both("Head", (0.07, 0.1, 0), *[(0, 0.06, 0)] * 3), *both("Hips", (0.2, 0, 0), (0, -0.1, 0))],
+    "a sheath and a lance": [
+        ("Hips", (0.15, 0, 0), (0, -0.3, -0.3), (0, -0.3, -0.3)),
+        ("RightHand", (0, 0, 0.1), (0, 0, 0.6), (0, 0, 0.6)),
+    ],
+}
+
+
+def assert_body_is_found(skeleton, body):
+    mapping = map_joints(anonymous(skeleton))
+
+    assert mapping.method == "geometry"
+    found = {joint: skeleton.joint_names[int(name[4:])] for joint, name in mapping.joints.items()}
+    known = {joint: name for joint, name in map_joints(body).joints.items() if joint in ESSENTIAL_JOINTS}
+    assert {joint: found.get(joint) for joint in known} == known
+
+
+@pytest.mark.parametrize("clothes", DRESSED.values(), ids=DRESSED)
+def test_a_body_without_telling_names_is_found_in_all_kinds_of_clothes(body, clothes):
+    assert_body_is_found(with_chains(body, *clothes), body)
+
+
+@pytest.mark.parametrize(
+    "bones",
+    [("ForeArm", "Hand"), ("Leg", "Foot"), ("Hand",), ("ForeArm", "Hand", "Leg", "Foot")],
+    ids=["arms", "legs", "forearms", "all"],
+)
+def test_twist_joints_are_not_taken_for_elbows_and_knees(body, bones):
+    twisted = with_twist_joints(body, *(f"{side}{bone}" for side in ("Left", "Right") for bone in bones))
+
+    assert_body_is_found(twisted, body)
+
+
+def test_arms_that_wings_may_be_as_well_are_doubted_in_words(body):
+    arm = [body.offsets[body.index_of(f"Left{bone}")] for bone in ("Shoulder", "Arm", "ForeArm", "Hand")]
+    mapping = map_joints(anonymous(with_chains(body, *both("Spine2", *map(tuple, arm)))))
+
+    assert mapping.confidence < 0.3
+    assert any("arms are doubtful: bone" in note for note in mapping.notes)
+    with pytest.raises(MappingError, match="arms are doubtful"):
+        require_trust(mapping)
+
+
+def test_sides_that_no_foot_tells_are_said_to_be_a_guess(body):
+    feet = [joint for joint, name in enumerate(body.joint_names) if "Toe" in name]
+    kept = [joint for joint in range(body.joint_count) if joint not in feet]
+    place = {joint: at for at, joint in enumerate(kept)}
+    footless = Skeleton(
+        tuple(f"bone{at}" for at in range(len(kept))),
+        np.array([place.get(int(body.parents[joint]), -1) for joint in kept]),
+        body.offsets[kept],
+        quaternions.identity(len(kept)),
+    )
+    mapping = map_joints(footless)
+
+    assert sum("are a guess: no foot tells" in note for note in mapping.notes) == 2
+    assert mapping.confidence < map_joints(anonymous(body)).confidence
 
 
 @pytest.mark.parametrize(("scale", "turn"), [(1.0, 0.0), (0.4, 2.0), (170.0, -1.0)])

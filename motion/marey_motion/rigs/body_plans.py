@@ -1,0 +1,177 @@
+"""Which pairs of limbs are the legs and arms of a person, and which of their joints bend: by proportions.
+
+A cape, wings or the bones of a skirt are pairs of chains as well, and twist bones stand between the joints that bend. A
+reading of all of them is worth the sum of the logarithms of how common its proportions are among people.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+from math import log
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.rigs.limbs import BoneTree, LimbPair
+
+Vector = NDArray[np.float64]
+
+# Joints nearer than this to their parent are rigging aids.
+SHORTEST_BONE_M = 1e-3
+# Pairs and readings of each that are looked at; a rig with more of them than this is no person's.
+MOST_PAIRS, MOST_READINGS = 40, 4
+# A limb bends nowhere beyond so many joints.
+LONGEST_CHAIN = 14
+# What no proportion costs more than.
+LEAST_WORTH = -8.0
+# Two bones are one with a joint in the middle when they are straighter than this.
+STRAIGHT = 0.998
+TWIST_JOINT, STRAIGHT_JOINT, BENT_JOINT, EXTRA_JOINT = -0.2, -0.8, -2.0, -0.4
+# Twist joints divide a bone evenly, but for this share of it.
+EVENNESS = 0.04
+# Rigs may end at the wrist or ankle, or soon after it.
+SHORT_END = -0.7
+# What it is worth that a wrist branches into nothing, a hand, a hand and a thumb; into more, 1.
+FINGERS = {0: 0.0, 1: 0.0, 2: 0.5}
+AGAINST_TRUNK = -1.5
+# Few have anything longer than their legs.
+SHORTER = -1.5
+
+
+@dataclass(frozen=True)
+class Build:
+    """Proportions of a limb among people, each with its spread as a logarithm."""
+
+    ratio: tuple[float, float]  # upper by lower long bone
+    end: tuple[float, float]  # what follows, to the tip of toes or fingers, by both long bones
+    before: float  # most that precedes the long bones, by their length
+
+
+LEG = Build(ratio=(1.02, 0.15), end=(0.27, 0.5), before=0.35)
+ARM = Build(ratio=(1.12, 0.25), end=(0.32, 0.4), before=0.6)
+ARM_BY_LEG = (0.62, 0.2)
+TRUNK_BY_LEG = (0.42, 0.45)
+# Pairs that differ more from legs and arms are no such.
+ARM_BY_LEG_LIMITS = (0.3, 1.2)
+
+
+@dataclass(frozen=True)
+class LimbReading:
+    """Where in both chains of a pair the joints are that carry the upper and the lower long bone, and the end."""
+
+    pair: LimbPair
+    places: tuple[int, int, int]
+    length: float
+    worth: float
+
+    @property
+    def triple(self) -> tuple[int, int, int]:
+        """The three joints on one side, for comparison and for words."""
+        a, b, c = (self.pair.limbs[0].chain[place] for place in self.places)
+        return a, b, c
+
+    def joint(self, side: int, place: int) -> int | None:
+        """Hip, knee, ankle, toe (0 to 3), or what they are in an arm; -1 is the joint before. None where none is."""
+        chain = self.pair.limbs[side].chain
+        at = {-1: self.places[0] - 1, 3: self.places[2] + 1}.get(place)
+        at = self.places[place] if at is None else at
+        return chain[at] if 0 <= at < len(chain) else None
+
+
+@dataclass(frozen=True)
+class BodyPlan:
+    """Legs and arms, and how common such a body is: 0 and more for most people, less for others."""
+
+    legs: LimbReading
+    arms: LimbReading
+    worth: float
+
+
+def body_plans(tree: BoneTree) -> list[BodyPlan]:
+    """What may be legs and arms, the likeliest first."""
+    pairs = sorted(tree.limb_pairs, key=lambda pair: -sum(pair.bones))[:MOST_PAIRS]
+    legs = [reading for pair in pairs for reading in _readings(tree, pair, LEG)]
+    arms = [reading for pair in pairs for reading in _readings(tree, pair, ARM)]
+    longest = max((leg.length for leg in legs), default=0.0)
+    plans = [
+        BodyPlan(
+            leg, arm, leg.worth + arm.worth + _worth_together(tree, leg, arm) + SHORTER * log(longest / leg.length)
+        )
+        for leg in legs
+        for arm in arms
+        if ARM_BY_LEG_LIMITS[0] < arm.length / leg.length < ARM_BY_LEG_LIMITS[1] and tree.are_apart(leg.pair, arm.pair)
+    ]
+    return sorted(plans, key=lambda plan: -plan.worth)
+
+
+def _readings(tree: BoneTree, pair: LimbPair, build: Build) -> list[LimbReading]:
+    count = min(len(pair.limbs[0].chain), LONGEST_CHAIN)
+    found = [
+        LimbReading(pair, (a, b, c), sum(pair.bones[a:c]), _worth(tree, pair, (a, b, c), build))
+        for a, b, c in combinations(range(count), 3)
+        if min(pair.bones[b - 1], pair.bones[c - 1]) > SHORTEST_BONE_M and sum(pair.bones[a:b]) > SHORTEST_BONE_M
+    ]
+    return sorted(found, key=_likeliest_first)[:MOST_READINGS]
+
+
+def _likeliest_first(reading: LimbReading) -> tuple[float, int, int, int]:
+    """By worth; of joints in one place, the lower ones carry the bones and the upper one is the wrist or ankle."""
+    a, b, c = reading.places
+    return -round(reading.worth, 6), -a, -b, c
+
+
+def _worth(tree: BoneTree, pair: LimbPair, places: tuple[int, int, int], build: Build) -> float:
+    a, b, c = places
+    upper, lower, end = (sum(pair.bones[start:stop]) for start, stop in ((a, b), (b, c), (c, len(pair.bones))))
+    length = upper + lower
+    worth = commonness(upper / lower, build.ratio)
+    worth += max(commonness(end / length, build.end), SHORT_END if end < build.end[0] * length else LEAST_WORTH)
+    before = [bone for bone in pair.bones[:a] if bone > SHORTEST_BONE_M]
+    worth -= 0.5 * (max(0.0, sum(before) / length - build.before) / 0.2) ** 2
+    worth += EXTRA_JOINT * max(0, len(before) - 1)
+    worth += sum(_worth_of_joints_between(tree, pair, *span) for span in ((a, b), (b, c)))
+    if build is ARM:
+        worth += FINGERS.get(min(len(tree.skeleton.children[limb.chain[c]]) for limb in pair.limbs), 1.0)
+    return max(worth, 3 * LEAST_WORTH)
+
+
+def _worth_of_joints_between(tree: BoneTree, pair: LimbPair, start: int, stop: int) -> float:
+    """What joints inside a long bone cost: less where they do not bend it, nothing where they have no length."""
+    count = sum(bone > SHORTEST_BONE_M for bone in pair.bones[start:stop]) - 1
+    if count < 1:
+        return 0.0
+    chain = pair.limbs[0].chain
+    positions = tree.skeleton.rest_global_positions
+    direct = float(np.linalg.norm(positions[chain[stop]] - positions[chain[start]]))
+    if direct < STRAIGHT * sum(pair.limbs[0].bones[start:stop]):
+        return count * BENT_JOINT
+    parts = [bone for bone in pair.bones[start:stop] if bone > SHORTEST_BONE_M]
+    return count * (TWIST_JOINT if max(parts) - min(parts) < EVENNESS * sum(parts) else STRAIGHT_JOINT)
+
+
+def _worth_together(tree: BoneTree, legs: LimbReading, arms: LimbReading) -> float:
+    trunk = tree.distance(legs.pair.parent, arms.pair.parent)
+    worth = commonness(arms.length / legs.length, ARM_BY_LEG) + commonness(trunk / legs.length, TRUNK_BY_LEG)
+    positions = tree.skeleton.rest_global_positions
+    up = unit(positions[arms.pair.parent] - positions[legs.pair.parent])
+    down = [unit(end - start) for start, end in _ends(positions, legs)]
+    return worth + AGAINST_TRUNK * float(np.mean([1.0 + way @ up for way in down]))
+
+
+def _ends(positions: Vector, legs: LimbReading) -> Iterator[tuple[Vector, Vector]]:
+    for limb in legs.pair.limbs:
+        yield positions[limb.chain[legs.places[0]]], positions[limb.chain[legs.places[2]]]
+
+
+def unit(vector: Vector) -> Vector:
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > SHORTEST_BONE_M else np.zeros(3)
+
+
+def commonness(value: float, usual: tuple[float, float]) -> float:
+    expected, spread = usual
+    if value <= 0.0:
+        return LEAST_WORTH
+    return max(LEAST_WORTH, -0.5 * (log(value / expected) / spread) ** 2)

@@ -1,0 +1,120 @@
+"""Chains of bones that may be limbs: pairs of equal build on one joint of a skeleton."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+
+from marey_motion.skeleton import Skeleton
+
+# Two limbs belong together when their bones differ by less than this share of their length.
+ASYMMETRY_LIMIT = 0.15
+# Limbs of unequal ends are still a pair when they have this many bones in common: an arm to the wrist.
+LEAST_COMMON_BONES = 2
+# Limbs of one joint that are compared with each other; nothing that walks has more.
+MOST_LIMBS = 12
+
+
+@dataclass(frozen=True)
+class Limb:
+    """The chain from a branching joint to the farthest tip, three joints or more."""
+
+    chain: tuple[int, ...]
+    bones: tuple[float, ...]  # length from each joint of the chain to the next
+
+    def cut(self, bones: int) -> Limb:
+        """The limb up to the end of so many bones."""
+        return Limb(self.chain[: bones + 1], self.bones[:bones])
+
+
+@dataclass(frozen=True)
+class LimbPair:
+    """Two limbs of equal build on one joint."""
+
+    parent: int
+    limbs: tuple[Limb, Limb]
+    asymmetry: float
+
+    @cached_property
+    def bones(self) -> tuple[float, ...]:
+        """Mean lengths of both sides' bones."""
+        return tuple((a + b) / 2 for a, b in zip(self.limbs[0].bones, self.limbs[1].bones, strict=True))
+
+
+class BoneTree:
+    """A skeleton's branching and lengths."""
+
+    def __init__(self, skeleton: Skeleton) -> None:
+        self.skeleton = skeleton
+        self.lengths = np.linalg.norm(skeleton.offsets, axis=1)
+        self.reach = np.zeros(skeleton.joint_count)  # from each joint to the farthest tip below it
+        for site in skeleton.end_sites:
+            self.reach[site.joint] = max(self.reach[site.joint], float(np.linalg.norm(site.offset)))
+        self.depth = np.ones(skeleton.joint_count, dtype=np.int32)  # joints from each one to the farthest leaf
+        for joint in range(skeleton.joint_count - 1, 0, -1):
+            parent = skeleton.parents[joint]
+            self.reach[parent] = max(self.reach[parent], self.lengths[joint] + self.reach[joint])
+            self.depth[parent] = max(self.depth[parent], 1 + self.depth[joint])
+
+    def extent(self, joint: int) -> float:
+        """Metres from a joint's parent to the farthest tip below the joint."""
+        return float(self.lengths[joint] + self.reach[joint])
+
+    def limb(self, start: int) -> Limb:
+        """The farthest-reaching chain from a joint. End sites are no bones: exporters write anything there."""
+        chain = [start]
+        while children := self.skeleton.children[chain[-1]]:
+            chain.append(max(children, key=self.extent))
+        return Limb(tuple(chain), tuple(float(self.lengths[joint]) for joint in chain[1:]))
+
+    @cached_property
+    def limb_pairs(self) -> tuple[LimbPair, ...]:
+        """All pairs of sibling chains of equal build and three joints or more."""
+        pairs = []
+        for parent, children in enumerate(self.skeleton.children):
+            long = [child for child in children if self.depth[child] >= 3]
+            if len(long) < 2:
+                continue
+            limbs = map(self.limb, sorted(long, key=lambda child: -self.reach[child])[:MOST_LIMBS])
+            pairs += [pair for two in combinations(limbs, 2) if (pair := _paired(parent, *two)) is not None]
+        return tuple(pairs)
+
+    def are_apart(self, legs: LimbPair, arms: LimbPair) -> bool:
+        """Whether two pairs sit on different joints, neither on the limbs of the other."""
+        above_legs, above_arms = (self.skeleton.path_to_root(pair.parent) for pair in (legs, arms))
+        nested = any(limb.chain[0] in above_arms for limb in legs.limbs) or any(
+            limb.chain[0] in above_legs for limb in arms.limbs
+        )
+        return legs.parent != arms.parent and not nested
+
+    def common_ancestor(self, a: int, b: int) -> int:
+        """The lowest joint that both descend from, or are."""
+        above = set(self.skeleton.path_to_root(a))
+        return next(joint for joint in self.skeleton.path_to_root(b) if joint in above)
+
+    def distance(self, a: int, b: int) -> float:
+        """Metres from one joint to another along the bones between them."""
+        between = set(self.skeleton.path_to_root(a)) ^ set(self.skeleton.path_to_root(b))
+        return float(sum(self.lengths[joint] for joint in between))
+
+
+def _paired(parent: int, first: Limb, second: Limb) -> LimbPair | None:
+    """Two limbs of equal build, or what they have in common before one of them goes on into what it holds."""
+    shorter = min(len(first.chain), len(second.chain)) - 1
+    for a, b in ((first, second), *((first.cut(k), second.cut(k)) for k in range(shorter, LEAST_COMMON_BONES - 1, -1))):
+        asymmetry = _asymmetry(a, b)
+        if asymmetry <= ASYMMETRY_LIMIT:
+            return LimbPair(parent, (a, b), asymmetry)
+    return None
+
+
+def _asymmetry(first: Limb, second: Limb) -> float:
+    """Difference of two chains' bones as a share of their length; infinite where they differ in build."""
+    if len(first.bones) != len(second.bones):
+        return float("inf")
+    a, b = np.array(first.bones), np.array(second.bones)
+    total = float(np.sum(a + b)) / 2
+    return float(np.sum(np.abs(a - b))) / total if total > 0.0 else float("inf")
