@@ -30,6 +30,7 @@ from marey_server.access.principal import SYSTEM
 from marey_server.administrators import TOKEN_FILE, make_first_administrator
 from marey_server.computing import compute_on_one_thread_each
 from marey_server.docs_page import render_page
+from marey_server.greeting import greeting
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.handlers.resource import Resource
 from marey_server.handlers.routes import RouteTable
@@ -75,7 +76,9 @@ class Application(TornadoApplication):
         status = handler.get_status()
         method = handler.request.method or ""
         self.services.metrics.count_request(method, route, status, duration_s, handler.received_bytes)
-        level = logging.INFO if status < 500 else logging.ERROR
+        level = logging.ERROR if status >= 500 else logging.INFO
+        if handler.uneventful and status < 400:
+            level = logging.DEBUG
         if access_log.isEnabledFor(level):
             access_log.log(level, "%s %s %d", method, route, status, extra=_fields(handler, route, status, duration_s))
 
@@ -187,7 +190,8 @@ async def serve(settings: Settings) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
     async with serving(settings) as running, compiling_kernels():
-        log.info("listening on %s", running.address)
+        for line in greeting(settings, running.address, running.app.services.database):
+            log.info("%s", line)
         await stop.wait()
         log.info("stopping")
 
@@ -215,6 +219,8 @@ async def serving(settings: Settings) -> AsyncIterator[Running]:
             url=running.address,
             token=make_worker_token(database, settings) if settings.local_workers else "",
             cache=settings.data / "worker-cache",
+            log_form=settings.log_form,
+            log_level=settings.log_level,
         ),
     ):
         yield running

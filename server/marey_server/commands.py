@@ -17,6 +17,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from marey_schemas.log_lines import usual_form
 from marey_server.settings import Settings
 
 
@@ -32,7 +33,7 @@ def serve(**settings: Any) -> None:
     from marey_server.store.opening import DatabaseUnusable
 
     chosen = read_settings(**settings)
-    comfort = {"local_workers": 1, "log_form": "text" if sys.stderr.isatty() else "json"}
+    comfort = {"local_workers": 1, "log_form": usual_form()}
     unset = {name: value for name, value in comfort.items() if name not in chosen.model_fields_set}
     try:
         asyncio.run(serve_until_stopped(read_settings(**settings, **unset)))

@@ -1,26 +1,21 @@
 """Logs, request ids and metrics.
 
-Logs are one JSON object per line on standard error. Metrics are labelled with route templates, never with addresses,
+Metrics are labelled with route templates, never with addresses,
 so that their number does not grow with the data.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 import secrets
-import sys
-from datetime import UTC, datetime
-from typing import Literal
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
+from marey_schemas.log_lines import LogForm, log_to_standard_error
+
 _SANE_ID = re.compile(r"[A-Za-z0-9._:-]{8,128}")
-_FIELDS = (
-    "request_id", "principal", "method", "route", "status", "duration_ms", "bytes_in", "bytes_out", "remote", "job",
-)  # fmt: skip
 _BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30)
 
 access_log = logging.getLogger("marey_server.access_log")
@@ -31,43 +26,9 @@ def request_id(given: str | None) -> str:
     return given if given is not None and _SANE_ID.fullmatch(given) else secrets.token_hex(12)
 
 
-class JsonFormatter(logging.Formatter):
-    """A log record as one line of JSON."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """The line of a record."""
-        line = {
-            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
-            "level": record.levelname.lower(),
-            "logger": record.name,
-            "message": record.getMessage(),
-        }
-        line |= {name: value for name in _FIELDS if (value := getattr(record, name, None)) is not None}
-        if record.exc_info:
-            line["traceback"] = self.formatException(record.exc_info)
-        return json.dumps(line, ensure_ascii=False)
-
-
-class TextFormatter(logging.Formatter):
-    """A log record as one line for people."""
-
-    def __init__(self) -> None:
-        super().__init__("%(asctime)s %(levelname)-7s %(name)s: %(message)s", datefmt="%H:%M:%S")
-
-    def format(self, record: logging.LogRecord) -> str:
-        """The line of a record."""
-        line = super().format(record)
-        given = getattr(record, "request_id", None)
-        return f"{line} [{given}]" if given else line
-
-
-def configure_logging(form: Literal["json", "text"], level: str) -> None:
+def configure_logging(form: LogForm, level: str) -> None:
     """Send every log record of the process to standard error, in one form."""
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
-    root = logging.getLogger()
-    root.handlers[:] = [handler]
-    root.setLevel(level.upper())
+    log_to_standard_error(form, level)
     logging.getLogger("tornado.access").setLevel("ERROR")  # requests are logged by log_request
     logging.getLogger("alembic.runtime.migration").addFilter(_tells_of_an_upgrade)
 

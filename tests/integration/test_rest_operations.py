@@ -29,15 +29,16 @@ SERVE = "import asyncio; from marey_server.app import serve; from marey_server.s
 class Process:
     """A server in a process of its own, as an operator runs it."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, **environment: str) -> None:
         self.folder = folder
         self.process = subprocess.Popen(
             [sys.executable, "-c", SERVE + "asyncio.run(serve(Settings()))"],
-            env={**os.environ, "MAREY_DATA": str(folder), "MAREY_PORT": "0", "MAREY_LOG_FORM": "json"},
+            env={**os.environ, "MAREY_DATA": str(folder), "MAREY_PORT": "0", "MAREY_LOG_FORM": "json", **environment},
             stderr=subprocess.PIPE,
             text=True,
         )
         self.lines: list[dict] = []
+        self.no_json: list[str] = []
         self._listening = threading.Event()
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
@@ -47,7 +48,10 @@ class Process:
     def _read(self) -> None:
         assert self.process.stderr is not None
         for line in self.process.stderr:
-            self.lines.append(json.loads(line))
+            if line.startswith("{"):
+                self.lines.append(json.loads(line))
+            else:
+                self.no_json.append(line)
             if "listening" in line:
                 self._listening.set()
 
@@ -98,13 +102,13 @@ def test_requests_are_logged_as_json_with_who_what_and_how_long(process: Process
     assert not any("secret-name" in json.dumps(line) or process.token in json.dumps(line) for line in process.lines)
 
 
-def test_a_question_for_readiness_is_logged_in_one_line(process: Process):
+def test_questions_for_readiness_are_not_logged(process: Process):
     before = len(process.lines)
     for _ in range(3):
         assert httpx.get(f"{process.address}/readyz").status_code == 200
     process.end()
     told = [line for line in process.lines[before:] if line["logger"] != "marey_server.app"]
-    assert [line.get("route") for line in told] == ["/readyz"] * 3
+    assert told == []
     assert any(line["message"].startswith("Running upgrade") for line in process.lines)
 
 
@@ -199,3 +203,52 @@ def test_signing_in_gives_a_token_and_signing_out_ends_it(database: Database, tm
         assert ann.get("/me").status_code == 401
         again = {"name": "ann", "password": "another long password"}
         assert server.client().post("/login", json=again).status_code == 200
+
+
+def test_a_log_tells_where_everything_is_and_what_to_do_next(process: Process):
+    process.end()
+    told = "\n".join(line["message"] for line in process.lines)
+    assert f"data: {process.folder}; database: {process.folder / 'marey.db'}" in told
+    assert f"administrator: admin; a token of an administrator is in {process.folder / 'admin.token'}" in told
+    assert f"marey --server {process.address} --token-file {process.folder / 'admin.token'} project create lab" in told
+    assert process.token not in told
+
+
+def test_questions_for_work_that_find_none_and_probes_are_not_logged(process: Process):
+    headers = {"Authorization": f"Bearer {process.token}"}
+    asked = httpx.post(f"{process.address}/api/v1/leases", json={"worker": "w", "kinds": ["retarget"]}, headers=headers)
+    assert (asked.status_code, asked.json()) == (200, {"leases": []})
+    for path in ("/healthz", "/readyz", "/metrics", "/api/v1/me"):
+        assert httpx.get(process.address + path, headers=headers).status_code == 200
+    assert (
+        httpx.post(f"{process.address}/api/v1/leases", json={"worker": "w", "kinds": ["retarget"]}).status_code == 401
+    )
+    process.end()
+    logged = [(line["route"], line["status"]) for line in process.lines if "route" in line]
+    assert logged == [("/api/v1/me", 200), ("/api/v1/leases", 401)]
+
+
+def test_a_worker_beside_the_server_logs_in_the_same_form(tmp_path: Path):
+    process = Process(tmp_path / "data", MAREY_LOCAL_WORKERS="1")
+    try:
+        deadline = time.monotonic() + 60
+        while not any(line["logger"] == "marey_worker.supervisor" for line in process.lines):
+            assert time.monotonic() < deadline, process.lines
+            time.sleep(0.1)
+    finally:
+        assert process.end() == 0
+    assert process.no_json == []
+
+
+@pytest.mark.parametrize("path", ["/", "/api/v1"])
+def test_the_roots_tell_programs_where_to_go_and_lead_browsers_to_the_page(server: Server, path: str):
+    with httpx.Client(base_url=server.address) as client:
+        told = client.get(path).json()
+        assert told["name"] == "Marey"
+        assert client.get(told["openapi"]).json()["info"]["version"] == told["version"]
+        assert client.get(told["ready"]).status_code == 200
+        browser = {"Accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"}
+        led = client.get(path, headers=browser)
+        assert (led.status_code, led.headers["Location"]) == (303, told["documentation"])
+        page = client.get(led.headers["Location"], headers=browser)
+        assert (page.status_code, page.headers["Content-Type"]) == (200, "text/html; charset=utf-8")

@@ -32,7 +32,10 @@ def main() -> None:
     pipe = Connection(int(sys.argv[1]))
     process = os.getpid()
     load(sys.argv[2:])
-    pipe.send(Ready())
+    try:
+        pipe.send(Ready())
+    except BrokenPipeError:  # the supervisor was stopped while this loaded
+        return
     while True:
         try:
             run = pipe.recv()

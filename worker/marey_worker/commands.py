@@ -8,13 +8,16 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Mapping
 from pathlib import Path
+from typing import cast, get_args
 
 from marey_client.credentials import Credential, resolve
 from marey_client.errors import MareyError, NoCredential
 from marey_client.retries import Retries
 from marey_client.transport import Transport
 from marey_schemas.job_kinds import UnknownKindError, find_kind, job_kinds
+from marey_schemas.log_lines import LogForm, log_to_standard_error, usual_form
 from marey_worker.supervisor import Supervisor, WorkerOptions, default_cache
 
 MIB = 1 << 20
@@ -31,16 +34,17 @@ def work(
     name: str | None = None,
     cache: Path | None = None,
     cache_mb: int = 2048,
+    log_form: LogForm | None = None,
     attached: bool = False,
 ) -> None:
     """Run a worker until SIGTERM or SIGINT, then exit; not with 0 if a job was running.
 
+    `log_form`: text where none is named and standard error is a terminal, else JSON, as for the server.
     `attached`: stop, too, when standard input closes, because whoever started this worker has gone.
     """
     if credential.token is None:
         raise NoCredential(f"a worker needs a token with the scope `work` for {credential.url}; see --token-file")
-    level = os.environ.get("MAREY_LOG_LEVEL", "info").upper()
-    logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
+    log_to_standard_error(log_form or _form_named(os.environ.get("MAREY_LOG_FORM")), _level_of(os.environ))
     logging.getLogger("httpx").setLevel(logging.WARNING)
     given = {} if name is None else {"name": name}
     options = WorkerOptions(
@@ -76,6 +80,21 @@ def main() -> None:
         work(credential, slots=given.slots, name=given.name, cache=given.cache, attached=given.attached)
     except MareyError as error:
         parser.exit(1, f"marey worker: {error}\n")
+
+
+def _form_named(name: str | None) -> LogForm:
+    if name is None:
+        return usual_form()
+    if name not in get_args(LogForm):
+        raise MareyError(f"MAREY_LOG_FORM is {name!r}; there are {' and '.join(get_args(LogForm))}")
+    return cast(LogForm, name)
+
+
+def _level_of(environment: Mapping[str, str]) -> str:
+    level = environment.get("MAREY_LOG_LEVEL", "info")
+    if level.upper() not in logging.getLevelNamesMapping():
+        raise MareyError(f"MAREY_LOG_LEVEL is {level!r}; there are debug, info, warning and error")
+    return level
 
 
 def _known_kinds(names: tuple[str, ...]) -> tuple[str, ...]:

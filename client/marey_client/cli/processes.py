@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,6 +14,13 @@ db = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="The database
 
 DataFolder = Annotated[Path | None, typer.Option(help="Data folder; default: MAREY_DATA, marey.toml, ./marey-data.")]
 DatabaseUrl = Annotated[str | None, typer.Option(help="postgresql://...; default: marey.db in the data folder.")]
+
+
+class LogForm(StrEnum):
+    """How log lines look."""
+
+    TEXT = "text"
+    JSON = "json"
 
 
 def add_to(app: typer.Typer) -> None:
@@ -29,12 +37,13 @@ def serve(
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="0 for any free one; default 8460.")] = None,
     workers: Annotated[int | None, typer.Option(min=0, help="Worker processes beside it; default 1.")] = None,
     database_url: DatabaseUrl = None,
-    log_form: Annotated[str | None, typer.Option(help="text, the default at a terminal, or json.")] = None,
+    log_form: Annotated[LogForm | None, typer.Option(help="text, the default at a terminal, or json.")] = None,
 ) -> None:
     """Run a server, its database file and a local worker until stopped."""
     from marey_client import embedded
 
-    embedded.serve(data=data, host=host, port=port, local_workers=workers, database_url=database_url, log_form=log_form)
+    form = None if log_form is None else log_form.value
+    embedded.serve(data=data, host=host, port=port, local_workers=workers, database_url=database_url, log_form=form)
 
 
 def worker(
@@ -45,6 +54,7 @@ def worker(
     name: Annotated[str | None, typer.Option(help="Name shown to people; default: host and process id.")] = None,
     cache: Annotated[Path | None, typer.Option(help="Folder that keeps downloaded inputs.")] = None,
     cache_mb: Annotated[int, typer.Option(min=16, help="How much it may keep.")] = 2048,
+    log_form: Annotated[LogForm | None, typer.Option(help="text, the default at a terminal, or json.")] = None,
 ) -> None:
     """Run jobs of a server until stopped. The token must have the scope `work`."""
     from marey_client import embedded
@@ -61,6 +71,7 @@ def worker(
         name=name,
         cache=cache,
         cache_mb=cache_mb,
+        log_form=None if log_form is None else log_form.value,
     )
 
 

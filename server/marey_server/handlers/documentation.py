@@ -2,9 +2,48 @@
 
 from __future__ import annotations
 
+from importlib.metadata import version
+
+from pydantic import Field
+
+from marey_schemas.base import Answer
 from marey_server.handlers.declarations import Access, Bytes, reads
-from marey_server.handlers.reply import Reply
+from marey_server.handlers.reply import API, Reply
 from marey_server.handlers.resource import Resource
+
+
+class Service(Answer):
+    """What answers at this address, and where to go from here."""
+
+    name: str = "Marey"
+    version: str
+    api: str = Field(API, description="What every path of the API begins with.")
+    documentation: str = Field(f"{API}/docs", description="The API for people.")
+    openapi: str = Field(f"{API}/openapi.json", description="The API for programs.")
+    ready: str = Field("/readyz", description="Whether the server can serve.")
+
+
+class ApiRoot(Resource):
+    """The root of the API."""
+
+    path = ""
+    tag = "Documentation"
+
+    @reads(access=Access.ANYONE, scope=None, answer=Service, also=((303, None),))
+    async def get(self) -> Reply:
+        """What this server is and where its API is described; browsers are led to the page for people."""
+        if "text/html" in self.request.headers.get("Accept", ""):
+            return Reply(status=303, location="/docs")
+        return Reply(Service(version=version("marey")))
+
+
+class ServerRoot(ApiRoot):
+    """The root of the server."""
+
+    root = ""
+    path = "/"
+
+    get = ApiRoot.get
 
 
 class OpenApiDocument(Resource):
@@ -35,4 +74,4 @@ class DocumentationPage(Resource):
         return Reply(description.page, rev=description.tag, media_type="text/html; charset=utf-8", headers=headers)
 
 
-RESOURCES: tuple[type[Resource], ...] = (OpenApiDocument, DocumentationPage)
+RESOURCES: tuple[type[Resource], ...] = (ServerRoot, ApiRoot, OpenApiDocument, DocumentationPage)

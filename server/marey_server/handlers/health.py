@@ -21,6 +21,7 @@ class Healthz(Resource):
 
     path = "/healthz"
     root = ""
+    uneventful = True
     tag = "Operations"
 
     @reads(access=Access.ANYONE, scope=None, answer=Health)
@@ -34,6 +35,7 @@ class Readyz(Resource):
 
     path = "/readyz"
     root = ""
+    uneventful = True
     tag = "Operations"
 
     @reads(access=Access.ANYONE, scope=None, answer=Health, also=((503, None),))
@@ -52,6 +54,7 @@ class MetricsPage(Resource):
 
     path = "/metrics"
     root = ""
+    uneventful = True
     tag = "Operations"
 
     @reads(access=Access.ANYONE, scope=None, answer=Bytes, answer_types=("text/plain",))

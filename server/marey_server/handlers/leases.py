@@ -52,6 +52,7 @@ class Leases(Resource):
                     reaper.claim_after_reaping, body, self.services.start_grace, self.services.queue_policy
                 )
                 left_s = deadline - loop.time()
+                self.uneventful = not leases
                 if leases or left_s <= 0:
                     return Reply(LeaseList(leases=tuple(leases)))
                 await listener.wait(min(left_s, LOOK_AGAIN_S))

@@ -56,6 +56,8 @@ class Resource(Exchange):
     """A thing with a path and declared methods."""
 
     tag: ClassVar[str]
+    uneventful = False
+    """Whether this success says nothing that a log should tell: nothing was leased, the server is still alive."""
 
     operation: Operation
     caller: Caller

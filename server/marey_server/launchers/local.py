@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import random
 import sys
 import time
 from asyncio.subprocess import Process
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
+
+from marey_schemas.log_lines import LogForm
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +30,9 @@ STOP_S = 20.0
 
 
 @asynccontextmanager
-async def local_workers(count: int, *, url: str, token: str, cache: Path) -> AsyncIterator[None]:
+async def local_workers(
+    count: int, *, url: str, token: str, cache: Path, log_form: LogForm, log_level: str
+) -> AsyncIterator[None]:
     """Keep `count` workers running inside the block; at its end, stop them politely.
 
     Parameters
@@ -35,8 +40,10 @@ async def local_workers(count: int, *, url: str, token: str, cache: Path) -> Asy
     url : where this server listens
     token : of a user who may work; scope `work`
     cache : folder where the workers keep inputs
+    log_form, log_level : of what they log, which goes where this server's log goes
     """
-    workers = [_LocalWorker(f"local-{number}", url, token, cache) for number in range(1, count + 1)]
+    logging_as_here = {"MAREY_LOG_FORM": log_form, "MAREY_LOG_LEVEL": log_level}
+    workers = [_LocalWorker(f"local-{number}", url, token, cache, logging_as_here) for number in range(1, count + 1)]
     keeping = [asyncio.create_task(worker.keep_running()) for worker in workers]
     try:
         yield
@@ -48,8 +55,9 @@ async def local_workers(count: int, *, url: str, token: str, cache: Path) -> Asy
 class _LocalWorker:
     """One worker: started again, with growing pauses, whenever it ends by itself."""
 
-    def __init__(self, name: str, url: str, token: str, cache: Path) -> None:
+    def __init__(self, name: str, url: str, token: str, cache: Path, environment: Mapping[str, str]) -> None:
         self._name = name
+        self._environment = environment
         self._token = token
         self._command = [
             sys.executable, "-m", "marey_worker", "--attached", "--server", url, "--name", name, "--cache", str(cache),
@@ -86,7 +94,9 @@ class _LocalWorker:
             await process.wait()
 
     async def _start(self) -> Process:
-        process = await asyncio.create_subprocess_exec(*self._command, stdin=asyncio.subprocess.PIPE)
+        process = await asyncio.create_subprocess_exec(
+            *self._command, stdin=asyncio.subprocess.PIPE, env={**os.environ, **self._environment}
+        )
         assert process.stdin is not None
         process.stdin.write(self._token.encode() + b"\n")
         log.info("worker %s is process %d", self._name, process.pid)

@@ -5,7 +5,8 @@ import logging
 
 import pytest
 
-from marey_server.observe import JsonFormatter, Metrics, TextFormatter, request_id
+from marey_schemas.log_lines import JsonFormatter, TextFormatter
+from marey_server.observe import Metrics, request_id
 
 
 def record(message: str, **extra: object) -> logging.LogRecord:

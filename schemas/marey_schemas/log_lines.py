@@ -1,0 +1,59 @@
+"""Lines of logs, of one form from the server and its workers: JSON for collectors, text for people."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from datetime import UTC, datetime
+from typing import Literal
+
+LogForm = Literal["json", "text"]
+
+_FIELDS = (
+    "request_id", "principal", "method", "route", "status", "duration_ms", "bytes_in", "bytes_out", "remote", "job",
+)  # fmt: skip
+
+
+class JsonFormatter(logging.Formatter):
+    """A log record as one line of JSON."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line of a record."""
+        line = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        line |= {name: value for name in _FIELDS if (value := getattr(record, name, None)) is not None}
+        if record.exc_info:
+            line["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(line, ensure_ascii=False)
+
+
+class TextFormatter(logging.Formatter):
+    """A log record as one line for people."""
+
+    def __init__(self) -> None:
+        super().__init__("%(asctime)s %(levelname)-7s %(name)s: %(message)s", datefmt="%H:%M:%S")
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line of a record."""
+        line = super().format(record)
+        given = getattr(record, "request_id", None)
+        return f"{line} [{given}]" if given else line
+
+
+def usual_form() -> LogForm:
+    """Text where somebody sits at a terminal and reads the standard error, else JSON."""
+    return "text" if sys.stderr is not None and sys.stderr.isatty() else "json"
+
+
+def log_to_standard_error(form: LogForm, level: str) -> None:
+    """Send every log record of the process to standard error, in one form."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(JsonFormatter() if form == "json" else TextFormatter())
+    root = logging.getLogger()
+    root.handlers[:] = [handler]
+    root.setLevel(level.upper())

@@ -1,0 +1,62 @@
+"""What a server says first."""
+
+from pathlib import Path
+
+import pytest
+
+from marey_server.access.principal import SYSTEM
+from marey_server.greeting import greeting, next_command
+from marey_server.settings import Settings
+from marey_server.store import users
+from marey_server.store.database import Database
+
+USUAL = "http://127.0.0.1:8460"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory, with a data folder at its usual place that holds a token."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "marey-data").mkdir()
+    (tmp_path / "marey-data" / "admin.token").write_text("marey_very_secret")
+    return tmp_path
+
+
+@pytest.fixture
+def database_with_administrator(database: Database) -> Database:
+    database.write(SYSTEM, users.ensure_first_administrator)
+    return database
+
+
+def test_where_the_defaults_lead_here_the_next_command_is_short(folder: Path):
+    assert next_command(Settings(), USUAL) == " in this folder: marey project create lab"
+    assert next_command(Settings(host="0.0.0.0"), "http://0.0.0.0:8460") == next_command(Settings(), USUAL)
+
+
+def test_elsewhere_it_names_the_server_and_the_token_file(folder: Path):
+    told = next_command(Settings(), "http://127.0.0.1:9000")
+    file = folder / "marey-data" / "admin.token"
+    assert told == f": marey --server http://127.0.0.1:9000 --token-file {file} project create lab"
+
+
+def test_without_a_token_the_next_thing_is_to_log_in(folder: Path):
+    assert next_command(Settings(data=Path("other")), USUAL) == f": marey login --server {USUAL}"
+
+
+def test_the_administrator_the_data_and_the_place_of_the_token_are_told_and_no_secret(
+    folder: Path, database_with_administrator: Database
+):
+    settings = Settings(database_url="postgresql+psycopg://marey:geheim@db.internal/marey?sslpassword=geheim")
+    told = "\n".join(greeting(settings, USUAL, database_with_administrator))
+    for part in (
+        f"listening on {USUAL}",
+        f"data: {folder / 'marey-data'}",
+        "db.internal/marey",
+        "administrator: admin;",
+        str(folder / "marey-data" / "admin.token"),
+    ):
+        assert part in told
+    assert "secret" not in told
+    assert "geheim" not in told
+    (folder / "marey-data" / "admin.token").unlink()
+    assert "marey db admin-token" in "\n".join(greeting(settings, USUAL, database_with_administrator))
