@@ -36,7 +36,7 @@ def pages() -> dict[str, str]:
 
 def command_line_page() -> str:
     """Every command with its arguments and options."""
-    text = "# Command line\n\nExit status: 0 success, 1 refused or failed, 2 wrong usage.\n\n"
+    text = "# Command line\n\nExit status: 0 success, 1 refused or failed, 2 wrong usage, 130 interrupted.\n\n"
     root = typer.main.get_command(app)
     text += "## marey\n\n" + _parameters(root)
     for name, command in _commands(root, "marey"):

@@ -9,8 +9,19 @@ GLOBAL_SWITCHES = ("-v", "--verbose")
 GLOBAL_OPTIONS = ("--server", "--token-file")
 
 
+INTERRUPTED = 130
+"""The exit status after Ctrl-C."""
+
+
 def main() -> None:
-    """Run the command line and exit: 0 success, 1 refused or failed, 2 wrong usage."""
+    """Run the command line and exit: 0 success, 1 refused or failed, 2 wrong usage, 130 interrupted."""
+    try:
+        _run()
+    except KeyboardInterrupt:  # also of who is impatient while modules load
+        sys.exit(INTERRUPTED)
+
+
+def _run() -> None:
     from marey_client.cli.app import app
     from marey_client.cli.failures import reported
 

@@ -86,6 +86,31 @@ def test_every_command_explains_itself():
     walk(get_command(app), ["marey"])
 
 
+def test_who_interrupts_while_modules_load_sees_nothing_and_gets_130():
+    probe = (
+        "import sys\n"
+        "class Impatience:\n"
+        "    def find_spec(self, name, path, target=None):\n"
+        "        if name == 'typer': raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Impatience())\n"
+        "from marey_client.cli import main; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+@pytest.mark.parametrize("arguments", [["edit", "commands"], ["--help"]])
+def test_a_reader_who_goes_away_is_no_news(arguments, nowhere):
+    command = [sys.executable, "-c", "from marey_client.cli import main; main()", *arguments]
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, env={**os.environ, **nowhere})
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
 @pytest.mark.parametrize("arguments", [["nonsense"], ["ls", "--nonsense"], ["upload"], ["ls", "/"], ["job", "ls"]])
 def test_wrong_usage_exits_with_2(arguments, nowhere):
     done = marey(*arguments, env=nowhere)
