@@ -13,6 +13,7 @@ from marey_client.annotations import AnnotationHandle
 from marey_client.evaluations import Places, as_input, as_places, items_at
 from marey_client.items import ItemHandle
 from marey_client.motions import ClipHandle, MotionArrays, frames_text
+from marey_client.one_or_several import several
 from marey_schemas.alignment import AlignmentInfo, AlignParams
 from marey_schemas.items import Item
 from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
@@ -26,10 +27,10 @@ class ProcessedHandle(ItemHandle):
     """One aligned clip: canonical frames of an action, and the way back to the clip that they come from."""
 
     def motion(
-        self, *, frames: slice | None = None, joints: Sequence[str] | None = None, revision: int | None = None
+        self, *, frames: slice | None = None, joints: str | Sequence[str] | None = None, revision: int | None = None
     ) -> MotionArrays:
         """Its canonical frames, in the canonical frame of reference."""
-        query = {"frames": frames_text(frames), "joints": ",".join(joints) if joints is not None else None}
+        query = {"frames": frames_text(frames), "joints": ",".join(several(joints)) if joints is not None else None}
         return MotionArrays.model_validate(self.part("motion", revision=revision, **query))
 
     def info(self, *, revision: int | None = None) -> AlignmentInfo:

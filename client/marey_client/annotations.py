@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from marey_client.items import ItemHandle
+from marey_client.one_or_several import several
 from marey_client.transport import as_json, read_model
 from marey_schemas.annotations import AnnotationChange
 from marey_schemas.documents import Annotation
@@ -19,14 +20,14 @@ class AnnotationHandle(ItemHandle):
         """The clip it is of, its segments and its keyframes."""
         return Annotation.model_validate(self.part("annotation", revision=revision))
 
-    def apply(self, commands: Sequence[Mapping[str, Any]], *, message: str = "") -> Item:
+    def apply(self, commands: Mapping[str, Any] | Sequence[Mapping[str, Any]], *, message: str = "") -> Item:
         """Apply commands one after another, all of them or none, as one new revision.
 
         A command is what its documentation lists, such as `{"command": "split_segment", "at": 120}`.
         `PreconditionFailed` if somebody changed the annotation since it was read, `RequestFailed` naming the command
         that cannot be carried out.
         """
-        change = AnnotationChange.model_validate({"commands": list(commands), "message": message})
+        change = AnnotationChange.model_validate({"commands": several(commands), "message": message})
         response = self.transport.send(
             "POST", f"{self.url}/commands", content=as_json(change), headers=self._if_match()
         )

@@ -11,6 +11,7 @@ import httpx
 
 from marey_client.downloads import saved_atomically
 from marey_client.errors import DigestMismatch, FileChanged
+from marey_client.one_or_several import several
 from marey_client.transport import OCTETS, Transport
 from marey_client.uploads import send_in_pieces
 from marey_schemas.items import BlobsMissing, BlobsQuery
@@ -37,9 +38,9 @@ class Blobs:
 
     transport: Transport
 
-    def missing(self, digests: Iterable[str]) -> set[str]:
+    def missing(self, digests: str | Iterable[str]) -> set[str]:
         """Those of `digests` that must be sent."""
-        wanted = list(dict.fromkeys(digests))
+        wanted = list(dict.fromkeys(several(digests)))
         lacking: set[str] = set()
         for start in range(0, len(wanted), DIGESTS_PER_QUESTION):
             question = BlobsQuery(digests=tuple(wanted[start : start + DIGESTS_PER_QUESTION]))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_client.one_or_several import several
 from marey_client.paging import pages
 from marey_client.transport import Transport, read_model
 from marey_schemas.codecs import MSGPACK, encode_tree
@@ -77,7 +78,7 @@ class CoverageStreamHandle:
         frames: NDArray[np.floating[Any]],
         *,
         translations: NDArray[np.floating[Any]] | None = None,
-        translated_joints: Sequence[str] = (),
+        translated_joints: str | Sequence[str] = (),
         ends_take: bool = False,
     ) -> CoverageProgress:
         """Send the next frames: poses (n, 3 + 4·joints), or roots (n, 3) of x, z in metres and heading in radians.
@@ -88,7 +89,7 @@ class CoverageStreamHandle:
         """
         said: dict[str, Any] = {"poses" if frames.shape[-1] != ROOT_COLUMNS else "roots": frames}
         if translations is not None:
-            said |= {"translations": translations, "translated_joints": list(translated_joints)}
+            said |= {"translations": translations, "translated_joints": list(several(translated_joints))}
         return self._send({"offset": self.offset, "ends_take": ends_take, **said})
 
     def end_take(self) -> CoverageProgress:

@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from marey_client.items import ItemHandle, Items
+from marey_client.one_or_several import several
 from marey_client.transport import BLOCKS, Transport, as_json, read_tree
 from marey_schemas.edit_previews import EditPreview, EditPreviewRequest
 from marey_schemas.editing import EditDocument
@@ -26,7 +27,8 @@ class EditHandle(ItemHandle):
         return self.put_part("edit", edit.model_dump(mode="json", by_alias=True), message=message)
 
 
-Commands = EditHandle | EditDocument | Sequence[Mapping[str, Any] | BaseModel]
+Command = Mapping[str, Any] | BaseModel
+Commands = EditHandle | EditDocument | Command | Sequence[Command]
 """An edit that is stored or not, or its commands, such as `{"command": "trim", "start": 10}`."""
 
 
@@ -36,7 +38,7 @@ class Edits(Items[EditHandle]):
     def save(
         self,
         name: str,
-        commands: EditDocument | Sequence[Mapping[str, Any] | BaseModel],
+        commands: EditDocument | Command | Sequence[Command],
         *,
         title: str = "",
         collection: str = "",
@@ -52,11 +54,11 @@ class Edits(Items[EditHandle]):
         return self.create(name, parts, collection=collection, message=message)
 
 
-def as_edit(commands: EditDocument | Sequence[Mapping[str, Any] | BaseModel], *, title: str = "") -> EditDocument:
+def as_edit(commands: EditDocument | Command | Sequence[Command], *, title: str = "") -> EditDocument:
     """Commands as the document of an edit; pydantic's `ValidationError` names what is wrong with which."""
     if isinstance(commands, EditDocument):
         return commands if not title else commands.model_copy(update={"title": title})
-    return EditDocument.model_validate({"title": title, "commands": list(commands)})
+    return EditDocument.model_validate({"title": title, "commands": several(commands)})
 
 
 def preview_edit(transport: Transport, url: str, commands: Commands, **options: Any) -> EditPreview:

@@ -14,6 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 from marey_client.blobs import Blobs, digest_of_file
 from marey_client.errors import BadFileName, NothingToUpload, SameName
 from marey_client.jobs import Jobs
+from marey_client.one_or_several import several
 from marey_client.transport import Transport, as_json, read_model
 from marey_schemas.imports import (
     FileName,
@@ -57,13 +58,13 @@ class FoundFiles:
     left_out: tuple[Path, ...]
 
 
-def find_files(places: Iterable[str | Path]) -> FoundFiles:
+def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
     """Motion files in folders and below, hidden ones left out; files named themselves are taken whatever they are.
 
     Raises `NothingToUpload` where a place does not exist or none holds a motion file, `SameName` where files of two
     places would get one name, `OSError` where a folder cannot be read.
     """
-    searched = [Path(place) for place in places]
+    searched = [Path(place) for place in several(places)]
     files: dict[str, LocalFile] = {}
     left_out: list[Path] = []
     for place in searched:

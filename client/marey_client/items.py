@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from marey_client.downloads import download
+from marey_client.one_or_several import several
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.items import Item, ItemChange, ItemCreate, Lineage, Page, Revision, Staleness
@@ -163,11 +164,11 @@ class Items(Generic[Handle]):
         parts: Mapping[str, Mapping[str, Any]],
         *,
         collection: str = "",
-        tags: tuple[str, ...] = (),
+        tags: str | Sequence[str] = (),
         message: str = "",
     ) -> Handle:
         """Make an item from its parts; numpy arrays are taken as they are. `Conflict` if the name is taken."""
-        wanted = ItemCreate(name=name, collection=collection, tags=tags, parts=dict(parts), message=message)
+        wanted = ItemCreate(name=name, collection=collection, tags=several(tags), parts=dict(parts), message=message)
         response = self.transport.send_tree("POST", self.url, wanted.model_dump(by_alias=True))
         return self._handle(read_model(Item, response))
 

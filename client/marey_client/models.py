@@ -95,7 +95,7 @@ class ModelHandle(SearchableHandle):
             return [_saved(Path(folder) / safe_file_name(name), archive.read(name)) for name in archive.namelist()]
 
     def add_samples(
-        self, n: int = 1, seed: int = 0, *, into: str, tags: tuple[str, ...] = (), names: str | None = None
+        self, n: int = 1, seed: int = 0, *, into: str, tags: str | Sequence[str] = (), names: str | None = None
     ) -> list[ClipHandle]:
         """Draw `n` motions and make clips of them in the folder `into`, on the model's skeleton.
 

@@ -12,6 +12,7 @@ from pydantic import ConfigDict
 from marey_client.annotations import AnnotationHandle
 from marey_client.edits import Commands, preview_edit
 from marey_client.items import ItemHandle, Items
+from marey_client.one_or_several import several
 from marey_schemas.annotations import AnnotationImport
 from marey_schemas.documents import Annotation, ClipInfo, Motion, SkeletonHierarchy, SkeletonMapping
 from marey_schemas.edit_previews import EditPreview
@@ -45,11 +46,11 @@ class ClipHandle(ItemHandle):
         self,
         *,
         frames: slice | None = None,
-        joints: Sequence[str] | None = None,
+        joints: str | Sequence[str] | None = None,
         revision: int | None = None,
     ) -> MotionArrays:
         """The poses as numpy arrays; only the blocks that hold `frames` and `joints` are read and sent."""
-        query = {"frames": frames_text(frames), "joints": ",".join(joints) if joints is not None else None}
+        query = {"frames": frames_text(frames), "joints": ",".join(several(joints)) if joints is not None else None}
         return MotionArrays.model_validate(self.part("motion", revision=revision, **query))
 
     def info(self) -> ClipInfo:

@@ -11,13 +11,15 @@ from pydantic import BaseModel
 from marey_client.downloads import safe_file_name, saved_atomically
 from marey_client.findings import OnProgress
 from marey_client.jobs import Jobs
+from marey_client.one_or_several import several
 from marey_client.reports import ReportedHandle
 from marey_client.transport import BLOCKS, as_json, read_tree
 from marey_schemas.jobs import Job, JobCreate
 from marey_schemas.sample_trees import TreeParams
 from marey_schemas.search import SearchAnswer, SearchRequest
 
-Constraints = Sequence[Mapping[str, Any] | BaseModel]
+Constraint = Mapping[str, Any] | BaseModel
+Constraints = Constraint | Sequence[Constraint]
 """Such as `{"type": "joint_position", "joint": "left_wrist", "at": "contact", "target_m": (0.3, 1.2, None)}`."""
 
 
@@ -74,4 +76,4 @@ class SearchableHandle(ReportedHandle):
 
 def search_request(constraints: Constraints, **options: Any) -> SearchRequest:
     """A request with these constraints."""
-    return SearchRequest.model_validate({"constraints": list(constraints), **options})
+    return SearchRequest.model_validate({"constraints": several(constraints), **options})

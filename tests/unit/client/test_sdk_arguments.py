@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 from marey_client.downloads import saved_atomically
+from marey_client.edits import as_edit
+from marey_client.imports import find_files
 from marey_client.motions import MotionArrays
+from marey_client.searches import search_request
 from marey_client.transport import BLOCKS
 from marey_schemas.codecs import decode_tree, encode_tree
 
@@ -94,3 +97,40 @@ def test_a_folder_in_the_place_of_a_file_that_arrives_is_told_and_nothing_is_lef
     with pytest.raises(OSError, match=r"walk\.bvh"), saved_atomically(tmp_path / "walk.bvh"):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["walk.bvh"]
+
+
+def query_of(request):
+    return dict(request.url.params)
+
+
+def test_one_joint_or_tag_or_command_needs_no_list_and_is_not_read_letter_by_letter(script):
+    motion = {
+        "schema": "marey/motion@1", "skeleton": {"item": "skeleton_1", "revision": 1}, "frame_rate_hz": 30.0,
+        "joints": ["Hips"], "poses": np.tile(np.float32([0, 1, 0, 1, 0, 0, 0]), (3, 1)),
+    }  # fmt: skip
+    stored = encode_tree(motion, "application/msgpack", arrays="blocks")
+    read = httpx.Response(200, content=stored, headers={"Content-Type": BLOCKS})
+    made = httpx.Response(201, json=CLIP)
+    script.answers = [httpx.Response(200, json=CLIP), read, read, made, made]
+    project = script.marey().project("lab")
+    clip = project.clips.get("clip_1")
+    clip.motion(joints="Hips")
+    clip.motion(joints=["Hips", "Spine"])
+    assert [query_of(request)["joints"] for request in script.requests[1:]] == ["Hips", "Hips,Spine"]
+    for tags in ("walk", ["walk"]):
+        project.clips.create("walk", {"motion": {"schema": "marey/motion@1"}}, tags=tags)
+        sent = decode_tree(script.requests[-1].content, "application/msgpack", max_bytes=1 << 20)
+        assert list(sent["tags"]) == ["walk"]
+
+
+def test_one_digest_one_folder_one_command_and_one_constraint_need_no_list(script, tmp_path):
+    digest = "sha256:" + "0" * 64
+    script.answers = [httpx.Response(200, json={"missing": [digest]})]
+    assert script.marey().blobs.missing(digest) == {digest}
+    assert json.loads(script.requests[0].content) == {"digests": [digest]}
+    (tmp_path / "walk.bvh").write_bytes(b"HIERARCHY")
+    assert [file.name for file in find_files(str(tmp_path)).files] == ["walk.bvh"]
+    assert [file.name for file in find_files(tmp_path).files] == ["walk.bvh"]
+    assert [command.command for command in as_edit({"command": "trim", "start": 1}).commands] == ["trim"]
+    constraint = {"type": "root_position", "at": 0, "target_m": [0, 1, 0]}
+    assert search_request(constraint) == search_request([constraint])
