@@ -132,5 +132,5 @@ def test_one_digest_one_folder_one_command_and_one_constraint_need_no_list(scrip
     assert [file.name for file in find_files(str(tmp_path)).files] == ["walk.bvh"]
     assert [file.name for file in find_files(tmp_path).files] == ["walk.bvh"]
     assert [command.command for command in as_edit({"command": "trim", "start": 1}).commands] == ["trim"]
-    constraint = {"type": "root_position", "at": 0, "target_m": [0, 1, 0]}
+    constraint = {"type": "root_position", "at": 0, "target_m": [0, 1]}
     assert search_request(constraint) == search_request([constraint])
