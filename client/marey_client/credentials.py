@@ -135,9 +135,14 @@ def forget_login(path: Path, url: str) -> bool:
 
 def _write_logins(path: Path, logins: Logins) -> None:
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False, encoding="utf-8") as file:  # mode 0600
-        json.dump({"default": logins.default, "tokens": dict(logins.tokens)}, file, indent=1)
-    Path(file.name).replace(path)
+    handle, name = tempfile.mkstemp(dir=path.parent)  # mode 0600
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            json.dump({"default": logins.default, "tokens": dict(logins.tokens)}, file, indent=1)
+        Path(name).replace(path)
+    except BaseException:
+        Path(name).unlink()  # it may hold tokens
+        raise
 
 
 def _local_token_file(url: str, environment: Mapping[str, str]) -> Path | None:

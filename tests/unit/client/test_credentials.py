@@ -1,6 +1,7 @@
 """Which server and which token."""
 
 import json
+import resource
 
 import httpx
 import pytest
@@ -110,3 +111,17 @@ def test_tokens_do_not_show_in_representations(environment):
     found = credentials.resolve(SERVER, None, environment)
     assert "secret-token" not in repr(found)
     assert "secret-token" not in repr(credentials.read_logins(credentials.logins_path(environment)))
+
+
+def test_a_login_that_there_is_no_room_for_leaves_no_token_behind(tmp_path):
+    path = tmp_path / "credentials.json"
+    credentials.store_login(path, SERVER, "kept")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            credentials.store_login(path, "https://other.test", "lost")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == [path]
+    assert dict(credentials.read_logins(path).tokens) == {SERVER: "kept"}
