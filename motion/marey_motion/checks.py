@@ -29,6 +29,7 @@ CODES = {
     "mixed-rotation-orders": "Joints differ in the order of their Euler angles; each was read in its own.",
     "duplicate-joint-names": "Joint names repeat; they were made unique with the parent's name.",
     "position-channels": "Joints below the root move against their parents; their translations were kept.",
+    "bones-moved-by-translations": "Retargeting pointed bones where the source's joints are, not as they turn.",
     "offsets-from-positions": "The file gives its bones no length; they were taken from the position channels.",
     "position-channels-relative": "Position channels are displacements from the offsets, not positions.",
     "non-unit-quaternions": "Rotations were not of unit length and were normalised.",

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from marey_motion import quaternions
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, MappingError
+from marey_motion.moved_bones import FollowedBones, follow_moved_bones
 from marey_motion.rigs import ESSENTIAL_JOINTS, STANDARD_JOINTS, JointAxes, JointMapping
 from marey_motion.rigs.standard import SIDES
 from marey_motion.skeleton import Skeleton, same_hierarchy
@@ -129,8 +130,8 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
     """The clip's motion on the plan's target skeleton.
 
     Mapped joints take the source's orientation, all others rest (or keep theirs between copies of one rig). Bones keep
-    the target's lengths, whatever the source's `translations` did to its own. The pelvis travels as in the source,
-    times the plan's scale; a root of its own, above the pelvis, moves along without turning.
+    the target's lengths, but point where `translations` of the source point its own. The pelvis travels as in the
+    source, times the plan's scale; a root of its own, above the pelvis, moves along without turning.
 
     Raises
     ------
@@ -148,7 +149,7 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
         ways[joint], sources[joint] = kernels.CARRIED, joint
     poses = np.empty((clip.frame_count, 3 + 4 * target.joint_count), dtype=np.float32)
     kernels.rotations(
-        clip.poses[:, 3:],
+        moved_bones(clip, plan).rotations,
         plan.source.parents,
         ways,
         sources,
@@ -162,6 +163,11 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
     travel = plan.scale * _position_in_world(clip, clip.skeleton.index_of(pelvis.source))
     poses[:, :3] = travel - _position_from_root(target, rotations, target.index_of(pelvis.target))
     return Clip(target, clip.frame_rate_hz, poses)
+
+
+def moved_bones(clip: Clip, plan: RetargetPlan) -> FollowedBones:
+    """The source's rotations as its bones point, with what to tell of bones that translations turned."""
+    return follow_moved_bones(clip, {pair.standard: clip.skeleton.index_of(pair.source) for pair in plan.pairs})
 
 
 def _paired(

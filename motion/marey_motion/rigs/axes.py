@@ -10,7 +10,7 @@ of a standing body; many files put all bones on one line at rest, and there it i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -97,6 +97,13 @@ def guess_axes(skeleton: Skeleton, mapping: JointMapping, motion: Clip | None = 
         swing = body.in_joint(standard, _swing(standard, body))
         axes[skeleton.joint_names[rest.joints[standard]]] = JointAxes(_triple(twist), _triple(_across(swing, twist)))
     return axes
+
+
+def bone_end(standard: str, joints: Collection[str]) -> str | None:
+    """Which of these standard joints the bone of one of them leads to; None for the last of a chain."""
+    side, _, joint = standard.partition("_")
+    prefix, joint = (f"{side}_", joint) if side in SIDES else ("", standard)
+    return next((prefix + end for end in _TOWARDS.get(joint, ()) if prefix + end in joints), None)
 
 
 def rest_pose_doubts(skeleton: Skeleton, mapping: JointMapping) -> tuple[str, ...]:

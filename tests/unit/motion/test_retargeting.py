@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from marey_motion import kinematics, quaternions
+from marey_motion.checks import CODES
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, MappingError, UnknownJoint
 from marey_motion.formats import read_motion
 from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
-from marey_motion.retargeting import plan_retarget, retarget
+from marey_motion.retargeting import moved_bones, plan_retarget, retarget
 from marey_motion.rigs import JointAxes, guess_axes, map_joints
 from marey_motion.skeleton import Skeleton
 
@@ -324,14 +325,56 @@ def test_translations_of_the_source_move_its_pelvis_but_stretch_no_bone(game, st
     clip = tumbling(game.skeleton, 5)
     pelvis, knee = game.joint("pelvis"), game.joint("left_knee")
     shift = np.zeros((5, 2, 3))
-    shift[:, 0], shift[:, 1] = (0.3, -0.2, 0.5), (9.0, 9.0, 9.0)
+    shift[:, 0], shift[:, 1] = (0.3, -0.2, 0.5), 1.5 * game.skeleton.offsets[knee]
     stretched = replace(clip, translations=shift, translated_joints=(pelvis, knee))
     plan = plan_between(game, studio)
     result, plain = retarget(stretched, plan), retarget(clip, plan)
 
     assert np.array_equal(result.rotations, plain.rotations)
+    assert moved_bones(stretched, plan).warning is None
     expected = plan.scale * kinematics.global_positions(stretched)[:, pelvis]
     assert np.abs(result.root_translations - expected).max() < 1e-5
+
+
+def with_moved_joints(actor, *standards, by_m=0.08):
+    """The actor's clip with joints that move against their parents, each its own way."""
+    joints = sorted(actor.joint(standard) for standard in standards)
+    time = np.arange(actor.clip.frame_count)[:, None, None] / 20.0
+    ways = by_m * np.sin(time + np.arange(3 * len(joints)).reshape(1, -1, 3))
+    moved = actor.skeleton.offsets[joints] + ways
+    return replace(actor.clip, translations=moved, translated_joints=tuple(joints))
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_bones_point_where_translations_of_the_source_point_them(studio, game, side):
+    clip = with_moved_joints(studio, *(f"{side}_{joint}" for joint in ("elbow", "wrist", "knee", "ankle")))
+    result = retarget(clip, plan_between(studio, game))
+
+    for start, end in (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle")):
+        start, end = f"{side}_{start}", f"{side}_{end}"
+        source, plain = (bone_directions(one, studio.joint(start), studio.joint(end)) for one in (clip, studio.clip))
+        found = bone_directions(result, game.joint(start), game.joint(end))
+        assert degrees_between(source, plain).max() > 5.0
+        assert degrees_between(source, found).max() < 0.01
+
+
+def test_bones_that_translations_moved_are_told_with_their_joints(studio, game):
+    clip, plan = with_moved_joints(studio, "left_elbow"), plan_between(studio, game)
+    warning = moved_bones(clip, plan).warning
+
+    assert warning.code == "bones-moved-by-translations"
+    assert warning.code in CODES
+    assert set(warning.joints) == {studio.mapping.joints["left_shoulder"]}
+    assert 5.0 < warning.values["largest_turn_deg"] < 45.0
+    assert moved_bones(studio.clip, plan).warning is None
+
+
+def test_a_joint_that_moves_onto_its_parent_leaves_the_bone_as_its_rotation_has_it(studio, game):
+    elbow = studio.joint("left_elbow")
+    clip = replace(studio.clip, translations=np.zeros((studio.clip.frame_count, 1, 3)), translated_joints=(elbow,))
+    plan = plan_between(studio, game)
+
+    assert np.array_equal(retarget(clip, plan).rotations, retarget(studio.clip, plan).rotations)
 
 
 def test_the_same_clip_gives_the_same_bytes(studio, game):

@@ -7,8 +7,8 @@ from typing import Any
 
 from marey_motion import documents
 from marey_motion.errors import MotionError
-from marey_motion.retargeting import RetargetPlan, retarget
-from marey_schemas.documents import ClipInfo, Motion, RevisionRef, Source
+from marey_motion.retargeting import RetargetPlan, moved_bones, retarget
+from marey_schemas.documents import Check, ClipInfo, Motion, RevisionRef, Source
 from marey_schemas.jobs import PinnedInput, RetargetParams, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused, NoSuchThing
@@ -70,7 +70,10 @@ class _Retargeting:
         edited = self._rigs.get(used.item)
         source = Rig(used, edited.ref if edited else used)
         plan = plan_between(self._context, source, self._target, self._params.scale)
-        clip = retarget(documents.clip_from_document(motion, plan.source), plan)
+        taken = documents.clip_from_document(motion, plan.source)
+        warning = moved_bones(taken, plan).warning
+        checks = () if warning is None else (Check.model_validate(warning.as_dict()),)
+        clip = retarget(taken, plan)
         self._frames += clip.frame_count
         return StagedOutput(
             name=f"{pin.collection}/{pin.name}",
@@ -80,7 +83,7 @@ class _Retargeting:
             tags=self._params.tags,
             parts={
                 "motion": documents.clip_to_document(clip, self._target.skeleton).model_dump(by_alias=True),
-                "info": self._info(pin, plan).model_dump(mode="json", by_alias=True, exclude_none=True),
+                "info": self._info(pin, plan, checks).model_dump(mode="json", by_alias=True, exclude_none=True),
             },
             sources={
                 "clips": (pin.as_input(),),
@@ -89,7 +92,7 @@ class _Retargeting:
             },
         )
 
-    def _info(self, pin: PinnedInput, plan: RetargetPlan) -> ClipInfo:
+    def _info(self, pin: PinnedInput, plan: RetargetPlan, checks: tuple[Check, ...]) -> ClipInfo:
         """What was known of the source and holds for the result, and how it was made."""
         details = {
             "scale": plan.scale,
@@ -102,8 +105,8 @@ class _Retargeting:
         try:
             stored = self._context.document(Kind.CLIP, pin.item, pin.revision, "info")
         except NoSuchThing:
-            return ClipInfo(source=made)
+            return ClipInfo(source=made, checks=checks)
         known = ClipInfo.model_validate(stored)
-        return known.model_copy(update={"source": made, "checks": ()})
+        return known.model_copy(update={"source": made, "checks": checks})
 
     # -- results --

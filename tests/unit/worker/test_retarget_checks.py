@@ -1,0 +1,36 @@
+"""What a retargeted clip says of bones that translations of its source moved."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from marey_motion.gait import generate_gait
+from marey_schemas.jobs import PinnedInput, RetargetParams
+from marey_schemas.kinds import Kind
+from marey_worker.kinds import retarget, rigged
+from marey_worker.kinds.rigged import Kept
+from project_in_memory import ProjectInMemory, add_clip
+
+
+def test_the_checks_of_a_result_name_the_bones_that_translations_moved(tmp_path, monkeypatch):
+    monkeypatch.setattr(rigged, "_skeletons", Kept(4))
+    monkeypatch.setattr(rigged, "_plans", Kept(4))
+    project = ProjectInMemory(tmp_path)
+    project.log = lambda text: None
+    plain = generate_gait(1.4, 0.0, 2.0)
+    knee = plain.skeleton.index_of("LeftLeg")
+    moved = np.tile(plain.skeleton.offsets[knee] + (0.1, 0.0, 0.0), (plain.frame_count, 1, 1))
+    add_clip(project, "plain", plain)
+    add_clip(project, "moved", replace(plain, translations=moved, translated_joints=(knee,)))
+    skeleton = {"item": "skeleton_a", "revision": 1, "kind": Kind.SKELETON, "name": "a", "collection": "rigs"}
+    project.inputs["skeleton"] = (PinnedInput(**skeleton),)
+
+    project.into = "out"
+    result = retarget.run(project, RetargetParams())
+    assert (result["clips"], result["refused"]) == (2, [])
+    checks = {output.item_name: output.parts["info"].get("checks", []) for output in project.staged}
+    assert checks["plain"] == []
+    (check,) = checks["moved"]
+    assert check["code"] == "bones-moved-by-translations"
+    assert check["joints"] == ["LeftUpLeg"]
+    assert 10.0 < check["values"]["largest_turn_deg"] < 20.0
