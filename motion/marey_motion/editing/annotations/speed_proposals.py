@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import find_peaks
 
 from marey_motion import kinematics
 from marey_motion.clip import Clip
@@ -55,6 +54,8 @@ def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: PauseOptions
 
     The first segment starts and the last ends with the clip. Without `joints`, the speed of the whole body counts.
     """
+    from scipy.signal import find_peaks  # brings all of scipy's signals and statistics: only who needs it shall wait
+
     options = options or PauseOptions()
     positions = kinematics.global_positions(clip)
     moving = positions[:, list(joints)] if joints else positions
