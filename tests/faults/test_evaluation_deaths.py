@@ -19,7 +19,7 @@ from marey_schemas.imports import ImportOptions
 from marey_schemas.jobs import Job, JobState
 from server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = pytest.mark.timeout(900)
 
 LONG: dict[str, Any] = {
     "name": "walks-eval",

@@ -22,7 +22,7 @@ from marey_schemas.jobs import JobState
 from marey_schemas.pipelines import PipelineCreate
 from server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 
-pytestmark = pytest.mark.timeout(240)
+pytestmark = pytest.mark.timeout(900)
 
 TAKES = 40
 StartWorker = Callable[..., WorkerProcess]

@@ -27,7 +27,7 @@ from marey_schemas.jobs import Job, JobCreate, JobState
 from server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 from tcp_proxy import TcpProxy
 
-pytestmark = pytest.mark.timeout(240)
+pytestmark = pytest.mark.timeout(900)
 
 
 @pytest.fixture(scope="session")
