@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -56,13 +57,20 @@ def sentence(error: BaseException) -> str:
     """An error in one line, with what is needed to ask for help."""
     from marey_client.errors import NotFound, RequestFailed
 
-    text = " ".join(str(error).split()) or type(error).__name__
+    text = " ".join(_told(error).split()) or type(error).__name__
     if not isinstance(error, RequestFailed):
         return text
     whole = f"{text} ({error.code}, request {error.request_id})"
     if error.anonymous and (isinstance(error, NotFound) or error.code == "unauthenticated"):
         return f"{whole}; {ANONYMOUS_HINT}"
     return "; ".join([whole, *getattr(error, "__notes__", ())])
+
+
+def _told(error: BaseException) -> str:
+    """What an error says; of a file, its name and what is wrong with it, without the number of the error."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror is not None:
+        return f"{os.fsdecode(error.filename)}: {error.strerror}"
+    return str(error)
 
 
 def _exit(status: int, text: str, verbose: bool) -> None:

@@ -129,6 +129,8 @@ def ls(
     with connect(context) as marey:
         folders = [] if recursive else _folders_in(marey, address)
         items = _items_in(marey, address, recursive=recursive, kinds=kind, tag=tag)
+        if not folders and not items and marey.project(address.project).collections.at(address.path) is None:
+            items = _items_called(marey, address)
     if as_json:
         return print_json({"collections": folders, "items": [one.item for one in items]})
     rows: list[tuple[object, ...]] = [(f"{name}/", "collection", *[""] * 5) for name in folders]
@@ -161,6 +163,16 @@ def _show_deleted(
     rows += [(one.path, one.item.kind, one.item.deleted_at, one.id) for one in items]
     print_table(("name", "kind", "deleted", "id"), rows)
     return tell(f"marey restore {address.project}/NAME brings one back; an id where a name stands twice")
+
+
+def _items_called(marey: Marey, address: Address) -> list[ItemHandle]:
+    """What has this name where no folder has it. Raises `WrongUsage` where nothing has; a project may be empty."""
+    from marey_schemas.kinds import Kind
+
+    item = find_item(marey, address, list(Kind))
+    if item is None and address.path:
+        raise WrongUsage(f"there is nothing at {address}; marey ls {address.project} shows what there is")
+    return [] if item is None else [item]
 
 
 def _folders_in(marey: Marey, address: Address) -> list[str]:

@@ -189,3 +189,12 @@ def test_a_disabled_user_is_let_in_again_and_an_administrator_made(run, marey, l
     run("user", "change", "ada", "--no-administrator")
     assert not marey.users.get("ada").administrator
     assert "say what changes" in run("user", "change", "ada", status=2).stderr
+
+
+def test_a_place_where_nothing_is_is_told_and_an_item_listed_by_its_name(run, lab):
+    assert "there is nothing at lab/rwa; marey ls lab shows" in run("ls", "lab/rwa", status=2).stderr
+    (item,) = json.loads(run("ls", "lab/raw/a", "--json").stdout)["items"]
+    assert (item["kind"], item["name"]) == ("clip", "a")
+    assert json.loads(run("ls", "lab/raw", "--tag", "nobody", "--json").stdout) == {"collections": [], "items": []}
+    lab.collections.create("empty")
+    assert json.loads(run("ls", "lab/empty", "--json").stdout) == {"collections": [], "items": []}

@@ -231,6 +231,12 @@ def test_what_is_hidden_from_a_request_without_a_token_hints_at_that(script, mak
     assert ("marey login" in sentence(raised.value)) is hinted
 
 
+def test_what_is_wrong_with_a_file_is_told_without_the_number_of_the_error(tmp_path):
+    with pytest.raises(OSError) as failed:
+        (tmp_path / "nowhere" / "walk.bvh").write_bytes(b"")
+    assert sentence(failed.value) == f"{tmp_path}/nowhere/walk.bvh: No such file or directory"
+
+
 def test_what_is_wrong_with_a_field_is_told_once(script, make_problem):
     errors = [{"pointer": "/a", "code": "bad", "detail": "no"}, {"pointer": "/b", "code": "bad", "detail": "neither"}]
     script.answers = [make_problem(422, "invalid", detail="/a: no", errors=errors)]
