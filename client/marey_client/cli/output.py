@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 
+COPIED = ("id", "job")
+"""Columns whose cells people copy into the next command: the others give way where a terminal is narrow."""
+
+
 def print_json(value: Any) -> None:
     """Print models, lists of models, or plain trees as JSON."""
     typer.echo(json.dumps(_plain(value), indent=2, ensure_ascii=False))
@@ -28,7 +32,9 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for column in columns:
-        table.add_column(column, justify="right" if column in right else "left", overflow="fold")
+        table.add_column(
+            column, justify="right" if column in right else "left", overflow="fold", no_wrap=column in COPIED
+        )
     for row in rows:
         table.add_row(*(Text(_shown(cell)) for cell in row))
     width = None if sys.stdout.isatty() else 200

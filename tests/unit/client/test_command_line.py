@@ -1,8 +1,10 @@
 """The command line where no server is needed."""
 
 import os
+import re
 import subprocess
 import sys
+from datetime import UTC, datetime
 
 import httpx
 import pytest
@@ -15,6 +17,7 @@ from marey_client.cli.failures import WrongUsage, sentence
 from marey_client.cli.files import _items_in
 from marey_client.cli.invocation import connect
 from marey_client.cli.jobs import watching
+from marey_client.cli.output import print_table
 from marey_client.cli.pipelines import _tell_shortfalls
 from marey_client.errors import Forbidden, Invalid, NotFound, Unauthenticated
 from marey_client.marey import Marey
@@ -350,3 +353,16 @@ def test_completion_is_offered_for_the_users_shell(nowhere):
 def test_version_is_told():
     done = marey("--version")
     assert done.stdout.startswith("marey ")
+
+
+def test_at_a_narrow_terminal_ids_stay_in_one_piece_and_moments_are_told_to_the_second(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    an_id = "token_01m80ke8tqf73e4b2grvtajq5j"
+    made = datetime(2026, 11, 22, 3, 5, 58, 123456, UTC)
+    name = "workers beside the server at 127.0.0.1:8460 on a machine with a long name"
+    print_table(("id", "name", "scopes", "last used"), [(an_id, name, "read write work", made)])
+    printed = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    assert an_id in printed
+    assert max(map(len, printed.splitlines())) <= 80
+    assert "03:05:58Z" in printed
