@@ -10,6 +10,10 @@ import re
 from dataclasses import dataclass
 
 from marey_server.errors import BadRequest, PreconditionFailed, PreconditionRequired
+from marey_server.store.revs import ExpectedRev
+
+MOST_STATES = 100
+"""Each is a parameter of the statement that writes."""
 
 _TAG = re.compile(r'\s*(W/)?"([\x21\x23-\x7e\x80-\xff]*)"\s*')
 _REV = re.compile("[0-9]{1,9}")
@@ -17,15 +21,11 @@ _REV = re.compile("[0-9]{1,9}")
 
 @dataclass(frozen=True, slots=True)
 class Precondition:
-    """What a writer believes about the thing: its state, any state (`*`), or that there is none."""
+    """What a writer believes about the thing: its state, or one of several; any state (`*`); or that there is none."""
 
-    revs: tuple[int, ...] | None = None
+    expected_rev: ExpectedRev = None
+    """What to require in the UPDATE."""
     absent: bool = False
-
-    @property
-    def expected_rev(self) -> int | None:
-        """The state to require in the UPDATE; None for any."""
-        return None if self.revs is None else self.revs[0]
 
 
 ANY_STATE = Precondition()
@@ -84,9 +84,9 @@ def write_precondition(if_match: str | None, if_none_match: str | None, *, may_c
     tags = parse_tags(if_match)
     if tags == ["*"]:
         return ANY_STATE
-    revs = tuple(sorted({int(rev) for tag in tags if _REV.fullmatch(rev := tag.partition(".")[0])}))
+    revs = sorted({int(rev) for tag in tags if _REV.fullmatch(rev := tag.partition(".")[0])})
     if not revs:
         raise PreconditionFailed(f"{if_match[:200]} is no state of this; read it again.")
-    if len(revs) > 1:
-        raise BadRequest("Send one state in If-Match: the ETag you read.")
-    return Precondition(revs)
+    if len(revs) > MOST_STATES:
+        raise BadRequest(f"If-Match names {len(revs)} states; at most {MOST_STATES} are possible.")
+    return Precondition(revs[0] if len(revs) == 1 else frozenset(revs))

@@ -14,7 +14,7 @@ from marey_server.store import listing, projects
 from marey_server.store.clock import datetime_of
 from marey_server.store.ids import new_id
 from marey_server.store.projects import ProjectRow
-from marey_server.store.revs import change_row
+from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import collection, item
 from marey_server.store.transaction import Transaction
 from marey_server.store.violations import taken
@@ -134,7 +134,7 @@ def _path_taken(path: str) -> Conflict:
 
 
 def move_collection(
-    tx: Transaction, project: str, collection_id: str, request: CollectionChange, *, expected_rev: int | None
+    tx: Transaction, project: str, collection_id: str, request: CollectionChange, *, expected_rev: ExpectedRev
 ) -> Collection:
     """Rename or move a folder with all it holds. Raises `Conflict` where there is a folder at the new path."""
     project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
@@ -181,7 +181,7 @@ def _lock_inside(tx: Transaction, project_row: ProjectRow, path: str) -> Sequenc
     return paths
 
 
-def delete_collection(tx: Transaction, project: str, collection_id: str, *, expected_rev: int | None) -> None:
+def delete_collection(tx: Transaction, project: str, collection_id: str, *, expected_rev: ExpectedRev) -> None:
     """Hide a folder with all it holds; it can be restored."""
     project_row = projects.require(tx, project, Role.MAINTAINER, "write")
     path = _find(tx, project_row, collection_id, _ALIVE, lock=True).path
@@ -204,7 +204,7 @@ def delete_collection(tx: Transaction, project: str, collection_id: str, *, expe
 
 
 def restore_collection(
-    tx: Transaction, project: str, collection_id: str, *, expected_rev: int | None = None
+    tx: Transaction, project: str, collection_id: str, *, expected_rev: ExpectedRev = None
 ) -> Collection:
     """Bring back a folder with what was deleted along with it. Raises `Conflict` where its path is taken again."""
     project_row = projects.require(tx, project, Role.MAINTAINER, "write")

@@ -23,6 +23,7 @@ from marey_server.store import staging
 from marey_server.store.fencing import HELD, earlier_answer, held, held_parameters, hold, lease_lost, require_attempt
 from marey_server.store.gathering import release_tasks
 from marey_server.store.job_ends import ENDED_COLUMNS, AttemptEnd, Ended, as_ended, end_attempts
+from marey_server.store.prepared import Prepared
 from marey_server.store.queue_policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.settling import settle
 from marey_server.store.tables import attempt, job, staged_output
@@ -67,8 +68,7 @@ def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> li
     return [_result(tx, one, answers, refused, own) for one in completions]
 
 
-# Built once: building a statement takes longer than running it.
-_WIN = (
+_WIN = Prepared(
     update(job)
     .where(HELD)
     .values(state="succeeded", finished_us=bindparam("now"), lease_expires_us=None, rev=job.c.rev + 1)
@@ -90,7 +90,7 @@ def _complete(
     """End those of the jobs that are still held, and record and publish what they brought."""
     if not requests:
         return {}
-    won = tx.execute(_WIN, {"now": tx.now_us, **held_parameters(requests)}).all()
+    won = tx.run(_WIN, {"now": tx.now_us, **held_parameters(requests)})
     staged = staging.staged_drafts(tx, [(row.id, row.fence) for row in won]) if won else {}
     done: dict[_Place, tuple[Ended, CompleteAnswer]] = {}
     records = []
@@ -134,7 +134,7 @@ def _complete(
     return done
 
 
-_RECORD = (
+_RECORD = Prepared(
     update(job)
     .where(job.c.id == bindparam("of_job"))
     .values(
@@ -148,7 +148,7 @@ _RECORD = (
 
 def _record(tx: Transaction, records: Sequence[dict[str, Any]]) -> None:
     """Write down what the jobs brought; this transaction has won them already."""
-    tx.execute(_RECORD, records)
+    tx.run_each(_RECORD, records)
 
 
 def _pass_fault_points(tx: Transaction) -> None:

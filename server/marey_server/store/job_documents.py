@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 from sqlalchemy import Row, Select, bindparam, func, select
 
 from marey_schemas.jobs import Job, JobState, Progress
 from marey_server.store.clock import datetime_of
+from marey_server.store.prepared import Prepared
 from marey_server.store.tables import job, job_dependency, project, user
 from marey_server.store.transaction import Transaction
 
@@ -24,16 +26,28 @@ def select_jobs() -> Select[Any]:
     )
 
 
-_JOBS_BY_ID = select_jobs().where(job.c.id.in_(bindparam("ids", expanding=True)))
+_JOBS_BY_ID = Prepared(select_jobs().where(job.c.id.in_(bindparam("ids", expanding=True))))
 
 
 def job_documents(tx: Transaction, ids: Sequence[str]) -> list[Job]:
     """The documents of these jobs, in this order."""
     found: dict[str, Job] = {}
     for start in range(0, len(ids), IN_LIST):
-        rows = tx.execute(_JOBS_BY_ID, {"ids": list(ids[start : start + IN_LIST])}).all()
+        rows = tx.run(_JOBS_BY_ID, {"ids": list(ids[start : start + IN_LIST])})
         found |= {document.id: document for document in as_documents(tx, rows)}
     return [found[one] for one in ids]
+
+
+_UNSAID = {column.key: None if column.default is None else column.default.arg for column in job.c}  # type: ignore[attr-defined]
+"""What stands in the columns of a new row that it does not name."""
+
+
+def document_of_new(tx: Transaction, project_name: str, row: Mapping[str, Any], after: Collection[str]) -> Job:
+    """The document of a job of the caller's, other than a gathering one, whose row is as it was inserted by this
+    transaction: what `job_documents` would read.
+    """
+    names = {"project_name": project_name, "author_name": tx.principal.user_name}
+    return _document(SimpleNamespace(**{**_UNSAID, **row, **names}), tuple(sorted(after)), {}, None)
 
 
 def as_documents(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Job]:
@@ -46,12 +60,18 @@ def as_documents(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Job]:
     return [_document(row, after.get(row.id, ()), children.get(row.id, {}), progress.get(row.id)) for row in rows]
 
 
+_DEPENDENCIES = Prepared(
+    select(job_dependency.c.job_id, job_dependency.c.on_job_id)
+    .where(job_dependency.c.job_id.in_(bindparam("ids", expanding=True)))
+    .order_by(job_dependency.c.on_job_id)
+)
+
+
 def _after(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, tuple[str, ...]]:
     """The jobs each of these comes after. Whom a job waits to share a result with, it does not need."""
     shared = {row.id: row.cached_from for row in rows}
-    statement = select(job_dependency.c.job_id, job_dependency.c.on_job_id).where(job_dependency.c.job_id.in_(shared))
     found: dict[str, tuple[str, ...]] = {}
-    for row in tx.execute(statement.order_by(job_dependency.c.on_job_id)):
+    for row in tx.run(_DEPENDENCIES, {"ids": list(shared)}):
         if row.on_job_id != shared[row.job_id]:
             found[row.job_id] = (*found.get(row.job_id, ()), row.on_job_id)
     return found
@@ -95,7 +115,7 @@ def _progress_of_tasks(
     return told
 
 
-def _document(row: Row[Any], after: tuple[str, ...], children: dict[str, int], at_work: Progress | None) -> Job:
+def _document(row: Any, after: tuple[str, ...], children: dict[str, int], at_work: Progress | None) -> Job:
     return Job(
         id=row.id,
         project=row.project_name,

@@ -9,6 +9,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Row, bindparam, update
 
 from marey_schemas.jobs import FailureReason, JobFailure
+from marey_server.store.prepared import Prepared
 from marey_server.store.tables import attempt, job
 from marey_server.store.transaction import Transaction
 
@@ -74,7 +75,7 @@ class AttemptEnd:
     answer: dict[str, Any] | None = None
 
 
-_END_ATTEMPT = (
+_END_ATTEMPT = Prepared(
     update(attempt)
     .where(
         attempt.c.job_id == bindparam("of_job"),
@@ -96,7 +97,7 @@ def end_attempts(tx: Transaction, ends: Sequence[AttemptEnd]) -> None:
     """Record how attempts ended; one that has ended already keeps its end."""
     if not ends:
         return
-    tx.execute(
+    tx.run_each(
         _END_ATTEMPT,
         [
             {

@@ -7,6 +7,7 @@ from typing import Any
 
 from sqlalchemy import insert, text
 
+from marey_server.store.prepared import Prepared
 from marey_server.store.tables import event
 from marey_server.store.transaction import Transaction
 from marey_server.store.wakeups import wakeups
@@ -15,8 +16,8 @@ EventOfJob = tuple[str, str, dict[str, Any]]
 """Project id, job id, body."""
 
 
-_INSERT = insert(event)
-_INSERT_WITH_XID = insert(event).values(xid=text("pg_current_xact_id()::text::bigint"))
+_INSERT = Prepared(insert(event))
+_INSERT_WITH_XID = Prepared(insert(event).values(xid=text("pg_current_xact_id()::text::bigint")))
 
 
 def emit_job_events(tx: Transaction, kind: str, events: Sequence[EventOfJob]) -> None:
@@ -25,7 +26,7 @@ def emit_job_events(tx: Transaction, kind: str, events: Sequence[EventOfJob]) ->
         return
     common = {"at_us": tx.now_us, "kind": kind, "actor": tx.principal.actor}
     rows = [{**common, "project_id": project, "subject": subject, "body": body} for project, subject, body in events]
-    tx.execute(_INSERT_WITH_XID if tx.is_postgres else _INSERT, rows)
+    tx.run_each(_INSERT_WITH_XID if tx.is_postgres else _INSERT, rows)
 
 
 def wake_workers(tx: Transaction, kinds: Iterable[str]) -> None:

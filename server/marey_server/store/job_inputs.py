@@ -11,6 +11,7 @@ from marey_schemas.job_kinds import KindDeclaration
 from marey_schemas.jobs import CollectionInput, InputSpec, ItemInput, JobCreate, JobInput, JobOutputsInput
 from marey_schemas.problems import FieldError
 from marey_server.errors import Invalid
+from marey_server.store.prepared import Prepared
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import collection, item
 from marey_server.store.transaction import Transaction
@@ -34,13 +35,12 @@ class FoundItem(NamedTuple):
     path: str
 
 
-# Built once: building a statement takes longer than running it.
 _ITEMS = (
     select(item.c.id, item.c.kind, item.c.name, item.c.head, collection.c.path)
     .join(collection, collection.c.id == item.c.collection_id)
     .where(item.c.project_id == bindparam("project_id"), item.c.deleted_us.is_(None))
 )
-_ITEMS_BY_ID = _ITEMS.where(item.c.id.in_(bindparam("ids", expanding=True)))
+_ITEMS_BY_ID = Prepared(_ITEMS.where(item.c.id.in_(bindparam("ids", expanding=True))))
 
 
 def find_items(tx: Transaction, project: ProjectRow, requests: Iterable[JobCreate]) -> dict[str, FoundItem]:
@@ -55,7 +55,7 @@ def items_by_id(tx: Transaction, project_id: str, ids: Iterable[str]) -> dict[st
     rows = [
         FoundItem(row.id, row.kind, row.name, row.head, row.path)
         for start in range(0, len(wanted), IN_LIST)
-        for row in tx.execute(_ITEMS_BY_ID, {"project_id": project_id, "ids": wanted[start : start + IN_LIST]})
+        for row in tx.run(_ITEMS_BY_ID, {"project_id": project_id, "ids": wanted[start : start + IN_LIST]})
     ]
     return {row.id: row for row in rows}
 

@@ -12,7 +12,7 @@ from marey_server.errors import Conflict, NotFound, PreconditionFailed
 from marey_server.store import listing, projects
 from marey_server.store.clock import datetime_of
 from marey_server.store.projects import ProjectRow
-from marey_server.store.revs import change_row, moved_on
+from marey_server.store.revs import ExpectedRev, at_rev, change_row, moved_on
 from marey_server.store.tables import member, project, user
 from marey_server.store.transaction import Transaction
 
@@ -45,7 +45,7 @@ def put_member(
     user_name: str,
     request: MemberChange,
     *,
-    expected_rev: int | None = None,
+    expected_rev: ExpectedRev = None,
     absent: bool = False,
 ) -> Member:
     """Make somebody a member, or change the role. `absent`: only if he is none yet.
@@ -77,17 +77,14 @@ def put_member(
     return _shown(user_name, changed)
 
 
-def remove_member(tx: Transaction, project_name: str, user_name: str, *, expected_rev: int | None) -> None:
+def remove_member(tx: Transaction, project_name: str, user_name: str, *, expected_rev: ExpectedRev) -> None:
     """End a membership. Raises `Conflict` where the project would lose its last owner."""
     project_row = _lock(tx, project_name)
     which = (
         member.c.project_id == project_row.id,
         member.c.user_id.in_(select(user.c.id).where(user.c.name == user_name)),
     )
-    statement = delete(member).where(*which)
-    if expected_rev is not None:
-        statement = statement.where(member.c.rev == expected_rev)
-    if tx.execute(statement).rowcount == 0:
+    if tx.execute(delete(member).where(*which, at_rev(member.c.rev, expected_rev))).rowcount == 0:
         current = tx.execute(select(member.c.rev).where(*which)).scalar()
         raise _no_member(user_name) if current is None else moved_on(current)
     _require_owner(tx, project_row)

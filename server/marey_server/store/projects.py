@@ -28,7 +28,8 @@ from marey_server.errors import Conflict, Forbidden, NotFound, Unauthenticated
 from marey_server.store import listing
 from marey_server.store.clock import datetime_of
 from marey_server.store.ids import new_id
-from marey_server.store.revs import change_row
+from marey_server.store.prepared import Prepared
+from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import member, project
 from marey_server.store.transaction import Transaction
 from marey_server.store.violations import taken
@@ -87,7 +88,7 @@ def require(
     `Unauthenticated` where signing in could help.
     """
     me = tx.principal.user_id or ""
-    row = tx.execute(_DELETED_BY_NAME if deleted else _ALIVE_BY_NAME, {"name": name, "me": me}).first()
+    row = tx.first(_DELETED_BY_NAME if deleted else _ALIVE_BY_NAME, {"name": name, "me": me})
     seen = None if row is None else _as_seen(tx.principal, row)
     if seen is None or (seen.guest and deleted):
         raise NotFound(f"There is no project {name!r} that you may see.", code="no-project")
@@ -111,10 +112,10 @@ def _with_role_of(user_id: str | BindParameter[str]) -> Select[Any]:
     return select(project, member.c.role).select_from(project.outerjoin(member, mine))
 
 
-# Almost every request runs one of these, so they are built once.
+# Almost every request runs one of these.
 _BY_NAME = _with_role_of(bindparam("me")).where(project.c.name == bindparam("name"))
-_ALIVE_BY_NAME = _BY_NAME.where(project.c.deleted_us.is_(None))
-_DELETED_BY_NAME = (
+_ALIVE_BY_NAME = Prepared(_BY_NAME.where(project.c.deleted_us.is_(None)))
+_DELETED_BY_NAME = Prepared(
     _BY_NAME.where(project.c.deleted_us.is_not(None)).order_by(project.c.deleted_us.desc()).limit(literal_column("1"))
 )
 
@@ -202,7 +203,7 @@ def _name_taken(name: str) -> Conflict:
     return Conflict(f"The name {name!r} is taken by another project.", code="name-taken")
 
 
-def change_project(tx: Transaction, name: str, request: ProjectChange, *, expected_rev: int | None) -> Project:
+def change_project(tx: Transaction, name: str, request: ProjectChange, *, expected_rev: ExpectedRev) -> Project:
     """Change title, description or visibility."""
     seen = require(tx, name, Role.OWNER, "write")
     values = {field: getattr(request, field) for field in request.model_fields_set}
@@ -214,14 +215,14 @@ def change_project(tx: Transaction, name: str, request: ProjectChange, *, expect
     return changed
 
 
-def delete_project(tx: Transaction, name: str, *, expected_rev: int | None) -> None:
+def delete_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev) -> None:
     """Hide a project and everything in it; an owner can restore it."""
     seen = require(tx, name, Role.OWNER, "write")
     _change(tx, seen, {"deleted_us": tx.now_us}, expected_rev, project.c.deleted_us.is_(None))
     tx.emit("project.deleted", seen.id, project_id=seen.id, name=name)
 
 
-def restore_project(tx: Transaction, name: str, *, expected_rev: int | None = None) -> Project:
+def restore_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev = None) -> Project:
     """Bring back the project of this name that was deleted last. Raises `Conflict` where the name is taken again."""
     seen = require(tx, name, Role.OWNER, "write", deleted=True)
     with taken(_name_taken(name)):
@@ -231,7 +232,7 @@ def restore_project(tx: Transaction, name: str, *, expected_rev: int | None = No
 
 
 def _change(
-    tx: Transaction, seen: ProjectRow, values: dict[str, Any], expected_rev: int | None, state: ColumnElement[bool]
+    tx: Transaction, seen: ProjectRow, values: dict[str, Any], expected_rev: ExpectedRev, state: ColumnElement[bool]
 ) -> Project:
     row = change_row(
         tx, project, (project.c.id == seen.id, state), {**values, "updated_us": tx.now_us},

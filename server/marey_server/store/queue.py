@@ -41,6 +41,7 @@ from marey_server.errors import Forbidden, Invalid
 from marey_server.store.fencing import QUEUED, RUNNING, earlier, held, lease_lost, require_attempt
 from marey_server.store.job_events import emit_job_events
 from marey_server.store.labels import keys_within
+from marey_server.store.prepared import Prepared
 from marey_server.store.queue_policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.tables import attempt, job, member, project
 from marey_server.store.transaction import Transaction
@@ -58,8 +59,8 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
     if not rows:
         return []
     tokens = [issue_attempt_token() for _ in rows]
-    tx.execute(
-        insert(attempt),
+    tx.run_each(
+        _INSERT_ATTEMPT,
         [
             {
                 "job_id": row.id,
@@ -78,6 +79,9 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
     return [
         _lease(row, sizes.get(row.parent_id, row.size), token, policy) for row, token in zip(rows, tokens, strict=True)
     ]
+
+
+_INSERT_ATTEMPT = Prepared(insert(attempt))
 
 
 def heartbeat(
@@ -108,7 +112,7 @@ def heartbeat(
 
 
 def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
-    """Pick and claim. Building it takes longer than running it, so each variant is built once."""
+    """Pick and claim."""
     pick = _pick(restriction)
     now_us = bindparam("now_us", type_=BigInteger)
     deadline_us = now_us + cast(job.c.time_limit_s, BigInteger) * SECOND_US
@@ -210,7 +214,7 @@ class _Restriction(NamedTuple):
 
 
 _CLAIM_STATEMENTS = {
-    restriction: _claim_statement(restriction)
+    restriction: Prepared(_claim_statement(restriction))
     for restriction in (_Restriction(*flags) for flags in product((False, True), repeat=3))
 }
 
@@ -235,7 +239,7 @@ def _claim_rows(tx: Transaction, request: ClaimRequest, policy: QueuePolicy) -> 
         parameters["project_names"] = [scope.partition("=")[2] for scope in scopes]
     if restriction.own_projects:
         parameters["user"] = caller.user_id
-    return sorted(tx.execute(_CLAIM_STATEMENTS[restriction], parameters), key=_pick_order)
+    return sorted(tx.run(_CLAIM_STATEMENTS[restriction], parameters), key=_pick_order)
 
 
 # -- answers ----------------------------------------------------------------------------------------------------------

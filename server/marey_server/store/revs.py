@@ -4,10 +4,25 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, Table, select, update
+from sqlalchemy import Column, ColumnElement, Row, Table, select, true, update
 
 from marey_server.errors import MareyError, PreconditionFailed
 from marey_server.store.transaction import Transaction
+
+ExpectedRev = int | frozenset[int] | None
+"""The `rev` that a writer believes in, or several of which any will do; None for any at all."""
+
+
+def at_rev(column: Column[int], expected: ExpectedRev) -> ColumnElement[bool]:
+    """Condition for the statement that writes: the row is at an expected `rev`."""
+    if expected is None:
+        return true()
+    return column == expected if isinstance(expected, int) else column.in_(sorted(expected))
+
+
+def is_expected(rev: int, expected: ExpectedRev) -> bool:
+    """The same of a `rev` that was read."""
+    return expected is None or (rev == expected if isinstance(expected, int) else rev in expected)
 
 
 def change_row(
@@ -16,16 +31,15 @@ def change_row(
     which: tuple[ColumnElement[bool], ...],
     values: dict[str, Any],
     *,
-    expected_rev: int | None,
+    expected_rev: ExpectedRev,
     absent: MareyError,
 ) -> Row[Any]:
-    """Change the one row that meets `which`, if its `rev` is the expected one (None: whatever it is).
+    """Change the one row that meets `which`, if its `rev` is an expected one.
 
     Raises `absent` where there is no such row, `PreconditionFailed` with the current `rev` where it has changed.
     """
-    statement = update(table).where(*which).values(**values, rev=table.c.rev + 1).returning(*table.c)
-    if expected_rev is not None:
-        statement = statement.where(table.c.rev == expected_rev)
+    expected = at_rev(table.c.rev, expected_rev)
+    statement = update(table).where(*which, expected).values(**values, rev=table.c.rev + 1).returning(*table.c)
     row = tx.execute(statement).first()
     if row is not None:
         return row

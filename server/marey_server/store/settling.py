@@ -18,6 +18,7 @@ from marey_server.store.fencing import RUNNING, WAITING
 from marey_server.store.gathering import gather
 from marey_server.store.job_ends import Ended, dependency_failure, end_jobs
 from marey_server.store.job_events import emit_job_events, wake_watchers, wake_workers
+from marey_server.store.prepared import Prepared
 from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import Transaction
 
@@ -67,7 +68,7 @@ def _announce(tx: Transaction, ended: Sequence[Ended]) -> None:
 # -- dependants -------------------------------------------------------------------------------------------------------
 
 
-_RELEASE = (
+_RELEASE = Prepared(
     update(job_dependency)
     .where(job_dependency.c.on_job_id.in_(bindparam("ended", expanding=True)), job_dependency.c.satisfied == false())
     .values(satisfied=True)
@@ -78,7 +79,7 @@ _RELEASE = (
 def _move_dependants(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
     ends = {end.id: end for end in ended}
     upstream: dict[str, list[Ended]] = {}
-    for row in tx.execute(_RELEASE, {"ended": list(ends)}):
+    for row in tx.run(_RELEASE, {"ended": list(ends)}):
         upstream.setdefault(row.job_id, []).append(ends[row.on_job_id])
     following: list[Ended] = []
     ids = iter(sorted(upstream))

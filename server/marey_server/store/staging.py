@@ -20,6 +20,7 @@ from marey_server.store.fencing import hold, require_attempt
 from marey_server.store.items.drafts import Draft, StoredDocument
 from marey_server.store.items.publishing import publish
 from marey_server.store.job_inputs import PinnedInputs
+from marey_server.store.prepared import Prepared
 from marey_server.store.projects import find_by_id
 from marey_server.store.tables import document, job, staged_output
 from marey_server.store.transaction import Transaction
@@ -128,8 +129,8 @@ def _pinned_source(role: str, source: ItemInput, pins: PinnedInputs) -> list[Any
 
 
 _BY_ATTEMPTS = tuple_(staged_output.c.job_id, staged_output.c.fence).in_(bindparam("attempts", expanding=True))
-_STAGED = select(staged_output).where(_BY_ATTEMPTS).order_by(staged_output.c.job_id, staged_output.c.position)
-_DROP_STAGED = delete(staged_output).where(_BY_ATTEMPTS)
+_STAGED = Prepared(select(staged_output).where(_BY_ATTEMPTS).order_by(staged_output.c.job_id, staged_output.c.position))
+_DROP_STAGED = Prepared(delete(staged_output).where(_BY_ATTEMPTS))
 
 
 def staged_drafts(
@@ -137,7 +138,7 @@ def staged_drafts(
 ) -> dict[tuple[str, int], dict[str, StagedDraft]]:
     """What attempts (job id and fence) staged: drafts by name, in the order staged."""
     drafts: dict[tuple[str, int], dict[str, StagedDraft]] = {}
-    for row in tx.execute(_STAGED, {"attempts": list(attempts)}):
+    for row in tx.run(_STAGED, {"attempts": list(attempts)}):
         drafts.setdefault((row.job_id, row.fence), {})[row.name] = row.draft
     return drafts
 
@@ -154,7 +155,7 @@ def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> boo
 
 def drop_staged(tx: Transaction, attempts: Collection[tuple[str, int]]) -> None:
     """Forget what attempts (job id and fence) staged: they ended without success, or no identical job can use it."""
-    tx.execute(_DROP_STAGED, {"attempts": list(attempts)})
+    tx.run(_DROP_STAGED, {"attempts": list(attempts)})
 
 
 def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: PinnedInputs) -> dict[str, StagedDraft]:

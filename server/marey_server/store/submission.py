@@ -19,12 +19,13 @@ from marey_server.errors import Invalid
 from marey_server.field_errors import field_errors, json_pointer
 from marey_server.store import job_cache, staging
 from marey_server.store.binding import bind
-from marey_server.store.job_documents import job_documents
+from marey_server.store.job_documents import document_of_new, job_documents
 from marey_server.store.job_ends import dependency_failure
 from marey_server.store.job_events import emit_job_events, wake_workers
 from marey_server.store.job_inputs import FoundItem, find_items, late_inputs, pin_inputs
 from marey_server.store.job_layout import NewJob, Submission, lay_out, new_row
 from marey_server.store.labels import labels_key
+from marey_server.store.prepared import Prepared
 from marey_server.store.projects import ProjectRow, require
 from marey_server.store.result_places import find_clash
 from marey_server.store.settling import settle
@@ -32,6 +33,7 @@ from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import Transaction
 
 IN_LIST = 1000
+_INSERT_JOB = Prepared(insert(job))
 
 
 class Upstream(NamedTuple):
@@ -83,8 +85,8 @@ def submit_checked(
     heads = [_head(project, one, upstream) for one in submissions]
     tasks, sources = lay_out(tx, [one for one in heads if not one.unbound])
     everything = [*heads, *tasks]
-    for start in range(0, len(everything), IN_LIST):
-        tx.execute(insert(job), [new_row(tx, one) for one in everything[start : start + IN_LIST]])
+    rows = {one.id: new_row(tx, one) for one in everything}
+    tx.run_each(_INSERT_JOB, list(rows.values()))
     _insert_dependencies(tx, submissions, upstream)
     for one in heads:
         staging.keep_named_blobs(tx, one.id, set(staging.named_blobs(one.submission.params)))
@@ -98,7 +100,9 @@ def submit_checked(
     settle(tx, ended)
     faults.point("submit.before_commit")
     tx.after_commit(lambda: faults.point("submit.after_commit"))
-    return job_documents(tx, [one.id for one in heads])
+    if ended or sources or bindable or tasks:  # what was inserted has been changed since, or is not the whole of it
+        return job_documents(tx, [one.id for one in heads])
+    return [document_of_new(tx, project.name, rows[one.id], one.submission.after) for one in heads]
 
 
 # -- checking ---------------------------------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from marey_server.store import listing
 from marey_server.store.clock import datetime_of
 from marey_server.store.fencing import lease_lost
 from marey_server.store.ids import new_id
+from marey_server.store.prepared import Prepared
 from marey_server.store.tables import attempt, job, token, user
 from marey_server.store.transaction import Transaction
 
@@ -31,14 +32,14 @@ NOTE_USE_EVERY_S = 3600
 
 _ATTEMPT_SCOPES = ("read",)
 
-# Every request runs one of these, so they are built once.
-_USER_TOKEN = (
+# Every request runs one of these.
+_USER_TOKEN = Prepared(
     select(token.c.id, token.c.secret_hash, token.c.scopes, token.c.expires_us)
     .add_columns(user.c.id.label("user_id"), user.c.name, user.c.administrator, user.c.disabled)
     .join(user, user.c.id == token.c.user_id)
     .where(token.c.prefix == bindparam("prefix"))
 )
-_ATTEMPT_TOKEN = (
+_ATTEMPT_TOKEN = Prepared(
     select(job.c.id, job.c.project_id, job.c.author_id, job.c.state, attempt.c.fence, user.c.name)
     .add_columns(job.c.fence.label("current_fence"))
     .select_from(attempt.join(job, job.c.id == attempt.c.job_id).outerjoin(user, user.c.id == job.c.author_id))
@@ -60,7 +61,7 @@ def _unknown() -> Unauthenticated:
 
 
 def _resolve_user(tx: Transaction, prefix: str, secret: str) -> Principal:
-    row = tx.execute(_USER_TOKEN, {"prefix": prefix}).first()
+    row = tx.first(_USER_TOKEN, {"prefix": prefix})
     if row is None or not secret_matches(secret, row.secret_hash) or row.disabled:
         raise _unknown()
     if row.expires_us is not None and row.expires_us <= tx.now_us:
@@ -72,7 +73,7 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
     """An attempt lives while its fence is the job's. Once the job has ended, the token only serves to hear again what
     `complete` or `fail` answered: it reads nothing any more. Raises `LeaseLost` once the fence has moved on.
     """
-    row = tx.execute(_ATTEMPT_TOKEN, {"hash": hash_secret(secret)}).first()
+    row = tx.first(_ATTEMPT_TOKEN, {"hash": hash_secret(secret)})
     if row is None:
         raise _unknown()
     if row.fence != row.current_fence:

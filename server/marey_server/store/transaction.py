@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import sqlalchemy
@@ -13,6 +13,7 @@ from marey_server.access.principal import Principal
 from marey_server.store import tables
 from marey_server.store.blob_backings import BlobBacking
 from marey_server.store.clock import Clock
+from marey_server.store.prepared import Prepared
 
 
 class Transaction:
@@ -47,6 +48,19 @@ class Transaction:
     def execute(self, statement: Executable, parameters: Any = None) -> CursorResult[Any]:
         """Run one statement."""
         return self.connection.execute(statement, parameters)
+
+    def run(self, statement: Prepared, parameters: Mapping[str, Any]) -> list[Any]:
+        """The rows of a prepared statement."""
+        return statement.run(self.connection, parameters)
+
+    def first(self, statement: Prepared, parameters: Mapping[str, Any]) -> Any | None:
+        """The first row of a prepared statement; None where it gives none."""
+        rows = statement.run(self.connection, parameters)
+        return rows[0] if rows else None
+
+    def run_each(self, statement: Prepared, many: Sequence[Mapping[str, Any]]) -> None:
+        """Run a prepared statement once for each of `many`."""
+        statement.run_each(self.connection, many)
 
     def insert_or_ignore(self, table: Table, row: Mapping[str, Any] | None = None) -> postgresql.Insert | sqlite.Insert:
         """An INSERT that does nothing where a unique index refuses the row; `returning` then gives nothing.

@@ -14,7 +14,7 @@ from marey_server.errors import Conflict, Forbidden, NotFound, PreconditionFaile
 from marey_server.store import listing
 from marey_server.store.clock import datetime_of
 from marey_server.store.ids import new_id
-from marey_server.store.revs import change_row
+from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import user
 from marey_server.store.transaction import Transaction
 from marey_server.store.violations import taken
@@ -68,7 +68,7 @@ def change_user(
     name: str,
     request: UserChange,
     *,
-    expected_rev: int | None,
+    expected_rev: ExpectedRev,
     password_hash: str | None = None,
     verified_hash: str | None = None,
 ) -> User:
@@ -115,7 +115,7 @@ def _values(request: UserChange, password_hash: str | None) -> dict[str, Any]:
     return values
 
 
-def delete_user(tx: Transaction, name: str, *, expected_rev: int | None) -> None:
+def delete_user(tx: Transaction, name: str, *, expected_rev: ExpectedRev) -> None:
     """Disable a user: the name stays with what he did, his tokens and password stop working."""
     require_administrator(tx.principal)
     change_user(tx, name, UserChange(disabled=True), expected_rev=expected_rev)

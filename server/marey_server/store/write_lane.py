@@ -14,6 +14,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import MareyError
+from marey_server.store.prepared import run_text
 from marey_server.store.transaction import Transaction
 
 P = ParamSpec("P")
@@ -96,11 +97,14 @@ class WriteLane:
 def _run(tx: Transaction, one: _Write) -> Callable[[], Any]:
     """Do it; what remains to be done once it is committed. Of a write that is refused nothing is left to commit."""
     own = tx.beside(one.principal)
+    run_text(tx.connection, "SAVEPOINT this_write")
     try:
-        with tx.connection.begin_nested():
-            answer = one.function(own)
+        answer = one.function(own)
     except MareyError as refusal:
+        run_text(tx.connection, "ROLLBACK TO this_write")
+        run_text(tx.connection, "RELEASE this_write")
         return _raiser(refusal)
+    run_text(tx.connection, "RELEASE this_write")
 
     def finish() -> Any:
         own.run_after_commit()

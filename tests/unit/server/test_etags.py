@@ -24,6 +24,18 @@ def test_what_was_read_in_one_form_can_be_changed_in_another():
     assert write_precondition('"7.msgpack"', None).expected_rev == 7
 
 
+def test_a_change_may_name_several_states():
+    assert write_precondition('"7.json", "9.msgpack", "foreign"', None).expected_rev == frozenset({7, 9})
+    assert write_precondition('"7.json", "7.msgpack"', None).expected_rev == 7
+
+
+def test_more_states_than_a_statement_should_take_are_refused():
+    tags = [f'"{number}.json"' for number in range(1, 102)]
+    assert write_precondition(",".join(tags[:100]), None).expected_rev == frozenset(range(1, 101))
+    with pytest.raises(BadRequest, match="101 states; at most 100"):
+        write_precondition(",".join(tags), None)
+
+
 def test_a_change_without_a_precondition_is_refused():
     with pytest.raises(PreconditionRequired):
         write_precondition(None, None)

@@ -17,7 +17,7 @@ from marey_server.store import projects
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.items.changing import prepare_part, prepare_parts, put_part
 from marey_server.store.items.reading import read_item, read_part
-from marey_server.store.revs import moved_on
+from marey_server.store.revs import ExpectedRev, is_expected, moved_on
 from marey_server.store.transaction import Transaction
 
 MOST_WORK = 30_000_000
@@ -49,14 +49,14 @@ def find_annotation(tx: Transaction, project: str, item_id: str) -> FoundAnnotat
 
 
 def apply_commands(
-    found: FoundAnnotation, change: AnnotationChange, *, expected_rev: int | None = None
+    found: FoundAnnotation, change: AnnotationChange, *, expected_rev: ExpectedRev = None
 ) -> ChangedAnnotation:
     """Apply commands to an annotation one after another, all of them or none. Needs no database, and much of the time.
 
     A refusal is handed on in place of the document, to be raised where the change is put: a request that is sent again
     gets its first answer, whatever has become of the annotation since.
     """
-    if expected_rev not in (None, found.rev):
+    if not is_expected(found.rev, expected_rev):
         return ChangedAnnotation(found.rev, moved_on(found.rev))
     try:
         return ChangedAnnotation(found.rev, _changed(found, change))

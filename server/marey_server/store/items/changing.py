@@ -19,7 +19,7 @@ from marey_server.store.items.reading import find_item, no_item, shown_items
 from marey_server.store.items.references import ReferenceCheck
 from marey_server.store.items.revisions import emit_item, read_part_digests, write_head, write_revision
 from marey_server.store.projects import ProjectRow
-from marey_server.store.revs import change_row, moved_on
+from marey_server.store.revs import ExpectedRev, change_row, is_expected, moved_on
 from marey_server.store.tables import item, item_tag
 from marey_server.store.transaction import Transaction
 from marey_server.store.violations import taken
@@ -65,7 +65,7 @@ def put_part(
     part: str,
     content: Any,
     *,
-    expected_rev: int | None,
+    expected_rev: ExpectedRev,
     message: str = "",
 ) -> Item:
     """A new revision in which one part is replaced; the same content makes none.
@@ -77,7 +77,7 @@ def put_part(
     prepared = prepare_part(kind, part, content)
     digest = documents.store_document(tx, prepared)
     ReferenceCheck(tx, project_row).require(kind, {part: prepared.body})
-    while expected_rev in (None, found.rev):
+    while is_expected(found.rev, expected_rev):
         parts = read_part_digests(tx, item_id, found.head)
         if parts.get(part) == digest:
             return _shown(tx, project_row, kind, item_id)
@@ -92,7 +92,7 @@ def put_part(
 
 
 def change_item(
-    tx: Transaction, project: str, kind: Kind, item_id: str, request: ItemChange, *, expected_rev: int | None
+    tx: Transaction, project: str, kind: Kind, item_id: str, request: ItemChange, *, expected_rev: ExpectedRev
 ) -> Item:
     """Rename, move or tag an item. Raises `Conflict` where the name is taken at its new place."""
     project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
@@ -113,7 +113,7 @@ def change_item(
     return shown
 
 
-def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: int | None) -> None:
+def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev) -> None:
     """Hide an item; it can be restored. What refers to its revisions stays right."""
     project_row = projects.require(tx, project, Role.MAINTAINER, "write")
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_(None))
@@ -123,7 +123,7 @@ def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expe
     emit_item(tx, "item.deleted", project_row, gone)
 
 
-def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: int | None = None) -> Item:
+def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev = None) -> Item:
     """Bring back a deleted item, and its collection if that is gone. Raises `Conflict` where its name is taken."""
     project_row = projects.require(tx, project, Role.MAINTAINER, "write")
     gone = find_item(tx, project_row, kind, item_id, deleted=True)

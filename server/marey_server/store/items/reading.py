@@ -15,6 +15,7 @@ from marey_server.errors import Invalid, NotFound
 from marey_server.store import documents, projects
 from marey_server.store.clock import datetime_of
 from marey_server.store.items.slices import slice_motion
+from marey_server.store.prepared import Prepared
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import collection, document, item, item_tag, revision_part
 from marey_server.store.transaction import Transaction
@@ -31,16 +32,17 @@ def item_rows() -> Select[Any]:
     return select(item, collection.c.path).join(collection, collection.c.id == item.c.collection_id)
 
 
-# What single items are read with is built once: building a statement takes longer than running it.
 _THIS_ITEM = (
     item.c.id == bindparam("item_id"),
     item.c.project_id == bindparam("project_id"),
     item.c.kind == bindparam("kind"),
 )
-_ITEM = item_rows().where(*_THIS_ITEM, item.c.deleted_us.is_(None))
-_DELETED_ITEM = item_rows().where(*_THIS_ITEM, item.c.deleted_us.is_not(None))
-_TAGS = select(item_tag.c.item_id, item_tag.c.tag).where(item_tag.c.item_id.in_(bindparam("items", expanding=True)))
-_PARTS = (
+_ITEM = Prepared(item_rows().where(*_THIS_ITEM, item.c.deleted_us.is_(None)))
+_DELETED_ITEM = Prepared(item_rows().where(*_THIS_ITEM, item.c.deleted_us.is_not(None)))
+_TAGS = Prepared(
+    select(item_tag.c.item_id, item_tag.c.tag).where(item_tag.c.item_id.in_(bindparam("items", expanding=True)))
+)
+_PARTS = Prepared(
     select(
         revision_part.c.item_id, revision_part.c.number, revision_part.c.part,
         document.c.digest, document.c.schema, document.c.size_bytes,
@@ -57,14 +59,14 @@ _PART = (
     .join(revision_part, revision_part.c.item_id == item.c.id)
     .where(*_THIS_ITEM, item.c.deleted_us.is_(None), revision_part.c.part == bindparam("part"))
 )
-_PART_OF_HEAD = _PART.where(revision_part.c.number == item.c.head)
-_PART_OF_REVISION = _PART.where(revision_part.c.number == bindparam("number"))
+_PART_OF_HEAD = Prepared(_PART.where(revision_part.c.number == item.c.head))
+_PART_OF_REVISION = Prepared(_PART.where(revision_part.c.number == bindparam("number")))
 
 
-def find_item(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, *, deleted: bool = False) -> Row[Any]:
+def find_item(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, *, deleted: bool = False) -> Any:
     """Row of an item. Raises `NotFound`."""
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value}
-    row = tx.execute(_DELETED_ITEM if deleted else _ITEM, which).first()
+    row = tx.first(_DELETED_ITEM if deleted else _ITEM, which)
     if row is None:
         raise no_item(kind, item_id)
     return row
@@ -93,7 +95,7 @@ def shown_items(tx: Transaction, rows: Sequence[Row[Any]], *, tags: bool = True,
 def read_tags(tx: Transaction, item_ids: Collection[str]) -> dict[str, tuple[str, ...]]:
     """Tags by item, sorted."""
     found: dict[str, list[str]] = {}
-    for row in tx.execute(_TAGS, {"items": list(item_ids)}):
+    for row in tx.run(_TAGS, {"items": list(item_ids)}):
         found.setdefault(row.item_id, []).append(row.tag)
     return {item_id: tuple(sorted(tags)) for item_id, tags in found.items()}
 
@@ -104,7 +106,7 @@ def read_parts(
     """Parts by item and revision number."""
     keys = {"items": list({item_id for item_id, _ in revisions}), "numbers": list({number for _, number in revisions})}
     found: dict[tuple[str, int], dict[str, PartSummary]] = {}
-    for row in tx.execute(_PARTS, keys):
+    for row in tx.run(_PARTS, keys):
         summary = PartSummary(document=row.digest, schema_=row.schema, size_bytes=row.size_bytes)
         found.setdefault((row.item_id, row.number), {})[row.part] = summary
     return found
@@ -127,9 +129,9 @@ def find_part(
     project_row = projects.require(tx, project, Role.READER)
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value, "part": part}
     if revision is None:
-        row = tx.execute(_PART_OF_HEAD, which).first()
+        row = tx.first(_PART_OF_HEAD, which)
     else:
-        row = tx.execute(_PART_OF_REVISION, {**which, "number": revision}).first()
+        row = tx.first(_PART_OF_REVISION, {**which, "number": revision})
     if row is None:
         raise NotFound(f"There is no part {part!r} of {kind} {item_id!r} at that revision.", code="no-part")
     return FoundPart(row.document_digest, row.number, row.rev)

@@ -1,0 +1,183 @@
+"""Statements that are run over and over: compiled once, and handed to the driver as text.
+
+SQLAlchemy spends some 55 µs on a statement that SQLite answers in 10, on finding what it compiled before, on a context
+for each execution and on a result with its metadata. Here the text, the order of the parameters and the conversions of
+values are kept from the first run (docs/decisions/0012).
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any
+
+from sqlalchemy import BindParameter, Connection, Delete, Dialect, Insert, Select, Update, exc
+from sqlalchemy.sql.schema import ScalarElementColumnDefault
+
+Statement = Select[Any] | Insert | Update | Delete
+Convert = Callable[[Any], Any]
+Parameters = Mapping[str, Any]
+
+MOST_FORMS = 64
+"""Texts kept of one statement: one for each length of the lists it takes."""
+
+
+class Prepared:
+    """A statement of SQLAlchemy Core with `bindparam`s; lists are parameters with `expanding=True`.
+
+    An INSERT without values takes those columns that its parameters name; the others get their default.
+    """
+
+    def __init__(self, statement: Statement) -> None:
+        self._statement = statement.inline() if isinstance(statement, Insert) else statement
+        self._lists: tuple[str, ...] | None = None
+        self._forms: dict[tuple[object, ...], _Form] = {}
+
+    def run(self, connection: Connection, parameters: Parameters) -> list[Any]:
+        """Run it; the rows that it gives, as named tuples."""
+        form = self._form(connection.dialect, parameters)
+        rows = _run(connection, form.text, form.values(parameters), gives_rows=form.to_row is not None)
+        return rows if form.to_row is None else list(map(form.to_row, rows))
+
+    def run_each(self, connection: Connection, many: Sequence[Parameters]) -> None:
+        """Run it once for each of `many`, which hold the same names; rows are not given."""
+        if len(many) == 1:
+            self.run(connection, many[0])
+        elif many:
+            form = self._form(connection.dialect, many[0])
+            _run(connection, form.text, [form.values(one) for one in many], many=True)
+
+    def _form(self, dialect: Dialect, parameters: Parameters) -> _Form:
+        if self._lists is not None:
+            form = self._forms.get(self._key(dialect, self._lists, parameters))
+            if form is not None:
+                return form
+        form = _compile(self._statement, dialect, parameters)
+        self._lists = tuple(form.expansion)
+        if len(self._forms) >= MOST_FORMS:
+            self._forms.clear()
+        self._forms[self._key(dialect, self._lists, parameters)] = form
+        return form
+
+    @staticmethod
+    def _key(dialect: Dialect, lists: Iterable[str], parameters: Parameters) -> tuple[object, ...]:
+        return (dialect.name, len(parameters), *[len(parameters[name]) for name in lists])
+
+
+def run_text(connection: Connection, text: str) -> None:
+    """Run a statement that has no parameters and gives no rows."""
+    _run(connection, text, ())
+
+
+@dataclass(frozen=True, slots=True)
+class _Form:
+    """The statement for one database and lists of certain lengths."""
+
+    text: str
+    constants: Mapping[str, Any]
+    """Values that stand in the statement itself."""
+    expansion: Mapping[str, Sequence[str]]
+    """Of lists: the names of their members."""
+    converts: Mapping[str, Convert]
+    order: tuple[str, ...] | None
+    """The names in the order of the text; None where the driver takes them by name."""
+    to_row: Convert | None
+
+    def values(self, parameters: Parameters) -> Any:
+        """The parameters as the driver takes them."""
+        named = {**self.constants, **parameters}
+        for name, members in self.expansion.items():
+            named.update(_members(members, named.pop(name)))
+        for name, convert in self.converts.items():
+            named[name] = convert(named[name])
+        return named if self.order is None else tuple([named[name] for name in self.order])
+
+
+def _members(names: Sequence[str], given: Sequence[Any]) -> Iterable[tuple[str, Any]]:
+    """The members of a list, or of a list of tuples, under their own names."""
+    nested = bool(given) and isinstance(given[0], tuple)
+    return zip(names, chain.from_iterable(given) if nested else given, strict=True)
+
+
+def _compile(statement: Statement, dialect: Dialect, parameters: Parameters) -> _Form:
+    compiled = statement.compile(
+        dialect=dialect, column_keys=list(parameters) if isinstance(statement, Insert) else None
+    )
+    binds: Mapping[str, BindParameter[Any]] = compiled.binds
+    if unknown := parameters.keys() - binds.keys():
+        raise TypeError(f"no parameters of this statement: {', '.join(sorted(unknown))}")
+    state = compiled.construct_expanded_state(dict(parameters))
+    converts = {
+        name: convert
+        for name, bind in binds.items()
+        if name not in state.parameter_expansion
+        and (convert := bind.type.dialect_impl(dialect).bind_processor(dialect)) is not None
+    }
+    fixed = {name: value for name, value in compiled.params.items() if name not in parameters}
+    for column in compiled.insert_prefetch:
+        assert isinstance(column.default, ScalarElementColumnDefault), f"{column} has no fixed value"
+        fixed[column.key] = column.default.arg
+    for name in fixed.keys() & state.parameter_expansion.keys():  # lists that stand in the statement itself
+        fixed.update(_members(state.parameter_expansion[name], fixed.pop(name)))
+    return _Form(
+        state.statement,
+        {name: converts[name](value) if name in converts else value for name, value in fixed.items()},
+        {name: members for name, members in state.parameter_expansion.items() if name in parameters},
+        {name: convert for name, convert in converts.items() if name in parameters},
+        None if state.positiontup is None else tuple(state.positiontup),
+        _row_maker(statement, dialect),
+    )
+
+
+def _row_maker(statement: Any, dialect: Dialect) -> Convert | None:
+    """Makes a row with names of what the driver gives; None where the statement gives no rows."""
+    columns = statement.exported_columns
+    if not columns:
+        return None
+    row: Any = namedtuple("Row", columns.keys())  # type: ignore[misc]
+    make: Convert = row._make
+    converts = [
+        (index, convert)
+        for index, column in enumerate(columns)
+        if (convert := column.type.dialect_impl(dialect).result_processor(dialect, None)) is not None
+    ]
+    if not converts:
+        return make
+
+    def make_converted(found: Iterable[Any]) -> Any:
+        values = list(found)
+        for index, convert in converts:
+            values[index] = convert(values[index])
+        return make(values)
+
+    return make_converted
+
+
+def _run(connection: Connection, text: str, values: Any, *, gives_rows: bool = False, many: bool = False) -> list[Any]:
+    try:
+        with closing(connection.connection.cursor()) as cursor:
+            (cursor.executemany if many else cursor.execute)(text, values)
+            return list(cursor.fetchall()) if gives_rows else []
+    except connection.dialect.loaded_dbapi.Error as error:
+        raise _failure(connection, text, error) from error
+
+
+def _failure(connection: Connection, text: str, error: Exception) -> Exception:
+    """The driver's error as SQLAlchemy's. Where the connection broke, those that rest in the pool are broken, too."""
+    dialect = connection.dialect
+    lost = dialect.is_disconnect(error, connection.connection, None)  # type: ignore[arg-type]
+    if lost:
+        connection.invalidate(error)
+        connection.engine.dispose()
+    return exc.DBAPIError.instance(
+        text,
+        None,
+        error,
+        dialect.loaded_dbapi.Error,
+        hide_parameters=True,
+        connection_invalidated=lost,
+        dialect=dialect,
+    )
