@@ -137,6 +137,30 @@ def test_a_change_says_which_state_it_changes(owner: httpx.Client, clip: str):
     assert owner.patch(clip, json={"name": "jump"}, headers={"If-Match": "*"}).status_code == 200
 
 
+def test_one_of_several_states_is_enough_for_a_change(owner: httpx.Client, clip: str):
+    first = owner.get(clip).headers["ETag"]
+    second = owner.patch(clip, json={"name": "run"}, headers={"If-Match": f'{first}, "77.json"'}).headers["ETag"]
+    assert owner.patch(clip, json={"name": "jump"}, headers={"If-Match": f'{first}, "77.json"'}).status_code == 412
+    assert owner.get(clip).json()["name"] == "run"
+    info = {"schema": "marey/clip-info@1", "subject": "somebody"}
+    assert owner.put(f"{clip}/parts/info", json=info, headers={"If-Match": f"{first}"}).status_code == 412
+    third = owner.put(f"{clip}/parts/info", json=info, headers={"If-Match": f"{first}, {second}"})
+    assert third.json()["revision"] == 2
+    assert owner.get(clip, headers={"If-None-Match": f"{first}, {third.headers['ETag']}"}).status_code == 304
+    assert owner.delete(clip, headers={"If-Match": f"{first}, {second}"}).status_code == 412
+    assert owner.delete(clip, headers={"If-Match": f"{second}, {third.headers['ETag']}"}).status_code == 204
+
+
+def test_a_member_at_one_of_several_states_is_changed_and_removed(server: Server, owner: httpx.Client):
+    server.make_user("ben")
+    ben = "/projects/lab/members/ben"
+    owner.put(ben, json={"role": "reader"}).raise_for_status()
+    for states, status in (('"2.json", "3.json"', 412), ('"1.json", "3.json"', 200)):
+        assert owner.put(ben, json={"role": "contributor"}, headers={"If-Match": states}).status_code == status
+    for states, status in (('"1.json", "3.json"', 412), ('"1.json", "2.json"', 204)):
+        assert owner.delete(ben, headers={"If-Match": states}).status_code == status
+
+
 def test_a_part_read_as_msgpack_can_be_replaced_with_json(owner: httpx.Client, clip: str):
     etag = owner.get(f"{clip}/parts/motion", headers={"Accept": "application/msgpack"}).headers["ETag"]
     info = {"schema": "marey/clip-info@1", "subject": "somebody"}
@@ -177,6 +201,35 @@ def test_the_same_request_with_the_same_key_is_done_once(owner: httpx.Client):
     other = owner.post("/projects/lab/collections", json={"path": "runs"}, headers=key)
     assert (other.status_code, other.json()["code"]) == (422, "idempotency-key-reused")
     assert owner.post("/projects/lab/collections", json={"path": "walks"}).status_code == 409
+
+
+def test_a_token_of_other_scopes_does_not_hear_what_the_first_was_answered(server: Server, owner: httpx.Client):
+    def token(*scopes: str) -> httpx.Client:
+        return server.client(owner.post("/tokens", json={"name": "t", "scopes": scopes}).json()["secret"])
+
+    def send(client: httpx.Client) -> httpx.Response:
+        return client.post("/projects/lab/collections", json={"path": "walks"}, headers={"Idempotency-Key": "walks"})
+
+    assert send(token("read", "write")).status_code == 201
+    elsewhere = send(token("write!project=run", "read!project=run"))
+    assert (elsewhere.status_code, elsewhere.json()["code"]) == (422, "idempotency-key-reused")
+    assert "walks" not in elsewhere.text
+    assert send(token("write", "read")).headers["Idempotent-Replayed"] == "true"
+
+
+def test_who_has_left_a_project_does_not_hear_his_answers_again(server: Server, owner: httpx.Client):
+    ben = server.client(server.make_user("ben"))
+    owner.put("/projects/lab/members/ben", json={"role": "contributor"}).raise_for_status()
+
+    def send() -> httpx.Response:
+        return ben.post("/projects/lab/collections", json={"path": "walks"}, headers={"Idempotency-Key": "walks"})
+
+    first = send()
+    assert (first.status_code, send().content) == (201, first.content)
+    owner.put("/projects/lab/members/ben", json={"role": "reader"}).raise_for_status()
+    assert (send().status_code, send().json()["code"]) == (403, "insufficient-role")
+    owner.delete("/projects/lab/members/ben", headers={"If-Match": "*"}).raise_for_status()
+    assert (send().status_code, send().json()["code"]) == (404, "no-project")
 
 
 # -- lists ----------------------------------------------------------------------------------------------------------

@@ -9,13 +9,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from marey_schemas.access import Role
 from marey_server.access import scopes
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.errors import Forbidden, Unauthenticated
 from marey_server.handlers.answer_cache import AnswerCache
 from marey_server.handlers.declarations import Access, Operation
 from marey_server.handlers.reply import Form, Rendered, Reply, render
-from marey_server.store import idempotency, tokens
+from marey_server.store import idempotency, projects, tokens
 from marey_server.store.transaction import Transaction
 
 CHALLENGE = {"WWW-Authenticate": 'Bearer realm="marey"'}
@@ -74,6 +75,8 @@ class Call:
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     idempotency_key: str | None = None
     fingerprint: str = ""
+    project: str | None = None
+    """The one that the address names."""
 
 
 def run_call(tx: Transaction, call: Call) -> Rendered:
@@ -82,12 +85,20 @@ def run_call(tx: Transaction, call: Call) -> Rendered:
     if call.idempotency_key is not None:
         stored = idempotency.begin(tx, call.idempotency_key, call.fingerprint)
         if stored is not None:
+            _require_role(tx, call)
             headers = {**stored.headers, "Idempotent-Replayed": "true"}
             return Rendered(stored.status, headers, stored.body)
     rendered = render(call.to_reply(call.function(tx, *call.args, **call.kwargs)), call.form, call.answers)
     if call.idempotency_key is not None:
         idempotency.finish(tx, call.idempotency_key, rendered.status, dict(rendered.headers), rendered.body)
     return rendered
+
+
+def _require_role(tx: Transaction, call: Call) -> None:
+    """What the first request was allowed: whose role has ended since does not hear its answer again."""
+    operation = call.caller.operation
+    if call.project is not None and operation.access.is_role:
+        projects.require(tx, call.project, Role(operation.access), operation.scope or "read")
 
 
 def only_identify(tx: Transaction) -> None:

@@ -114,7 +114,8 @@ class Resource(Exchange):
         key = self._idempotency_key()
         fingerprint = self._fingerprint() if key else ""
         answers = self.services.answers
-        call = Call(self.caller, self.answer_form, answers, to_reply, function, args, kwargs, key, fingerprint)
+        project = self.path_kwargs.get("project")
+        call = Call(self.caller, self.answer_form, answers, to_reply, function, args, kwargs, key, fingerprint, project)
         database = self.services.database
         submit = database.submit_read if self.operation.method == "GET" else database.submit_write
         return await asyncio.wrap_future(submit(ANONYMOUS, run_call, call))

@@ -5,11 +5,13 @@ Key, answer and work are written in one transaction: all are there or none is, a
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, delete, select, update
 
+from marey_schemas.canonical import canonical_json
 from marey_server.access.principal import Principal
 from marey_server.errors import Invalid
 from marey_server.store.tables import idempotency_key
@@ -30,9 +32,11 @@ class StoredAnswer:
 def begin(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
     """Claim `key` for a request (None), or tell what the same request was answered.
 
-    `fingerprint` tells requests apart. Raises `Invalid` where the key stands for another request. The caller says
-    `finish` in the same transaction.
+    `fingerprint` tells requests apart; one that was sent with a token of another reach is another request, so that no
+    narrower token hears what it may not ask for. Raises `Invalid` where the key stands for another request. The caller
+    says `finish` in the same transaction.
     """
+    fingerprint = _with_reach(fingerprint, tx.principal)
     mine = _mine(tx.principal, key)
     tx.execute(delete(idempotency_key).where(*mine, idempotency_key.c.created_us < tx.now_us - LIFETIME_US))
     row = {
@@ -43,7 +47,8 @@ def begin(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
         return None
     stored = tx.execute(select(idempotency_key).where(*mine)).one()
     if stored.fingerprint != fingerprint:
-        raise Invalid("This Idempotency-Key was used for another request.", code="idempotency-key-reused")
+        detail = "This Idempotency-Key was used for another request, or with a token of other scopes."
+        raise Invalid(detail, code="idempotency-key-reused")
     return StoredAnswer(stored.status, dict(stored.headers), bytes(stored.body))
 
 
@@ -58,6 +63,11 @@ def principal_key(principal: Principal) -> str:
     if principal.kind == "attempt":
         return f"{principal.job_id}/{principal.fence}"
     return principal.user_id or principal.kind
+
+
+def _with_reach(fingerprint: str, principal: Principal) -> str:
+    reach = canonical_json([fingerprint, principal.kind, sorted(principal.scopes)])
+    return f"sha256:{hashlib.sha256(reach).hexdigest()}"
 
 
 def _mine(principal: Principal, key: str) -> tuple[ColumnElement[bool], ColumnElement[bool]]:
