@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 from math import log
 
 import numpy as np
@@ -21,7 +21,7 @@ Vector = NDArray[np.float64]
 # Joints nearer than this to their parent are rigging aids.
 SHORTEST_BONE_M = 1e-3
 # Pairs and readings of each that are looked at; a rig with more of them than this is no person's.
-MOST_PAIRS, MOST_READINGS = 40, 4
+MOST_PAIRS, MOST_READINGS = 32, 4
 # A limb bends nowhere beyond so many joints.
 LONGEST_CHAIN = 14
 # What no proportion costs more than.
@@ -92,17 +92,17 @@ class BodyPlan:
 def body_plans(tree: BoneTree) -> list[BodyPlan]:
     """What may be legs and arms, the likeliest first."""
     pairs = sorted(tree.limb_pairs, key=lambda pair: -sum(pair.bones))[:MOST_PAIRS]
-    legs = [reading for pair in pairs for reading in _readings(tree, pair, LEG)]
-    arms = [reading for pair in pairs for reading in _readings(tree, pair, ARM)]
-    longest = max((leg.length for leg in legs), default=0.0)
-    plans = [
-        BodyPlan(
-            leg, arm, leg.worth + arm.worth + _worth_together(tree, leg, arm) + SHORTER * log(longest / leg.length)
-        )
-        for leg in legs
-        for arm in arms
-        if ARM_BY_LEG_LIMITS[0] < arm.length / leg.length < ARM_BY_LEG_LIMITS[1] and tree.are_apart(leg.pair, arm.pair)
-    ]
+    legs = {pair: _readings(tree, pair, LEG) for pair in pairs}
+    arms = {pair: _readings(tree, pair, ARM) for pair in pairs}
+    longest = max((reading.length for readings in legs.values() for reading in readings), default=0.0)
+    plans = []
+    # What two pairs are to each other is worked out once for all their readings: a rig may be thousands of joints deep.
+    for above, below in ((a, b) for a in pairs for b in pairs if tree.are_apart(b, a)):
+        trunk = tree.distance(below.parent, above.parent)
+        for leg, arm in product(legs[below], arms[above]):
+            if ARM_BY_LEG_LIMITS[0] < arm.length / leg.length < ARM_BY_LEG_LIMITS[1]:
+                together = _worth_together(tree, leg, arm, trunk) + SHORTER * log(longest / leg.length)
+                plans.append(BodyPlan(leg, arm, leg.worth + arm.worth + together))
     return sorted(plans, key=lambda plan: -plan.worth)
 
 
@@ -151,8 +151,7 @@ def _worth_of_joints_between(tree: BoneTree, pair: LimbPair, start: int, stop: i
     return count * (TWIST_JOINT if max(parts) - min(parts) < EVENNESS * sum(parts) else STRAIGHT_JOINT)
 
 
-def _worth_together(tree: BoneTree, legs: LimbReading, arms: LimbReading) -> float:
-    trunk = tree.distance(legs.pair.parent, arms.pair.parent)
+def _worth_together(tree: BoneTree, legs: LimbReading, arms: LimbReading, trunk: float) -> float:
     worth = commonness(arms.length / legs.length, ARM_BY_LEG) + commonness(trunk / legs.length, TRUNK_BY_LEG)
     positions = tree.skeleton.rest_global_positions
     up = unit(positions[arms.pair.parent] - positions[legs.pair.parent])

@@ -30,7 +30,7 @@ class Limb:
         return Limb(self.chain[: bones + 1], self.bones[:bones])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LimbPair:
     """Two limbs of equal build on one joint."""
 
@@ -49,6 +49,7 @@ class BoneTree:
 
     def __init__(self, skeleton: Skeleton) -> None:
         self.skeleton = skeleton
+        self._paths: dict[int, tuple[int, ...]] = {}
         self.lengths = np.linalg.norm(skeleton.offsets, axis=1)
         self.reach = np.zeros(skeleton.joint_count)  # from each joint to the farthest tip below it
         for site in skeleton.end_sites:
@@ -58,6 +59,12 @@ class BoneTree:
             parent = skeleton.parents[joint]
             self.reach[parent] = max(self.reach[parent], self.lengths[joint] + self.reach[joint])
             self.depth[parent] = max(self.depth[parent], 1 + self.depth[joint])
+
+    def path_to_root(self, joint: int) -> tuple[int, ...]:
+        """As of the skeleton, worked out once for each joint."""
+        if joint not in self._paths:
+            self._paths[joint] = self.skeleton.path_to_root(joint)
+        return self._paths[joint]
 
     def extent(self, joint: int) -> float:
         """Metres from a joint's parent to the farthest tip below the joint."""
@@ -84,7 +91,7 @@ class BoneTree:
 
     def are_apart(self, legs: LimbPair, arms: LimbPair) -> bool:
         """Whether two pairs sit on different joints, neither on the limbs of the other."""
-        above_legs, above_arms = (self.skeleton.path_to_root(pair.parent) for pair in (legs, arms))
+        above_legs, above_arms = (self.path_to_root(pair.parent) for pair in (legs, arms))
         nested = any(limb.chain[0] in above_arms for limb in legs.limbs) or any(
             limb.chain[0] in above_legs for limb in arms.limbs
         )
@@ -92,12 +99,12 @@ class BoneTree:
 
     def common_ancestor(self, a: int, b: int) -> int:
         """The lowest joint that both descend from, or are."""
-        above = set(self.skeleton.path_to_root(a))
-        return next(joint for joint in self.skeleton.path_to_root(b) if joint in above)
+        above = set(self.path_to_root(a))
+        return next(joint for joint in self.path_to_root(b) if joint in above)
 
     def distance(self, a: int, b: int) -> float:
         """Metres from one joint to another along the bones between them."""
-        between = set(self.skeleton.path_to_root(a)) ^ set(self.skeleton.path_to_root(b))
+        between = set(self.path_to_root(a)) ^ set(self.path_to_root(b))
         return float(sum(self.lengths[joint] for joint in between))
 
 

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from time import process_time
 
 import numpy as np
 import pytest
@@ -615,3 +616,19 @@ def test_a_dog_is_not_passed_off_as_a_person(mocap, file):
     assert mapping.rig is None
     assert mapping.confidence <= 0.2
     assert any("animal" in note for note in mapping.notes)
+
+
+def test_a_rig_of_many_limbs_on_a_chain_of_a_thousand_joints_is_read_soon(body):
+    links = 1000
+    many = with_chains(
+        body, *((joint, *[(0.1 + 0.01 * k, 0.02, 0)] * 13) for joint in ("Hips", "Spine2") for k in range(12))
+    )
+    parents = np.concatenate((np.arange(-1, links - 1), many.parents + links))
+    parents[links] = links - 1
+    offsets = np.concatenate((np.full((links, 3), 0.001), many.offsets))
+    names = tuple(f"bone{joint}" for joint in range(len(parents)))
+    started = process_time()
+    mapping = map_joints(Skeleton(names, parents, offsets, quaternions.identity(len(parents))))
+
+    assert process_time() - started < 5.0
+    assert mapping.method == "geometry"
