@@ -5,8 +5,6 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 
-from sqlalchemy import make_url
-
 from marey_server.access.principal import SYSTEM
 from marey_server.administrators import TOKEN_FILE
 from marey_server.settings import Settings
@@ -20,7 +18,7 @@ def greeting(settings: Settings, address: str, database: Database) -> Iterator[s
     """Its lines, without any secret."""
     yield f"listening on {address}"
     data = settings.data.absolute()
-    yield f"data: {data}; database: {_database_shown(settings)}"
+    yield f"data: {data}; database: {database.shown}"
     administrator = database.read(SYSTEM, users.administrator_principal).user_name
     token_file = data / TOKEN_FILE
     if token_file.is_file():
@@ -42,11 +40,3 @@ def next_command(settings: Settings, address: str) -> str:
         return f": marey login --server {reachable}"
     program, words = FIRST_COMMAND.split(" ", 1)
     return f": {program} --server {reachable} --token-file {shlex.quote(str(token_file))} {words}"
-
-
-def _database_shown(settings: Settings) -> str:
-    """Where the database is, without its password."""
-    url = make_url(settings.resolved_database_url)
-    if url.get_backend_name() == "sqlite":
-        return str(url.database)
-    return url.set(query={}).render_as_string(hide_password=True)

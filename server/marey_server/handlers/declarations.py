@@ -39,6 +39,11 @@ class Access(StrEnum):
     WORKER = "worker"
     ATTEMPT = "attempt"
 
+    @property
+    def is_role(self) -> bool:
+        """Whether it is a role in a project."""
+        return self in (Access.READER, Access.CONTRIBUTOR, Access.MAINTAINER, Access.OWNER)
+
 
 class Document:
     """Marks a body or an answer that is a document: a tree with arrays, of the schema it names."""

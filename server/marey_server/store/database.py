@@ -82,6 +82,13 @@ class Database:
         self._readers = ThreadPoolExecutor(readers, thread_name_prefix="marey-read")
         self._write_lane = WriteLane(self.write) if self.is_sqlite else None
 
+    @property
+    def shown(self) -> str:
+        """Where it is, without any password."""
+        if self.is_sqlite:
+            return str(self.url.database)
+        return self.url.set(query={}).render_as_string(hide_password=True)
+
     # -- running functions in transactions ----------------------------------------------------------------------------
 
     def read(

@@ -1,5 +1,6 @@
 """What a server says first."""
 
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -46,17 +47,20 @@ def test_without_a_token_the_next_thing_is_to_log_in(folder: Path):
 def test_the_administrator_the_data_and_the_place_of_the_token_are_told_and_no_secret(
     folder: Path, database_with_administrator: Database
 ):
-    settings = Settings(database_url="postgresql+psycopg://marey:geheim@db.internal/marey?sslpassword=geheim")
-    told = "\n".join(greeting(settings, USUAL, database_with_administrator))
+    told = "\n".join(greeting(Settings(), USUAL, database_with_administrator))
     for part in (
         f"listening on {USUAL}",
         f"data: {folder / 'marey-data'}",
-        "db.internal/marey",
+        f"database: {database_with_administrator.shown}",
         "administrator: admin;",
         str(folder / "marey-data" / "admin.token"),
     ):
         assert part in told
     assert "secret" not in told
-    assert "geheim" not in told
     (folder / "marey-data" / "admin.token").unlink()
-    assert "marey db admin-token" in "\n".join(greeting(settings, USUAL, database_with_administrator))
+    assert "marey db admin-token" in "\n".join(greeting(Settings(), USUAL, database_with_administrator))
+
+
+def test_where_a_database_is_is_told_without_its_passwords():
+    with closing(Database("postgresql://marey:geheim@db.internal/marey?sslpassword=geheim")) as database:
+        assert database.shown == "postgresql+psycopg://marey:***@db.internal/marey"
