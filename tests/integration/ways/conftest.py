@@ -1,11 +1,17 @@
-"""What everybody has who walks a way: a real server with a real worker, a client, a command line, a project."""
+"""What everybody has who walks a way: a real server with a real worker, a client, a command line, a project.
 
+Starting them takes longer than most ways. So the tests of a module share them, and each begins with a project `lab` of
+its own: the one before it is deleted, which hides all it held and frees the name.
+"""
+
+import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from command_line import CommandLine
+from database_fixtures import BACKENDS, fresh_database
 from evaluation_takes import write_walks
 from marey_client import Marey
 from marey_client.imports import find_files
@@ -15,17 +21,31 @@ from marey_schemas.imports import ImportOptions
 from server_process import ServerProcess, serving
 
 
-@pytest.fixture
-def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
-    with serving(tmp_path, database_url) as process:
+@pytest.fixture(scope="module", params=BACKENDS)
+def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
+    folder = tmp_path_factory.mktemp("server")
+    with fresh_database(request, folder) as database_url, serving(folder, database_url) as process:
         yield process
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def marey(server: ServerProcess) -> Iterator[Marey]:
     """The first administrator's client."""
     with server.client() as client:
         yield client
+
+
+@pytest.fixture
+def new_lab(marey: Marey) -> Iterator[Callable[[], ProjectHandle]]:
+    """Makes the project `lab`, which is gone after the test."""
+    with contextlib.ExitStack() as after:
+
+        def make() -> ProjectHandle:
+            project = marey.create_project(ProjectCreate(name="lab"))
+            after.callback(project.delete)
+            return project
+
+        yield make
 
 
 @pytest.fixture
@@ -34,11 +54,11 @@ def run(server: ServerProcess, tmp_path: Path) -> CommandLine:
 
 
 @pytest.fixture
-def lab_of(marey: Marey) -> Callable[..., ProjectHandle]:
+def lab_of(new_lab: Callable[[], ProjectHandle]) -> Callable[..., ProjectHandle]:
     """Makes the project `lab` of these files and folders, in a collection."""
 
     def make(*paths: Path, collection: str = "walks") -> ProjectHandle:
-        project = marey.create_project(ProjectCreate(name="lab"))
+        project = new_lab()
         project.imports.upload(find_files(sorted(paths)).files, ImportOptions(collection=collection))
         return project
 

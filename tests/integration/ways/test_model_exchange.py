@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,25 +12,26 @@ import numpy as np
 import pytest
 
 import predecessor_models as models
+from command_line import CommandLine
 from marey_client import Marey
 from marey_client.errors import RequestFailed
 from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
 from marey_motion.formats.predecessor_encoding import encode_document
 from marey_motion.formats.predecessor_model import read_predecessor_model
-from marey_schemas.access import ProjectCreate
 from marey_schemas.imports import ImportEntry, ImportOptions
 from marey_schemas.items import ItemChange
 from marey_schemas.jobs import ImportParams, JobCreate
 from marey_schemas.kinds import Kind
+from server_process import ServerProcess
 
 pytestmark = pytest.mark.timeout(300)
 
 
 @pytest.fixture
-def lab(marey: Marey) -> ProjectHandle:
+def lab(new_lab: Callable[[], ProjectHandle]) -> ProjectHandle:
     """An empty project."""
-    return marey.create_project(ProjectCreate(name="lab"))
+    return new_lab()
 
 
 def upload(lab: ProjectHandle, folder: Path, files: dict[str, bytes]) -> dict[str, ImportEntry]:
@@ -156,6 +159,13 @@ def test_a_graph_finds_its_models_by_name_and_comes_out_as_it_was(lab: ProjectHa
     part["actions"]["walk"]["primitives"]["walk_left"]["model"] = {"item": "model_gone", "revision": 1}
     with pytest.raises(RequestFailed, match="no model 'model_gone'"):
         graph.put_part("graph", part)
+
+
+def test_what_a_server_stores_is_verified_while_it_runs(
+    lab: ProjectHandle, run: CommandLine, server: ServerProcess, tmp_path: Path
+) -> None:
+    upload(lab, tmp_path / "in", model_files())
+    assert re.match(r"checked .*[1-9][0-9]* documents", run("db", "fsck", **server.environment).stdout)
 
 
 def test_a_tree_alone_and_a_model_without_a_skeleton_are_refused_with_what_to_do(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from marey_motion.formats import write_motion
 from marey_motion.gait import generate_gait
 from marey_schemas.imports import ImportOptions
 from marey_schemas.kinds import Kind
+from server_process import ServerProcess, serving
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -30,6 +31,19 @@ TAKES = 20
 QUICK = ("model.leave_one_out=false", "model.folds=0", "model.report_samples=20", "tree.samples=500")
 QUICK_FLAGS = tuple(flag for choice in QUICK for flag in ("--set", choice))
 CHANGED = "walk-003"
+
+
+@pytest.fixture
+def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
+    """One for each test: jobs may still run when a test ends, and would keep the worker from those of the next."""
+    with serving(tmp_path, database_url) as process:
+        yield process
+
+
+@pytest.fixture
+def marey(server: ServerProcess) -> Iterator[Marey]:
+    with server.client() as client:
+        yield client
 
 
 @pytest.fixture

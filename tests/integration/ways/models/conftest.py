@@ -1,13 +1,10 @@
-"""A server and a project that all tests of a module share, for what takes long to make."""
+"""A project that all tests of a module share, for what takes long to make."""
 
-from collections.abc import Iterator
 from math import radians
 from pathlib import Path
 
 import pytest
 
-from command_line import CommandLine
-from database_fixtures import BACKENDS, fresh_database
 from marey_client import Marey
 from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
@@ -15,27 +12,8 @@ from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
 from marey_schemas.access import ProjectCreate
 from marey_schemas.imports import ImportOptions
-from server_process import ServerProcess, serving
 
 EXAMPLES = 12
-
-
-@pytest.fixture(scope="module", params=BACKENDS)
-def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
-    folder = tmp_path_factory.mktemp("server")
-    with fresh_database(request, folder) as database_url, serving(folder, database_url) as process:
-        yield process
-
-
-@pytest.fixture(scope="module")
-def marey(server: ServerProcess) -> Iterator[Marey]:
-    with server.client() as client:
-        yield client
-
-
-@pytest.fixture
-def run(server: ServerProcess, tmp_path: Path) -> CommandLine:
-    return CommandLine(server, tmp_path)
 
 
 @pytest.fixture(scope="module")
