@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -33,6 +34,7 @@ Floats = NDArray[np.floating[Any]]
 
 FEWEST_ESSENTIAL = 8  # of the essential joints: a pelvis, and more than the legs or the arms alone
 SAME_SKELETON_M = 1e-5  # by which offsets may differ that went through a file
+SAME_RAD = 1e-6  # by which axes may differ that went through a document
 SAME_DIRECTION = 0.94  # cosine of about 20 degrees: bones of one rig on two people differ by less
 STANDING = 0.7  # cosine between legs and trunk from which a rest pose is taken for one that stands
 FOOT_DROP = 0.45  # of the ankle-to-toe length: the height of the ankle above the toe of a foot that stands
@@ -72,6 +74,12 @@ class RetargetPlan:
     missing: tuple[str, ...]
     sources: NDArray[np.int32]
     corrections: NDArray[np.float64]
+
+    @cached_property
+    def changes_no_pose(self) -> bool:
+        """Whether both skeletons are one, and its axes are those of the source."""
+        turned = quaternions.angle_between(self.corrections, quaternions.identity(len(self.corrections)))
+        return same_hierarchy(self.source, self.target, tolerance_m=SAME_SKELETON_M) and bool(np.all(turned < SAME_RAD))
 
 
 def plan_retarget(
@@ -130,8 +138,9 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
     """The clip's motion on the plan's target skeleton.
 
     Mapped joints take the source's orientation, all others rest (or keep theirs between copies of one rig). Bones keep
-    the target's lengths, but point where `translations` of the source point its own. The pelvis travels as in the
-    source, times the plan's scale; a root of its own, above the pelvis, moves along without turning.
+    the target's lengths, but point where `translations` of the source point its own; on its own skeleton a clip keeps
+    them. The pelvis travels as in the source, times the plan's scale; a root of its own, above the pelvis, moves along
+    without turning.
 
     Raises
     ------
@@ -159,14 +168,19 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
         poses[:, 3:],
     )
     rotations = poses[:, 3:].reshape(clip.frame_count, -1, 4)
+    translations, joints = (clip.translations, clip.translated_joints) if plan.changes_no_pose else (None, ())
     pelvis = next(pair for pair in plan.pairs if pair.standard == "pelvis")
     travel = plan.scale * _position_in_world(clip, clip.skeleton.index_of(pelvis.source))
-    poses[:, :3] = travel - _position_from_root(target, rotations, target.index_of(pelvis.target))
-    return Clip(target, clip.frame_rate_hz, poses)
+    poses[:, :3] = travel - _position_from_root(
+        target, rotations, target.index_of(pelvis.target), _offsets_by_joint(translations, joints)
+    )
+    return Clip(target, clip.frame_rate_hz, poses, translations, joints)
 
 
 def moved_bones(clip: Clip, plan: RetargetPlan) -> FollowedBones:
     """The source's rotations as its bones point, with what to tell of bones that translations turned."""
+    if plan.changes_no_pose:
+        return FollowedBones(clip.poses[:, 3:], {})
     return follow_moved_bones(clip, {pair.standard: clip.skeleton.index_of(pair.source) for pair in plan.pairs})
 
 
@@ -283,10 +297,13 @@ def _are_same_rig(source: Skeleton, target: Skeleton) -> bool:
 
 def _position_in_world(clip: Clip, joint: int) -> Floats:
     """Positions (F, 3) of one joint of a clip, metres."""
-    moved: dict[int, Floats] = {}
-    if clip.translations is not None:
-        moved = {other: clip.translations[:, slot] for slot, other in enumerate(clip.translated_joints)}
+    moved = _offsets_by_joint(clip.translations, clip.translated_joints)
     return clip.root_translations + _position_from_root(clip.skeleton, clip.rotations, joint, moved)
+
+
+def _offsets_by_joint(translations: NDArray[np.float32] | None, joints: tuple[int, ...]) -> dict[int, Floats]:
+    """Offsets (F, 3) of the joints whose offset is not constant."""
+    return {} if translations is None else {joint: translations[:, slot] for slot, joint in enumerate(joints)}
 
 
 def _position_from_root(

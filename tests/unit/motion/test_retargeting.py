@@ -369,6 +369,16 @@ def test_bones_that_translations_moved_are_told_with_their_joints(studio, game):
     assert moved_bones(studio.clip, plan).warning is None
 
 
+def test_a_clip_keeps_the_translations_of_its_joints_on_its_own_skeleton(studio):
+    clip, plan = with_moved_joints(studio, "left_elbow", "left_knee"), plan_between(studio, studio)
+    result = retarget(clip, plan)
+
+    assert moved_bones(clip, plan).warning is None
+    assert result.translated_joints == clip.translated_joints
+    assert np.abs(kinematics.global_positions(result) - kinematics.global_positions(clip)).max() < 1e-6
+    assert quaternions.angle_between(result.rotations, clip.rotations).max() < 1e-6
+
+
 def test_a_joint_that_moves_onto_its_parent_leaves_the_bone_as_its_rotation_has_it(studio, game):
     elbow = studio.joint("left_elbow")
     clip = replace(studio.clip, translations=np.zeros((studio.clip.frame_count, 1, 3)), translated_joints=(elbow,))

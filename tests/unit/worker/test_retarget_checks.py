@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from marey_motion.gait import generate_gait
+from marey_motion.documents import skeleton_to_document
+from marey_motion.gait import game_skeleton, generate_gait
 from marey_schemas.jobs import PinnedInput, RetargetParams
 from marey_schemas.kinds import Kind
 from marey_worker.kinds import retarget, rigged
@@ -22,7 +23,8 @@ def test_the_checks_of_a_result_name_the_bones_that_translations_moved(tmp_path,
     moved = np.tile(plain.skeleton.offsets[knee] + (0.1, 0.0, 0.0), (plain.frame_count, 1, 1))
     add_clip(project, "plain", plain)
     add_clip(project, "moved", replace(plain, translations=moved, translated_joints=(knee,)))
-    skeleton = {"item": "skeleton_a", "revision": 1, "kind": Kind.SKELETON, "name": "a", "collection": "rigs"}
+    project.parts["skeleton_b", 1, "hierarchy"] = skeleton_to_document(game_skeleton()).model_dump(by_alias=True)
+    skeleton = {"item": "skeleton_b", "revision": 1, "kind": Kind.SKELETON, "name": "b", "collection": "rigs"}
     project.inputs["skeleton"] = (PinnedInput(**skeleton),)
 
     project.into = "out"
