@@ -32,6 +32,8 @@ LEAD = "housekeeping"
 LEAD_TTL_US = 30_000_000
 LONGEST_TICK_S = 5.0
 GARBAGE_EVERY_S = 3600.0
+FIRST_GARBAGE_S = 60.0
+"""After the start: who runs a server for an hour a day must not keep garbage for ever."""
 
 
 @asynccontextmanager
@@ -39,10 +41,12 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
     """Keep house inside the block; at its end, let another process lead."""
     holder = secrets.token_hex(8)
     tick_s = min(LONGEST_TICK_S, services.queue_policy.lease_ttl_s / 4)
-    tasks = [
-        asyncio.create_task(_repeat(services, holder, every_s, chore))
-        for every_s, chore in ((tick_s, _reap), (tick_s, _share_results), (GARBAGE_EVERY_S, _collect_garbage))
-    ]
+    chores = (
+        (tick_s, tick_s, _reap),
+        (tick_s, tick_s, _share_results),
+        (FIRST_GARBAGE_S, GARBAGE_EVERY_S, _collect_garbage),
+    )
+    tasks = [asyncio.create_task(_repeat(services, holder, *chore)) for chore in chores]
     try:
         yield
     finally:
@@ -60,16 +64,17 @@ async def _give_up_lead(services: Services, holder: str) -> None:
         log.warning("another process leads only in %d s: %s", LEAD_TTL_US / 1_000_000, error.detail)
 
 
-async def _repeat(services: Services, holder: str, every_s: float, chore: Chore) -> None:
+async def _repeat(services: Services, holder: str, first_s: float, every_s: float, chore: Chore) -> None:
     """Do a chore now and then. A failure is told and is no reason to stop."""
+    await asyncio.sleep(first_s)
     while True:
-        await asyncio.sleep(every_s)
         try:
             await chore(services, holder)
         except MareyError as error:
             log.warning("housekeeping was interrupted: %s", error.detail)
         except Exception:
             log.exception("housekeeping failed")
+        await asyncio.sleep(every_s)
 
 
 async def _reap(services: Services, holder: str) -> None:

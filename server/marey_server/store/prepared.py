@@ -22,7 +22,7 @@ Convert = Callable[[Any], Any]
 Parameters = Mapping[str, Any]
 
 MOST_FORMS = 64
-"""Texts kept of one statement: one for each length of the lists it takes."""
+"""Texts kept of one statement: one for each set of names and each length of the lists it takes."""
 
 
 class Prepared:
@@ -64,7 +64,7 @@ class Prepared:
 
     @staticmethod
     def _key(dialect: Dialect, lists: Iterable[str], parameters: Parameters) -> tuple[object, ...]:
-        return (dialect.name, len(parameters), *[len(parameters[name]) for name in lists])
+        return (dialect.name, *parameters, *[len(parameters[name]) for name in lists])
 
 
 def run_text(connection: Connection, text: str) -> None:

@@ -32,6 +32,18 @@ def test_what_is_inserted_is_what_sqlalchemy_inserts(database):
     assert ours[0] == 0  # `xid`, which has a default and was not given
 
 
+def test_an_insert_takes_the_columns_that_are_named_this_time(database):
+    somebody = {"id": "user_ann", "name": "ann", "created_us": 7}
+    add = Prepared(insert(user))
+
+    def both(tx):
+        tx.run(add, {**somebody, "administrator": True})
+        tx.run(add, {**somebody, "id": "user_ben", "name": "ben", "disabled": True})
+        return tx.execute(select(user.c.administrator, user.c.disabled).order_by(user.c.name)).all()
+
+    assert database.write(SYSTEM, both) == [(True, False), (False, True)]
+
+
 def test_rows_hold_what_sqlalchemy_reads(database):
     people = [
         {"id": f"user_{name}", "name": name, "administrator": name == "ann", "created_us": 2**50}

@@ -1,0 +1,28 @@
+"""What a server does by itself, and when."""
+
+import asyncio
+
+from marey_server import housekeeping
+from marey_server.app import create_app
+from marey_server.settings import Settings
+
+
+def test_garbage_is_collected_soon_after_the_start_and_again_later(database, tmp_path, monkeypatch):
+    monkeypatch.setattr(housekeeping, "FIRST_GARBAGE_S", 0.02)
+    monkeypatch.setattr(housekeeping, "GARBAGE_EVERY_S", 0.02)
+    app = create_app(Settings(data=tmp_path, port=0), database)
+
+    async def two_rounds():
+        rounds, both_done = [], asyncio.Event()
+
+        async def noted(services, holder):
+            rounds.append(holder)
+            if len(rounds) == 2:
+                both_done.set()
+
+        monkeypatch.setattr(housekeeping, "_collect_garbage", noted)
+        async with housekeeping.keeping_house(app.services):
+            await asyncio.wait_for(both_done.wait(), 30)
+        return rounds
+
+    assert len(asyncio.run(two_rounds())) >= 2
