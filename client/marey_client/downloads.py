@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import os
 import re
+import threading
+import unicodedata
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from email.message import Message
+from email.utils import collapse_rfc2231_value
 from io import BufferedRandom
 from pathlib import Path
 
 from marey_client.transport import Params, Transport
 
 _NOT_IN_A_NAME = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]+')
+LONGEST_NAME_BYTES = 240
+"""File systems take 255; the rest is for a number."""
+LONGEST_ENDING = 16
 
 
 @contextmanager
@@ -36,16 +42,55 @@ def saved_atomically(target: str | Path) -> Iterator[BufferedRandom]:
 
 
 def safe_file_name(name: str) -> str:
-    """`name` without anything that a file system could take for a path or refuse."""
-    return _NOT_IN_A_NAME.sub("_", name).strip(". ")[:200] or "unnamed"
+    """`name` without anything that a file system could take for a path or refuse; its ending stays where it is long."""
+    clean = _NOT_IN_A_NAME.sub("_", name).strip(". ") or "unnamed"
+    if len(clean.encode()) <= LONGEST_NAME_BYTES:
+        return clean
+    ending = Path(clean).suffix if len(Path(clean).suffix) <= LONGEST_ENDING else ""
+    room = LONGEST_NAME_BYTES - len(ending.encode())
+    return clean.removesuffix(ending).encode()[:room].decode(errors="ignore") + ending
 
 
-def download(transport: Transport, path: str, folder: str | Path, *, params: Params | None = None, name: str) -> Path:
-    """Fetch a file into `folder` under the name the server gives it, or `name`; answer where it is."""
+class TakenPaths:
+    """Where the files of one download go: of two that would get one name, the later gets a number."""
+
+    def __init__(self) -> None:
+        self._taken: set[str] = set()
+        self._lock = threading.Lock()
+
+    def take(self, target: Path) -> Path:
+        """`target`, or the next like it that is free; case makes no difference, as on many file systems."""
+        with self._lock:
+            free, number = target, 1
+            while (key := unicodedata.normalize("NFC", str(free)).casefold()) in self._taken:
+                number += 1
+                free = target.with_name(f"{target.stem} ({number}){target.suffix}")
+            self._taken.add(key)
+            return free
+
+
+def download(
+    transport: Transport,
+    path: str,
+    folder: str | Path,
+    *,
+    params: Params | None = None,
+    name: str,
+    beside: TakenPaths | None = None,
+) -> Path:
+    """Fetch a file into `folder` under the name the server gives it, or `name`; answer where it is.
+
+    A file of that name is replaced, unless it is one of those `beside` which this one was asked for.
+    """
+    places = TakenPaths() if beside is None else beside
+    target: Path | None = None
 
     def once() -> Path:
+        nonlocal target
         with transport.stream(path, params=params) as response:
-            target = Path(folder) / safe_file_name(_offered_name(response.headers.get("Content-Disposition")) or name)
+            if target is None:
+                offered = _offered_name(response.headers.get("Content-Disposition"))
+                target = places.take(Path(folder) / safe_file_name(offered or name))
             with saved_atomically(target) as file:
                 for chunk in response.iter_bytes():
                     file.write(chunk)
@@ -59,4 +104,7 @@ def _offered_name(disposition: str | None) -> str | None:
         return None
     header = Message()
     header["Content-Disposition"] = disposition
-    return header.get_filename()
+    names = [value for key, value in header.get_params([], "content-disposition") if key == "filename"]
+    # The one with a character set has all characters, and comes before the plain one (RFC 6266).
+    names.sort(key=lambda value: not isinstance(value, tuple))
+    return collapse_rfc2231_value(names[0]) if names else None

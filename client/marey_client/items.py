@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from marey_client.downloads import download
+from marey_client.downloads import TakenPaths, download
 from marey_client.one_or_several import several
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
@@ -92,10 +92,26 @@ class ItemHandle:
         """Whether something it was made from has changed."""
         return self.transport.get(Staleness, f"{self.url}/stale")
 
-    def export(self, folder: str | Path, *, format: str = "original", **options: str | None) -> Path:  # noqa: A002
-        """Write the item to `folder` as a file of `format`; answer where it is."""
-        params = {"format": format, **options}
-        return download(self.transport, f"{self.url}/export", folder, params=params, name=f"{self.name}.{format}")
+    def export(
+        self,
+        folder: str | Path,
+        *,
+        format: str = "original",  # noqa: A002
+        beside: TakenPaths | None = None,
+        **options: str | None,
+    ) -> Path:
+        """Write the item to `folder` as a file of `format`; answer where it is.
+
+        Exports of several items with the same `beside` do not replace each other's files.
+        """
+        return download(
+            self.transport,
+            f"{self.url}/export",
+            folder,
+            params={"format": format, **options},
+            name=f"{self.name}.{format}",
+            beside=beside,
+        )
 
     def _if_match(self) -> dict[str, str]:
         return {"If-Match": f'"{self.item.rev}.json"'}

@@ -281,7 +281,7 @@ def download(
 ) -> None:
     """Write clips to files. A folder comes with the folders below it; one without clips with its aligned clips.
 
-    A file that is there already is replaced.
+    A file that is there already is replaced; of clips that would have one file name, the later ones get a number.
     """
     if format not in FORMATS:
         raise WrongUsage(f"{format!r} is no format; there are {', '.join(FORMATS)}")
@@ -324,17 +324,18 @@ def _download_all(
     clips: Sequence[ItemHandle], base: str, output: Path, options: Mapping[str, Any]
 ) -> tuple[list[Path], dict[str, str]]:
     from marey_client.cli.failures import sentence
-    from marey_client.downloads import safe_file_name
+    from marey_client.downloads import TakenPaths, safe_file_name
     from marey_client.errors import RequestFailed
 
     written: list[Path] = []
     refused: dict[str, str] = {}
+    paths = TakenPaths()
 
     def one(clip: ItemHandle) -> Path | str:
         below = clip.item.collection.removeprefix(base).strip("/")
         try:
             folder = output.joinpath(*(safe_file_name(name) for name in below.split("/") if name))
-            return clip.export(folder, **options)
+            return clip.export(folder, beside=paths, **options)
         except RequestFailed as error:
             if error.status >= 500 or error.status == 401:
                 raise
