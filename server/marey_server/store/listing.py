@@ -16,10 +16,12 @@ from sqlalchemy import ColumnElement, Row, Select, UnaryExpression, and_, or_, s
 
 from marey_schemas.canonical import canonical_json
 from marey_server.errors import BadRequest
+from marey_server.store.prepared import Prepared
 from marey_server.store.tables import server_state
 from marey_server.store.transaction import Transaction
 
 _KEY_NAME = "cursor_key"
+_CURSOR_KEY = Prepared(select(server_state.c.value).where(server_state.c.key == _KEY_NAME))
 _MAC_BYTES = 16
 DEFAULT_LIMIT = 50
 MAX_LIMIT = 1000
@@ -92,8 +94,8 @@ def _fingerprint(identity: Any) -> str:
 
 
 def _mac(tx: Transaction, payload: bytes) -> bytes:
-    key = tx.execute(select(server_state.c.value).where(server_state.c.key == _KEY_NAME)).scalar_one()
-    return hmac.digest(bytes.fromhex(key), payload, "sha256")[:_MAC_BYTES]
+    (key,) = tx.run(_CURSOR_KEY, {})
+    return hmac.digest(bytes.fromhex(key.value), payload, "sha256")[:_MAC_BYTES]
 
 
 def make_cursor_key(tx: Transaction) -> None:
