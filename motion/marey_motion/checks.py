@@ -15,6 +15,7 @@ from marey_motion.clip import Clip
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.landmarks import Landmarks, common_ancestor, find_landmarks, path_length
 from marey_motion.skeleton import Skeleton
+from marey_schemas.wording import counted
 
 # Every code a warning may carry, and what it means to the reader of an import report.
 CODES = {
@@ -178,8 +179,8 @@ def _position_channels(clip: Clip) -> CheckWarning | None:
     moved = np.linalg.norm(clip.translations - clip.skeleton.offsets[list(clip.translated_joints)], axis=2)
     return CheckWarning(
         "position-channels",
-        f"{len(names)} joints below the root move against their parents, {names[int(moved.max(axis=0).argmax())]} "
-        f"by up to {moved.max():.3f} m",
+        f"positions of {counted(len(names), 'joint')} below the root change against the parents, "
+        f"{names[int(moved.max(axis=0).argmax())]} by up to {moved.max():.3f} m",
         joints=names,
         values={"largest_m": float(moved.max())},
     )
@@ -194,7 +195,7 @@ def _rest_poses(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
     for place, first, last in (("begins", 0, start), ("ends", clip.frame_count - end, clip.frame_count)):
         if last > first:
             advice = "" if start == clip.frame_count else "; trim it with --trim-rest-pose (trim_rest_pose)"
-            message = f"the motion {place} with {last - first} frames of a rest pose{advice}"
+            message = f"the motion {place} with {counted(last - first, 'frame')} of a rest pose{advice}"
             found.append(CheckWarning("rest-pose-frame", message, frames=(first, last)))
     return found
 
@@ -257,7 +258,7 @@ def _floor_penetration(tracks: _Tracks) -> CheckWarning | None:
     deepest = int(depths.argmax())
     return CheckWarning(
         "floor-penetration",
-        f"feet go below their ground in {below.size} frames, by {depths[deepest]:.2f} m in frame {deepest}",
+        f"feet go below their ground in {counted(below.size, 'frame')}, by {depths[deepest]:.2f} m in frame {deepest}",
         frames=(int(below[0]), int(below[-1]) + 1),
         values={"deepest_m": float(depths[deepest]), "frame": deepest, "frame_count": int(below.size)},
     )
@@ -324,7 +325,7 @@ def _rotation_jumps(clip: Clip) -> CheckWarning | None:
     worst = float(np.degrees(angles[frame, joint]))
     return CheckWarning(
         "rotation-jump",
-        f"{joints.size} joints jump, {clip.skeleton.joint_names[joint]} by {worst:.0f}° "
+        f"{counted(joints.size, 'joint')} with jumps, {clip.skeleton.joint_names[joint]} by {worst:.0f}° "
         f"from frame {frame} to {frame + 1}",
         joints=tuple(clip.skeleton.joint_names[joint] for joint in joints),
         frames=(int(frames[0]), int(frames[-1]) + 2),
@@ -345,7 +346,7 @@ def _dead_joints(clip: Clip, tracks: _Tracks) -> CheckWarning | None:
     if not dead or (clip.rotations == clip.rotations[0]).all():
         return None
     names = tuple(skeleton.joint_names[joint] for joint in dead)
-    return CheckWarning("dead-joints", f"{len(names)} joints of whole limbs never turn", joints=names)
+    return CheckWarning("dead-joints", f"whole limbs of {counted(len(names), 'joint')} never turn", joints=names)
 
 
 def _step_cosines(rotations: NDArray[np.float32]) -> NDArray[np.float32]:

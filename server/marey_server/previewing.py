@@ -13,6 +13,7 @@ from marey_schemas.edit_previews import EditPreview, EditPreviewRequest
 from marey_schemas.editing import EditDocument
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
+from marey_schemas.wording import counted
 from marey_server.errors import Invalid, NotFound, TooLarge
 from marey_server.field_errors import field_errors
 from marey_server.store import items
@@ -85,12 +86,12 @@ def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
             raise TooLarge(f"{error}; hand in a job.", code="preview-too-large") from error
         raise _invalid("/commands", error.code, str(error)) from error
     if request.piece >= len(made):
-        raise _invalid("/piece", "no-piece", f"The edit makes {len(made)} clips, counted from 0.")
+        raise _invalid("/piece", "no-piece", f"The edit makes {counted(len(made), 'clip')}, counted from 0.")
     wanted = made[request.piece]
     start, stop = request.frames
     stop = min(wanted.clip.frame_count, wanted.clip.frame_count if stop is None else stop)
     if start >= stop:
-        raise _invalid("/frames", "no-frames", f"The result has {wanted.clip.frame_count} frames.")
+        raise _invalid("/frames", "no-frames", f"The result has {counted(wanted.clip.frame_count, 'frame')}.")
     shown = wanted.clip.sliced(start, stop)
     if shown.poses.size > MOST_SHOWN:
         raise TooLarge(

@@ -16,6 +16,7 @@ from marey_client.cli.given_files import read_json
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import clips_at, follow
 from marey_client.cli.output import print_json, print_pairs, print_table, tell, tell_refused
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_client.annotations import AnnotationHandle
@@ -324,7 +325,8 @@ def _apply(context: typer.Context, place: str, **command: Any) -> None:
         found = annotation_at(marey, place)
         item = found.apply([{name: value for name, value in command.items() if value is not None}])
     summary = item.summary
-    typer.echo(f"{place}: revision {item.revision}, {summary['segments']} segments, {summary['keyframes']} keyframes")
+    held = f"{counted(summary['segments'], 'segment')}, {counted(summary['keyframes'], 'keyframe')}"
+    typer.echo(f"{place}: revision {item.revision}, {held}")
 
 
 def _finish(marey: Marey, job: Job, wait: bool, as_json: bool) -> None:
@@ -335,11 +337,11 @@ def _finish(marey: Marey, job: Job, wait: bool, as_json: bool) -> None:
         return print_json(ended)
     result = ended.result or {}
     counts = result.get("segments") or result.get("labels") or {}
-    made = f"{result['clips']} clips" if "clips" in result else f"{result['annotations']} annotations"
+    made = counted(result["clips"], "clip") if "clips" in result else counted(result["annotations"], "annotation")
     typer.echo(", ".join([made, *(f"{count} {label}" for label, count in counts.items())]))
     tell_refused(result.get("refused", ()))
     if empty := result.get("empty"):
-        tell(f"nothing was found in {len(empty)} clips, such as {empty[0]}")
+        tell(f"nothing was found in {counted(len(empty), 'clip')}, such as {empty[0]}")
     if result.get("refused"):
         raise Refused
     return None

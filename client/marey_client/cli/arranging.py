@@ -13,6 +13,7 @@ from marey_client.cli.failures import Refused, WrongUsage, sentence
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, tell
 from marey_client.cli.standing import FOLDER, Thing, require_apart, the_thing
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_client.items import ItemHandle
@@ -72,7 +73,7 @@ def rm(
         require_apart(things)
         count = sum(thing.count() for thing in things)
         if count > 1 and not yes:
-            _ask(f"remove {count} items ({_named(things)})?")
+            _ask(f"remove {counted(count, 'item')} ({_named(things)})?")
 
         def remove(thing: Thing) -> Any:
             thing.delete()

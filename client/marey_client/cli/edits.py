@@ -14,6 +14,7 @@ from marey_client.cli.given_files import read_json
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import clips_at, follow, print_ended
 from marey_client.cli.output import print_json, print_pairs, print_table
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_client.edits import EditHandle
@@ -96,7 +97,8 @@ def save_edit(
         held = edits.save(place.name, commands, title=title, collection=folder, message=message)
     if as_json:
         return print_json(held.item)
-    return typer.echo(f"{held.id} {held.path} revision {held.item.revision}: {len(commands.commands)} commands")
+    told = counted(len(commands.commands), "command")
+    return typer.echo(f"{held.id} {held.path} revision {held.item.revision}: {told}")
 
 
 @edit.command("show")

@@ -14,6 +14,7 @@ from marey_client.cli.failures import Refused, WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, print_pairs, print_table, progress, tell
 from marey_client.cli.standing import kind_named
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -98,7 +99,7 @@ def _print_entries(entries: Sequence[ImportEntry]) -> None:
             found.setdefault(warning.code, []).append(f"{entry.name}: {warning.message}")
     for code, texts in found.items():
         others = len(texts) - WARNINGS_SHOWN
-        more = [f"and {others} more files; --json tells them all"] if others > 0 else []
+        more = [f"and {counted(others, 'more file')}; --json tells them all"] if others > 0 else []
         for text in [*texts[:WARNINGS_SHOWN], *more]:
             tell(f"warning {code}: {text}")
     counts = Counter(entry.status for entry in entries)
@@ -106,7 +107,7 @@ def _print_entries(entries: Sequence[ImportEntry]) -> None:
     told = ", ".join(
         f"{counts[status]} {status}" for status in ("created", "unchanged", "companion", "failed") if counts[status]
     )
-    typer.echo(f"{len(entries)} files: {told}; {frames} frames")
+    typer.echo(f"{counted(len(entries), 'file')}: {told}; {counted(frames, 'frame')}")
 
 
 def ls(
@@ -293,7 +294,7 @@ def download(
     if as_json:
         print_json({"files": [str(path) for path in written], "refused": refused})
     else:
-        typer.echo(f"wrote {len(written)} files to {output}")
+        typer.echo(f"wrote {counted(len(written), 'file')} to {output}")
         for name, reason in refused.items():
             tell(f"{name}: {reason}")
     if refused:

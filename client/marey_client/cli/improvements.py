@@ -13,6 +13,7 @@ from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import clips_at, watching
 from marey_client.cli.output import print_json, print_table, tell
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -101,7 +102,7 @@ def suggest(
     if remove_out is not None:
         names = [f"{clip['name']}\n" for clip in document["unused"]["clips"]]
         remove_out.write_text("".join(names), encoding="utf-8")
-        tell(f"{len(names)} clips that can go: {remove_out}")
+        tell(f"{counted(len(names), 'clip')} that can go: {remove_out}")
     if as_json:
         return print_json({"summary": found.summary, **_plain(document)})
     return _print_suggestions(document)
@@ -237,7 +238,7 @@ def _print_comparison(document: Mapping[str, Any]) -> None:
         print_table(columns_of_trials, rows_of_trials, right=columns_of_trials[1:])
     for name, label in (("removed", "removed"), ("added", "added"), ("newly_unused", "newly unused")):
         if document[name]:
-            typer.echo(f"{label}: {len(document[name])} clips")
+            typer.echo(f"{label}: {counted(len(document[name]), 'clip')}")
 
 
 def _rise(one: Mapping[str, Any]) -> float:
@@ -251,15 +252,16 @@ def _metres(value: float | None) -> str:
 def _print_suggestions(document: Mapping[str, Any]) -> None:
     unused, redundant = document["unused"], document["redundant"]
     sections = (
-        (f"Can go without any change: {len(unused['clips'])} clips, {_seconds(unused['clips'])}", unused["clips"]),
-        (f"Can be cut with hardly a change: {len(unused['ranges'])} stretches of clips, "
+        (f"Can go without any change: {counted(len(unused['clips']), 'clip')}, "
+         f"{_seconds(unused['clips'])}", unused["clips"]),
+        (f"Can be cut with hardly a change: {counted(len(unused['ranges']), 'range')} of clips, "
          f"{_seconds(unused['ranges'])}", unused["ranges"]),
         (f"Can go with little harm{' once those clips are gone' if unused['clips'] else ''}: one after another, "
          f"{len(redundant['plan'])} planned; "
          f"{redundant['tried']} of {redundant['needed']} used clips tried", redundant["plan"]),
-        (f"Is there twice: {len(document['near_duplicates']['pairs'])} pairs within "
+        (f"Is there twice: {counted(len(document['near_duplicates']['pairs']), 'pair')} within "
          f"{document['near_duplicates']['threshold_cm']:g} cm", document["near_duplicates"]["spared"]),
-        (f"Would fill holes: {len(document['fillings'])} clips", document["fillings"]),
+        (f"Would fill holes: {counted(len(document['fillings']), 'clip')}", document["fillings"]),
         ("In this order", document["additions"]),
     )  # fmt: skip
     for heading, entries in sections:
@@ -271,7 +273,7 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
                 typer.echo(f"  … and {len(entries) - SHOWN} more; --json has all.")
             typer.echo("")
     for one in document["unusable"]:
-        tell(f"{one['folder']}: {one['clips']} clips cannot be matched: {one['detail']} ({one['code']})")
+        tell(f"{one['folder']}: {counted(one['clips'], 'clip')} cannot be matched: {one['detail']} ({one['code']})")
     if not any(entries for _, entries in sections):
         typer.echo("Every clip is needed, and nothing was found that would fill a hole.")
 

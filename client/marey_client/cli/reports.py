@@ -10,6 +10,7 @@ import typer
 from marey_client.cli.addresses import Address, require_item
 from marey_client.cli.invocation import connect
 from marey_client.cli.output import tell
+from marey_schemas.wording import counted
 
 
 def add_to(app: typer.Typer) -> None:
@@ -35,7 +36,7 @@ def report(
         drawn = found.save_figures(figures) if figures is not None else []
     typer.echo(out)
     if figures is not None:
-        tell(f"{len(drawn)} files of figures in {figures}")
+        tell(f"{counted(len(drawn), 'file')} of figures in {figures}")
     if open_it:
         import webbrowser
 

@@ -14,6 +14,7 @@ from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import watching
 from marey_client.cli.models import model_at
 from marey_client.cli.output import print_json, print_table, tell
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_schemas.search import SearchAnswer
@@ -48,7 +49,7 @@ def tree(
     if as_json:
         return print_json(job)
     made = job.result or {}
-    return typer.echo(f"{made['samples']} samples in {made['nodes']} nodes")
+    return typer.echo(f"{counted(made['samples'], 'sample')} in {counted(made['nodes'], 'node')}")
 
 
 def search(

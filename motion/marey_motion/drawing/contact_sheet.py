@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from marey_motion.clip import Clip
 from marey_motion.drawing.stick_figures import CENTRE, LEFT, RIGHT, Body, Camera, Stances, body_of, stances_at
 from marey_motion.errors import MotionError
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -148,8 +149,8 @@ class _Stage:
 def _draw_header(axes: Axes, top: float, heading: str, count: int) -> None:
     line = top - 0.50
     _write(axes, (MARGIN, line), heading, 21, weight="bold")
-    takes = "1 take" if count == 1 else f"{count} takes"
-    _write(axes, (MARGIN, line - 0.31), f"{takes}, each moment as source (white) and result (tinted)", 10.5, QUIET)
+    takes = f"{counted(count, 'take')}, each moment as source (white) and result (tinted)"
+    _write(axes, (MARGIN, line - 0.31), takes, 10.5, QUIET)
     right, middle = PAGE_WIDTH - MARGIN, line + 0.08
     for place, (label, side) in enumerate((("left side", LEFT), ("right side", RIGHT))):
         start = right - 3.75 + 1.30 * place
@@ -184,7 +185,7 @@ def _draw_titles(axes: Axes, row: _Row, top: float) -> None:
     title = row.take.title if len(row.take.title) <= LONGEST_TITLE else f"{row.take.title[: LONGEST_TITLE - 1]}…"
     _write(axes, (MARGIN, top - 0.2), title, 12.5, weight="bold")
     joints = " → ".join(str(clip.skeleton.joint_count) for clip in clips)
-    about = f"{clips[0].frame_count} frames at {clips[0].frame_rate_hz:g} Hz, {joints} joints"
+    about = f"{counted(clips[0].frame_count, 'frame')} at {clips[0].frame_rate_hz:g} Hz, {joints} joints"
     _write(axes, (PAGE_WIDTH - MARGIN, top - 0.2), about, 9.5, QUIET, ha="right")
 
 

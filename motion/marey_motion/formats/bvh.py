@@ -19,6 +19,7 @@ from marey_motion.formats.joint_names import unique_names
 from marey_motion.formats.numeric_text import BadToken, scan_numbers
 from marey_motion.formats.text_lines import TextLines, number_problem
 from marey_motion.source import SourceMotion
+from marey_schemas.wording import counted
 
 FORMAT = "bvh"
 # Offsets and positions of the same joint agree to this part of the largest offset where exporters rounded both.
@@ -114,13 +115,14 @@ def _read_frames(
         lines.number = table.ragged_line
         cut = table.ragged_line == table.last_line and table.ragged_count < width
         raise lines.error(
-            f"{table.ragged_count} values where the channels need {width}"
+            f"{counted(table.ragged_count, 'value')} where the channels need {width}"
             + ("; the file is cut off in its last line" if cut else ""),
             code="file-truncated" if cut else "frame-width",
         )
     if frames == 0 and header.declared_frames:
         lines.number = header.data_line
-        raise lines.error(f"{header.declared_frames} frames are declared and none follows", code="file-truncated")
+        declared = counted(header.declared_frames, "frame")
+        raise lines.error(f"the header declares {declared} and none follows", code="file-truncated")
     _warn_of_layout(header, frames, wrapped, warnings)
     return table.values.reshape(frames, width) if frames else np.empty((0, width))
 
@@ -130,7 +132,8 @@ def _warn_of_layout(header: BvhHeader, frames: int, wrapped: bool, warnings: lis
         warnings.append(
             CheckWarning(
                 "frame-count-mismatch",
-                f"the header declares {header.declared_frames} frames, the file holds {frames}; all {frames} are read",
+                f"the header declares {counted(header.declared_frames, 'frame')}, the file holds {frames:,}; "
+                "what it holds is read",
                 values={"declared": header.declared_frames, "found": frames},
             )
         )
@@ -174,7 +177,8 @@ def _take_bones_from_positions(source: SourceMotion, translations: NDArray[np.fl
     source.warnings.append(
         CheckWarning(
             "offsets-from-positions",
-            f"every OFFSET below the root is zero; the position channels of {len(bones)} joints give the bones",
+            "every OFFSET below the root is zero; the position channels of "
+            f"{counted(len(bones), 'joint')} give the bones",
             joints=tuple(source.joint_names[joint] for joint in source.translated_joints),
         )
     )
@@ -196,8 +200,8 @@ def _resolve_displacements(source: SourceMotion, translations: NDArray[np.float6
     source.warnings.append(
         CheckWarning(
             "position-channels-relative",
-            f"position channels of {len(lengths)} joints stay near zero; they are read as displacements from OFFSET, "
-            "not as positions that replace it",
+            f"position channels of {counted(len(lengths), 'joint')} stay near zero; "
+            "they are read as displacements from OFFSET, not as positions that replace it",
             joints=tuple(source.joint_names[joint] for joint in source.translated_joints),
         )
     )

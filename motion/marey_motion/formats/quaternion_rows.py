@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from marey_motion import quaternions
 from marey_motion.checks import CheckWarning
 from marey_motion.errors import FormatError
+from marey_schemas.wording import counted
 
 _NOTABLE_DEVIATION = 1e-3
 _ROUNDING = 1e-6
@@ -38,12 +39,14 @@ def as_rotations(
     if deviating.any():
         names = tuple(name for name, is_one in zip(joint_names, deviating, strict=True) if is_one)
         worst = float(np.abs(norms - 1.0).max())
-        message = f"rotations of {len(names)} joints differ from unit length by up to {worst:.2g}; they were normalised"
+        whose = f"rotations of {counted(len(names), 'joint')}"
+        message = f"{whose} differ from unit length by up to {worst:.2g}; they were normalised"
         warnings.append(CheckWarning("non-unit-quaternions", message, joints=names, values={"deviation": worst}))
     flips = np.sum(values[1:] * values[:-1], axis=2) < 0
     if flips.any():
         names = tuple(name for name, is_one in zip(joint_names, flips.any(axis=0), strict=True) if is_one)
-        message = f"rotations of {len(names)} joints jump to their negative {int(flips.sum())} times; unrolled"
+        whose = f"rotations of {counted(len(names), 'joint')}"
+        message = f"{whose} jump to their negative {counted(int(flips.sum()), 'time')}; unrolled"
         warnings.append(CheckWarning("sign-flips-unrolled", message, joints=names, values={"count": int(flips.sum())}))
     # Rounded unit quaternions stay as they are, to the bit.
     unit = values / np.where(np.abs(norms - 1.0) > _ROUNDING, norms, 1.0)[..., None]

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 from marey_motion.errors import FormatError
 from marey_motion.formats.numeric_text import excerpt
+from marey_schemas.wording import counted
 
 _LINE_END = re.compile(rb"\r\n|\n|\r")
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
@@ -54,7 +55,7 @@ class TextLines:
     def numbers(self, words: list[bytes], count: int, what: str, joint: str | None = None) -> list[float]:
         """Exactly `count` finite decimal numbers out of `words`."""
         if len(words) != count:
-            raise self.error(f"{what} has {len(words)} values, {count} are needed", joint=joint)
+            raise self.error(f"{what} has {counted(len(words), 'value')}, {count} are needed", joint=joint)
         return [self.number_in(word, what, joint) for word in words]
 
     def number_in(self, word: bytes, what: str, joint: str | None = None) -> float:

@@ -21,6 +21,7 @@ from marey_motion.matching.normaliser import Normaliser, fit_normaliser
 from marey_motion.matching.options import DatabaseOptions
 from marey_motion.matching.preparing import PreparedClip, mirror_prepared, prepare_clip
 from marey_motion.matching.rows import ClipRows, clip_rows
+from marey_schemas.wording import counted
 
 MOST_MATCHED_JOINTS = 5
 
@@ -188,7 +189,8 @@ def _entry(clip: PreparedClip) -> DatabaseClip:
 def _row_notes(clip: PreparedClip, rows: ClipRows) -> tuple[DatabaseNote, ...]:
     if rows.selectable.any() or (clip.mirrored and not clip.notes):
         return ()
-    message = f"{clip.source.name}: its {len(rows.selectable)} frames are too few to look ahead; none can be chosen"
+    length = counted(len(rows.selectable), "frame")
+    message = f"{clip.source.name}: with {length} too short to look ahead; none can be chosen"
     return (DatabaseNote("too-short", message, clip.uid),)
 
 

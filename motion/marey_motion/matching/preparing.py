@@ -21,6 +21,7 @@ from marey_motion.mirroring import mirror_motion
 from marey_motion.motion import Motion
 from marey_motion.resampling import resample_motion
 from marey_motion.skeleton import Skeleton, same_hierarchy
+from marey_schemas.wording import counted
 
 SAME_OFFSET_M = 1e-3
 """By which bones of one skeleton may differ between files."""
@@ -137,7 +138,7 @@ def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], tell: _T
                 stop = warning.frames[0]
     if stop - start < clip.frame_count:
         ending = clip.frame_count - stop
-        tell("rest-pose-dropped", f"{start} frames at its start and {ending} at its end are a rest pose")
+        tell("rest-pose-dropped", f"a rest pose takes {counted(start, 'frame')} at its start and {ending} at its end")
     return start, stop
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from marey_motion.modelling.training import TrainedPrimitive
+from marey_schemas.wording import counted
 
 Headline = dict[str, float | int | str | None]
 
@@ -11,9 +12,9 @@ def verdict_of(trained: TrainedPrimitive) -> str:
     """How good the model is, in a sentence or two."""
     report, primitive = trained.report, trained.primitive
     count = len(report.examples)
-    parts = [f"{count} example{'s' if count != 1 else ''} in {primitive.dimensions} dimensions"]
+    parts = [f"{counted(count, 'example')} in {primitive.dimensions} dimensions"]
     kinds = len(primitive.mixture.weights)
-    parts.append(f"{kinds} kind{'s' if kinds != 1 else ''} of motion")
+    parts.append(f"{counted(kinds, 'kind')} of motion")
     error = _left_out_cm(trained)
     if error is not None:
         parts.append(f"an unseen example is reconstructed {error:.1f} cm off on average")

@@ -233,7 +233,8 @@ class TestFrames:
         assert trimmed.features.tobytes() == built(WALK).features.tobytes()
         assert trimmed.clips[0].first_s == 12 / WALK.frame_rate_hz
         assert built(clip, frames=(4, 180)).clips[0].first_s == 12 / WALK.frame_rate_hz
-        assert [str(note) for note in trimmed.notes] == ["one: 12 frames at its start and 5 at its end are a rest pose"]
+        (note,) = trimmed.notes
+        assert str(note) == "one: a rest pose takes 12 frames at its start and 5 at its end"
         assert built(clip, DatabaseOptions(keep_rest_poses=True)).row_count == 197
 
     def test_walking_on_the_spot_as_on_a_treadmill_is_flagged(self) -> None:

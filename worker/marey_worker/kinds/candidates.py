@@ -16,6 +16,7 @@ from marey_motion.skeleton import same_hierarchy
 from marey_schemas.documents import Motion, RevisionRef
 from marey_schemas.jobs import PinnedInput
 from marey_schemas.kinds import Kind
+from marey_schemas.wording import counted
 from marey_worker.context import Context
 from marey_worker.kinds.evaluated_set import EvaluatedSet
 from marey_worker.kinds.matching_clips import ClipSet, build_clips, read_motions, uid_of
@@ -60,7 +61,7 @@ def read_candidates(context: Context, evaluated: EvaluatedSet) -> Candidates:
             found.databases[name] = _build(context, group, database)
         except MotionError as error:
             found.unusable.append(Unusable(name, len(group.pins), error.code, str(error)))
-            context.log(f"{name}: {len(group.pins)} clips cannot be matched: {error}")
+            context.log(f"{name}: {counted(len(group.pins), 'clip')} cannot be matched: {error}")
     return found
 
 

@@ -16,6 +16,7 @@ from marey_schemas.documents import Motion, RevisionRef, SkeletonHierarchy
 from marey_schemas.jobs import ExportParams, PinnedInput
 from marey_schemas.kinds import Kind
 from marey_schemas.reports import StoredFile
+from marey_schemas.wording import counted
 from marey_worker.context import Context, JobRefused, NoSuchThing
 
 EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -56,7 +57,7 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
             written.add(name)
             target.writestr(_entry(name), file.data)
     if not written:
-        raise JobRefused("nothing-to-export", f"none of {len(pins)} clips can be written as {params.format}")
+        raise JobRefused("nothing-to-export", f"none of {counted(len(pins), 'clip')} can be written as {params.format}")
     size = archive.stat().st_size
     stored = StoredFile(blob=context.put_file(archive), size_bytes=size)
     return {"archive": stored.model_dump(mode="json"), "clips": len(written), "refused": refused}

@@ -22,6 +22,7 @@ from marey_schemas.documents import Motion, RevisionRef
 from marey_schemas.evaluation import EvaluateParams
 from marey_schemas.jobs import PinnedInput
 from marey_schemas.kinds import Kind
+from marey_schemas.wording import counted
 from marey_worker.context import Context, JobRefused
 from marey_worker.kept import Kept
 from marey_worker.kinds.rigged import Rig, read_rigged
@@ -155,7 +156,7 @@ def build_clips(
         )
         for (pin, info), (content, motion) in zip(infos, motions, strict=True)
     ]
-    context.progress(0, None, f"building a database of {len(clips)} clips")
+    context.progress(0, None, f"building a database of {counted(len(clips), 'clip')}")
     return build_database(clips, body, options, normaliser=normaliser)
 
 

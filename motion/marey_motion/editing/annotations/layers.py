@@ -59,7 +59,7 @@ class Layer:
         object.__setattr__(self, "segments", tuple(sorted(self.segments, key=lambda one: (one.start, one.end))))
         object.__setattr__(self, "keyframes", tuple(sorted(self.keyframes, key=lambda one: (one.frame, one.label))))
         if self.frame_count < 1:
-            raise AnnotationError(f"a clip of {self.frame_count} frames has nothing to annotate", code="no-frames")
+            raise AnnotationError("a clip without frames has nothing to annotate", code="no-frames")
         _require_segments(self.segments, self.frame_count)
         _require_keyframes(self.keyframes, self.frame_count)
 

@@ -22,6 +22,7 @@ from marey_motion.drawing.paper import (
 )
 from marey_motion.drawing.words import amount
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,7 +60,7 @@ def draw_usage(subjects: Sequence[Subject], trial: str | None, options: FigureOp
         _draw_bars(panel, places, values, use, number, 0.92 * thick, bool(others))
         largest = max(largest, use.transitions, *values, 0)
     names = [next(use.names[uid] for use in uses if uid in use.names) for uid in shown]
-    rest = [f"{len(others)} other clip{'s' if len(others) > 1 else ''}"] * bool(others)
+    rest = [counted(len(others), "other clip")] * bool(others)
     name_ticks(panel, range(rows), names, [*rest, TRANSITIONS])
     if options.logarithmic:
         panel.set_xscale("log")

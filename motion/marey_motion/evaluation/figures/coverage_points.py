@@ -26,6 +26,7 @@ from marey_motion.drawing.paper import (
 from marey_motion.drawing.words import amount
 from marey_motion.evaluation.figures.axes import SPEED, TURN_RATE, mark_sides
 from marey_motion.evaluation.figures.subjects import FigureOptions, Subject
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -125,7 +126,7 @@ def _draw_keys(panel: Axes, subjects: Sequence[Subject], chosen: Sequence[_Point
     rest = max(_other_clips(subject, points) for subject, points in zip(subjects, chosen, strict=True))
     if rest:
         keys.append(Line2D([], [], ls="", color=REFERENCE, marker="o", markersize=3.5, markeredgewidth=0))
-        labels.append(f"{rest} other clip{'s' if rest > 1 else ''}")
+        labels.append(counted(rest, "other clip"))
     if not keys:
         panel.text(0.5, 0.5, "no clip of a second or longer", transform=panel.transAxes, ha="center", color=QUIET)
         return

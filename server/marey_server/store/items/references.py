@@ -9,6 +9,7 @@ from sqlalchemy import select
 
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
+from marey_schemas.wording import counted
 from marey_server.errors import Invalid
 from marey_server.store.items.drafts import Published
 from marey_server.store.projects import ProjectRow
@@ -109,7 +110,8 @@ class ReferenceCheck:
         ends = [segment["end"] for segment in annotation.get("segments", ())]
         ends += [keyframe["frame"] + 1 for keyframe in annotation.get("keyframes", ())]
         if max(ends, default=0) > frames:
-            raise _invalid("/annotation", "beyond-end", f"The clip has {frames} frames; the annotation {max(ends)}.")
+            detail = f"The clip has {counted(frames, 'frame')}; the annotation {max(ends)}."
+            raise _invalid("/annotation", "beyond-end", detail)
 
     def _require_models(self, graph: Tree) -> None:
         for action, group in graph["actions"].items():

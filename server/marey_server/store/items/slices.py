@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from marey_schemas import blocks
 from marey_schemas.arrays import EncodedArray
 from marey_schemas.problems import FieldError
+from marey_schemas.wording import counted
 from marey_server.errors import Invalid
 
 Tree = dict[str, Any]
@@ -28,7 +29,8 @@ def slice_motion(motion: Tree, frames: slice | None, joints: Sequence[str] | Non
     cut = dict(motion)
     poses: EncodedArray = motion["poses"]
     if frames is not None and len(range(*frames.indices(poses.shape[0]))) == 0:
-        raise _invalid("frames", "no-frames", f"The motion has {poses.shape[0]} frames; the range holds none of them.")
+        detail = f"The motion has {counted(poses.shape[0], 'frame')}; the range holds none of them."
+        raise _invalid("frames", "no-frames", detail)
     names = list(motion["joints"])
     wanted = names if joints is None else list(joints)
     if unknown := [name for name in wanted if name not in names]:
