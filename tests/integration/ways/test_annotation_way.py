@@ -109,7 +109,7 @@ def test_annotations_are_made_corrected_and_exchanged_from_the_command_line(
     run("annotation", "add", place, "d", "100:110")
     run("annotation", "merge", place, 105, "--with", "previous")
     run("annotation", "relabel", place, 105, "e")
-    assert "revision 9, 2 segments, 1 keyframe" in run("annotation", "remove", place, 0).stdout
+    assert "revision 9, 2 segments, 1 keyframe\n" in run("annotation", "remove", place, 0).stdout
     shown = run("annotation", "show", place).stdout
     assert "middle" in shown
     document = json.loads(run("annotation", "show", place, "--json").stdout)
