@@ -53,7 +53,7 @@ bench: $(VENV)/.installed-bench ## Speed against peers, as ratios
 	$(BIN)/python -m benchmarks
 
 fuzz: $(VENV)/.installed-dev ## An hour of malformed motion files and twenty minutes of malformed requests
-	$(BIN)/python tests/motion_fuzz.py 3600
+	$(BIN)/python -m tests.support.motion_fuzz 3600
 	MAREY_FUZZ_EXAMPLES=200 $(BIN)/python -m pytest -q tests/integration/test_rest_fuzz.py -o timeout=3600
 
 docs: $(VENV)/.installed-dev ## Write the reference pages that come from the code

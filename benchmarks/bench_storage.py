@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from benchmarks.material import noisy_clip
 from benchmarks.timing import Row, time_in_turn
-from marey_schemas import blocks
+from marey_schemas.encoding import blocks
 
 FRAMES = 3000
 GOAL_BYTES = 500

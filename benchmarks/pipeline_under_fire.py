@@ -31,7 +31,7 @@ from marey_motion.clip import Clip
 from marey_motion.formats import write_motion
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_schemas.access import ProjectCreate
-from marey_schemas.canonical import array_digest
+from marey_schemas.encoding.canonical import array_digest
 from marey_schemas.kinds import Kind
 from marey_schemas.model_pipelines import model_pipeline
 

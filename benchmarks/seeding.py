@@ -15,7 +15,7 @@ from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM
 from marey_server.app import open_database
-from marey_server.settings import Settings
+from marey_server.process.settings import Settings
 from marey_server.store import items, projects, users
 from marey_server.store.transaction import Transaction
 

@@ -13,10 +13,10 @@ from pydantic_core import PydanticUndefined
 
 import marey_server.app  # noqa: F401 - loads every module, and so every class of errors
 from marey_client.cli.app import app
-from marey_motion import checks
+from marey_motion.importing import checks
 from marey_schemas.job_kinds import job_kinds
 from marey_server import errors
-from marey_server.settings import Settings
+from marey_server.process.settings import Settings
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = Path(__file__).parent / "reference"

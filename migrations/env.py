@@ -5,7 +5,7 @@ import os
 from alembic import context
 from sqlalchemy import Connection
 
-from marey_server.store.database import Database
+from marey_server.store.database.connections import Database
 from marey_server.store.tables import metadata
 
 

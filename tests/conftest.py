@@ -11,8 +11,7 @@ import pytest
 
 from marey_motion.warm_up import discard_outdated_kernels
 
-sys.path.insert(0, str(Path(__file__).parent))
-pytest_plugins = ("database_fixtures", "store_fixtures", "queue_desk")
+pytest_plugins = ("tests.support.database_fixtures", "tests.support.store_fixtures", "tests.support.queue_desk")
 
 # A machine that does much else at once takes its time; how fast things are is for benchmarks to tell.
 hypothesis.settings.register_profile("marey", deadline=None)

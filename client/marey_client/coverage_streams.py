@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from marey_client.one_or_several import several
 from marey_client.paging import pages
 from marey_client.transport import Transport, read_model
-from marey_schemas.codecs import MSGPACK, encode_tree
 from marey_schemas.coverage_streams import (
     CoverageProgress,
     CoverageStream,
     CoverageStreamCreate,
     CoverageStreamState,
 )
+from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 
 ROOT_COLUMNS = 3
 

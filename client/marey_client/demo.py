@@ -125,7 +125,7 @@ class Story:
         """Source and result figures side by side, as a picture."""
         if not pairs:
             return None
-        figures = embedded.room("marey_motion.drawing.contact_sheet", "all")
+        figures = embedded.room("marey_reports.drawing.contact_sheet", "all")
         load = _clip_loader(self.project)
         takes = [figures.TakePair(source.name, load(source), load(result)) for source, result in pairs]
         path = self.data / "contact-sheet.png"

@@ -10,8 +10,8 @@ from pydantic import BaseModel
 from marey_client.items import ItemHandle, Items
 from marey_client.one_or_several import several
 from marey_client.transport import BLOCKS, Transport, as_json, read_tree
-from marey_schemas.edit_previews import EditPreview, EditPreviewRequest
-from marey_schemas.editing import EditDocument
+from marey_schemas.editing.edits import EditDocument
+from marey_schemas.editing.previews import EditPreview, EditPreviewRequest
 from marey_schemas.items import Item
 
 

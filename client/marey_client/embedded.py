@@ -47,7 +47,7 @@ def work(credential: Credential, **options: Any) -> None:
 def server_in_thread(data: Path, *, workers: int) -> Iterator[str]:
     """A server with workers on a free port of this machine while the block runs; its address."""
     app = room("marey_server.app", "all")
-    settings = room("marey_server.settings", "all").Settings(
+    settings = room("marey_server.process.settings", "all").Settings(
         data=data, host="127.0.0.1", port=0, local_workers=workers, log_form="text"
     )
     started: Future[str] = Future()

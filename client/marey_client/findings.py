@@ -11,7 +11,7 @@ from marey_client.blobs import Blobs
 from marey_client.jobs import Jobs
 from marey_client.transport import Transport
 from marey_schemas.base import Request
-from marey_schemas.codecs import JSON, decode_tree
+from marey_schemas.encoding.codecs import JSON, decode_tree
 from marey_schemas.jobs import CollectionInput, ItemInput, Job, JobCreate
 
 OnProgress = Callable[[Job], None]

@@ -15,7 +15,7 @@ from marey_client.items import ItemHandle, Items
 from marey_client.one_or_several import several
 from marey_schemas.annotations import AnnotationImport
 from marey_schemas.documents import Annotation, ClipInfo, Motion, SkeletonHierarchy, SkeletonMapping
-from marey_schemas.edit_previews import EditPreview
+from marey_schemas.editing.previews import EditPreview
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ValidationError
 from marey_client.credentials import as_token, require_address
 from marey_client.errors import RequestFailed, UnexpectedAnswer, Unreachable, error_of
 from marey_client.retries import BUSY_STATUSES, NEVER_ARRIVED, Retries, retry_after_s
-from marey_schemas.codecs import CodecError, decode_tree, encode_tree
+from marey_schemas.encoding.codecs import CodecError, decode_tree, encode_tree
 from marey_schemas.problems import MEDIA_TYPE as PROBLEM
 from marey_schemas.problems import Problem
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from marey_motion.clip import Clip as Clip
-    from marey_motion.drawing.contact_sheet import contact_sheet as contact_sheet
     from marey_motion.errors import AmbiguousUnits as AmbiguousUnits
     from marey_motion.errors import ClipError as ClipError
     from marey_motion.errors import FormatError as FormatError
@@ -28,6 +27,8 @@ if TYPE_CHECKING:
     from marey_motion.gait import generate_dataset as generate_dataset
     from marey_motion.gait import generate_gait as generate_gait
     from marey_motion.gait import studio_skeleton as studio_skeleton
+    from marey_motion.importing.source import ImportedMotion as ImportedMotion
+    from marey_motion.importing.source import ImportOptions as ImportOptions
     from marey_motion.kinematics import foot_contacts as foot_contacts
     from marey_motion.kinematics import forward_directions as forward_directions
     from marey_motion.kinematics import forward_kinematics as forward_kinematics
@@ -46,8 +47,6 @@ if TYPE_CHECKING:
     from marey_motion.skeleton import EndSite as EndSite
     from marey_motion.skeleton import Skeleton as Skeleton
     from marey_motion.skeleton import same_hierarchy as same_hierarchy
-    from marey_motion.source import ImportedMotion as ImportedMotion
-    from marey_motion.source import ImportOptions as ImportOptions
 
 _HOMES = {
     "clip": ("Clip",),
@@ -63,7 +62,6 @@ _HOMES = {
         "UnknownFormat",
         "UnknownJoint",
     ),
-    "drawing.contact_sheet": ("contact_sheet",),
     "formats": ("read_motion", "write_motion"),
     "gait": ("game_skeleton", "generate_dataset", "generate_gait", "studio_skeleton"),
     "kinematics": (
@@ -79,7 +77,7 @@ _HOMES = {
     "retargeting": ("RetargetPlan", "plan_retarget", "retarget"),
     "rigs": ("JointAxes", "JointMapping", "guess_axes", "map_joints"),
     "skeleton": ("EndSite", "Skeleton", "same_hierarchy"),
-    "source": ("ImportOptions", "ImportedMotion"),
+    "importing.source": ("ImportOptions", "ImportedMotion"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -15,7 +15,7 @@ from marey_motion.errors import ClipError, MappingError
 from marey_motion.rigs import STANDARD_JOINTS, JointAxes, JointMapping
 from marey_motion.skeleton import EndSite, Skeleton
 from marey_schemas import documents as schemas
-from marey_schemas.editing import EditDocument
+from marey_schemas.editing.edits import EditDocument
 
 
 def skeleton_to_document(skeleton: Skeleton) -> schemas.SkeletonHierarchy:

@@ -8,7 +8,7 @@ from typing import Any
 
 from marey_motion.clip import Clip
 from marey_motion.formats import write_bvh, write_npz, write_predecessor_clip
-from marey_motion.source import SourceInfo
+from marey_motion.importing.source import SourceInfo
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import kinematics, quaternions
-from marey_motion.checks import CheckWarning
 from marey_motion.clip import Clip
+from marey_motion.importing.checks import CheckWarning
 from marey_motion.rigs.axes import bone_end
 
 Floats = NDArray[np.floating[Any]]

@@ -204,13 +204,13 @@ def _model(clip: Clip) -> None:
 
 def _search(clip: Clip) -> None:
     """Search a model of a single motion for two steps, and refine them."""
-    from marey_motion.modelling.constraints import RootPosition
     from marey_motion.modelling.mixture import LatentMixture
     from marey_motion.modelling.primitive import FunctionalComponents, MotionPrimitive
+    from marey_motion.modelling.search.constraints import RootPosition
+    from marey_motion.modelling.search.step_search import search_steps
+    from marey_motion.modelling.search.steps import Step
+    from marey_motion.modelling.search.tree import END_EFFECTORS, TreeOptions, build_tree
     from marey_motion.modelling.splines import SplineBasis
-    from marey_motion.modelling.step_search import search_steps
-    from marey_motion.modelling.steps import Step
-    from marey_motion.modelling.tree import END_EFFECTORS, TreeOptions, build_tree
     from marey_motion.motion import Motion
     from marey_motion.rigs import map_joints
 

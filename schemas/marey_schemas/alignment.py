@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pydantic import Field, StringConstraints, field_validator, model_validator
 
 from marey_schemas.annotations import Label, LayerName
-from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Request
+from marey_schemas.encoding.arrays import ArrayOf
 from marey_schemas.names import Digest, JointName, NameSuffix, Tag
 
 MOST_EXAMPLES = 2000

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Answer, Request
 from marey_schemas.documents import MAX_JOINTS, RevisionRef
+from marey_schemas.encoding.arrays import ArrayOf
 from marey_schemas.evaluation import ItemId, Speed, TurnRate
 from marey_schemas.names import JointName
 

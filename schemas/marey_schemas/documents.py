@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, StringConstraints, model_validator
 
 from marey_schemas.alignment import AlignmentInfo
-from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Request
-from marey_schemas.editing import EditDocument
+from marey_schemas.editing.edits import EditDocument
+from marey_schemas.encoding.arrays import ArrayOf
 from marey_schemas.evaluation import EvaluationDocument, EvaluationRecords
 from marey_schemas.graphs import ModelGraph
 from marey_schemas.modelling import MotionPrimitiveDocument

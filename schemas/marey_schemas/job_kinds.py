@@ -15,7 +15,7 @@ from typing import Any, Literal
 from marey_schemas.alignment import AlignParams
 from marey_schemas.annotations import AnnotateParams, CutParams
 from marey_schemas.base import Request
-from marey_schemas.editing import EditParams
+from marey_schemas.editing.edits import EditParams
 from marey_schemas.evaluation import EvaluateParams, count_evaluation_tasks
 from marey_schemas.improvement import CompareParams, OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
 from marey_schemas.jobs import ExportParams, ImportParams, InputSpec, JobKind, RetargetParams

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
-from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Request
+from marey_schemas.encoding.arrays import ArrayOf
 from marey_schemas.names import ItemName, JointName, Tag
 from marey_schemas.originals import StoredOriginal
 from marey_schemas.references import OutputRef, RevisionRef

@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_schemas.canonical import document_digest
+from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.names import Digest
 
 CONTENT = {

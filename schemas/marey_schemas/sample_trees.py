@@ -1,6 +1,6 @@
 """Trees over samples of a model: how one is made, and part `tree` of an item of the kind `model`.
 
-The options are those of `marey_motion.modelling.tree`.
+The options are those of `marey_motion.modelling.search.tree`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from marey_schemas.arrays import ArrayOf
 from marey_schemas.base import Request
+from marey_schemas.encoding.arrays import ArrayOf
 from marey_schemas.names import Digest
 from marey_schemas.references import PartDigestRef
 

@@ -27,25 +27,25 @@ from tornado.web import RequestHandler
 from marey_schemas.access import TokenCreate
 from marey_schemas.names import MAX_NAME_LENGTH
 from marey_server.access.principal import SYSTEM
-from marey_server.administrators import TOKEN_FILE, make_first_administrator
-from marey_server.computing import compute_on_one_thread_each
-from marey_server.docs_page import render_page
-from marey_server.greeting import greeting
 from marey_server.handlers.catalogue import RESOURCES
-from marey_server.handlers.resource import Resource
-from marey_server.handlers.routes import RouteTable
-from marey_server.housekeeping import keeping_house
+from marey_server.http.docs_page import render_page
+from marey_server.http.openapi import build_document
+from marey_server.http.resource import Resource
+from marey_server.http.routes import RouteTable
 from marey_server.launchers.local import local_workers
-from marey_server.memory import keep_freed_memory
-from marey_server.observe import access_log, configure_logging
-from marey_server.openapi import build_document
-from marey_server.services import Description, Services
-from marey_server.settings import Settings, misspelt_variables
+from marey_server.process.administrators import TOKEN_FILE, make_first_administrator
+from marey_server.process.computing import compute_on_one_thread_each
+from marey_server.process.greeting import greeting
+from marey_server.process.housekeeping import keeping_house
+from marey_server.process.memory import keep_freed_memory
+from marey_server.process.observe import access_log, configure_logging
+from marey_server.process.services import Description, Services
+from marey_server.process.settings import Settings, misspelt_variables
 from marey_server.store import tokens, users
 from marey_server.store.blob_backings import DirectoryBlobs
-from marey_server.store.database import Database
-from marey_server.store.opening import opening
-from marey_server.store.schema import upgrade_schema
+from marey_server.store.database.connections import Database
+from marey_server.store.database.opening import opening
+from marey_server.store.database.schema import upgrade_schema
 from marey_server.store.transaction import Transaction
 from marey_server.store.wakeups import wakeups
 

@@ -18,7 +18,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from marey_schemas.log_lines import usual_form
-from marey_server.settings import Settings
+from marey_server.process.settings import Settings
 
 
 class CommandFailed(Exception):
@@ -29,8 +29,8 @@ def serve(**settings: Any) -> None:
     """Run a server, and the workers it is told to start, until SIGTERM or SIGINT."""
     from marey_server.app import CannotListen
     from marey_server.app import serve as serve_until_stopped
-    from marey_server.computing import leave
-    from marey_server.store.opening import DatabaseUnusable
+    from marey_server.process.computing import leave
+    from marey_server.store.database.opening import DatabaseUnusable
 
     chosen = read_settings(**settings)
     comfort = {"local_workers": 1, "log_form": usual_form()}
@@ -55,7 +55,7 @@ def read_settings(**given: Any) -> Settings:
 
 def upgrade(**settings: Any) -> None:
     """Bring the tables to this version's."""
-    from marey_server.store.schema import upgrade_schema
+    from marey_server.store.database.schema import upgrade_schema
 
     chosen = read_settings(**settings)
     chosen.data.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -120,9 +120,9 @@ def fsck(*, as_json: bool = False, **settings: Any) -> None:
 def admin_token(*, user: str | None = None, **settings: Any) -> None:
     """A new token of an administrator in place of the data folder's `admin.token`, when that one is lost."""
     from marey_server.access.principal import SYSTEM
-    from marey_server.administrators import TOKEN_FILE, give_token
     from marey_server.app import connect_database
     from marey_server.errors import NotFound
+    from marey_server.process.administrators import TOKEN_FILE, give_token
 
     chosen = read_settings(**settings)
     if chosen.database_url is None:
@@ -141,7 +141,7 @@ def admin_token(*, user: str | None = None, **settings: Any) -> None:
 @contextmanager
 def _database_of(settings: Settings) -> Iterator[str]:
     """The url of the database; what goes wrong with it inside the block is told in a sentence."""
-    from marey_server.store.opening import DatabaseUnusable, opening
+    from marey_server.store.database.opening import DatabaseUnusable, opening
 
     try:
         with opening(settings.resolved_database_url):

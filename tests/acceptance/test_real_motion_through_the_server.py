@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.support.another_loader import positions_by_another_loader
+from tests.support.server_process import ServerProcess
 
-from another_loader import positions_by_another_loader
 from marey_client import Marey
 from marey_client.imports import find_files
 from marey_client.motions import ClipHandle
 from marey_client.project import ProjectHandle
 from marey_motion.documents import clip_from_document, skeleton_from_document
 from marey_motion.kinematics import global_positions
-from marey_schemas.codecs import MEDIA_TYPES, decode_tree
 from marey_schemas.documents import Motion
-from server_process import ServerProcess
+from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree
 
 pytestmark = pytest.mark.timeout(600)
 

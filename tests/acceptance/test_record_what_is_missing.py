@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.rest_server import Server, server
 
 from marey_client import Marey
 from marey_motion.documents import mapping_to_document, skeleton_to_document
 from marey_motion.gait import generate_gait
 from marey_motion.rigs import guess_axes, map_joints
 from marey_schemas.kinds import Kind
-from rest_server import Server, server
 
 __all__ = ["server"]
 

@@ -4,13 +4,13 @@ import os
 import threading
 
 import pytest
+from tests.support.store_fixtures import Lab
 
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import Invalid, NotFound, StorageFull
 from marey_server.store import blobs, garbage
 from marey_server.store.blob_backings import CHUNK_BYTES, DatabaseBlobs, DirectoryBlobs
 from marey_server.store.blobs import Spool, digest_of
-from store_fixtures import Lab
 
 SIZES = (0, 1, 1000, CHUNK_BYTES - 1, CHUNK_BYTES, CHUNK_BYTES + 1, 3 * CHUNK_BYTES + 17)
 OLD_US = 2 * 24 * 3600 * 1_000_000

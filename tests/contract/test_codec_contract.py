@@ -14,10 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from marey_schemas import codecs
-from marey_schemas.arrays import EncodedArray
-from marey_schemas.arrayspec import DTYPES
-from marey_schemas.codecs import ArrayForm, CodecError, decode_tree, encode_tree
+from marey_schemas.encoding import codecs
+from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.encoding.arrayspec import DTYPES
+from marey_schemas.encoding.codecs import ArrayForm, CodecError, decode_tree, encode_tree
 
 
 def finite_arrays() -> st.SearchStrategy[np.ndarray[Any, Any]]:

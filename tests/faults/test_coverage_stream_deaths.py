@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.support.server_process import ServerProcess
 
 from marey_motion.evaluation.online import OnlineCoverage
 from marey_schemas.access import ProjectCreate
 from marey_schemas.coverage_streams import CoverageProgress
-from server_process import ServerProcess
 
 pytestmark = pytest.mark.timeout(900)
 

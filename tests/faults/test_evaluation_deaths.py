@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.support.evaluation_takes import write_walks
+from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 
-from evaluation_takes import write_walks
 from marey_client import Marey
 from marey_client.evaluations import EvaluationHandle
 from marey_client.imports import find_files
@@ -17,7 +18,6 @@ from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate
 from marey_schemas.imports import ImportOptions
 from marey_schemas.jobs import Job, JobState
-from server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 
 pytestmark = pytest.mark.timeout(900)
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
+from tests.support.interleaving import Step, interleave
+from tests.support.store_fixtures import Lab, skeleton_tree
 
-from interleaving import Step, interleave
 from marey_schemas.items import CollectionChange, CollectionCreate, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.errors import MareyError
 from marey_server.store import collections, items
-from marey_server.store.database import Database
+from marey_server.store.database.connections import Database
 from marey_server.store.items import ItemFilters
 from marey_server.store.transaction import Transaction
-from store_fixtures import Lab, skeleton_tree
 
 Folders = dict[str, str]
 

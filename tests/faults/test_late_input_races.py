@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
+from tests.support.interleaving import Step, interleave
+from tests.support.queue_desk import Desk
 
-from interleaving import Step, interleave
 from marey_schemas.jobs import CompleteRequest, JobCreate, Lease
 from marey_server.errors import MareyError
-from marey_server.store import completion, jobs, submission
-from marey_server.store.database import Database
-from marey_server.store.retrying import retry_job
-from queue_desk import Desk
+from marey_server.store.database.connections import Database
+from marey_server.store.jobs import completion, reading, submission
+from marey_server.store.jobs.retrying import retry_job
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def test_a_job_that_is_cancelled_while_it_gets_its_inputs_ends_with_its_tasks(
     lease = claimed_maker(desk, made=made)
     (job,) = desk.submit_many(squares_of(lease.job))
     done = completes(desk, desk.database, lease)
-    cancel = Step(other, desk.user, lambda tx: jobs.cancel_job(tx, job))
+    cancel = Step(other, desk.user, lambda tx: reading.cancel_job(tx, job))
     outcomes = interleave(done, cancel) if order == "complete first" else interleave(cancel, done)
     assert not any(isinstance(outcome, MareyError) for outcome in outcomes), outcomes
     assert desk.state(lease.job) == "succeeded"

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 
 from marey_client.imports import LocalFile, find_files
 from marey_client.pipelines import PipelineRun
@@ -20,7 +21,6 @@ from marey_motion.gait import game_skeleton, generate_gait
 from marey_schemas.access import ProjectCreate
 from marey_schemas.jobs import JobState
 from marey_schemas.pipelines import PipelineCreate
-from server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 
 pytestmark = pytest.mark.timeout(900)
 

@@ -12,6 +12,8 @@ import httpx
 import numpy as np
 import pytest
 import sqlalchemy
+from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
+from tests.support.tcp_proxy import TcpProxy
 
 from marey_client import Marey
 from marey_client.blobs import digest_of
@@ -24,8 +26,6 @@ from marey_motion.gait import game_skeleton, generate_gait
 from marey_schemas.access import ProjectCreate
 from marey_schemas.imports import ImportEntry
 from marey_schemas.jobs import Job, JobCreate, JobState
-from server_process import QUICK_LEASES, ServerProcess, WorkerProcess
-from tcp_proxy import TcpProxy
 
 pytestmark = pytest.mark.timeout(900)
 

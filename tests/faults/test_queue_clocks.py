@@ -6,15 +6,15 @@ import time
 from collections.abc import Callable
 
 import pytest
+from tests.support.queue_desk import Desk
 
 from marey_schemas.jobs import ClaimRequest
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import LeaseLost
-from marey_server.store.clock import DatabaseClock
-from marey_server.store.database import Database
-from marey_server.store.reaper import StartGrace, claim_after_reaping, correct_times, reap_page
+from marey_server.store.database.clock import DatabaseClock
+from marey_server.store.database.connections import Database
+from marey_server.store.jobs.reaper import StartGrace, claim_after_reaping, correct_times, reap_page
 from marey_server.store.transaction import Transaction
-from queue_desk import Desk
 
 HOUR_S = 3600.0
 

@@ -10,17 +10,18 @@ from typing import Any
 
 import pytest
 from sqlalchemy import ColumnElement, func, select, true
+from tests.support.interleaving import Abandoned, Step, interleave
+from tests.support.queue_desk import Desk, output
 
-from interleaving import Abandoned, Step, interleave
 from marey_schemas.jobs import ClaimRequest, CompleteRequest, FailRequest, Heartbeat, JobCreate, Lease
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import Conflict, LeaseLost, MareyError
-from marey_server.store import completion, fencing, job_logs, jobs, leader, queue, staging, submission
-from marey_server.store.database import Database
-from marey_server.store.reaper import reap_page
+from marey_server.store import leader
+from marey_server.store.database.connections import Database
+from marey_server.store.jobs import completion, fencing, logs, queue, reading, staging, submission
+from marey_server.store.jobs.reaper import reap_page
 from marey_server.store.tables import attempt, event, job
 from marey_server.store.transaction import Transaction
-from queue_desk import Desk, output
 
 TERMINAL = ("succeeded", "failed", "cancelled")
 
@@ -55,12 +56,12 @@ class Bout:
                 lambda tx: completion.fail(tx, *self._place, FailRequest(write_id="write-two", code="x")),
             ),
             "heartbeat": (self.worker, lambda tx: queue.heartbeat(tx, *self._place, Heartbeat())),
-            "log": (self.worker, lambda tx: job_logs.append_log(tx, *self._place, 0, b"hello")),
+            "log": (self.worker, lambda tx: logs.append_log(tx, *self._place, 0, b"hello")),
             "stage": (
                 self.worker,
                 lambda tx: staging.stage(tx, *self._place, [staging.prepare_output(output("more"))]),
             ),
-            "cancel": (self.desk.user, lambda tx: jobs.cancel_job(tx, self.job)),
+            "cancel": (self.desk.user, lambda tx: reading.cancel_job(tx, self.job)),
             "reap": (SYSTEM, reap_page),
             "claim": (SYSTEM, lambda tx: queue.claim(tx, ClaimRequest(worker="v", kinds=("errand",), job=self.job))),
         }
@@ -196,7 +197,7 @@ def test_cancelling_the_whole_while_a_task_completes_ends_both(desk: Desk, other
                 tx, lease.job, lease.fence, CompleteRequest(write_id="write-one")
             ),
         )
-        stop = Step(other, desk.user, lambda tx, head=head: jobs.cancel_job(tx, head))
+        stop = Step(other, desk.user, lambda tx, head=head: reading.cancel_job(tx, head))
         interleave(*((done, stop) if order == "complete first" else (stop, done)))
         desk.fail(rest, "cancelled")
         assert desk.state(head) == "cancelled"
@@ -304,7 +305,7 @@ STALE_ACTS: dict[str, Callable[[Desk, Lease], object]] = {
     "complete": lambda desk, lease: desk.complete(lease),
     "fail": lambda desk, lease: desk.fail(lease),
     "log": lambda desk, lease: desk.database.write(
-        desk._attempt_of(lease), job_logs.append_log, lease.job, lease.fence, 0, b"late"
+        desk._attempt_of(lease), logs.append_log, lease.job, lease.fence, 0, b"late"
     ),
 }
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
+from tests.support.interleaving import Step, interleave
+from tests.support.store_fixtures import Lab, skeleton_tree
 
-from interleaving import Step, interleave
 from marey_schemas.access import MemberChange, Role
 from marey_schemas.kinds import Kind
 from marey_server.errors import Forbidden, NotFound
 from marey_server.store import items, members, projects
-from marey_server.store.database import Database
+from marey_server.store.database.connections import Database
 from marey_server.store.items import Draft
 from marey_server.store.items.publishing import publish
 from marey_server.store.transaction import Transaction
-from store_fixtures import Lab, skeleton_tree
 
 Act = Callable[[Transaction], object]
 

@@ -1,5 +1,5 @@
 """Fixtures of the integration tests."""
 
-from rest_server import owner, server
+from tests.support.rest_server import owner, server
 
 __all__ = ["owner", "server"]

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import httpx
 import pytest
+from tests.support.rest_server import ALL_SCOPES, Server
 
 from marey_schemas.access import Role
 from marey_server.handlers.catalogue import RESOURCES
-from marey_server.handlers.declarations import Access
-from rest_server import ALL_SCOPES, Server
+from marey_server.http.declarations import Access
 
 CANARY = "canary-5e0f2b"
 ROLES = ("none", "stranger", "reader", "contributor", "maintainer", "owner", "admin", "attempt")

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.formats.bvh import read_bvh
-from marey_schemas import blocks
+from marey_schemas.encoding import blocks
 
 
 def arrays_of(path: Path) -> list[NDArray[np.float32]]:

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.support.another_loader import positions_by_another_loader
 
-from another_loader import positions_by_another_loader
-from marey_motion.checks import CODES
 from marey_motion.errors import AmbiguousUnits, FormatError, MotionError
 from marey_motion.formats import ImportedMotion, pair_companions, read_motion, write_bvh
+from marey_motion.importing.checks import CODES
+from marey_motion.importing.landmarks import find_landmarks
+from marey_motion.importing.units import hip_heights
 from marey_motion.kinematics import global_positions, global_rotations
-from marey_motion.landmarks import find_landmarks
 from marey_motion.quaternions import angle_between
-from marey_motion.units import hip_heights
 
 Outcome = ImportedMotion | MotionError
 

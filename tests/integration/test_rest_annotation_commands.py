@@ -13,8 +13,8 @@ from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, skeleton_to_document
 from marey_motion.editing.annotations import layers
 from marey_motion.skeleton import Skeleton
-from marey_schemas.codecs import MSGPACK, encode_tree
 from marey_schemas.documents import RevisionRef
+from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 from marey_server.store.items import annotating
 
 ANNOTATIONS = "/projects/lab/annotations"

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import httpx
 import numpy as np
 import pytest
+from tests.support.rest_server import Server, running
 
 from marey_motion.documents import mapping_to_document, skeleton_to_document
 from marey_motion.evaluation import live_windows, online
@@ -13,8 +14,7 @@ from marey_motion.gait import generate_gait
 from marey_motion.rigs import guess_axes, map_joints
 from marey_schemas import coverage_streams
 from marey_schemas.access import Role
-from marey_schemas.codecs import BSON, JSON, MSGPACK, encode_tree
-from rest_server import Server, running
+from marey_schemas.encoding.codecs import BSON, JSON, MSGPACK, encode_tree
 
 STREAMS = "/projects/lab/coverage-streams"
 RATE_HZ = 60.0

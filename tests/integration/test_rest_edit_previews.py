@@ -5,8 +5,9 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from tests.support.edited_takes import make_walk
+from tests.support.rest_server import Server
 
-from edited_takes import make_walk
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, mapping_to_document, skeleton_to_document
 from marey_motion.editing.allowance import PER_COMMAND, PER_NUMBER
@@ -14,10 +15,9 @@ from marey_motion.editing.registry import apply_edit
 from marey_motion.kinematics import global_positions
 from marey_motion.rigs import guess_axes, map_joints
 from marey_schemas.access import ProjectChange, Role, Visibility
-from marey_schemas.codecs import BSON, JSON, MSGPACK, decode_tree, encode_tree
 from marey_schemas.documents import RevisionRef
-from marey_server import previewing
-from rest_server import Server
+from marey_schemas.encoding.codecs import BSON, JSON, MSGPACK, decode_tree, encode_tree
+from marey_server.motions import previewing
 
 CLIPS = "/projects/lab/clips"
 

@@ -19,14 +19,14 @@ from schemathesis.specs.openapi.checks import (
     response_schema_conformance,
     status_code_conformance,
 )
+from tests.support.rest_server import Server, running
 
 from marey_schemas.access import Role
 from marey_server.handlers.catalogue import RESOURCES
-from marey_server.handlers.routes import RouteTable
-from marey_server.openapi import build_document
-from marey_server.store.database import Database
-from marey_server.store.schema import upgrade_schema
-from rest_server import Server, running
+from marey_server.http.openapi import build_document
+from marey_server.http.routes import RouteTable
+from marey_server.store.database.connections import Database
+from marey_server.store.database.schema import upgrade_schema
 
 EXAMPLES = int(os.environ.get("MAREY_FUZZ_EXAMPLES", "4"))
 CANARY = "canary-91ab"

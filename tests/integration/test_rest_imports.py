@@ -8,11 +8,11 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+from tests.support.rest_server import Server, running
 
 from marey_motion.formats import read_motion
 from marey_motion.kinematics import forward_kinematics
-from marey_server.store.database import Database
-from rest_server import Server, running
+from marey_server.store.database.connections import Database
 
 BVH = """HIERARCHY
 ROOT Hips

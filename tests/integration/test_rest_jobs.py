@@ -12,15 +12,15 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from tests.support.database_fixtures import AdjustableClock
+from tests.support.rest_server import Server, running
 
-from database_fixtures import AdjustableClock
-from marey_schemas import codecs
+from marey_schemas.encoding import codecs
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import Invalid
-from marey_server.store import reaper
-from marey_server.store.database import Database
+from marey_server.store.database.connections import Database
+from marey_server.store.jobs import reaper
 from marey_server.store.transaction import Transaction
-from rest_server import Server, running
 
 BLOCKS = "application/msgpack; arrays=blocks"
 

@@ -15,15 +15,15 @@ from pathlib import Path
 
 import httpx
 import pytest
+from tests.support.rest_server import Server, running
 
 from marey_schemas.access import UserCreate
 from marey_server.access.passwords import hash_password
 from marey_server.access.principal import SYSTEM
 from marey_server.store import users
-from marey_server.store.database import Database
-from rest_server import Server, running
+from marey_server.store.database.connections import Database
 
-SERVE = "import asyncio; from marey_server.app import serve; from marey_server.settings import Settings; "
+SERVE = "import asyncio; from marey_server.app import serve; from marey_server.process.settings import Settings; "
 
 
 class Process:

@@ -6,9 +6,9 @@ from typing import Any
 
 import httpx
 import pytest
+from tests.support.rest_server import Server
 
 from marey_schemas.access import Role
-from rest_server import Server
 
 STUDY = {"schema": "marey/document@1", "answer": 42}
 FORMS = ("application/json", "application/msgpack", "application/bson", "application/msgpack; arrays=blocks")

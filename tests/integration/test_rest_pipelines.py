@@ -8,9 +8,9 @@ from typing import Any
 
 import httpx
 import pytest
+from tests.support.rest_server import Server, running
 
-from marey_server.store.database import Database
-from rest_server import Server, running
+from marey_server.store.database.connections import Database
 
 
 @pytest.fixture

@@ -13,11 +13,11 @@ import httpx
 import msgpack
 import numpy as np
 import pytest
+from tests.support.rest_server import Server
 
-from marey_schemas.arrays import EncodedArray
-from marey_schemas.codecs import MEDIA_TYPES, decode_tree
+from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree
 from marey_server.store.blobs import Spool
-from rest_server import Server
 
 JOINTS = ("hips", "knee", "foot")
 HIERARCHY = {

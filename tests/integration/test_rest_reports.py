@@ -5,8 +5,7 @@ import hashlib
 
 import httpx
 import pytest
-
-from rest_server import Server
+from tests.support.rest_server import Server
 
 PAGE = b"<!doctype html><title>Report</title><p>All is well."
 SCRIPT = "sha256-" + base64.b64encode(hashlib.sha256(b"sort()").digest()).decode()

@@ -3,11 +3,11 @@
 import hashlib
 
 import httpx
+from tests.support.search_primitives import walking
 
 from marey_motion.documents import skeleton_to_document
 from marey_motion.modelling.primitive_documents import primitive_to_tree
-from marey_schemas import codecs
-from search_primitives import walking
+from marey_schemas.encoding import codecs
 
 
 def created(owner: httpx.Client, kind: str, name: str, **parts: object) -> dict:

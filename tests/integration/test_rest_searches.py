@@ -7,17 +7,17 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from tests.support.search_primitives import FRAMES, standard_joints, walking
 
 from marey_motion.documents import skeleton_to_document
-from marey_motion.modelling.constraints import JointPosition
 from marey_motion.modelling.primitive_documents import primitive_to_tree
-from marey_motion.modelling.sample_tree_documents import sample_tree_to_tree
-from marey_motion.modelling.search_work import drawing_work, searching_work
-from marey_motion.modelling.steps import SeveralSteps, Step
-from marey_motion.modelling.tree import END_EFFECTORS, TreeOptions, build_tree
-from marey_schemas.codecs import MSGPACK, encode_tree
-from marey_server import search_answers, searching
-from search_primitives import FRAMES, standard_joints, walking
+from marey_motion.modelling.search.constraints import JointPosition
+from marey_motion.modelling.search.steps import SeveralSteps, Step
+from marey_motion.modelling.search.tree import END_EFFECTORS, TreeOptions, build_tree
+from marey_motion.modelling.search.tree_documents import sample_tree_to_tree
+from marey_motion.modelling.search.work import drawing_work, searching_work
+from marey_schemas.encoding.codecs import MSGPACK, encode_tree
+from marey_server.motions import search_answers, searching
 
 MODELS = "/projects/lab/models"
 AHEAD = {"type": "root_position", "at": "end", "target_m": [0, 1]}

@@ -14,12 +14,12 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
+from tests.support.store_fixtures import Lab
 
 from marey_schemas.items import ItemChange, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.errors import Conflict, NotFound, PreconditionFailed
 from marey_server.store import fsck, garbage, items
-from store_fixtures import Lab
 
 NAMES = st.sampled_from(["walk", "run", "Über"])
 PLACES = st.sampled_from(["", "a", "a/b", "c"])

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.support.server_process import ServerProcess
 
 from marey_client import Marey
 from marey_client.errors import JobUnsuccessful
 from marey_schemas.access import ProjectCreate
 from marey_schemas.jobs import FailureReason, JobCreate, JobState, Resources
-from server_process import ServerProcess
 
 THIRD_PARTY = Path(__file__).parents[1] / "unit" / "worker" / "thirdparty"
 

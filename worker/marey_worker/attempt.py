@@ -20,11 +20,11 @@ from marey_schemas.job_kinds import find_kind
 from marey_schemas.jobs import CompleteRequest, FailRequest, Lease
 from marey_worker import faults, signatures
 from marey_worker.attempt_api import AttemptApi
-from marey_worker.cache import InputCache
 from marey_worker.child_process import ChildProcess
 from marey_worker.environment import environment
+from marey_worker.heartbeats import LeaseKeeper
+from marey_worker.job_io.input_cache import InputCache
 from marey_worker.job_log import JobLog
-from marey_worker.keeper import LeaseKeeper
 from marey_worker.messages import (
     Done,
     Failed,

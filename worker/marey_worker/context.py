@@ -9,7 +9,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from marey_schemas.codecs import MSGPACK, decode_tree, encode_tree
+from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.items import Item
 from marey_schemas.jobs import PinnedInput, Progress, StagedOutput, StageRequest
 from marey_schemas.kinds import Kind

@@ -21,8 +21,8 @@ from marey_schemas.jobs import ClaimRequest, Lease
 from marey_worker import faults
 from marey_worker.attempt import Attempt, Stop
 from marey_worker.attempt_api import AttemptApi, claim
-from marey_worker.cache import InputCache
 from marey_worker.child_process import ChildBroken, ChildProcess
+from marey_worker.job_io.input_cache import InputCache
 
 log = logging.getLogger(__name__)
 

@@ -12,9 +12,9 @@ import typer
 from marey_client.cli.addresses import Address, find_item, require_item
 from marey_client.cli.command_texts import is_frame
 from marey_client.cli.failures import Refused, WrongUsage
-from marey_client.cli.given_files import read_json
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import clips_at, follow
+from marey_client.cli.json_files import read_json
 from marey_client.cli.output import print_json, print_pairs, print_table, tell, tell_refused
 from marey_schemas.wording import counted
 

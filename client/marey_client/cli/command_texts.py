@@ -21,7 +21,7 @@ MOST_DIGITS = 18
 
 def parse_command(text: str) -> dict[str, Any]:
     """A command with its parameters. Raises `WrongUsage`, and says what there is, for what no command has."""
-    from marey_schemas.editing import COMMAND_MODELS
+    from marey_schemas.editing.edits import COMMAND_MODELS
 
     try:
         name, *assigned = shlex.split(text) or [""]

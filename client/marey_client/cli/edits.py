@@ -10,17 +10,17 @@ import typer
 from marey_client.cli.addresses import Address, require_item
 from marey_client.cli.command_texts import is_frame, parameter_rows, parse_command
 from marey_client.cli.failures import WrongUsage
-from marey_client.cli.given_files import read_json
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import clips_at, follow, print_ended
+from marey_client.cli.json_files import read_json
 from marey_client.cli.output import print_json, print_pairs, print_table
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_client.edits import EditHandle
     from marey_client.marey import Marey
-    from marey_schemas.edit_previews import EditPreview
-    from marey_schemas.editing import EditDocument
+    from marey_schemas.editing.edits import EditDocument
+    from marey_schemas.editing.previews import EditPreview
 
 edit = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Edits: commands on clips.")
 
@@ -150,7 +150,7 @@ def list_commands(
     as_json: AsJson = False,
 ) -> None:
     """Show what an edit can do, or the parameters of one command."""
-    from marey_schemas.editing import COMMAND_MODELS
+    from marey_schemas.editing.edits import COMMAND_MODELS
 
     if name is not None and name not in COMMAND_MODELS:
         raise WrongUsage(f"there is no command {name!r}; there are {', '.join(COMMAND_MODELS)}")

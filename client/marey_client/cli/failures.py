@@ -38,7 +38,7 @@ def reported(*, verbose: bool) -> Iterator[None]:
         from pydantic import ValidationError
 
         from marey_client.errors import BadAddress, MareyError
-        from marey_schemas.codecs import CodecError
+        from marey_schemas.encoding.codecs import CodecError
 
         if isinstance(error, ValidationError):
             first = error.errors(include_url=False)[0]

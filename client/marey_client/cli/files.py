@@ -12,8 +12,8 @@ import typer
 from marey_client.cli.addresses import Address, find_item, require_item
 from marey_client.cli.failures import Refused, WrongUsage
 from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.lookup import kind_named
 from marey_client.cli.output import print_json, print_pairs, print_table, progress, tell
-from marey_client.cli.standing import kind_named
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ def show(
     with connect(context) as marey:
         item = require_item(marey, Address.parse(place), list(Kind))
         if part is not None:
-            from marey_schemas.codecs import encode_tree
+            from marey_schemas.encoding.codecs import encode_tree
 
             return typer.echo(encode_tree(item.part(part), "application/json"))
         if history:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.failures import Refused
-from marey_client.cli.given_files import read_json
 from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.json_files import read_json
 from marey_client.cli.output import print_json, print_table, tell, tell_refused
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.failures import WrongUsage
-from marey_client.cli.given_files import read_json
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import watching
+from marey_client.cli.json_files import read_json
 from marey_client.cli.models import model_at
 from marey_client.cli.output import print_json, print_table, tell
 from marey_schemas.wording import counted

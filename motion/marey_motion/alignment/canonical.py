@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from marey_motion import quaternions
 from marey_motion.alignment.aligned import Placement
-from marey_motion.carrying import carried_at, spins_of
 from marey_motion.kinematics import forward_directions, headings
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
+from marey_motion.root_carrier import carried_at, spins_of
 from marey_motion.skeleton import Skeleton
 
 Floats = NDArray[np.float64]

@@ -48,7 +48,7 @@ def constrain(
 
     Parameters
     ----------
-    constraints, limits : trees as of `marey_schemas.edit_constraints`, with radians
+    constraints, limits : trees as of `marey_schemas.editing.constraints`, with radians
 
     Raises
     ------

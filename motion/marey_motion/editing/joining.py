@@ -7,7 +7,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.carrying import body_first, root_first, root_stands
 from marey_motion.editing.borders import blended, smooth_step
 from marey_motion.editing.offsets import VELOCITY_S, add_offset, dying_away, seam_offset
 from marey_motion.editing.placement import body_track, moved_over
@@ -17,6 +16,7 @@ from marey_motion.errors import EditError
 from marey_motion.looping import LoopSeam, loop_seam, rotated
 from marey_motion.motion import Motion
 from marey_motion.resampling import count_samples, resample_motion
+from marey_motion.root_carrier import body_first, root_first, root_stands
 from marey_motion.skeleton import same_hierarchy
 
 Floats = NDArray[np.float64]

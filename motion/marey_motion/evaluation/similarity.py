@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.improvement.selection import clips_by_source
 from marey_motion.evaluation.result import Coverage
-from marey_motion.evaluation.selection import clips_by_source
 from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import Status, TrialRecord

@@ -15,8 +15,12 @@ from marey_motion.formats.bvh_writer import write_bvh
 from marey_motion.formats.conversion import convert
 from marey_motion.formats.detection import detect_format
 from marey_motion.formats.npz import read_npz, write_npz
-from marey_motion.formats.predecessor import read_predecessor, write_predecessor_clip, write_predecessor_skeleton
-from marey_motion.source import ImportedMotion, ImportOptions, SourceInfo, SourceMotion
+from marey_motion.formats.predecessor.clips import (
+    read_predecessor,
+    write_predecessor_clip,
+    write_predecessor_skeleton,
+)
+from marey_motion.importing.source import ImportedMotion, ImportOptions, SourceInfo, SourceMotion
 
 __all__ = [
     "WRITERS",

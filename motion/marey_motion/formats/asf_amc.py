@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import quaternions
-from marey_motion.checks import CheckWarning
 from marey_motion.formats.amc_frames import scan_frames
 from marey_motion.formats.asf import AsfSkeleton, read_asf
 from marey_motion.formats.euler import NO_COLUMN, rotations_from_euler
 from marey_motion.formats.numeric_text import excerpt
 from marey_motion.formats.text_lines import TextLines
-from marey_motion.source import SourceMotion
+from marey_motion.importing.checks import CheckWarning
+from marey_motion.importing.source import SourceMotion
 
 FORMAT = "asf-amc"
 DEFAULT_RATE_HZ = 120.0

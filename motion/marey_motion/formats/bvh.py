@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.checks import CheckWarning
 from marey_motion.formats.bvh_hierarchy import BvhHeader, read_header
 from marey_motion.formats.euler import NO_COLUMN, rotations_from_euler
 from marey_motion.formats.frame_times import frame_rate_of
 from marey_motion.formats.joint_names import unique_names
 from marey_motion.formats.numeric_text import BadToken, scan_numbers
 from marey_motion.formats.text_lines import TextLines, number_problem
-from marey_motion.source import SourceMotion
+from marey_motion.importing.checks import CheckWarning
+from marey_motion.importing.source import SourceMotion
 from marey_schemas.wording import counted
 
 FORMAT = "bvh"

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from marey_motion.clip import Clip
 from marey_motion.errors import FormatError
 from marey_motion.formats.euler import euler_from_rotations
+from marey_motion.importing.source import SourceInfo
+from marey_motion.importing.units import unit_in_metres
 from marey_motion.skeleton import Skeleton
-from marey_motion.source import SourceInfo
-from marey_motion.units import unit_in_metres
 
 DEFAULT_ORDER = "zxy"
 _DECIMALS = 6

@@ -7,14 +7,14 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion import checks
-from marey_motion.checks import CheckWarning
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, FormatError, SkeletonError
-from marey_motion.landmarks import find_landmarks
+from marey_motion.importing import checks
+from marey_motion.importing.checks import CheckWarning
+from marey_motion.importing.landmarks import find_landmarks
+from marey_motion.importing.source import ImportedMotion, ImportOptions, SourceInfo, SourceMotion, UpAxis
+from marey_motion.importing.units import infer_conversion
 from marey_motion.skeleton import EndSite, Skeleton
-from marey_motion.source import ImportedMotion, ImportOptions, SourceInfo, SourceMotion, UpAxis
-from marey_motion.units import infer_conversion
 
 Real = TypeVar("Real", np.float32, np.float64)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from marey_motion.checks import CheckWarning
 from marey_motion.errors import FormatError
+from marey_motion.importing.checks import CheckWarning
 
 KNOWN_RATES_HZ = (
     *(10.0, 12.0, 12.5, 15.0, 20.0, 24.0, 25.0, 30.0, 40.0, 48.0, 50.0, 60.0, 72.0, 75.0, 80.0, 90.0, 96.0, 100.0),

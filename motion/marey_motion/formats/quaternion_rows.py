@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import quaternions
-from marey_motion.checks import CheckWarning
 from marey_motion.errors import FormatError
+from marey_motion.importing.checks import CheckWarning
 from marey_schemas.wording import counted
 
 _NOTABLE_DEVIATION = 1e-3

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
-from marey_motion.landmarks import find_landmarks
+from marey_motion.importing.landmarks import find_landmarks
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.database import DatabaseClip, DatabaseNote, MatchingDatabase, SourceClip
 from marey_motion.matching.features import FeatureLayout, feature_layout

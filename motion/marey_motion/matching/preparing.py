@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from marey_motion import quaternions
-from marey_motion.checks import CheckWarning, check_clip
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
-from marey_motion.landmarks import Landmarks
+from marey_motion.importing.checks import CheckWarning, check_clip
+from marey_motion.importing.landmarks import Landmarks
 from marey_motion.looping import LoopSeam, loop_seam
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.database import DatabaseNote, SourceClip

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import AlignedSet
-from marey_motion.landmarks import find_landmarks
+from marey_motion.importing.landmarks import find_landmarks
 from marey_motion.modelling.fpca import PrincipalExamples
 from marey_motion.modelling.mixture_fitting import Candidate, FittedMixture
 from marey_motion.modelling.options import ModelOptions

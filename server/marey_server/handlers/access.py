@@ -8,10 +8,10 @@ from marey_schemas.access import Login, Me, NewToken, Token, TokenCreate, User, 
 from marey_server.access import passwords
 from marey_server.access.principal import Principal
 from marey_server.errors import Forbidden
-from marey_server.handlers.declarations import Access, reads, writes
-from marey_server.handlers.queries import PageQuery
-from marey_server.handlers.reply import Rendered, Reply
-from marey_server.handlers.resource import Resource
+from marey_server.http.declarations import Access, reads, writes
+from marey_server.http.queries import PageQuery
+from marey_server.http.reply import Rendered, Reply
+from marey_server.http.resource import Resource
 from marey_server.store import tokens, users
 from marey_server.store.transaction import Transaction
 

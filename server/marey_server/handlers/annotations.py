@@ -6,10 +6,10 @@ from marey_schemas.annotations import AnnotationChange, AnnotationImport
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_server.errors import Conflict, NotFound, PreconditionFailed
-from marey_server.handlers.declarations import Access, Body, writes
 from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
-from marey_server.handlers.reply import Rendered, Reply
-from marey_server.handlers.resource import Resource
+from marey_server.http.declarations import Access, Body, writes
+from marey_server.http.reply import Rendered, Reply
+from marey_server.http.resource import Resource
 from marey_server.store import items
 
 MOST_TRIES = 5

@@ -6,12 +6,12 @@ import re
 
 from marey_schemas.items import BlobsMissing, BlobsQuery
 from marey_server.errors import NotFound
-from marey_server.handlers.calls import only_identify
-from marey_server.handlers.declarations import MIB, Access, Body, Bytes, reads, writes
-from marey_server.handlers.receiving import Receiver
-from marey_server.handlers.reply import Rendered, Reply
-from marey_server.handlers.resource import Resource
-from marey_server.handlers.streaming import BlobSender
+from marey_server.http.calls import only_identify
+from marey_server.http.declarations import MIB, Access, Body, Bytes, reads, writes
+from marey_server.http.receiving import Receiver
+from marey_server.http.reply import Rendered, Reply
+from marey_server.http.resource import Resource
+from marey_server.http.streaming import BlobSender
 from marey_server.store import blobs
 
 MAX_BLOB_BYTES = 1024 * MIB

@@ -23,7 +23,7 @@ from marey_server.handlers import (
     searches,
     uploads,
 )
-from marey_server.handlers.resource import Resource
+from marey_server.http.resource import Resource
 
 RESOURCES: tuple[type[Resource], ...] = (
     *access.RESOURCES,

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pydantic import Field
 
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate
-from marey_server.handlers.declarations import Access, reads, writes
-from marey_server.handlers.queries import PageQuery
-from marey_server.handlers.reply import Rendered, Reply
-from marey_server.handlers.resource import Resource
+from marey_server.http.declarations import Access, reads, writes
+from marey_server.http.queries import PageQuery
+from marey_server.http.reply import Rendered, Reply
+from marey_server.http.resource import Resource
 from marey_server.store import collections
 
 

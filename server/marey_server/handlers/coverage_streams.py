@@ -14,11 +14,11 @@ from marey_schemas.coverage_streams import (
     CoverageStreamCreate,
     CoverageStreamState,
 )
-from marey_server import covering
-from marey_server.handlers.declarations import MIB, Access, Body, reads, writes
-from marey_server.handlers.queries import PageQuery
-from marey_server.handlers.reply import Rendered, Reply
-from marey_server.handlers.resource import Resource
+from marey_server.http.declarations import MIB, Access, Body, reads, writes
+from marey_server.http.queries import PageQuery
+from marey_server.http.reply import Rendered, Reply
+from marey_server.http.resource import Resource
+from marey_server.motions import coverage
 from marey_server.store import coverage_streams
 from marey_server.store.coverage_streams import Step, Stream
 
@@ -49,8 +49,8 @@ class CoverageStreams(Resource):
 
         A stream to which no frames come for a day is dropped; a project has at most 64.
         """
-        given = await self.look_up(covering.read_given, project, body)
-        new, state = await self.compute(covering.begin, body, given)
+        given = await self.look_up(coverage.read_given, project, body)
+        new, state = await self.compute(coverage.begin, body, given)
 
         def created(stream: Stream) -> Reply:
             location = f"/projects/{project}/coverage-streams/{stream.id}"
@@ -69,7 +69,7 @@ class CoverageStreamResource(Resource):
     async def get(self, project: str, stream: str) -> Reply:
         """A stream with its map, the performer, and what to record next."""
         held = await self.look_up(coverage_streams.read_stream, project, stream)
-        state = await self.compute(covering.look, held)
+        state = await self.compute(coverage.look, held)
         return Reply(state, rev=held.rev)
 
     @writes(access=Access.CONTRIBUTOR)
@@ -92,7 +92,7 @@ class CoverageStreamFrames(Resource):
         409 with the right one in the context.
         """
         held = await self.look_up(coverage_streams.read_to_advance, project, stream)
-        step = await self.compute(covering.advance, held, body)
+        step = await self.compute(coverage.advance, held, body)
         if not isinstance(step, Step):
             return _progress(step)
         return await self.answer_with(_progress, coverage_streams.advance_stream, project, held, step)

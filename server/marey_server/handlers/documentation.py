@@ -7,9 +7,9 @@ from importlib.metadata import version
 from pydantic import Field
 
 from marey_schemas.base import Answer
-from marey_server.handlers.declarations import Access, Bytes, reads
-from marey_server.handlers.reply import API, Reply
-from marey_server.handlers.resource import Resource
+from marey_server.http.declarations import Access, Bytes, reads
+from marey_server.http.reply import API, Reply
+from marey_server.http.resource import Resource
 
 
 class Service(Answer):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from marey_schemas.edit_previews import EditPreviewRequest
-from marey_server import previewing
-from marey_server.handlers.declarations import Access, Document, reads
+from marey_schemas.editing.previews import EditPreviewRequest
 from marey_server.handlers.items import kind_of
-from marey_server.handlers.reply import Rendered, Reply, render
-from marey_server.handlers.resource import Resource
+from marey_server.http.declarations import Access, Document, reads
+from marey_server.http.reply import Rendered, Reply, render
+from marey_server.http.resource import Resource
+from marey_server.motions import previewing
 
 
 class EditPreviewResource(Resource):

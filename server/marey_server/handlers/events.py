@@ -9,10 +9,10 @@ from pydantic import Field
 from marey_schemas.base import Request
 from marey_schemas.items import Event, Page
 from marey_server.errors import BadRequest
-from marey_server.handlers.declarations import Access, reads
-from marey_server.handlers.negotiation import EVENT_STREAM
-from marey_server.handlers.reply import Reply
-from marey_server.handlers.resource import Resource
+from marey_server.http.declarations import Access, reads
+from marey_server.http.negotiation import EVENT_STREAM
+from marey_server.http.reply import Reply
+from marey_server.http.resource import Resource
 from marey_server.store import events
 
 POLL_S = 1.0

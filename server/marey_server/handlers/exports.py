@@ -7,15 +7,15 @@ from typing import Literal
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_server import exporting
-from marey_server.exporting import ExportFormat, ExportTime
-from marey_server.handlers.declarations import Access, Bytes, reads
 from marey_server.handlers.items import kind_of
-from marey_server.handlers.queries import MAX_INTEGER
-from marey_server.handlers.reply import Rendered, Reply
-from marey_server.handlers.resource import Resource
-from marey_server.handlers.streaming import BlobSender, attachment
-from marey_server.predecessor_exports import PredecessorOptions
+from marey_server.http.declarations import Access, Bytes, reads
+from marey_server.http.queries import MAX_INTEGER
+from marey_server.http.reply import Rendered, Reply
+from marey_server.http.resource import Resource
+from marey_server.http.streaming import BlobSender, attachment
+from marey_server.motions import exporting
+from marey_server.motions.exporting import ExportFormat, ExportTime
+from marey_server.motions.predecessor_exports import PredecessorOptions
 
 
 class ExportQuery(Request):

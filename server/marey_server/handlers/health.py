@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from marey_schemas.base import Answer
 from marey_server.errors import Unavailable
-from marey_server.handlers.declarations import Access, Bytes, reads
-from marey_server.handlers.reply import Reply
-from marey_server.handlers.resource import Resource
+from marey_server.http.declarations import Access, Bytes, reads
+from marey_server.http.reply import Reply
+from marey_server.http.resource import Resource
 from marey_server.store import readiness
 
 

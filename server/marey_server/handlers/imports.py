@@ -11,22 +11,23 @@ from pydantic import ValidationError
 
 from marey_schemas.imports import ImportAnswer, ImportEntry, ImportOptions, ImportRequest, Refusal
 from marey_schemas.jobs import Job, JobCreate
-from marey_server import importing
 from marey_server.errors import BadRequest, Invalid, MareyError, TooLarge
 from marey_server.field_errors import field_errors
-from marey_server.handlers.declarations import MIB, Access, Body, Files, writes
-from marey_server.handlers.multipart import MultipartReader, PartHead, Piece, boundary_of
-from marey_server.handlers.negotiation import body_type
-from marey_server.handlers.receiving import Receiver
-from marey_server.handlers.reply import Reply
-from marey_server.handlers.resource import Resource
-from marey_server.handlers.validation import decode_body, validate_body
-from marey_server.importing import PreparedImport, SourceFile
-from marey_server.store import blobs, submission
+from marey_server.http.declarations import MIB, Access, Body, Files, writes
+from marey_server.http.multipart import MultipartReader, PartHead, Piece, boundary_of
+from marey_server.http.negotiation import body_type
+from marey_server.http.receiving import Receiver
+from marey_server.http.reply import Reply
+from marey_server.http.resource import Resource
+from marey_server.http.validation import decode_body, validate_body
+from marey_server.motions import importing
+from marey_server.motions.importing import PreparedImport, SourceFile
+from marey_server.store import blobs
+from marey_server.store.jobs import submission
 from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:
-    from marey_motion.importing import PlannedFile
+    from marey_motion.importing.files import PlannedFile
 
 MAX_FILES = 1000
 MAX_UPLOAD_BYTES = 2048 * MIB

@@ -8,10 +8,10 @@ from marey_schemas.base import Request
 from marey_schemas.items import Item, ItemChange, ItemCreate, Lineage, Revision, Staleness
 from marey_schemas.kinds import Kind
 from marey_server.errors import NotFound
-from marey_server.handlers.declarations import MIB, Access, Body, reads, writes
-from marey_server.handlers.queries import MAX_INTEGER, CommaSeparated, CountedPageQuery, PageQuery
-from marey_server.handlers.reply import Rendered, Reply
-from marey_server.handlers.resource import Resource
+from marey_server.http.declarations import MIB, Access, Body, reads, writes
+from marey_server.http.queries import MAX_INTEGER, CommaSeparated, CountedPageQuery, PageQuery
+from marey_server.http.reply import Rendered, Reply
+from marey_server.http.resource import Resource
 from marey_server.store import items
 from marey_server.store.items import ItemFilters
 

@@ -12,13 +12,14 @@ from marey_schemas.items import Event, Page
 from marey_schemas.job_kinds import UnknownKindError, find_kind, job_kinds
 from marey_schemas.jobs import Attempt, Job, JobBatch, JobCreate, JobKind, JobList, JobOutput, JobState, TaskResult
 from marey_server.errors import NotFound
-from marey_server.handlers.declarations import MIB, Access, Body, Bytes, reads, writes
-from marey_server.handlers.queries import CommaSeparated, CommaSeparatedOf, CountedPageQuery, PageQuery
-from marey_server.handlers.reply import Rendered, Reply
-from marey_server.handlers.resource import Resource
-from marey_server.store import events, jobs, retrying, submission
-from marey_server.store.job_logs import MOST_READ_BYTES, LogPage
-from marey_server.store.jobs import JobFilters
+from marey_server.http.declarations import MIB, Access, Body, Bytes, reads, writes
+from marey_server.http.queries import CommaSeparated, CommaSeparatedOf, CountedPageQuery, PageQuery
+from marey_server.http.reply import Rendered, Reply
+from marey_server.http.resource import Resource
+from marey_server.store import events
+from marey_server.store.jobs import reading, retrying, submission
+from marey_server.store.jobs.logs import MOST_READ_BYTES, LogPage
+from marey_server.store.jobs.reading import JobFilters
 from marey_server.store.wakeups import wakeups
 
 LONGEST_WAIT_S = 30.0
@@ -80,7 +81,7 @@ class ProjectJobs(Resource):
     async def get(self, project: str, query: JobsQuery) -> Rendered:
         """Jobs, newest first."""
         return await self.answer(
-            jobs.list_jobs,
+            reading.list_jobs,
             project,
             query.filters(),
             sort=query.sort,
@@ -149,7 +150,7 @@ class JobResource(Resource):
         """A job and how it stands. `Prefer: wait=n` answers when it has ended, at the latest after n seconds."""
         wait_s = wait_preferred(self)
         if wait_s == 0:
-            return await self.answer(jobs.read_job, job)
+            return await self.answer(reading.read_job, job)
         return Reply(await wait_for_end(self, job, wait_s))
 
 
@@ -165,7 +166,7 @@ async def wait_for_end(resource: Resource, job_id: str, wait_s: float) -> Job:
     deadline = loop.time() + wait_s
     with wakeups.listen([f"job:{job_id}"]) as listener:
         while True:
-            job = await resource.look_up(jobs.read_job, job_id)
+            job = await resource.look_up(reading.read_job, job_id)
             left_s = deadline - loop.time()
             if job.state.terminal or left_s <= 0 or not resource.is_awaited():
                 return job
@@ -181,7 +182,7 @@ class JobAttempts(Resource):
     @reads(access=Access.READER, answer=Attempt, paged=True)
     async def get(self, job: str) -> Rendered:
         """Every try at a job: by which worker, when, and how it ended."""
-        return await self.answer(jobs.list_attempts, job)
+        return await self.answer(reading.list_attempts, job)
 
 
 class JobOutputs(Resource):
@@ -193,7 +194,7 @@ class JobOutputs(Resource):
     @reads(access=Access.READER, query=PageQuery, answer=JobOutput, paged=True)
     async def get(self, job: str, query: PageQuery) -> Rendered:
         """The revisions a job made, or its tasks; of those, a page holds what `limit` tasks made."""
-        return await self.answer(jobs.list_outputs, job, query.cursor, query.limit)
+        return await self.answer(reading.list_outputs, job, query.cursor, query.limit)
 
 
 class JobResults(Resource):
@@ -205,7 +206,7 @@ class JobResults(Resource):
     @reads(access=Access.READER, query=PageQuery, answer=TaskResult, paged=True)
     async def get(self, job: str, query: PageQuery) -> Rendered:
         """What the tasks of a gathering job brought, in their order; blobs they name stay until it is gathered."""
-        return await self.answer(jobs.list_results, job, query.cursor, query.limit)
+        return await self.answer(reading.list_results, job, query.cursor, query.limit)
 
 
 class JobEventsQuery(Request):
@@ -224,7 +225,7 @@ class JobEvents(Resource):
     @reads(access=Access.READER, query=JobEventsQuery, answer=Event, paged=True, public=False)
     async def get(self, job: str, query: JobEventsQuery) -> Rendered:
         """What happened to a job, in the order it became visible."""
-        return await self.answer(jobs.list_job_events, job, query.after, query.limit)
+        return await self.answer(reading.list_job_events, job, query.after, query.limit)
 
 
 class JobLogQuery(Request):
@@ -246,7 +247,7 @@ class JobLog(Resource):
 
         The header `Log-Offset` says where the next piece begins; `Log-Sealed: true` that there will be none.
         """
-        return await self.answer_with(_log_reply, jobs.read_job_log, job, query.offset, query.limit)
+        return await self.answer_with(_log_reply, reading.read_job_log, job, query.offset, query.limit)
 
 
 def _log_reply(page: LogPage) -> Reply:
@@ -263,7 +264,7 @@ class JobCancellation(Resource):
     @writes(access=Access.CONTRIBUTOR, scope="jobs", answer=Job)
     async def post(self, job: str) -> Rendered:
         """Cancel a job and its tasks: at once where nobody works on it, else as soon as the worker stops."""
-        return await self.answer(jobs.cancel_job, job, self.services.queue_policy)
+        return await self.answer(reading.cancel_job, job, self.services.queue_policy)
 
 
 class JobRetry(Resource):

@@ -21,11 +21,11 @@ from marey_schemas.jobs import (
     StageRequest,
 )
 from marey_server.errors import BadRequest
-from marey_server.handlers.declarations import KIB, MIB, Access, Body, Bytes, writes
-from marey_server.handlers.reply import Rendered, Reply
-from marey_server.handlers.resource import Resource
-from marey_server.store import completion, job_logs, queue, reaper, staging
-from marey_server.store.staging import PreparedOutput
+from marey_server.http.declarations import KIB, MIB, Access, Body, Bytes, writes
+from marey_server.http.reply import Rendered, Reply
+from marey_server.http.resource import Resource
+from marey_server.store.jobs import completion, logs, queue, reaper, staging
+from marey_server.store.jobs.staging import PreparedOutput
 from marey_server.store.wakeups import wakeups
 
 LOOK_AGAIN_S = 2.0
@@ -112,7 +112,7 @@ class AttemptLog(Resource):
         if not (text.isascii() and text.isdigit() and len(text) <= 15):
             raise BadRequest("Upload-Offset says how many bytes the log has already.", code="bad-upload-offset")
         policy = self.services.queue_policy
-        return await self.answer(job_logs.append_log, job, fence, int(text), body or b"", policy)
+        return await self.answer(logs.append_log, job, fence, int(text), body or b"", policy)
 
 
 class AttemptOutputs(Resource):

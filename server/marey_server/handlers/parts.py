@@ -12,11 +12,11 @@ from marey_schemas.base import Request
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_schemas.names import Message
-from marey_server.handlers.declarations import Access, Body, Document, reads, writes
 from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
-from marey_server.handlers.queries import MAX_INTEGER, CommaSeparated
-from marey_server.handlers.reply import Lasting, Rendered, Reply
-from marey_server.handlers.resource import Resource
+from marey_server.http.declarations import Access, Body, Document, reads, writes
+from marey_server.http.queries import MAX_INTEGER, CommaSeparated
+from marey_server.http.reply import Lasting, Rendered, Reply
+from marey_server.http.resource import Resource
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from marey_schemas.pipelines import Pipeline, PipelineCreate
-from marey_server.handlers.declarations import Access, Body, writes
 from marey_server.handlers.jobs import MAX_SUBMISSION_BYTES
-from marey_server.handlers.reply import Rendered, Reply
-from marey_server.handlers.resource import Resource
-from marey_server.store import pipelines
+from marey_server.http.declarations import Access, Body, writes
+from marey_server.http.reply import Rendered, Reply
+from marey_server.http.resource import Resource
+from marey_server.store.jobs import pipelines
 
 
 class ProjectPipelines(Resource):

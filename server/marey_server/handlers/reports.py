@@ -11,12 +11,12 @@ from marey_schemas.kinds import Kind
 from marey_schemas.reports import REPORTS, StoredFigure, StoredFile
 from marey_schemas.reports import Report as ReportDocument
 from marey_server.errors import NotFound
-from marey_server.handlers.declarations import Access, Bytes, reads
 from marey_server.handlers.items import kind_of
-from marey_server.handlers.queries import MAX_INTEGER
-from marey_server.handlers.reply import Rendered
-from marey_server.handlers.resource import Resource
-from marey_server.handlers.streaming import IMMUTABLE, BlobSender
+from marey_server.http.declarations import Access, Bytes, reads
+from marey_server.http.queries import MAX_INTEGER
+from marey_server.http.reply import Rendered
+from marey_server.http.resource import Resource
+from marey_server.http.streaming import IMMUTABLE, BlobSender
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
 

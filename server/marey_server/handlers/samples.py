@@ -8,14 +8,14 @@ from pydantic import Field
 
 from marey_schemas.base import Request
 from marey_schemas.modelling import MOST_SAMPLES, MOST_SEED
-from marey_server import models
-from marey_server.handlers.declarations import Access, Bytes, Document, reads
 from marey_server.handlers.items import kind_of
-from marey_server.handlers.queries import MAX_INTEGER
-from marey_server.handlers.reply import Rendered, Reply, render
-from marey_server.handlers.resource import Resource
-from marey_server.handlers.streaming import IMMUTABLE, attachment
-from marey_server.models import FoundModel, SampleFormat, UsableModel
+from marey_server.http.declarations import Access, Bytes, Document, reads
+from marey_server.http.queries import MAX_INTEGER
+from marey_server.http.reply import Rendered, Reply, render
+from marey_server.http.resource import Resource
+from marey_server.http.streaming import IMMUTABLE, attachment
+from marey_server.motions import models
+from marey_server.motions.models import FoundModel, SampleFormat, UsableModel
 
 
 class SampleQuery(Request):

@@ -8,14 +8,14 @@ from pydantic import Field
 
 from marey_schemas.base import Request
 from marey_schemas.search import SearchRequest
-from marey_server import search_answers, searching
-from marey_server.handlers.declarations import Access, Bytes, Document, reads
 from marey_server.handlers.items import kind_of
-from marey_server.handlers.reply import Rendered, Reply, render
-from marey_server.handlers.resource import Resource
-from marey_server.handlers.streaming import attachment
-from marey_server.models import SampleFormat
-from marey_server.searching import FoundSearchable, Key, Searchable
+from marey_server.http.declarations import Access, Bytes, Document, reads
+from marey_server.http.reply import Rendered, Reply, render
+from marey_server.http.resource import Resource
+from marey_server.http.streaming import attachment
+from marey_server.motions import search_answers, searching
+from marey_server.motions.models import SampleFormat
+from marey_server.motions.searching import FoundSearchable, Key, Searchable
 
 
 class FoundFileQuery(Request):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from marey_schemas.items import Upload, UploadCreate
 from marey_server.errors import BadRequest, Conflict
-from marey_server.handlers.declarations import MIB, Access, Body, Bytes, reads, writes
-from marey_server.handlers.reply import Rendered, Reply
-from marey_server.handlers.resource import Resource
+from marey_server.http.declarations import MIB, Access, Body, Bytes, reads, writes
+from marey_server.http.reply import Rendered, Reply
+from marey_server.http.resource import Resource
 from marey_server.store import uploads
 from marey_server.store.transaction import Transaction
 

@@ -11,13 +11,13 @@ from marey_schemas.access import Role
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Page
 from marey_server.errors import Conflict, Invalid, NotFound
 from marey_server.store import listing, projects
-from marey_server.store.clock import datetime_of
+from marey_server.store.database.clock import datetime_of
+from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
 from marey_server.store.projects import ProjectRow
 from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import collection, item
 from marey_server.store.transaction import Transaction
-from marey_server.store.violations import taken
 
 MAX_PATH_LENGTH = 1024
 MAX_PATH_BYTES = 2048

@@ -16,7 +16,7 @@ from marey_schemas.coverage_streams import CoverageStream
 from marey_schemas.items import Page
 from marey_server.errors import Conflict, NotFound
 from marey_server.store import listing, projects
-from marey_server.store.clock import datetime_of
+from marey_server.store.database.clock import datetime_of
 from marey_server.store.ids import new_id
 from marey_server.store.tables import coverage_stream
 from marey_server.store.transaction import Transaction

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from sqlalchemy import bindparam, insert, select
 
-from marey_schemas import blocks
-from marey_schemas.arrays import EncodedArray
-from marey_schemas.canonical import canonical_json, detach_arrays
 from marey_schemas.documents import SCHEMAS
+from marey_schemas.encoding import blocks
+from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.encoding.canonical import canonical_json, detach_arrays
 from marey_schemas.problems import FieldError
 from marey_server.errors import Invalid, NotFound
 from marey_server.field_errors import field_errors

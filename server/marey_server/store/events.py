@@ -8,7 +8,7 @@ from sqlalchemy import ColumnElement, Row, and_, or_, select, text
 
 from marey_schemas.items import Event
 from marey_server.store import projects, users
-from marey_server.store.clock import datetime_of
+from marey_server.store.database.clock import datetime_of
 from marey_server.store.tables import event, project
 from marey_server.store.transaction import Transaction
 

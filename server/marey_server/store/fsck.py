@@ -12,13 +12,13 @@ from typing import Any
 
 from sqlalchemy import Row, Select, Table, and_, exists, func, select, text
 
-from marey_schemas.arrays import ArrayError, EncodedArray
-from marey_schemas.canonical import array_digest, canonical_json
+from marey_schemas.encoding.arrays import ArrayError, EncodedArray
+from marey_schemas.encoding.canonical import array_digest, canonical_json
 from marey_schemas.kinds import PARTS, Kind
 from marey_server.access.principal import SYSTEM
 from marey_server.store import documents
 from marey_server.store.blobs import digest_of, read_blob
-from marey_server.store.database import Database
+from marey_server.store.database.connections import Database
 from marey_server.store.items.summaries import summarise
 from marey_server.store.tables import (
     blob,

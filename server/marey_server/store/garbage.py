@@ -18,7 +18,7 @@ from marey_server.access.principal import SYSTEM
 from marey_server.store import uploads
 from marey_server.store.blobs import GRACE_US
 from marey_server.store.coverage_streams import drop_old_streams
-from marey_server.store.database import Database
+from marey_server.store.database.connections import Database
 from marey_server.store.idempotency import LIFETIME_US as KEY_LIFETIME_US
 from marey_server.store.tables import (
     blob,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, delete, select, update
 
-from marey_schemas.canonical import canonical_json
+from marey_schemas.encoding.canonical import canonical_json
 from marey_server.access.principal import Principal
 from marey_server.errors import Invalid
 from marey_server.store.tables import idempotency_key

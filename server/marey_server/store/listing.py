@@ -14,9 +14,9 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Row, Select, UnaryExpression, and_, or_, select
 
-from marey_schemas.canonical import canonical_json
+from marey_schemas.encoding.canonical import canonical_json
 from marey_server.errors import BadRequest
-from marey_server.store.prepared import Prepared
+from marey_server.store.database.prepared import Prepared
 from marey_server.store.tables import server_state
 from marey_server.store.transaction import Transaction
 

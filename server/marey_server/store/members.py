@@ -10,7 +10,7 @@ from marey_schemas.access import Member, MemberChange, Role
 from marey_schemas.items import Page
 from marey_server.errors import Conflict, NotFound, PreconditionFailed
 from marey_server.store import listing, projects
-from marey_server.store.clock import datetime_of
+from marey_server.store.database.clock import datetime_of
 from marey_server.store.projects import ProjectRow
 from marey_server.store.revs import ExpectedRev, at_rev, change_row, moved_on
 from marey_server.store.tables import member, project, user

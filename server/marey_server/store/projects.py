@@ -26,13 +26,13 @@ from marey_server.access import roles, scopes
 from marey_server.access.principal import Principal
 from marey_server.errors import Conflict, Forbidden, NotFound, Unauthenticated
 from marey_server.store import listing
-from marey_server.store.clock import datetime_of
+from marey_server.store.database.clock import datetime_of
+from marey_server.store.database.prepared import Prepared
+from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
-from marey_server.store.prepared import Prepared
 from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import member, project
 from marey_server.store.transaction import Transaction
-from marey_server.store.violations import taken
 
 SORT_KEYS: dict[str, ColumnElement[Any]] = {
     "name": project.c.name,

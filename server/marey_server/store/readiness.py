@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from marey_server.store.schema import schema_at_head
+from marey_server.store.database.schema import schema_at_head
 from marey_server.store.transaction import Transaction
 
 

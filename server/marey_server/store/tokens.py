@@ -20,10 +20,10 @@ from marey_server.access.secret_tokens import (
 )
 from marey_server.errors import Forbidden, NotFound, Unauthenticated
 from marey_server.store import listing
-from marey_server.store.clock import datetime_of
-from marey_server.store.fencing import lease_lost
+from marey_server.store.database.clock import datetime_of
+from marey_server.store.database.prepared import Prepared
 from marey_server.store.ids import new_id
-from marey_server.store.prepared import Prepared
+from marey_server.store.jobs.fencing import lease_lost
 from marey_server.store.tables import attempt, job, token, user
 from marey_server.store.transaction import Transaction
 

@@ -12,8 +12,8 @@ from sqlalchemy.dialects import postgresql, sqlite
 from marey_server.access.principal import Principal
 from marey_server.store import tables
 from marey_server.store.blob_backings import BlobBacking
-from marey_server.store.clock import Clock
-from marey_server.store.prepared import Prepared
+from marey_server.store.database.clock import Clock
+from marey_server.store.database.prepared import Prepared
 
 
 class Transaction:

@@ -9,16 +9,16 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from tests.support.command_line import CommandLine
+from tests.support.database_fixtures import BACKENDS, fresh_database
+from tests.support.evaluation_takes import write_walks
+from tests.support.server_process import ServerProcess, serving
 
-from command_line import CommandLine
-from database_fixtures import BACKENDS, fresh_database
-from evaluation_takes import write_walks
 from marey_client import Marey
 from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate
 from marey_schemas.imports import ImportOptions
-from server_process import ServerProcess, serving
 
 
 @pytest.fixture(scope="module", params=BACKENDS)

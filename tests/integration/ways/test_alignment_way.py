@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.alignment_examples import warped_walks
+from tests.support.command_line import CommandLine
 
-from alignment_examples import warped_walks
-from command_line import CommandLine
 from marey_client.errors import JobUnsuccessful
 from marey_client.jobs import Jobs
 from marey_client.project import ProjectHandle

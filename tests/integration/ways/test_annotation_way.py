@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.support.command_line import CommandLine
 
-from command_line import CommandLine
 from marey_client.errors import JobUnsuccessful, PreconditionFailed, RequestFailed
 from marey_client.jobs import Jobs
 from marey_client.project import ProjectHandle

@@ -8,6 +8,7 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+from tests.support.server_process import ServerProcess
 
 from marey_client.cli import main
 from marey_client.imports import find_files
@@ -16,7 +17,6 @@ from marey_motion.gait import generate_gait
 from marey_schemas.access import ProjectCreate
 from marey_schemas.imports import ImportOptions
 from marey_schemas.items import ItemChange
-from server_process import ServerProcess
 
 NAMES = (f"lab{number}" for number in itertools.count(1))
 

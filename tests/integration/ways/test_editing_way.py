@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.command_line import CommandLine
 
-from command_line import CommandLine
 from marey_client import Marey
 from marey_client.errors import Invalid, RequestFailed
 from marey_client.motions import ClipHandle
@@ -21,7 +21,7 @@ from marey_motion.documents import clip_from_document, commands_of_edit, skeleto
 from marey_motion.editing.registry import edit_clip
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
-from marey_schemas.editing import EditDocument
+from marey_schemas.editing.edits import EditDocument
 from marey_schemas.jobs import Job
 
 pytestmark = pytest.mark.timeout(300)

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.command_line import CommandLine
 
-from command_line import CommandLine
 from marey_client.errors import JobUnsuccessful
 from marey_client.imports import find_files
 from marey_client.project import ProjectHandle

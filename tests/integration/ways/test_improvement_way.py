@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.support.command_line import CommandLine
+from tests.support.server_process import ServerProcess
 
-from command_line import CommandLine
 from marey_client import Marey
 from marey_client.errors import JobUnsuccessful
 from marey_client.evaluations import EvaluationHandle
 from marey_client.project import ProjectHandle
 from marey_schemas.access import Login, Role, UserCreate
 from marey_schemas.jobs import CollectionInput, JobCreate
-from server_process import ServerProcess
 
 pytestmark = pytest.mark.timeout(300)
 

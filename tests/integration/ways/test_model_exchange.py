@@ -10,20 +10,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support import predecessor_models as models
+from tests.support.command_line import CommandLine
+from tests.support.server_process import ServerProcess
 
-import predecessor_models as models
-from command_line import CommandLine
 from marey_client import Marey
 from marey_client.errors import RequestFailed
 from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
-from marey_motion.formats.predecessor_encoding import encode_document
-from marey_motion.formats.predecessor_model import read_predecessor_model
+from marey_motion.formats.predecessor.encoding import encode_document
+from marey_motion.formats.predecessor.model import read_predecessor_model
 from marey_schemas.imports import ImportEntry, ImportOptions
 from marey_schemas.items import ItemChange
 from marey_schemas.jobs import ImportParams, JobCreate
 from marey_schemas.kinds import Kind
-from server_process import ServerProcess
 
 pytestmark = pytest.mark.timeout(300)
 

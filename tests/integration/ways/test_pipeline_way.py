@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 from benchmarks.pipeline_under_fire import write_takes
+from tests.support.command_line import CommandLine
+from tests.support.server_process import ServerProcess, serving
 
-from command_line import CommandLine
 from marey_client import Marey
 from marey_client.errors import NoAnnotations
 from marey_client.imports import find_files
@@ -21,7 +22,6 @@ from marey_motion.formats import write_motion
 from marey_motion.gait import generate_gait
 from marey_schemas.imports import ImportOptions
 from marey_schemas.kinds import Kind
-from server_process import ServerProcess, serving
 
 pytestmark = pytest.mark.timeout(600)
 

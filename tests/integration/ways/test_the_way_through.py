@@ -9,8 +9,9 @@ import zipfile
 
 import numpy as np
 import pytest
+from tests.support.command_line import CommandLine
+from tests.support.server_process import serving
 
-from command_line import CommandLine
 from marey_client import errors
 from marey_client.imports import FILES_PER_IMPORT, find_files
 from marey_motion.formats import read_motion, write_bvh
@@ -20,7 +21,6 @@ from marey_schemas.documents import SkeletonMapping
 from marey_schemas.imports import ImportFile, ImportOptions
 from marey_schemas.items import ItemChange
 from marey_schemas.jobs import CollectionInput, ImportParams, ItemInput, JobCreate
-from server_process import serving
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import pytest
 
 from marey_client.cli.command_texts import parameter_rows, parse_command
 from marey_client.cli.failures import WrongUsage
-from marey_schemas.editing import COMMAND_MODELS, EditDocument
+from marey_schemas.editing.edits import COMMAND_MODELS, EditDocument
 
 
 @pytest.mark.parametrize(

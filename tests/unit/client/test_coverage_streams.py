@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from marey_client.errors import Conflict, RequestFailed
-from marey_schemas.codecs import decode_tree
+from marey_schemas.encoding.codecs import decode_tree
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC).isoformat()
 STREAM = {

@@ -6,7 +6,7 @@ import httpx
 import pytest
 
 from marey_client.downloads import TakenPaths, download, safe_file_name
-from marey_server.handlers.streaming import attachment
+from marey_server.http.streaming import attachment
 
 
 def answer(file_name, content=b"motion"):

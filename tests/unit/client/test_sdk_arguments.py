@@ -14,7 +14,7 @@ from marey_client.imports import find_files
 from marey_client.motions import MotionArrays
 from marey_client.searches import search_request
 from marey_client.transport import BLOCKS
-from marey_schemas.codecs import decode_tree, encode_tree
+from marey_schemas.encoding.codecs import decode_tree, encode_tree
 
 NOW = "2026-01-01T00:00:00Z"
 CLIP = {

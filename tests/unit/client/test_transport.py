@@ -13,7 +13,7 @@ from marey_client.marey import Marey
 from marey_client.retries import Retries
 from marey_client.transport import trusted_authorities
 from marey_schemas.access import Login, NewToken, ProjectCreate, TokenCreate
-from marey_schemas.codecs import encode_tree
+from marey_schemas.encoding.codecs import encode_tree
 from marey_schemas.items import ItemChange
 
 PROJECT = {

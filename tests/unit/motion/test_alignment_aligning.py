@@ -5,8 +5,8 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from tests.support.alignment_examples import body_of, moved, played, sine_warp, walk, warped_walks
 
-from alignment_examples import body_of, moved, played, sine_warp, walk, warped_walks
 from marey_motion.alignment import aligning
 from marey_motion.alignment.aligning import (
     MIRRORED,

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.support.alignment_examples import body_of, moved, walk
+from tests.support.edited_takes import under_static_root
 
-from alignment_examples import body_of, moved, walk
-from edited_takes import under_static_root
 from marey_motion import quaternions
 from marey_motion.alignment.canonical import placed, to_canonical
 from marey_motion.errors import MotionError

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.alignment_examples import body_of, walk, warped_walks
 
-from alignment_examples import body_of, walk, warped_walks
 from marey_motion.alignment.aligned_documents import StoredExample, example_to_tree, set_from_examples, uid_of
 from marey_motion.alignment.aligning import AlignOptions, align_clips, restore, with_mirrored
 from marey_motion.alignment.segments import Cut
 from marey_motion.errors import MotionError
 from marey_schemas.alignment import AlignmentInfo
-from marey_schemas.codecs import JSON, MEDIA_TYPES, decode_tree, encode_tree
+from marey_schemas.encoding.codecs import JSON, MEDIA_TYPES, decode_tree, encode_tree
 
 BODY = body_of(walk())
 DIGEST = f"sha256:{64 * 'a'}"

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from tests.support.alignment_examples import played, sine_warp, walk
 
-from alignment_examples import played, sine_warp, walk
 from marey_motion.alignment.dtw import align
 from marey_motion.alignment.warp import LEAST_SLOPE, inverse, time_function, warped
 from marey_motion.errors import MotionError

@@ -18,7 +18,7 @@ from marey_motion.motion import Motion
 from marey_motion.retargeting import plan_retarget, retarget
 from marey_motion.rigs import guess_axes, map_joints
 from marey_motion.skeleton import Skeleton
-from marey_schemas.editing import EditDocument
+from marey_schemas.editing.edits import EditDocument
 
 
 @pytest.fixture(scope="module")

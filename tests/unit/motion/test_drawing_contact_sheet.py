@@ -10,7 +10,10 @@ from matplotlib.image import imread
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
-from marey_motion.drawing.contact_sheet import (
+from marey_motion.errors import MotionError
+from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
+from marey_motion.skeleton import EndSite, Skeleton
+from marey_reports.drawing.contact_sheet import (
     DPI,
     HEADER,
     MARGIN,
@@ -21,10 +24,7 @@ from marey_motion.drawing.contact_sheet import (
     TakePair,
     contact_sheet,
 )
-from marey_motion.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, body_of, stances_at
-from marey_motion.errors import MotionError
-from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
-from marey_motion.skeleton import EndSite, Skeleton
+from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, body_of, stances_at
 
 BLUE, ORANGE = (0x1F, 0x6F, 0xB2), (0xE0, 0x7B, 0x1A)
 

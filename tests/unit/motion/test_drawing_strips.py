@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 from matplotlib.patches import Circle, PathPatch
+from tests.support.drawn_figures import cut_off
 
-from drawn_figures import cut_off
 from marey_motion import kinematics
-from marey_motion.drawing.paper import COLOURS, INK, REFERENCE
-from marey_motion.drawing.stick_figures import body_of, runs_of
-from marey_motion.drawing.strips import Moments, StripRow, draw_strips
 from marey_motion.gait import generate_gait
+from marey_reports.drawing.paper import COLOURS, INK, REFERENCE
+from marey_reports.drawing.stick_figures import body_of, runs_of
+from marey_reports.drawing.strips import Moments, StripRow, draw_strips
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tests.support.edited_takes import make_breathing_walk, make_walk, require_sound
 
-from edited_takes import make_breathing_walk, make_walk, require_sound
 from marey_motion.clip import Clip
 from marey_motion.editing.registry import EditedClip, NamedCommand, edit_clip
 from marey_motion.errors import MotionError

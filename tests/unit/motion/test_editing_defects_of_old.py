@@ -2,16 +2,16 @@
 
 import numpy as np
 import pytest
+from tests.support.edit_examples import EXAMPLES, SOURCE
+from tests.support.edited_takes import make_breathing_walk, make_walk, require_sound, same_poses
 
-from edit_examples import EXAMPLES, SOURCE
-from edited_takes import make_breathing_walk, make_walk, require_sound, same_poses
 from marey_motion.clip import Clip
 from marey_motion.documents import commands_of_edit
 from marey_motion.editing.registry import apply_edit, edit_clip
 from marey_motion.gait import game_skeleton, studio_skeleton
 from marey_motion.kinematics import global_positions
 from marey_motion.skeleton import Skeleton
-from marey_schemas.editing import EditDocument
+from marey_schemas.editing.edits import EditDocument
 
 
 def test_guess_ground_height_tells_a_height_instead_of_a_name_error() -> None:

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.edited_takes import make_walk
 
-from edited_takes import make_walk
 from marey_motion.clip import Clip
 from marey_motion.editing.registry import apply_edit, edit_clip
 from marey_motion.errors import MotionError

@@ -4,8 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.edited_takes import (
+    largest_step,
+    make_breathing_walk,
+    make_walk,
+    require_sound,
+    same_poses,
+    under_static_root,
+)
 
-from edited_takes import largest_step, make_breathing_walk, make_walk, require_sound, same_poses, under_static_root
 from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
 from marey_motion.editing.registry import apply_edit

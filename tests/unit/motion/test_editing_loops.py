@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from tests.support.edited_takes import make_breathing_walk, make_walk, require_sound, same_poses, under_static_root
 
-from edited_takes import make_breathing_walk, make_walk, require_sound, same_poses, under_static_root
 from marey_motion import kinematics
 from marey_motion.clip import Clip
 from marey_motion.editing.registry import apply_edit

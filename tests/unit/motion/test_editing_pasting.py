@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.edited_takes import are_exactly, make_breathing_walk, make_walk, require_sound
 
-from edited_takes import are_exactly, make_breathing_walk, make_walk, require_sound
 from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
 from marey_motion.editing.registry import apply_edit

@@ -4,8 +4,8 @@ from math import pi, radians
 
 import numpy as np
 import pytest
+from tests.support.edited_takes import make_breathing_walk, make_walk, same_poses
 
-from edited_takes import make_breathing_walk, make_walk, same_poses
 from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
 from marey_motion.editing.registry import apply_edit

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from tests.support.edited_takes import make_breathing_walk, make_walk
 
-from edited_takes import make_breathing_walk, make_walk
 from marey_motion.editing.registry import apply_edit, edit_clip
 from marey_motion.errors import EditError
 

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic_core import PydanticUndefined
+from tests.support.edit_examples import EXAMPLES, SOURCE, commands_of_all
+from tests.support.edited_takes import make_breathing_walk, make_walk, require_sound
 
-from edit_examples import EXAMPLES, SOURCE, commands_of_all
-from edited_takes import make_breathing_walk, make_walk, require_sound
 from marey_motion.clip import Clip
 from marey_motion.documents import commands_of_edit
 from marey_motion.editing.registry import COMMANDS, EditedClip, apply_edit, edit_clip
 from marey_motion.errors import EditError, MotionError
-from marey_schemas.editing import COMMAND_MODELS, EditDocument
+from marey_schemas.editing.edits import COMMAND_MODELS, EditDocument
 
 
 def edit_of(*commands: dict[str, Any]) -> EditDocument:

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.edited_takes import make_breathing_walk, make_walk, require_sound, same_poses
 
-from edited_takes import make_breathing_walk, make_walk, require_sound, same_poses
 from marey_motion import quaternions
 from marey_motion.clip import Clip
 from marey_motion.editing import smoothing

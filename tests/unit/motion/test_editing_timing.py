@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from tests.support.edited_takes import make_breathing_walk, make_walk, same_poses
 
-from edited_takes import make_breathing_walk, make_walk, same_poses
 from marey_motion.editing.registry import apply_edit
 from marey_motion.errors import EditError, MappingError
 from marey_motion.kinematics import global_positions

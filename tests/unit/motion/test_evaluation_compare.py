@@ -5,13 +5,13 @@ from statistics import NormalDist
 
 import numpy as np
 import pytest
+from tests.support.made_databases import arc_track, made_database
+from tests.support.suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
 
-from made_databases import arc_track, made_database
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.compare import compare_results, paired_change, under_one_normaliser
-from marey_motion.evaluation.selection import joined, without_sources
+from marey_motion.evaluation.improvement.selection import joined, without_sources
 from marey_motion.matching.building import union_normaliser
-from suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.evaluation_cases import RATE_HZ, arc, root_database
 
-from evaluation_cases import RATE_HZ, arc, root_database
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import (
     cell_edges,

@@ -2,8 +2,8 @@ from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
+from tests.support.evaluation_cases import arc, clips_of, record_of, root_database
 
-from evaluation_cases import arc, clips_of, record_of, root_database
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.result import EvaluationOptions, Grid
 from marey_motion.evaluation.result_documents import (
@@ -16,7 +16,7 @@ from marey_motion.evaluation.scenario import reference, suite_trials
 from marey_motion.evaluation.suite import assemble
 from marey_motion.matching.options import ControllerOptions, DatabaseOptions
 from marey_motion.matching.record import Status
-from marey_schemas.codecs import MEDIA_TYPES, decode_tree, encode_tree
+from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree, encode_tree
 
 OPTIONS = EvaluationOptions(
     grid=Grid((1.0, 2.0), (-50.0, 0.0, 50.0)),

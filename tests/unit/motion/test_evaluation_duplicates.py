@@ -5,10 +5,11 @@ from math import radians
 
 import numpy as np
 import pytest
+from tests.support.made_databases import made_database
+from tests.support.suggestion_cases import named, wandering_tracks
 
-from made_databases import made_database
 from marey_motion.alignment.dtw import warped_distance
-from marey_motion.evaluation.duplicates import find_near_duplicates, frame_points, spared_sources
+from marey_motion.evaluation.improvement.duplicates import find_near_duplicates, frame_points, spared_sources
 from marey_motion.evaluation.suite import EvaluationCancelled
 from marey_motion.gait import generate_gait
 from marey_motion.gait.style import GaitStyle
@@ -18,7 +19,6 @@ from marey_motion.matching.database import SourceClip
 from marey_motion.matching.options import DatabaseOptions
 from marey_motion.mirroring import mirror_clip
 from marey_motion.rigs import map_joints
-from suggestion_cases import named, wandering_tracks
 
 
 def gaits(mirroring="none", **clips):

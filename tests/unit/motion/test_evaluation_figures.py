@@ -11,19 +11,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.drawn_figures import is_sound, rows_of
+from tests.support.evaluation_results import SMALL, evaluated, made_up, some_coverage, wandering
 
-from drawn_figures import is_sound, rows_of
-from evaluation_results import SMALL, evaluated, made_up, some_coverage, wandering
-from marey_motion.drawing.paper import labels_of, nice_levels, shortened, without_shared_folder
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import Windows, coverage_of
-from marey_motion.evaluation.figures import FIGURES, FigureOptions, draw_figure, draw_figures
-from marey_motion.evaluation.figures.clip_graph_layout import MOST_DOTS, arrange
-from marey_motion.evaluation.figures.mixtures import fit_one, fit_two
 from marey_motion.evaluation.result import EvaluationOptions, Grid
 from marey_motion.evaluation.scenario import demand, suite_trials
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import Status
+from marey_reports.drawing.paper import labels_of, nice_levels, shortened, without_shared_folder
+from marey_reports.evaluation.figures import FIGURES, FigureOptions, draw_figure, draw_figures
+from marey_reports.evaluation.figures.clip_graph_layout import MOST_DOTS, arrange
+from marey_reports.evaluation.figures.mixtures import fit_one, fit_two
 
 ONE_TRIAL = [name for name, kind in FIGURES.items() if kind.trials == "one"]
 SWITCHING = "switching v=2 w=50"
@@ -66,7 +66,7 @@ def test_drawing_leaves_the_settings_of_matplotlib_alone(result):
 
 
 def test_matplotlib_is_not_loaded_before_something_is_drawn():
-    script = "import sys, marey_motion.evaluation.report; sys.exit('matplotlib' in sys.modules)"
+    script = "import sys, marey_reports.evaluation.page; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
+from tests.support.evaluation_cases import RATE_HZ, closed_reference, record_of, straight_record
 
-from evaluation_cases import RATE_HZ, closed_reference, record_of, straight_record
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.metrics import measure_trial, offset_asymmetry, pooled_metrics, trial_series
 from marey_motion.evaluation.result import EvaluationOptions, TrialResult

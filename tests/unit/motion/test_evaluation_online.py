@@ -16,7 +16,7 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.simulation_root import simulation_root
 from marey_motion.motion import Motion
 from marey_motion.rigs import map_joints
-from marey_schemas.codecs import MSGPACK, decode_tree, encode_tree
+from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 
 RATE_HZ = 60.0
 TOLERANCE = 1e-10

@@ -5,16 +5,16 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
+from tests.support.made_databases import arc_track, made_database
+from tests.support.suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
 
-from made_databases import arc_track, made_database
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.objective import Objective, headline_means
-from marey_motion.evaluation.optimise import OptimisationOptions, optimise
-from marey_motion.evaluation.resimulation import Resimulation
-from marey_motion.evaluation.selection import without_sources
-from marey_motion.evaluation.suggestion_documents import optimisation_to_tree, steps_from_tree
+from marey_motion.evaluation.improvement.objective import Objective, headline_means
+from marey_motion.evaluation.improvement.optimise import OptimisationOptions, optimise
+from marey_motion.evaluation.improvement.resimulation import Resimulation
+from marey_motion.evaluation.improvement.selection import without_sources
+from marey_motion.evaluation.improvement.suggestion_documents import optimisation_to_tree, steps_from_tree
 from marey_motion.evaluation.suite import EvaluationCancelled
-from suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
 
 TURNS = ("turn_left", "turn_right")
 AIM = OptimisationOptions(objective=Objective(seconds=0.002), max_steps=6)

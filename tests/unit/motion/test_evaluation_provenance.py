@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.evaluation_cases import arc, root_database
 
-from evaluation_cases import arc, root_database
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.provenance import provenance_of, require_comparable
 from marey_motion.evaluation.result import EvaluationOptions, Grid

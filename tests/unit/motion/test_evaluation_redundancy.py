@@ -1,15 +1,15 @@
 """Leaving clips out: what is predicted is what an evaluation of the clips that are left finds."""
 
 import pytest
+from tests.support.made_databases import made_database
+from tests.support.suggestion_cases import OPTIONS, evaluated, named, wandering_tracks, with_mirrored
 
-from made_databases import made_database
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.objective import HEADLINES, Objective, headline_means
-from marey_motion.evaluation.redundancy import leave_one_out, plan_removals
-from marey_motion.evaluation.resimulation import Resimulation
-from marey_motion.evaluation.selection import without_sources
+from marey_motion.evaluation.improvement.objective import HEADLINES, Objective, headline_means
+from marey_motion.evaluation.improvement.redundancy import leave_one_out, plan_removals
+from marey_motion.evaluation.improvement.resimulation import Resimulation
+from marey_motion.evaluation.improvement.selection import without_sources
 from marey_motion.evaluation.suite import EvaluationCancelled
-from suggestion_cases import OPTIONS, evaluated, named, wandering_tracks, with_mirrored
 
 
 @pytest.fixture(scope="module")

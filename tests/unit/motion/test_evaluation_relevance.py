@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.evaluation_cases import clips_of, walked_record
 
-from evaluation_cases import clips_of, walked_record
 from marey_motion.evaluation.relevance import (
     clips_of_rows,
     count_switches,

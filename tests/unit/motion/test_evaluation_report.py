@@ -6,16 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.evaluation_results import made_up
+from tests.support.report_pages import HOSTILE, is_sound
 
-from evaluation_results import made_up
-from marey_motion.drawing.markup import element, text
-from marey_motion.drawing.words import amount, duration
 from marey_motion.evaluation.compare import compare_results
-from marey_motion.evaluation.figures import FIGURES, draw_figures
 from marey_motion.evaluation.judgement import is_followed, judge, mean_speed_m_s
-from marey_motion.evaluation.report import compared, render_comparison, render_report, verdict
-from marey_motion.evaluation.report.definitions import METRICS
-from marey_motion.evaluation.report.words import find_holes
 from marey_motion.evaluation.result import EvaluationOptions, Grid, TrialResult
 from marey_motion.evaluation.scenario import Trial, demand
 from marey_motion.evaluation.suite import evaluate
@@ -24,7 +19,13 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import SourceClip
 from marey_motion.rigs import map_joints
-from report_pages import HOSTILE, is_sound
+from marey_reports.drawing.markup import element, text
+from marey_reports.drawing.words import amount, duration
+from marey_reports.evaluation import verdict
+from marey_reports.evaluation.definitions import METRICS
+from marey_reports.evaluation.figures import FIGURES, draw_figures
+from marey_reports.evaluation.page import compared, render_comparison, render_report
+from marey_reports.evaluation.words import find_holes
 
 
 @pytest.fixture(scope="module")

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.made_databases import made_database
+from tests.support.suggestion_cases import named, same_to_the_bit, simulated, wandering_tracks, with_mirrored
 
-from made_databases import made_database
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.selection import (
+from marey_motion.evaluation.improvement.selection import (
     clips_by_source,
     joined,
     rows_of_sources,
@@ -15,7 +16,6 @@ from marey_motion.evaluation.selection import (
     without_rows,
     without_sources,
 )
-from suggestion_cases import named, same_to_the_bit, simulated, wandering_tracks, with_mirrored
 
 ROWS = ("features", "selectable", "root_positions", "root_headings", "pose_points", "poses", "contacts")
 

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.made_databases import arc_track, made_database
+from tests.support.suggestion_cases import OPTIONS, evaluated, named, wandering_tracks, with_mirrored
 
-from made_databases import arc_track, made_database
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.similarity import (
@@ -18,7 +19,6 @@ from marey_motion.evaluation.similarity import (
 )
 from marey_motion.evaluation.suite import EvaluationCancelled
 from marey_motion.matching.record import Status
-from suggestion_cases import OPTIONS, evaluated, named, wandering_tracks, with_mirrored
 
 
 def straight_walks(count=3, seconds=5.0, **given):

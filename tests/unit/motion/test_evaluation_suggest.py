@@ -5,26 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from made_databases import arc_track, made_database
-from marey_motion.errors import MotionError
-from marey_motion.evaluation.compare import compare_results
-from marey_motion.evaluation.filling import FilledCell, Filling
-from marey_motion.evaluation.objective import headline_means
-from marey_motion.evaluation.reasons import why_filling, why_redundant
-from marey_motion.evaluation.redundancy import Removal
-from marey_motion.evaluation.result import EvaluationOptions
-from marey_motion.evaluation.selection import joined, without_rows, without_sources
-from marey_motion.evaluation.similarity import accepted_distance
-from marey_motion.evaluation.suggest import SuggestionOptions, suggest
-from marey_motion.evaluation.suggestion_documents import comparison_to_tree, suggestions_to_tree
-from marey_motion.evaluation.suite import EvaluationCancelled
-from marey_motion.formats import read_motion
-from marey_motion.matching.body import MatchingBody
-from marey_motion.matching.building import build_database
-from marey_motion.matching.database import SourceClip
-from marey_motion.rigs import map_joints
-from suggestion_cases import (
+from tests.support.made_databases import arc_track, made_database
+from tests.support.suggestion_cases import (
     UNWANTED,
     evaluated,
     named,
@@ -32,6 +14,24 @@ from suggestion_cases import (
     simulated,
     wandering_tracks,
 )
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.compare import compare_results
+from marey_motion.evaluation.improvement.filling import FilledCell, Filling
+from marey_motion.evaluation.improvement.objective import headline_means
+from marey_motion.evaluation.improvement.reasons import why_filling, why_redundant
+from marey_motion.evaluation.improvement.redundancy import Removal
+from marey_motion.evaluation.improvement.selection import joined, without_rows, without_sources
+from marey_motion.evaluation.improvement.suggest import SuggestionOptions, suggest
+from marey_motion.evaluation.improvement.suggestion_documents import comparison_to_tree, suggestions_to_tree
+from marey_motion.evaluation.result import EvaluationOptions
+from marey_motion.evaluation.similarity import accepted_distance
+from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_motion.formats import read_motion
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.building import build_database
+from marey_motion.matching.database import SourceClip
+from marey_motion.rigs import map_joints
 
 
 @pytest.fixture(scope="module")

@@ -4,15 +4,15 @@ from itertools import product
 
 import numpy as np
 import pytest
+from tests.support.evaluation_cases import arc, trajectory_database
 
-from evaluation_cases import arc, trajectory_database
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.result import EvaluationOptions, Grid
 from marey_motion.evaluation.result_documents import records_to_tree
 from marey_motion.evaluation.scenario import reference, suite_trials
 from marey_motion.evaluation.suite import EvaluationCancelled, assemble, run_suite
 from marey_motion.matching.options import ControllerOptions
-from marey_schemas.codecs import encode_tree
+from marey_schemas.encoding.codecs import encode_tree
 
 OPTIONS = EvaluationOptions(grid=Grid((1.0, 2.0), (-50.0, 0.0, 50.0)), duration_s=6.0, switch_every_s=2.0)
 TRIALS = suite_trials(OPTIONS)

@@ -5,12 +5,11 @@ from math import radians
 
 import numpy as np
 import pytest
+from tests.support.suggestion_cases import OPTIONS, evaluated
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.metrics import pooled_metrics
-from marey_motion.evaluation.objective import Objective
-from marey_motion.evaluation.suite import EvaluationCancelled
-from marey_motion.evaluation.sweep import (
+from marey_motion.evaluation.improvement.objective import Objective
+from marey_motion.evaluation.improvement.sweep import (
     GROUPS,
     SweepRow,
     group_influences,
@@ -18,13 +17,14 @@ from marey_motion.evaluation.sweep import (
     sweep_weights,
     vary_each_group,
 )
+from marey_motion.evaluation.metrics import pooled_metrics
+from marey_motion.evaluation.suite import EvaluationCancelled
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import SourceClip
 from marey_motion.matching.options import DatabaseOptions, FeatureWeights
 from marey_motion.rigs import map_joints
-from suggestion_cases import OPTIONS, evaluated
 
 
 def walks(weights=None):

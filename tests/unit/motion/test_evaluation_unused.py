@@ -4,18 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from made_databases import arc_track, made_database
-from marey_motion.evaluation.resimulation import needed_rows
-from marey_motion.evaluation.result import Grid
-from marey_motion.evaluation.scenario import suite_trials
-from marey_motion.evaluation.selection import without_rows, without_sources
-from marey_motion.evaluation.suite import run_suite
-from marey_motion.evaluation.unused import find_unused
-from marey_motion.matching.options import DatabaseOptions
-from marey_motion.matching.record import Status
-from marey_motion.matching.search import build_index
-from suggestion_cases import (
+from tests.support.made_databases import arc_track, made_database
+from tests.support.suggestion_cases import (
     OPTIONS,
     UNWANTED,
     named,
@@ -24,6 +14,16 @@ from suggestion_cases import (
     wandering_tracks,
     with_mirrored,
 )
+
+from marey_motion.evaluation.improvement.resimulation import needed_rows
+from marey_motion.evaluation.improvement.selection import without_rows, without_sources
+from marey_motion.evaluation.improvement.unused import find_unused
+from marey_motion.evaluation.result import Grid
+from marey_motion.evaluation.scenario import suite_trials
+from marey_motion.evaluation.suite import run_suite
+from marey_motion.matching.options import DatabaseOptions
+from marey_motion.matching.record import Status
+from marey_motion.matching.search import build_index
 
 VARIANTS = {
     "as usual": {},

@@ -4,8 +4,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from tests.support.evaluation_cases import clips_of, walked_record
 
-from evaluation_cases import clips_of, walked_record
 from marey_motion.evaluation.relevance import count_switches, measure_usage
 from marey_motion.evaluation.walk_graph import clip_graph, graph_to_graphml, graph_to_tree, walk_graph
 

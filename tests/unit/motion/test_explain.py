@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.made_databases import arc_track, index_of, made_database, random_tracks
 
-from made_databases import arc_track, index_of, made_database, random_tracks
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.scenario import Trial, reference
 from marey_motion.matching.controller import run_trial

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.support.motion_files import AMC, ASF
 
 from marey_motion.errors import FormatError
 from marey_motion.formats import pair_companions, read_motion
 from marey_motion.formats.asf_amc import read_asf_amc
+from marey_motion.importing.source import ImportOptions, SourceMotion
 from marey_motion.kinematics import global_positions
-from marey_motion.source import ImportOptions, SourceMotion
-from motion_files import AMC, ASF
 
 
 def read(amc: str = AMC, asf: str = ASF, **options: float) -> SourceMotion:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.support.motion_files import ARM, POSITIONS, ZXY, bvh, nested, rows_of
 
 from marey_motion.errors import FormatError, FormatLimit
 from marey_motion.formats.bvh import read_bvh
-from marey_motion.source import SourceMotion
-from motion_files import ARM, POSITIONS, ZXY, bvh, nested, rows_of
+from marey_motion.importing.source import SourceMotion
 
 
 def read(data: bytes, **options: float) -> SourceMotion:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import bz2
 
 import pytest
+from tests.support.motion_files import AMC, ASF, bvh
 
 from marey_motion.errors import FormatError, UnknownFormat
 from marey_motion.formats import detect_format, read_motion, write_motion
 from marey_motion.gait import generate_gait
-from motion_files import AMC, ASF, bvh
 
 
 @pytest.mark.parametrize(

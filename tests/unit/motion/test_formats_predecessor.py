@@ -14,7 +14,8 @@ import pytest
 from marey_motion import quaternions
 from marey_motion.clip import Clip
 from marey_motion.errors import FormatError, FormatLimit
-from marey_motion.formats import predecessor_encoding, read_motion, write_motion, write_predecessor_skeleton
+from marey_motion.formats import read_motion, write_motion, write_predecessor_skeleton
+from marey_motion.formats.predecessor import encoding as predecessor_encoding
 from marey_motion.kinematics import global_positions
 from marey_motion.skeleton import Skeleton, same_hierarchy
 

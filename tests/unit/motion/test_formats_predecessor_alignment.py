@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from marey_motion.errors import FormatError
-from marey_motion.formats.predecessor_alignment import (
+from marey_motion.formats.predecessor.alignment import (
     as_increasing,
     read_predecessor_alignment,
     write_predecessor_alignment,

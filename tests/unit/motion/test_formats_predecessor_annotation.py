@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import FormatError
-from marey_motion.formats.predecessor_annotation import read_predecessor_annotation, write_predecessor_annotation
+from marey_motion.formats.predecessor.annotation import read_predecessor_annotation, write_predecessor_annotation
 
 FRAMES = 40
 

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from marey_motion.errors import FormatError
-from marey_motion.formats.predecessor_graph import graph_of_document, is_graph, write_predecessor_graph
+from marey_motion.formats.predecessor.graph import graph_of_document, is_graph, write_predecessor_graph
 
 
 def transition(action, name, model_id):

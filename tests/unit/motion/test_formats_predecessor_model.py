@@ -7,14 +7,14 @@ import json
 import numpy as np
 import pytest
 from scipy.interpolate import BSpline
+from tests.support import model_examples
+from tests.support import predecessor_models as models
 
-import model_examples
-import predecessor_models as models
 from marey_motion.errors import FormatError
-from marey_motion.formats.predecessor_encoding import encode_document
-from marey_motion.formats.predecessor_model import read_predecessor_model
-from marey_motion.formats.predecessor_model_writer import write_predecessor_model
-from marey_motion.formats.predecessor_time import PredecessorTime, as_log_slopes
+from marey_motion.formats.predecessor.encoding import encode_document
+from marey_motion.formats.predecessor.model import read_predecessor_model
+from marey_motion.formats.predecessor.model_writer import write_predecessor_model
+from marey_motion.formats.predecessor.time_functions import PredecessorTime, as_log_slopes
 from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.modelling.training import train_primitive

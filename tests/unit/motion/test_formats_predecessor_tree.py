@@ -5,10 +5,10 @@ import json
 
 import numpy as np
 import pytest
+from tests.support import predecessor_models as models
 
-import predecessor_models as models
 from marey_motion.errors import FormatError
-from marey_motion.formats.predecessor_tree import is_tree, read_predecessor_tree, write_predecessor_tree
+from marey_motion.formats.predecessor.tree import is_tree, read_predecessor_tree, write_predecessor_tree
 
 
 def read(document):

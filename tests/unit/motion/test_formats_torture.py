@@ -7,20 +7,20 @@ import random
 from collections.abc import Callable
 from pathlib import Path
 
+import motion_big_files as big
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.support.motion_files import ARM, ZXY, bvh, nested
+from tests.support.motion_fuzz import read_broken, seeds
 
-import motion_big_files as big
 from marey_motion import quaternions
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.formats import ImportOptions, read_motion, write_bvh
 from marey_motion.kinematics import global_positions
 from marey_motion.skeleton import EndSite, Skeleton
-from motion_files import ARM, ZXY, bvh, nested
-from motion_fuzz import read_broken, seeds
 
 CENTIMETRES = ImportOptions(unit_scale_m=0.01, up_axis="y")
 

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from made_databases import (
+from tests.support.made_databases import (
     EXACT,
     arc_track,
     circle,
@@ -17,13 +16,14 @@ from made_databases import (
     random_tracks,
     switches,
 )
+from tests.support.plain_controller import run_plainly
+
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.scenario import Reference, Trial, reference
 from marey_motion.matching.controller import run_trial
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.options import ControllerOptions, DatabaseOptions
 from marey_motion.matching.record import Status, TrialRecord
-from plain_controller import run_plainly
 
 # The loop as it is defined
 

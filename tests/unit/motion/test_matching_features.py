@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.plain_features import plain_rows
 
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
@@ -12,7 +13,6 @@ from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.features import feature_layout
 from marey_motion.matching.options import DatabaseOptions, FeatureWeights
 from marey_motion.rigs import map_joints
-from plain_features import plain_rows
 
 DEFAULTS = DatabaseOptions()
 BODY = MatchingBody.from_mapping(studio_skeleton(), map_joints(studio_skeleton()))

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from made_databases import (
+from tests.support.made_databases import (
     EXACT,
     FOLLOWS,
     arc_track,
@@ -20,6 +19,7 @@ from made_databases import (
     random_tracks,
     switches,
 )
+
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.options import ControllerOptions
 

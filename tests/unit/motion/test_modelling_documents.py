@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from tests.support.modelling_examples import bending_chains, chain, walks
 
 from marey_motion.errors import MotionError
 from marey_motion.modelling.options import ModelOptions
@@ -14,10 +15,9 @@ from marey_motion.modelling.primitive_documents import (
 )
 from marey_motion.modelling.training import train_primitive
 from marey_motion.skeleton import Skeleton
-from marey_schemas.canonical import document_digest
-from marey_schemas.codecs import MEDIA_TYPES, decode_tree, encode_tree
+from marey_schemas.encoding.canonical import document_digest
+from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree, encode_tree
 from marey_schemas.modelling import ModelParams, MotionPrimitiveDocument
-from modelling_examples import bending_chains, chain, walks
 
 SKELETON = {"item": "skel_1", "revision": 2}
 

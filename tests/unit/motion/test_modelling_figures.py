@@ -7,10 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.drawn_figures import cut_off, is_sound, rows_of
+from tests.support.model_examples import FRAMES, walks
 
-from drawn_figures import cut_off, is_sound, rows_of
-from marey_motion.drawing.drawn import finish
-from marey_motion.modelling.figures import (
+from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.search.check import SearchCheck
+from marey_motion.modelling.training import train_primitive
+from marey_motion.skeleton import Skeleton
+from marey_reports.drawing.drawn import finish
+from marey_reports.models.figures import (
     ALIGNMENT_FIGURES,
     MODEL_FIGURES,
     ModelSubject,
@@ -18,14 +23,9 @@ from marey_motion.modelling.figures import (
     draw_model_figures,
     draw_search_errors,
 )
-from marey_motion.modelling.figures.components import draw_component
-from marey_motion.modelling.figures.latent_space import ellipse
-from marey_motion.modelling.figures.samples import reach_of
-from marey_motion.modelling.options import ModelOptions
-from marey_motion.modelling.search_check import SearchCheck
-from marey_motion.modelling.training import train_primitive
-from marey_motion.skeleton import Skeleton
-from model_examples import FRAMES, walks
+from marey_reports.models.figures.components import draw_component
+from marey_reports.models.figures.latent_space import ellipse
+from marey_reports.models.figures.samples import reach_of
 
 QUICK = ModelOptions(report_samples=20, starts=1)
 
@@ -65,7 +65,7 @@ def test_threads_draw_the_same_figures_at_once(subject, figures):
 
 
 def test_matplotlib_is_not_loaded_before_something_is_drawn():
-    script = "import sys, marey_motion.modelling.report; sys.exit('matplotlib' in sys.modules)"
+    script = "import sys, marey_reports.models.page; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
 
 

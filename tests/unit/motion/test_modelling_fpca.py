@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.decomposition import PCA
+from tests.support.modelling_examples import bending_chains, chain, unit_poses, walks
 
 from marey_motion import quaternions
 from marey_motion.alignment.signs import consistent_signs
@@ -14,7 +15,6 @@ from marey_motion.modelling.scaled_fpca import SMALLEST_WEIGHT, _logarithms, _Pr
 from marey_motion.modelling.scaling import LEAST_WEIGHT_M, jacobian_weights, root_max_weights
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.skeleton import Skeleton
-from modelling_examples import bending_chains, chain, unit_poses, walks
 
 BASIS = SplineBasis.clamped(30, 8)
 CHANNELS = 11

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.search_primitives import FRAMES, sliding, standard_joints, walking
 
 from marey_motion import quaternions
 from marey_motion.alignment.aligned import Placement
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import as_global_rotations, forward_directions, forward_kinematics, headings
-from marey_motion.modelling.constraints import (
+from marey_motion.modelling.search.constraints import (
     ConstraintError,
     JointOrientation,
     JointPosition,
@@ -18,9 +19,8 @@ from marey_motion.modelling.constraints import (
     RootHeading,
     RootPosition,
 )
-from marey_motion.modelling.objective import MOST_CONSTRAINTS, build_objective
-from marey_motion.modelling.steps import SeveralSteps, Step
-from search_primitives import FRAMES, sliding, standard_joints, walking
+from marey_motion.modelling.search.objective import MOST_CONSTRAINTS, build_objective
+from marey_motion.modelling.search.steps import SeveralSteps, Step
 
 PLACEMENT = Placement(0.7, 0.4, -0.3)
 EVERY_KIND = (

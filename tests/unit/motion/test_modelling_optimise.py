@@ -4,17 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.search_primitives import FRAMES, sliding, standard_joints, walking
 
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
-from marey_motion.modelling.constraints import JointPosition, KeyframeTime, RootHeading, RootPosition
 from marey_motion.modelling.mixture import LatentMixture
-from marey_motion.modelling.objective import build_objective
-from marey_motion.modelling.optimise import RefineOptions, _Prior, refine
-from marey_motion.modelling.search import search_tree
-from marey_motion.modelling.steps import SeveralSteps, Step
-from marey_motion.modelling.tree import TreeOptions, build_tree
-from search_primitives import FRAMES, sliding, standard_joints, walking
+from marey_motion.modelling.search.constraints import JointPosition, KeyframeTime, RootHeading, RootPosition
+from marey_motion.modelling.search.objective import build_objective
+from marey_motion.modelling.search.optimise import RefineOptions, _Prior, refine
+from marey_motion.modelling.search.samples import search_tree
+from marey_motion.modelling.search.steps import SeveralSteps, Step
+from marey_motion.modelling.search.tree import TreeOptions, build_tree
 
 WRIST = (JointPosition("left_wrist", "middle", (0.35, 1.0, 0.6)),)
 

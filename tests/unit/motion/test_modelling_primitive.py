@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.search_primitives import walking
 
 from marey_motion.errors import MotionError
-from marey_motion.modelling.constraints import ConstraintError, KeyframeTime
-from marey_motion.modelling.objective import build_objective
-from search_primitives import walking
+from marey_motion.modelling.search.constraints import ConstraintError, KeyframeTime
+from marey_motion.modelling.search.objective import build_objective
 
 FAR = 1e3
 

@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.support.modelling_examples import walks
+from tests.support.search_primitives import sliding, standard_joints, walking
 
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
-from marey_motion.modelling.constraints import JointPosition, RootPosition
-from marey_motion.modelling.objective import build_objective
-from marey_motion.modelling.optimise import RefineOptions, refine
 from marey_motion.modelling.options import ModelOptions
-from marey_motion.modelling.search import search_all, search_closely, search_tree
-from marey_motion.modelling.steps import SeveralSteps, Step
+from marey_motion.modelling.search.constraints import JointPosition, RootPosition
+from marey_motion.modelling.search.objective import build_objective
+from marey_motion.modelling.search.optimise import RefineOptions, refine
+from marey_motion.modelling.search.samples import search_all, search_closely, search_tree
+from marey_motion.modelling.search.steps import SeveralSteps, Step
+from marey_motion.modelling.search.tree import END_EFFECTORS, SampleTree, TreeOptions, build_tree
 from marey_motion.modelling.training import train_primitive
-from marey_motion.modelling.tree import END_EFFECTORS, SampleTree, TreeOptions, build_tree
-from modelling_examples import walks
-from search_primitives import sliding, standard_joints, walking
 
 EVERYTHING = 10**6
 

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.model_examples import walks
 
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.modelling.options import ModelOptions
-from marey_motion.modelling.search_check import check_search
+from marey_motion.modelling.search.check import check_search
 from marey_motion.rigs import map_joints
-from model_examples import walks
 
 OPTIONS = ModelOptions(starts=1)
 

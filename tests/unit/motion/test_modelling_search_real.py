@@ -9,14 +9,14 @@ from marey_motion.alignment.signs import consistent_poses
 from marey_motion.formats import read_motion
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.matching.body import MatchingBody
-from marey_motion.modelling.constraints import JointPosition
-from marey_motion.modelling.objective import build_objective
-from marey_motion.modelling.optimise import RefineOptions
 from marey_motion.modelling.options import ModelOptions
-from marey_motion.modelling.step_search import search_steps
-from marey_motion.modelling.steps import Step
+from marey_motion.modelling.search.constraints import JointPosition
+from marey_motion.modelling.search.objective import build_objective
+from marey_motion.modelling.search.optimise import RefineOptions
+from marey_motion.modelling.search.step_search import search_steps
+from marey_motion.modelling.search.steps import Step
+from marey_motion.modelling.search.tree import END_EFFECTORS, build_tree
 from marey_motion.modelling.training import train_primitive
-from marey_motion.modelling.tree import END_EFFECTORS, build_tree
 from marey_motion.retargeting import plan_retarget, retarget
 from marey_motion.rigs import guess_axes, map_joints
 from marey_motion.skeleton import same_hierarchy

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.search_primitives import sliding, standard_joints, walking
 
 from marey_motion.alignment.aligned import Placement
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_directions, headings
-from marey_motion.modelling.constraints import (
+from marey_motion.modelling.search.constraints import (
     ConstraintError,
     JointOrientation,
     JointPosition,
@@ -16,15 +17,14 @@ from marey_motion.modelling.constraints import (
     RootHeading,
     RootPosition,
 )
-from marey_motion.modelling.finishing import finish_motion
-from marey_motion.modelling.found_motions import found_motion
-from marey_motion.modelling.optimise import RefineOptions
-from marey_motion.modelling.step_search import search_steps
-from marey_motion.modelling.steps import MOST_STEPS, Step, TransitionOptions
-from marey_motion.modelling.tree import TreeOptions, build_tree
+from marey_motion.modelling.search.finishing import finish_motion
+from marey_motion.modelling.search.found_motions import found_motion
+from marey_motion.modelling.search.optimise import RefineOptions
+from marey_motion.modelling.search.step_search import search_steps
+from marey_motion.modelling.search.steps import MOST_STEPS, Step, TransitionOptions
+from marey_motion.modelling.search.tree import TreeOptions, build_tree
 from marey_motion.quaternions import from_axis_angle
 from marey_motion.rigs import map_joints
-from search_primitives import sliding, standard_joints, walking
 
 START = Placement(0.5, 1.0, -2.0)
 

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
+from tests.support.modelling_examples import aligned_set, bending_chains, chain, unit_poses, walks, warps
 
 from marey_motion.alignment.aligned import AlignedClip
 from marey_motion.alignment.signs import consistent_poses
@@ -20,8 +21,7 @@ from marey_motion.modelling.splines import SplineBasis
 from marey_motion.modelling.training import fit_examples, train_primitive
 from marey_motion.modelling.training_warnings import warnings_of
 from marey_motion.modelling.verdict import headline_of, verdict_of
-from marey_schemas.codecs import MSGPACK, encode_tree
-from modelling_examples import aligned_set, bending_chains, chain, unit_poses, walks, warps
+from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 
 SCALINGS = ["jacobian", "root_max", "sfpca", "none"]
 QUICK = ModelOptions(leave_one_out=False, folds=0, report_samples=0)

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.support.search_primitives import sliding, standard_joints, walking
 
 from marey_motion.errors import MotionError
-from marey_motion.modelling.constraints import JointPosition
 from marey_motion.modelling.mixture import LatentMixture
-from marey_motion.modelling.objective import build_objective
-from marey_motion.modelling.sample_tree_documents import sample_tree_from_tree, sample_tree_to_tree
-from marey_motion.modelling.search import search_tree
-from marey_motion.modelling.tree import END_EFFECTORS, SampleTree, TreeOptions, build_tree
-from marey_schemas.codecs import MEDIA_TYPES, decode_tree, encode_tree
+from marey_motion.modelling.search.constraints import JointPosition
+from marey_motion.modelling.search.objective import build_objective
+from marey_motion.modelling.search.samples import search_tree
+from marey_motion.modelling.search.tree import END_EFFECTORS, SampleTree, TreeOptions, build_tree
+from marey_motion.modelling.search.tree_documents import sample_tree_from_tree, sample_tree_to_tree
+from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree, encode_tree
 from marey_schemas.sample_trees import SampleTreeDocument
-from search_primitives import sliding, standard_joints, walking
 
 LATENT = TreeOptions(samples=600, features="latent")
 

@@ -9,8 +9,8 @@ from marey_motion import documents
 from marey_motion.errors import ClipError, MappingError, SkeletonError
 from marey_motion.rigs import guess_axes, map_joints
 from marey_motion.skeleton import same_hierarchy
-from marey_schemas import codecs
 from marey_schemas import documents as schemas
+from marey_schemas.encoding import codecs
 
 STORED = schemas.RevisionRef(item="skeleton-1", revision=3)
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from marey_motion import kinematics, quaternions
-from marey_motion.checks import CODES
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, MappingError, UnknownJoint
 from marey_motion.formats import read_motion
 from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
+from marey_motion.importing.checks import CODES
 from marey_motion.retargeting import moved_bones, plan_retarget, retarget
 from marey_motion.rigs import JointAxes, guess_axes, map_joints
 from marey_motion.skeleton import Skeleton

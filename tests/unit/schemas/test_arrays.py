@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
-from marey_schemas import blocks
-from marey_schemas.arrays import Array, ArrayError, ArrayOf, EncodedArray, array_from_leaf, nested_lists
+from marey_schemas.encoding import blocks
+from marey_schemas.encoding.arrays import Array, ArrayError, ArrayOf, EncodedArray, array_from_leaf, nested_lists
 
 
 class Take(BaseModel):

@@ -1,7 +1,14 @@
 import numpy as np
 import pytest
 
-from marey_schemas.arrayspec import DTYPES, MAX_DIMENSIONS, ArrayError, ArraySpec, little_endian, require_finite
+from marey_schemas.encoding.arrayspec import (
+    DTYPES,
+    MAX_DIMENSIONS,
+    ArrayError,
+    ArraySpec,
+    little_endian,
+    require_finite,
+)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

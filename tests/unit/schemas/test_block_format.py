@@ -12,7 +12,7 @@ import pytest
 import zstandard
 from numpy.typing import NDArray
 
-from marey_schemas import blocks
+from marey_schemas.encoding import blocks
 
 
 def read_file(data: bytes) -> NDArray[Any]:

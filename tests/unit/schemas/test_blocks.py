@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from marey_schemas import blocks
-from marey_schemas.arrayspec import DTYPES, ArrayError, ArraySpec
-from marey_schemas.blocks import BlockError
+from marey_schemas.encoding import blocks
+from marey_schemas.encoding.arrayspec import DTYPES, ArrayError, ArraySpec
+from marey_schemas.encoding.blocks import BlockError
 
 
 def any_bits() -> st.SearchStrategy[NDArray[Any]]:

@@ -5,9 +5,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marey_schemas.arrays import EncodedArray
-from marey_schemas.canonical import array_digest, attach_arrays, canonical_json, detach_arrays, document_digest
-from marey_schemas.codecs import MEDIA_TYPES, decode_tree, encode_tree
+from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.encoding.canonical import (
+    array_digest,
+    attach_arrays,
+    canonical_json,
+    detach_arrays,
+    document_digest,
+)
+from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree, encode_tree
 
 POSES = np.arange(6, dtype=np.float32).reshape(2, 3)
 TREE = {"b": [1, 2.5, None, True, "é"], "a": {"poses": POSES}}

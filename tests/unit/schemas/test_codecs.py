@@ -9,8 +9,17 @@ import numpy as np
 import pytest
 from bson import Binary, Code, Decimal128, Int64, ObjectId, Regex
 
-from marey_schemas import blocks, codecs
-from marey_schemas.codecs import BSON, JSON, MAX_LIST, MEDIA_TYPES, MSGPACK, CodecError, decode_tree, encode_tree
+from marey_schemas.encoding import blocks, codecs
+from marey_schemas.encoding.codecs import (
+    BSON,
+    JSON,
+    MAX_LIST,
+    MEDIA_TYPES,
+    MSGPACK,
+    CodecError,
+    decode_tree,
+    encode_tree,
+)
 
 
 def refusal(data: bytes, media_type: str, **limits: int) -> CodecError:

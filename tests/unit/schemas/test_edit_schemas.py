@@ -5,11 +5,11 @@ from typing import Any
 
 import pytest
 from pydantic import ValidationError
+from tests.support.edit_examples import commands_of_all
 
-from edit_examples import commands_of_all
-from marey_schemas.codecs import BSON, JSON, MSGPACK, decode_tree, encode_tree
 from marey_schemas.documents import SCHEMAS
-from marey_schemas.editing import COMMAND_MODELS, EditDocument, EditParams
+from marey_schemas.editing.edits import COMMAND_MODELS, EditDocument, EditParams
+from marey_schemas.encoding.codecs import BSON, JSON, MSGPACK, decode_tree, encode_tree
 from marey_schemas.job_kinds import find_kind
 
 

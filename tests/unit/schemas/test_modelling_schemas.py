@@ -2,10 +2,10 @@
 
 import pytest
 from pydantic import ValidationError
+from tests.support import predecessor_models as models
+from tests.support.predecessor_models import FILE
 
-import predecessor_models as models
 from marey_schemas.modelling import MotionPrimitiveDocument, log_likelihoods, predecessor_origin
-from predecessor_models import FILE
 
 
 @pytest.fixture(scope="module")

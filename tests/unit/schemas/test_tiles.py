@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from marey_schemas import tiles
-from marey_schemas.tiles import DIFFERENCES, QUATERNIONS, RAW, TileError
+from marey_schemas.encoding import tiles
+from marey_schemas.encoding.tiles import DIFFERENCES, QUATERNIONS, RAW, TileError
 
 FLOAT = np.dtype("<f4")
 

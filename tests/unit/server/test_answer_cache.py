@@ -1,6 +1,6 @@
 """What the cache of answers keeps, and what it lets go."""
 
-from marey_server.handlers.answer_cache import ENTRY_BYTES, LARGEST_SHARE, AnswerCache
+from marey_server.http.answer_cache import ENTRY_BYTES, LARGEST_SHARE, AnswerCache
 
 BODY = bytes(1000)
 PLACES = 8

@@ -8,16 +8,16 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from tests.support.rest_server import running
 
 from marey_schemas.access import UserChange, UserCreate
 from marey_server.access.principal import SYSTEM
-from marey_server.administrators import give_token, make_first_administrator
 from marey_server.app import make_worker_token
 from marey_server.errors import NotFound, Unauthenticated, Unavailable
-from marey_server.settings import Settings
+from marey_server.process.administrators import give_token, make_first_administrator
+from marey_server.process.settings import Settings
 from marey_server.store import leader, tokens, users
-from marey_server.store.database import Database
-from rest_server import running
+from marey_server.store.database.connections import Database
 
 
 def test_the_first_administrator_is_made_once_and_the_token_works(database: Database, tmp_path: Path):

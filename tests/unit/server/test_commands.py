@@ -8,8 +8,8 @@ import pytest
 from marey_server import commands
 from marey_server.app import open_database
 from marey_server.errors import StorageFull
-from marey_server.settings import Settings
-from marey_server.store.opening import DatabaseUnusable
+from marey_server.process.settings import Settings
+from marey_server.store.database.opening import DatabaseUnusable
 
 
 @pytest.fixture
@@ -112,7 +112,7 @@ def test_a_disk_without_room_for_the_tables_is_told(tmp_path, command, monkeypat
     def full(_tx):
         raise StorageFull("The disk has no room left.")
 
-    monkeypatch.setattr("marey_server.store.schema.make_cursor_key", full)
+    monkeypatch.setattr("marey_server.store.database.schema.make_cursor_key", full)
     with pytest.raises((commands.CommandFailed, DatabaseUnusable), match="for writing: The disk has no room"):
         command(data=tmp_path)
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from marey_server import computing
-from marey_server.computing import ComputeThreads
 from marey_server.errors import Unavailable
+from marey_server.process import computing
+from marey_server.process.computing import ComputeThreads
 
 
 def test_long_computations_leave_a_thread_to_others() -> None:

@@ -1,9 +1,9 @@
 """Rows of coverage streams: moved on by one sender at a time, answered once and for all, dropped after a day."""
 
 import pytest
+from tests.support.interleaving import Step as Half
+from tests.support.interleaving import interleave
 
-from interleaving import Step as Half
-from interleaving import interleave
 from marey_server.errors import Conflict, Forbidden, NotFound
 from marey_server.store import coverage_streams, garbage
 from marey_server.store.coverage_streams import LIFETIME_US, MOST_STREAMS, CoverageOffset, NewStream, Step
@@ -105,7 +105,7 @@ def test_contributors_send_readers_look_on_and_nobody_else_knows_of_it(lab, stre
 
 
 def test_a_stream_is_known_in_its_own_project_only(lab, stream):
-    from store_fixtures import Lab
+    from tests.support.store_fixtures import Lab
 
     Lab(lab.database, "other")
     admin = lab.sign_up("root", administrator=True)

@@ -11,9 +11,9 @@ import sqlalchemy
 
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import Invalid, StorageFull, Unavailable
-from marey_server.store import database as database_module
-from marey_server.store.clock import DatabaseClock
-from marey_server.store.database import Database
+from marey_server.store.database import connections as database_module
+from marey_server.store.database.clock import DatabaseClock
+from marey_server.store.database.connections import Database
 from marey_server.store.tables import server_state, user
 
 on_sqlite = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)

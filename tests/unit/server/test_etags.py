@@ -3,7 +3,7 @@
 import pytest
 
 from marey_server.errors import BadRequest, PreconditionFailed, PreconditionRequired
-from marey_server.handlers.etags import ABSENT, ANY_STATE, entity_tag, matches, parse_tags, write_precondition
+from marey_server.http.etags import ABSENT, ANY_STATE, entity_tag, matches, parse_tags, write_precondition
 
 
 def test_a_tag_names_state_and_form():

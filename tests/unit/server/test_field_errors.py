@@ -3,8 +3,8 @@
 import pytest
 from pydantic import ValidationError
 
-from marey_schemas.edit_commands import Trim
-from marey_schemas.editing import EditDocument
+from marey_schemas.editing.commands import Trim
+from marey_schemas.editing.edits import EditDocument
 from marey_server.errors import Invalid
 from marey_server.field_errors import MAX_ERRORS, field_errors, json_pointer
 from marey_server.store import documents

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import sqlalchemy
 
-from marey_schemas import blocks
+from marey_schemas.encoding import blocks
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.store import blobs, fsck, items, uploads

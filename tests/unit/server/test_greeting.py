@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from marey_server.access.principal import SYSTEM
-from marey_server.greeting import greeting, next_command
-from marey_server.settings import Settings
+from marey_server.process.greeting import greeting, next_command
+from marey_server.process.settings import Settings
 from marey_server.store import users
-from marey_server.store.database import Database
+from marey_server.store.database.connections import Database
 
 USUAL = "http://127.0.0.1:8460"
 

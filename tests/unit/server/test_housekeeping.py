@@ -2,9 +2,9 @@
 
 import asyncio
 
-from marey_server import housekeeping
 from marey_server.app import create_app
-from marey_server.settings import Settings
+from marey_server.process import housekeeping
+from marey_server.process.settings import Settings
 
 
 def test_garbage_is_collected_soon_after_the_start_and_again_later(database, tmp_path, monkeypatch):

@@ -1,14 +1,14 @@
 """A graph finds the models of its nodes by their names."""
 
 import pytest
+from tests.support.predecessor_models import imported
 
-from marey_motion.formats.predecessor_graph import GraphNode, PredecessorGraph
+from marey_motion.formats.predecessor.graph import GraphNode, PredecessorGraph
 from marey_schemas.kinds import Kind
 from marey_server.errors import Invalid
-from marey_server.importing_graphs import ImportedGraph, graph_draft
+from marey_server.motions.importing_graphs import ImportedGraph, graph_draft
 from marey_server.store import items, projects
 from marey_server.store.items import Draft
-from predecessor_models import imported
 
 
 @pytest.fixture(scope="module")

@@ -6,13 +6,13 @@ from functools import partial
 
 import numpy as np
 import pytest
+from tests.support.store_fixtures import motion_tree, skeleton_tree
 
-from marey_schemas.arrays import EncodedArray
+from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.items import CollectionChange, CollectionCreate, ItemChange, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.errors import Conflict, Forbidden, Invalid, NotFound, PreconditionFailed, Unauthenticated
 from marey_server.store import collections, items, projects
-from store_fixtures import motion_tree, skeleton_tree
 
 
 @pytest.fixture
@@ -389,7 +389,7 @@ def test_a_motion_names_a_skeleton_of_the_project_with_its_joints(lab, rig, data
     assert refused(lab, Kind.CLIP, {"motion": motion_tree(rig, joints=2)}).error_code == "wrong-joints"
     moved_root = motion_tree(rig) | {"translations": np.zeros((5, 1, 3), "<f4"), "translated_joints": ["j0"]}
     assert refused(lab, Kind.CLIP, {"motion": moved_root}).error_code == "root-translated"
-    from store_fixtures import Lab
+    from tests.support.store_fixtures import Lab
 
     elsewhere = Lab(database, "elsewhere").add_skeleton()
     assert refused(lab, Kind.CLIP, {"motion": motion_tree(elsewhere)}).error_code == "no-skeleton"
@@ -463,7 +463,7 @@ def test_guests_of_a_public_project_read_and_change_nothing(lab, rig):
 
 
 def test_an_item_is_found_only_under_its_own_kind_and_project(lab, rig, database):
-    from store_fixtures import Lab
+    from tests.support.store_fixtures import Lab
 
     elsewhere = Lab(database, "elsewhere")
     with pytest.raises(NotFound):

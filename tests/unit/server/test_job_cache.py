@@ -3,13 +3,13 @@
 from typing import Any
 
 import pytest
+from tests.support.queue_desk import Desk
+from tests.support.store_fixtures import motion_tree, skeleton_tree
 
 from marey_schemas.kinds import Kind
 from marey_server.errors import Invalid
 from marey_server.store import blobs, items
 from marey_server.store.items.drafts import Draft
-from queue_desk import Desk
-from store_fixtures import motion_tree, skeleton_tree
 
 TRIM: dict[str, Any] = {"commands": [{"command": "trim", "stop": 3}]}
 

@@ -1,23 +1,23 @@
 """Logs of attempts: appended by offset, read as one text."""
 
 import pytest
+from tests.support.queue_desk import Desk
 
 from marey_schemas.jobs import Lease, LogAnswer
 from marey_server.errors import LeaseLost
-from marey_server.store import job_logs, jobs
-from marey_server.store.job_logs import LogOffset, LogPage
-from marey_server.store.queue_policy import QueuePolicy
-from queue_desk import Desk
+from marey_server.store.jobs import logs, reading
+from marey_server.store.jobs.logs import LogOffset, LogPage
+from marey_server.store.jobs.policy import QueuePolicy
 
 
 def append(desk: Desk, lease: Lease, offset: int, data: bytes) -> LogAnswer:
     return desk.database.write(
-        desk._attempt_of(lease), job_logs.append_log, lease.job, lease.fence, offset, data, desk.policy
+        desk._attempt_of(lease), logs.append_log, lease.job, lease.fence, offset, data, desk.policy
     )
 
 
 def read(desk: Desk, job: str, offset: int = 0, limit: int = 1000) -> LogPage:
-    return desk.database.read(desk.user, jobs.read_job_log, job, offset, limit)
+    return desk.database.read(desk.user, reading.read_job_log, job, offset, limit)
 
 
 def test_pieces_are_added_one_behind_the_other(desk: Desk) -> None:
@@ -76,5 +76,5 @@ def test_a_log_that_is_full_says_so_and_stops_the_attempt_from_nothing(desk: Des
     answer = append(desk, lease, 7, b"89abcdef")
     assert answer.capped
     assert append(desk, lease, answer.offset, b"more") == answer
-    assert read(desk, job).data == b"123456789a" + job_logs.CAPPED
+    assert read(desk, job).data == b"123456789a" + logs.CAPPED
     desk.complete(lease)

@@ -5,6 +5,8 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from tests.support.queue_desk import KINDS, SUM, Desk, document
+from tests.support.store_fixtures import skeleton_tree
 
 from marey_schemas import job_kinds
 from marey_schemas.access import ProjectCreate
@@ -12,12 +14,12 @@ from marey_schemas.jobs import InputSpec, JobCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import Conflict, Invalid
-from marey_server.store import binding, items, job_cache, job_inputs, jobs, projects, submission
+from marey_server.store import items, projects
 from marey_server.store.items.drafts import Draft
-from marey_server.store.reaper import share_waiting
-from marey_server.store.retrying import retry_job
-from queue_desk import KINDS, SUM, Desk, document
-from store_fixtures import skeleton_tree
+from marey_server.store.jobs import inputs as job_inputs
+from marey_server.store.jobs import late_inputs, reading, result_cache, submission
+from marey_server.store.jobs.reaper import share_waiting
+from marey_server.store.jobs.retrying import retry_job
 
 
 def make(desk: Desk, job: str, *names: str, **facts: Any) -> None:
@@ -205,7 +207,7 @@ def test_a_long_chain_that_was_computed_before_is_served_in_portions(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No transaction holds the database for as long as a whole pipeline takes to publish."""
-    monkeypatch.setattr(job_cache, "MOST_SHARED_OUTPUTS", 3)
+    monkeypatch.setattr(result_cache, "MOST_SHARED_OUTPUTS", 3)
 
     def submit_chain() -> list[str]:
         chain = [desk.submit("sum", into="made")]
@@ -316,7 +318,7 @@ def test_an_input_that_a_job_can_do_without_is_left_out_where_nothing_was_made(d
 
 
 def test_more_inputs_than_can_be_fail_the_job(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(binding, "MOST_INPUTS", 2)
+    monkeypatch.setattr(late_inputs, "MOST_INPUTS", 2)
     maker = desk.submit("sum")
     (job,) = desk.submit_many(squares_of(maker))
     make(desk, maker, "a", "b", "c")
@@ -432,7 +434,8 @@ def test_what_failed_with_a_job_goes_on_when_that_is_tried_again(desk: Desk) -> 
     assert desk.state(second) == "failed"
     make(desk, again(desk, maker), "a")
     assert square(desk) == [["a"], ["a-squared"]]
-    by_try = {job.retry_of: job for job in desk.database.read(desk.user, jobs.list_jobs, "lab").items if job.retry_of}
+    jobs = desk.database.read(desk.user, reading.list_jobs, "lab").items
+    by_try = {job.retry_of: job for job in jobs if job.retry_of}
     assert {job: by_try[job].state for job in (maker, first, second)} == dict.fromkeys(
         (maker, first, second), "succeeded"
     )
@@ -468,7 +471,7 @@ def test_a_job_that_was_cancelled_by_itself_is_not_taken_up_with_what_it_needs(d
     desk.cancel(job)
     desk.fail(desk.claim(), retryable=False)
     again(desk, maker)
-    assert [one.retry_of for one in desk.database.read(desk.user, jobs.list_jobs, "lab").items if one.retry_of] == [
+    assert [one.retry_of for one in desk.database.read(desk.user, reading.list_jobs, "lab").items if one.retry_of] == [
         maker
     ]
 
@@ -479,7 +482,7 @@ def test_a_job_that_misses_something_else_is_not_taken_up(desk: Desk) -> None:
     for lease in desk.claim_many():
         desk.fail(lease, retryable=False)
     tries = [again(desk, maker) for maker in makers]
-    waiting = [one for one in desk.database.read(desk.user, jobs.list_jobs, "lab").items if one.retry_of == job]
+    waiting = [one for one in desk.database.read(desk.user, reading.list_jobs, "lab").items if one.retry_of == job]
     assert [one.after for one in waiting] == [tuple(sorted(tries))]
 
 
@@ -489,7 +492,7 @@ def test_a_job_that_only_shared_the_result_of_a_failed_one_does_not_need_that(de
     desk.fail(desk.claim(job=first), retryable=False)
     desk.fail(desk.claim(job=joined), retryable=False)
     again(desk, joined)
-    assert [one.retry_of for one in desk.database.read(desk.user, jobs.list_jobs, "lab").items if one.retry_of] == [
+    assert [one.retry_of for one in desk.database.read(desk.user, reading.list_jobs, "lab").items if one.retry_of] == [
         joined
     ]
 

@@ -8,15 +8,15 @@ import zipfile
 
 import numpy as np
 import pytest
+from tests.support.modelling_examples import bending_chains
 
 from marey_motion.documents import skeleton_to_document
 from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.primitive_documents import primitive_to_tree
 from marey_motion.modelling.training import train_primitive
 from marey_server.errors import Invalid
-from marey_server.models import FoundModel, LoadedModel, ModelCache, parse_model, sample_document, sample_file
+from marey_server.motions.models import FoundModel, LoadedModel, ModelCache, parse_model, sample_document, sample_file
 from marey_server.store.items.reading import FoundPart
-from modelling_examples import bending_chains
 
 FOUND = FoundModel("model_1", "sway", FoundPart("sha256:" + "0" * 64, 3, 7))
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marey_server.errors import BadRequest, TooLarge, UnsupportedMediaType
-from marey_server.handlers.multipart import MultipartReader, PartEnd, PartHead, boundary_of
+from marey_server.http.multipart import MultipartReader, PartEnd, PartHead, boundary_of
 
 BOUNDARY = b"frontier"
 

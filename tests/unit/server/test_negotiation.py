@@ -3,8 +3,8 @@
 import pytest
 
 from marey_server.errors import NotAcceptable, Unauthenticated, UnsupportedMediaType
-from marey_server.handlers import negotiation
-from marey_server.handlers.negotiation import BSON, DOCUMENT_FORMS, JSON, MODEL_FORMS, MSGPACK, MSGPACK_BLOCKS, choose
+from marey_server.http import negotiation
+from marey_server.http.negotiation import BSON, DOCUMENT_FORMS, JSON, MODEL_FORMS, MSGPACK, MSGPACK_BLOCKS, choose
 
 
 @pytest.mark.parametrize("accept", [None, "", "*/*", "application/*", "text/html, */*;q=0.1"])

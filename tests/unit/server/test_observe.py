@@ -6,7 +6,7 @@ import logging
 import pytest
 
 from marey_schemas.log_lines import JsonFormatter, TextFormatter
-from marey_server.observe import Metrics, request_id
+from marey_server.process.observe import Metrics, request_id
 
 
 def record(message: str, **extra: object) -> logging.LogRecord:

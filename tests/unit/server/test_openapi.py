@@ -5,11 +5,11 @@ import re
 
 import pytest
 
-from marey_schemas.codecs import MEDIA_TYPES
-from marey_server.docs_page import render_page
+from marey_schemas.encoding.codecs import MEDIA_TYPES
 from marey_server.handlers.catalogue import RESOURCES
-from marey_server.handlers.routes import RouteTable
-from marey_server.openapi import build_document
+from marey_server.http.docs_page import render_page
+from marey_server.http.openapi import build_document
+from marey_server.http.routes import RouteTable
 
 ROUTES = list(RouteTable(None, RESOURCES))
 DOCUMENT = build_document(ROUTES, "1.2.3")

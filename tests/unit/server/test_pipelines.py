@@ -3,13 +3,14 @@
 from typing import Any
 
 import pytest
+from tests.support.queue_desk import Desk
 
 from marey_schemas.jobs import Job
 from marey_schemas.kinds import Kind
 from marey_schemas.pipelines import PipelineCreate
 from marey_server.errors import Invalid
-from marey_server.store import blobs, items, jobs, pipelines
-from queue_desk import Desk
+from marey_server.store import blobs, items
+from marey_server.store.jobs import pipelines, reading
 
 
 def submit(desk: Desk, steps: dict[str, Any], **shared: Any) -> dict[str, Job]:
@@ -94,7 +95,7 @@ def test_one_bad_step_lets_none_in(desk: Desk, changes: dict[str, Any], pointer:
     with pytest.raises(Invalid) as refused:
         submit(desk, steps)
     assert [(error.pointer, error.code) for error in refused.value.errors] == [(pointer, code)]
-    assert desk.database.read(desk.user, jobs.list_jobs, "lab").items == ()
+    assert desk.database.read(desk.user, reading.list_jobs, "lab").items == ()
 
 
 def test_a_tree_may_wait_for_a_model_that_is_imported(desk: Desk) -> None:

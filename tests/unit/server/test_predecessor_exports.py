@@ -4,12 +4,12 @@ import json
 
 import numpy as np
 import pytest
+from tests.support import predecessor_models as models
+from tests.support.predecessor_models import FILE, TREE_FILE
 
-import predecessor_models as models
 from marey_schemas.kinds import Kind
 from marey_server.errors import Invalid, NotFound
-from marey_server.predecessor_exports import PredecessorOptions, unchanged_original, write_predecessor
-from predecessor_models import FILE, TREE_FILE
+from marey_server.motions.predecessor_exports import PredecessorOptions, unchanged_original, write_predecessor
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,9 @@ import pytest
 from sqlalchemy import bindparam, delete, exc, false, insert, select, tuple_, update
 
 from marey_server.access.principal import SYSTEM
-from marey_server.store import prepared
-from marey_server.store.database import Database
-from marey_server.store.prepared import Prepared, run_text
+from marey_server.store.database import prepared
+from marey_server.store.database.connections import Database
+from marey_server.store.database.prepared import Prepared, run_text
 from marey_server.store.tables import event, user
 
 on_postgres = pytest.mark.parametrize("database_url", ["postgres"], indirect=True)

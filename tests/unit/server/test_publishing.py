@@ -5,13 +5,13 @@ from dataclasses import replace
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.support.predecessor_models import imported
+from tests.support.store_fixtures import motion_tree, skeleton_tree
 
 from marey_schemas.kinds import Kind
 from marey_server.errors import Conflict, Invalid
 from marey_server.store import documents, items, projects
 from marey_server.store.items import Draft, StoredDocument, references
-from predecessor_models import imported
-from store_fixtures import motion_tree, skeleton_tree
 
 
 def publish(lab, *drafts, **kwargs):

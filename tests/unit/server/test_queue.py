@@ -3,16 +3,17 @@
 from dataclasses import replace
 
 import pytest
+from tests.support.queue_desk import Desk
 
 from marey_schemas.access import ProjectCreate
 from marey_schemas.jobs import BatchCompletion, ClaimRequest, CompleteRequest, JobCreate, Progress
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import Forbidden, Invalid, LeaseLost, NotFound
-from marey_server.store import completion, projects, queue
-from marey_server.store.job_ends import Ended
-from marey_server.store.settling import settle
+from marey_server.store import projects
+from marey_server.store.jobs import completion, queue
+from marey_server.store.jobs.endings import Ended
+from marey_server.store.jobs.propagation import settle
 from marey_server.store.transaction import Transaction
-from queue_desk import Desk
 
 
 def test_a_job_is_claimed_once_and_completed(desk: Desk) -> None:
@@ -181,7 +182,7 @@ def test_an_overdue_job_that_cannot_be_taken_back_keeps_no_other_from_it(
             raise ValueError("a fault of ours")
         settle(tx, ended)
 
-    monkeypatch.setattr("marey_server.store.verdicts.settle", settle_all_but_one)
+    monkeypatch.setattr("marey_server.store.jobs.failure.settle", settle_all_but_one)
     assert desk.reap() == 2
     assert [desk.state(job) for job in jobs] == ["failed", "running", "failed"]
     desk.complete(leases[jobs[1]])

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 from sqlalchemy import select, update
+from tests.support.queue_desk import SUM, Desk, document
 
 from marey_schemas import job_kinds
 from marey_schemas.access import MemberChange, Role, UserCreate
@@ -12,13 +13,13 @@ from marey_schemas.jobs import JobCreate, Progress
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import Conflict, Forbidden, Invalid, LeaseLost, NotFound
-from marey_server.store import blobs, garbage, items, jobs, members, retrying, users
+from marey_server.store import blobs, garbage, items, members, users
 from marey_server.store.items.drafts import Draft
-from marey_server.store.job_cache import SHARED_AT_ONCE
-from marey_server.store.reaper import share_waiting
+from marey_server.store.jobs import reading, retrying
+from marey_server.store.jobs.reaper import share_waiting
+from marey_server.store.jobs.result_cache import SHARED_AT_ONCE
 from marey_server.store.tables import staged_output
 from marey_server.store.transaction import Transaction
-from queue_desk import SUM, Desk, document
 
 
 def fail_for_good(desk: Desk, job: str | None = None) -> None:
@@ -159,7 +160,7 @@ def test_one_bad_job_of_a_batch_lets_none_in(desk: Desk) -> None:
     with pytest.raises(Invalid) as refused:
         desk.submit_many(JobCreate(kind="errand"), JobCreate(kind="errand", params={"numbre": 3}))
     assert refused.value.errors[0].pointer == "/jobs/1/params/numbre"
-    assert desk.database.read(desk.user, jobs.list_jobs, "lab").items == ()
+    assert desk.database.read(desk.user, reading.list_jobs, "lab").items == ()
     with pytest.raises(Invalid) as refused:
         desk.submit("unheard-of")
     assert refused.value.errors[0].pointer == "/kind"
@@ -281,7 +282,7 @@ def test_a_task_cancelled_before_its_job_begins_is_not_waited_for(desk: Desk) ->
     desk.things(4)
     first = desk.submit()
     job = desk.submit("square", inputs={"things": {"collection": "raw"}}, after=[first])
-    listed = desk.database.read(desk.user, jobs.list_jobs, "lab", jobs.JobFilters(parent=job))
+    listed = desk.database.read(desk.user, reading.list_jobs, "lab", reading.JobFilters(parent=job))
     for task in listed.items:
         desk.cancel(task.id)
     desk.complete(desk.claim())
@@ -320,7 +321,7 @@ def test_when_all_tasks_have_succeeded_a_worker_gathers_what_they_brought(desk: 
     gathering = desk.claim()
     assert (gathering.job, gathering.position, gathering.size) == (job, None, 3)
     assert len(gathering.inputs["things"]) == 2
-    seen = desk.database.read(desk.user, jobs.list_results, job).items
+    seen = desk.database.read(desk.user, reading.list_results, job).items
     assert [(one.position, one.state, one.result["seen"]) for one in seen] == [
         (0, "succeeded", 0),
         (1, "succeeded", 1),
@@ -689,10 +690,10 @@ def test_a_job_that_cannot_have_a_result_that_is_there_is_computed_and_those_beh
     desk.stage(lease, "total", collection="deep" * 5)
     desk.complete(lease)
     places = [*(f"place{n}" for n in range(SHARED_AT_ONCE)), LONG_PATH, "last"]
-    jobs = desk.submit_many(*(JobCreate(kind="sum", into=place) for place in places))
-    assert [desk.state(job) for job in jobs[-3:]] == ["succeeded", "waiting", "waiting"]
+    reading = desk.submit_many(*(JobCreate(kind="sum", into=place) for place in places))
+    assert [desk.state(job) for job in reading[-3:]] == ["succeeded", "waiting", "waiting"]
     assert desk.database.write(SYSTEM, share_waiting) == 1
-    assert [desk.state(job) for job in jobs[-3:]] == ["succeeded", "queued", "succeeded"]
+    assert [desk.state(job) for job in reading[-3:]] == ["succeeded", "queued", "succeeded"]
 
 
 def test_tasks_find_the_results_of_earlier_tasks(desk: Desk) -> None:
@@ -734,31 +735,31 @@ def test_others_jobs_are_cancelled_by_maintainers_only_and_hidden_from_strangers
     made = desk.database.write(SYSTEM, users.create_user, UserCreate(name="bob"))
     bob = Principal("user", made.id, "bob", scopes=("read", "write", "jobs"))
     with pytest.raises(NotFound):
-        desk.database.read(bob, jobs.read_job, job)
+        desk.database.read(bob, reading.read_job, job)
     desk.database.write(SYSTEM, members.put_member, "lab", "bob", MemberChange(role=Role.CONTRIBUTOR))
-    assert desk.database.read(bob, jobs.read_job, job).id == job
+    assert desk.database.read(bob, reading.read_job, job).id == job
     with pytest.raises(Forbidden):
-        desk.database.write(bob, jobs.cancel_job, job)
+        desk.database.write(bob, reading.cancel_job, job)
     desk.database.write(SYSTEM, members.put_member, "lab", "bob", MemberChange(role=Role.MAINTAINER))
-    assert desk.database.write(bob, jobs.cancel_job, job).state == "cancelled"
+    assert desk.database.write(bob, reading.cancel_job, job).state == "cancelled"
 
 
 def test_lists_show_jobs_newest_first_by_state_kind_and_author(desk: Desk) -> None:
     first, second = desk.submit(), desk.submit("sum")
     desk.complete(desk.claim(kinds=("errand",)))
 
-    def listed(filters: jobs.JobFilters, **more: Any) -> list[str]:
-        page = desk.database.read(desk.user, jobs.list_jobs, "lab", filters, **more)
+    def listed(filters: reading.JobFilters, **more: Any) -> list[str]:
+        page = desk.database.read(desk.user, reading.list_jobs, "lab", filters, **more)
         return [one.id for one in page.items]
 
-    assert listed(jobs.JobFilters()) == [second, first]
-    assert listed(jobs.JobFilters(states=("succeeded",))) == [first]
-    assert listed(jobs.JobFilters(kinds=("sum",))) == [second]
-    assert listed(jobs.JobFilters(author="ann")) == [second, first]
-    assert listed(jobs.JobFilters(author="bob")) == []
-    page = desk.database.read(desk.user, jobs.list_jobs, "lab", limit=1, count=True)
+    assert listed(reading.JobFilters()) == [second, first]
+    assert listed(reading.JobFilters(states=("succeeded",))) == [first]
+    assert listed(reading.JobFilters(kinds=("sum",))) == [second]
+    assert listed(reading.JobFilters(author="ann")) == [second, first]
+    assert listed(reading.JobFilters(author="bob")) == []
+    page = desk.database.read(desk.user, reading.list_jobs, "lab", limit=1, count=True)
     assert (page.count, [one.id for one in page.items]) == (2, [second])
-    rest = desk.database.read(desk.user, jobs.list_jobs, "lab", limit=1, cursor=page.next_cursor)
+    rest = desk.database.read(desk.user, reading.list_jobs, "lab", limit=1, cursor=page.next_cursor)
     assert [one.id for one in rest.items] == [first]
 
 
@@ -767,7 +768,7 @@ def test_what_happened_to_a_job_can_be_told(desk: Desk) -> None:
     desk.fail(desk.claim())
     desk.clock.advance(11)
     desk.complete(desk.claim())
-    told = desk.database.read(desk.user, jobs.list_job_events, job).items
+    told = desk.database.read(desk.user, reading.list_job_events, job).items
     assert [one.kind for one in told] == [
         "job.submitted",
         "job.started",
@@ -775,7 +776,7 @@ def test_what_happened_to_a_job_can_be_told(desk: Desk) -> None:
         "job.started",
         "job.succeeded",
     ]
-    attempts = desk.database.read(desk.user, jobs.list_attempts, job).items
+    attempts = desk.database.read(desk.user, reading.list_attempts, job).items
     assert [(one.fence, one.outcome) for one in attempts] == [(1, "failed"), (2, "succeeded")]
 
 

@@ -10,15 +10,16 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
 from sqlalchemy import Connection, delete, func, select
+from tests.support.queue_desk import Desk
+from tests.support.queue_model import TERMINAL, ModelJob, ModelQueue
 
 from marey_schemas.jobs import Lease
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import Conflict, LeaseLost
-from marey_server.store import job_layout, retrying, tables
-from marey_server.store.reaper import share_waiting
+from marey_server.store import tables
+from marey_server.store.jobs import layout, retrying
+from marey_server.store.jobs.reaper import share_waiting
 from marey_server.store.transaction import Transaction
-from queue_desk import Desk
-from queue_model import TERMINAL, ModelJob, ModelQueue
 
 ERRANDS = ("errand",)
 CHAINED = ("sum", "square", "survey")
@@ -357,7 +358,7 @@ def run_machine(desk: Desk, monkeypatch: pytest.MonkeyPatch, *, examples: int = 
     """Run the machine on a desk whose clock stands still and whose ids are numbers, so that runs can be repeated."""
     clock = StillClock()
     numbers = itertools.count(1)
-    for module in (job_layout, retrying):
+    for module in (layout, retrying):
         monkeypatch.setattr(module, "new_id", lambda prefix: f"{prefix}_{next(numbers):08}")
     desk.database.clock = clock
     desk.things(4)

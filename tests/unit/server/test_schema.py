@@ -5,8 +5,8 @@ import sqlalchemy
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 
-from marey_server.store import schema
-from marey_server.store.database import Database
+from marey_server.store.database import schema
+from marey_server.store.database.connections import Database
 from marey_server.store.tables import metadata
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from marey_server.settings import Settings, misspelt_variables
+from marey_server.process.settings import Settings, misspelt_variables
 
 
 def test_flags_win_over_variables_and_variables_over_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

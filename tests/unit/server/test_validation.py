@@ -10,8 +10,8 @@ from marey_schemas.access import ProjectCreate
 from marey_schemas.items import ItemCreate, UploadCreate
 from marey_schemas.jobs import JobCreate
 from marey_server.errors import BadRequest, Invalid
-from marey_server.handlers.queries import CommaSeparated, PageQuery
-from marey_server.handlers.validation import decode_body, parse_query, validate_body
+from marey_server.http.queries import CommaSeparated, PageQuery
+from marey_server.http.validation import decode_body, parse_query, validate_body
 
 
 class Query(PageQuery):

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from marey_schemas.codecs import MSGPACK, decode_tree, encode_tree
+from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 
 THIRD_PARTY = Path(__file__).parent / "thirdparty"
 ATTEMPT = re.compile(r"/api/v1/jobs/(\w+)/attempts/(\d+)/(\w+)")

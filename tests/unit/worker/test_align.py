@@ -1,20 +1,20 @@
 """The function behind `align`, with a project in memory instead of a server."""
 
 import pytest
+from tests.support.alignment_examples import walk, warped_walks
+from tests.support.project_in_memory import ProjectInMemory, add_clip
 
-from alignment_examples import walk, warped_walks
 from marey_motion import documents
 from marey_motion.alignment.aligned_documents import StoredExample, set_from_examples
 from marey_motion.gait import generate_gait
 from marey_schemas.alignment import AlignmentInfo, AlignParams
-from marey_schemas.canonical import document_digest
 from marey_schemas.documents import Annotation
 from marey_schemas.documents import Motion as MotionDocument
+from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.jobs import PinnedInput
 from marey_schemas.kinds import Kind
 from marey_worker.context import JobRefused
 from marey_worker.kinds import align
-from project_in_memory import ProjectInMemory, add_clip
 
 NAMES = ("a", "b", "c", "d")
 

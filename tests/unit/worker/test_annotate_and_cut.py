@@ -4,6 +4,7 @@ from math import radians
 
 import numpy as np
 import pytest
+from tests.support.project_in_memory import ProjectInMemory, add_clip
 
 from marey_motion.gait import generate_gait
 from marey_schemas.annotations import AnnotateParams, CutParams
@@ -11,9 +12,9 @@ from marey_schemas.documents import Annotation
 from marey_schemas.jobs import PinnedInput
 from marey_schemas.kinds import Kind
 from marey_worker.context import JobRefused
-from marey_worker.kinds import annotate, cut, rigged
-from marey_worker.kinds.rigged import Kept
-from project_in_memory import ProjectInMemory, add_clip
+from marey_worker.job_io import skeleton_cache
+from marey_worker.job_io.skeleton_cache import Kept
+from marey_worker.kinds import annotate, cut
 
 STEPS = AnnotateParams.model_validate({"proposal": {"method": "steps"}})
 
@@ -21,7 +22,7 @@ STEPS = AnnotateParams.model_validate({"proposal": {"method": "steps"}})
 @pytest.fixture
 def project(tmp_path, monkeypatch):
     """A walk ahead and one backward; nothing is kept of earlier tests."""
-    monkeypatch.setattr(rigged, "_skeletons", Kept(4))
+    monkeypatch.setattr(skeleton_cache, "_skeletons", Kept(4))
     made = ProjectInMemory(tmp_path)
     made.log = lambda text: None
     add_clip(made, "walk", generate_gait(1.4, 0.0, 5.0))

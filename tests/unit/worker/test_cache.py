@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from marey_worker.cache import InputCache
+from marey_worker.job_io.input_cache import InputCache
 
 
 class Source:

@@ -4,12 +4,13 @@ from math import radians
 
 import numpy as np
 import pytest
+from tests.support.project_in_memory import PARAMS, ProjectInMemory, add_clip
 
 from marey_motion.gait import generate_gait
 from marey_motion.matching.database import MatchingDatabase
 from marey_worker.context import JobRefused, Task
-from marey_worker.kinds import evaluate, matching_clips
-from project_in_memory import PARAMS, ProjectInMemory, add_clip
+from marey_worker.job_io import matching_clips
+from marey_worker.kinds import evaluate
 
 
 @pytest.fixture

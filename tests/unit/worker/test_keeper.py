@@ -11,8 +11,8 @@ from marey_client.retries import Retries
 from marey_client.transport import Transport
 from marey_schemas.jobs import HeartbeatAnswer, Lease, Progress, Resources
 from marey_schemas.problems import Problem
-from marey_worker import attempt_api, keeper
-from marey_worker.keeper import LeaseKeeper
+from marey_worker import attempt_api, heartbeats
+from marey_worker.heartbeats import LeaseKeeper
 
 LOST = LeaseLost(Problem(type="", title="", status=409, detail="lost", instance="r", code="lease-lost"))
 
@@ -43,8 +43,8 @@ def lease(*, heartbeat_s=0.01, ttl_s=60.0):
 
 @pytest.fixture
 def api(monkeypatch):
-    monkeypatch.setattr(keeper, "TICK_S", 0.005)
-    monkeypatch.setattr(keeper, "RETRY_S", 0.01)
+    monkeypatch.setattr(heartbeats, "TICK_S", 0.005)
+    monkeypatch.setattr(heartbeats, "RETRY_S", 0.01)
     return Api()
 
 
@@ -73,7 +73,7 @@ def test_heartbeats_go_on_until_stopped(api, keep):
 
 
 def test_progress_is_told_before_the_next_heartbeat_is_due(api, keep, monkeypatch):
-    monkeypatch.setattr(keeper, "PROGRESS_EVERY_S", 0.02)
+    monkeypatch.setattr(heartbeats, "PROGRESS_EVERY_S", 0.02)
     keep(heartbeat_s=1000).tell(Progress(done=1, total=2))
     assert api.beat.wait(5)
     assert api.heard[0].done == 1

@@ -3,19 +3,20 @@
 from math import radians
 
 import pytest
+from tests.support.project_in_memory import ProjectInMemory, add_clip
 
 from marey_motion.gait import generate_gait
 from marey_schemas.alignment import AlignParams
 from marey_schemas.annotations import AnnotateParams, CutParams
 from marey_schemas.documents import Annotation
-from marey_schemas.editing import EditParams
+from marey_schemas.editing.edits import EditParams
 from marey_schemas.jobs import ExportParams, PinnedInput, RetargetParams, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import JobRefused
-from marey_worker.kinds import align, annotate, cut, edit, export, retarget, rigged
-from marey_worker.kinds.rigged import Kept
-from marey_worker.kinds.staged_results import StagedResults
-from project_in_memory import ProjectInMemory, add_clip
+from marey_worker.job_io import skeleton_cache
+from marey_worker.job_io.skeleton_cache import Kept
+from marey_worker.job_io.staged_results import StagedResults
+from marey_worker.kinds import align, annotate, cut, edit, export, retarget
 
 SHORTER = ({"command": "trim", "stop": 40},)
 STEPS = AnnotateParams.model_validate({"proposal": {"method": "steps"}})
@@ -24,8 +25,8 @@ STEPS = AnnotateParams.model_validate({"proposal": {"method": "steps"}})
 @pytest.fixture
 def project(tmp_path, monkeypatch):
     """Two walks of one skeleton; nothing is kept of earlier tests."""
-    monkeypatch.setattr(rigged, "_skeletons", Kept(4))
-    monkeypatch.setattr(rigged, "_plans", Kept(4))
+    monkeypatch.setattr(skeleton_cache, "_skeletons", Kept(4))
+    monkeypatch.setattr(skeleton_cache, "_plans", Kept(4))
     made = ProjectInMemory(tmp_path)
     made.log = lambda text: None
     for name, turn in (("left", 20), ("right", -20)):

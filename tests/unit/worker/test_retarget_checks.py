@@ -3,19 +3,20 @@
 from dataclasses import replace
 
 import numpy as np
+from tests.support.project_in_memory import ProjectInMemory, add_clip
 
 from marey_motion.documents import skeleton_to_document
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_schemas.jobs import PinnedInput, RetargetParams
 from marey_schemas.kinds import Kind
-from marey_worker.kinds import retarget, rigged
-from marey_worker.kinds.rigged import Kept
-from project_in_memory import ProjectInMemory, add_clip
+from marey_worker.job_io import skeleton_cache
+from marey_worker.job_io.skeleton_cache import Kept
+from marey_worker.kinds import retarget
 
 
 def test_the_checks_of_a_result_name_the_bones_that_translations_moved(tmp_path, monkeypatch):
-    monkeypatch.setattr(rigged, "_skeletons", Kept(4))
-    monkeypatch.setattr(rigged, "_plans", Kept(4))
+    monkeypatch.setattr(skeleton_cache, "_skeletons", Kept(4))
+    monkeypatch.setattr(skeleton_cache, "_plans", Kept(4))
     project = ProjectInMemory(tmp_path)
     project.log = lambda text: None
     plain = generate_gait(1.4, 0.0, 2.0)

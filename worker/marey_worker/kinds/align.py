@@ -26,17 +26,17 @@ from marey_motion.alignment.segments import Cut, cuts_of
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
 from marey_schemas.alignment import MOST_EXAMPLES, AlignParams
-from marey_schemas.canonical import document_digest
 from marey_schemas.documents import Annotation, Motion, RevisionRef
+from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.jobs import PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
 from marey_worker.context import Context, JobRefused
-from marey_worker.kinds.matching_clips import refusing_motion_errors
-from marey_worker.kinds.refusals import UNUSABLE, Refusals, present
-from marey_worker.kinds.result_places import require_different
-from marey_worker.kinds.rigged import Rig, read_rigged
-from marey_worker.kinds.staged_results import StagedResults
+from marey_worker.job_io.matching_clips import refusing_motion_errors
+from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
+from marey_worker.job_io.result_places import require_different
+from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.staged_results import StagedResults
 
 MIRRORED_NAME = " mirrored"
 

@@ -20,10 +20,10 @@ from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
 from marey_worker.context import Context, JobRefused
-from marey_worker.kinds.refusals import UNUSABLE, Refusals, present
-from marey_worker.kinds.result_places import require_different
-from marey_worker.kinds.rigged import Rig, Rigged, read_rigged
-from marey_worker.kinds.staged_results import StagedResults
+from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
+from marey_worker.job_io.result_places import require_different
+from marey_worker.job_io.skeleton_cache import Rig, Rigged, read_rigged
+from marey_worker.job_io.staged_results import StagedResults
 
 Propose = Callable[[Clip, Rigged], Layer]
 

@@ -18,9 +18,9 @@ from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
 from marey_worker.context import Context, JobRefused, NoSuchThing
-from marey_worker.kinds.refusals import UNUSABLE, Refusals, present
-from marey_worker.kinds.result_places import ResultPlaces
-from marey_worker.kinds.staged_results import StagedResults
+from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
+from marey_worker.job_io.result_places import ResultPlaces
+from marey_worker.job_io.staged_results import StagedResults
 
 
 def run(context: Context, params: CutParams) -> dict[str, Any]:

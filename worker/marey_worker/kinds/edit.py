@@ -15,14 +15,14 @@ from marey_motion.editing.take import EditedBody
 from marey_motion.errors import EditError, MotionError
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents import ClipInfo, Motion, RevisionRef, SkeletonHierarchy, Source
-from marey_schemas.editing import EditDocument, EditParams
+from marey_schemas.editing.edits import EditDocument, EditParams
 from marey_schemas.jobs import PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused, NoSuchThing
-from marey_worker.kinds.refusals import UNUSABLE, Refusals, present
-from marey_worker.kinds.result_places import ResultPlaces
-from marey_worker.kinds.rigged import Rig, read_rigged
-from marey_worker.kinds.staged_results import StagedResults
+from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
+from marey_worker.job_io.result_places import ResultPlaces
+from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.job_io.staged_results import StagedResults
 
 
 def run(context: Context, params: EditParams) -> dict[str, Any]:

@@ -6,21 +6,21 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from marey_motion.evaluation.report import verdict
 from marey_motion.evaluation.result import EvaluationOptions
 from marey_motion.evaluation.result_documents import records_from_tree, records_to_tree, result_to_tree
 from marey_motion.evaluation.scenario import Trial, suite_trials
 from marey_motion.evaluation.suite import assemble, evaluate_baseline, run_suite
 from marey_motion.matching.record import TrialRecord
-from marey_schemas.codecs import MSGPACK, decode_tree, encode_tree
+from marey_reports.evaluation.page import verdict
+from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.evaluation import EvaluateParams
 from marey_schemas.jobs import StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused
+from marey_worker.job_io.matching_clips import read_clips, refusing_motion_errors, wanted_clips
 from marey_worker.kinds.evaluation_headline import headline_of
 from marey_worker.kinds.evaluation_options import options_of
 from marey_worker.kinds.evaluation_report import write_report
-from marey_worker.kinds.matching_clips import read_clips, refusing_motion_errors, wanted_clips
 
 GATHERING_STEPS = 4
 

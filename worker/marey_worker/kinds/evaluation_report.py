@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from marey_motion.evaluation.figures import FIGURES, DrawnFigure, draw_figure, draw_figures
-from marey_motion.evaluation.report import render_report
 from marey_motion.evaluation.result import EvaluationResult
+from marey_reports.evaluation.figures import FIGURES, DrawnFigure, draw_figure, draw_figures
+from marey_reports.evaluation.page import render_report
 from marey_schemas.evaluation import EvaluateParams
 from marey_schemas.reports import EvaluationReport
 from marey_worker.context import Context
-from marey_worker.kinds.stored_reports import store_report
+from marey_worker.job_io.stored_reports import store_report
 
 
 def write_report(context: Context, result: EvaluationResult, params: EvaluateParams) -> dict[str, Any]:

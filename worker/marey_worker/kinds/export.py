@@ -11,8 +11,8 @@ from marey_motion import documents
 from marey_motion.errors import MotionError
 from marey_motion.exporting import write_clip_file
 from marey_motion.skeleton import Skeleton
-from marey_schemas import codecs
 from marey_schemas.documents import Motion, RevisionRef, SkeletonHierarchy
+from marey_schemas.encoding import codecs
 from marey_schemas.jobs import ExportParams, PinnedInput
 from marey_schemas.kinds import Kind
 from marey_schemas.reports import StoredFile

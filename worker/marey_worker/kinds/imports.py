@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from marey_motion import importing
 from marey_motion.documents import skeleton_from_document
 from marey_motion.errors import MotionError
-from marey_motion.importing import FileDigests, ImportedDocuments, ImportRequest, ModelledDocuments, PlannedFile
+from marey_motion.importing import files
+from marey_motion.importing.files import FileDigests, ImportedDocuments, ImportRequest, ModelledDocuments, PlannedFile
 from marey_schemas.documents import Check, OutputRef, SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, Refusal, skeleton_output
 from marey_schemas.jobs import ImportParams, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused, NoSuchThing
-from marey_worker.kinds.staged_results import StagedResults
+from marey_worker.job_io.staged_results import StagedResults
 
 SKELETON_COLLECTION = "skeletons"
 
@@ -35,7 +35,7 @@ class _Importing:
 
     def run(self) -> dict[str, Any]:
         """All files; what became of them, in the order given."""
-        plan = importing.plan_imports([file.name for file in self._params.files])
+        plan = files.plan_imports([file.name for file in self._params.files])
         entries = []
         for done, planned in enumerate(plan):
             self._context.progress(done, len(plan), f"importing {planned.name}")
@@ -78,16 +78,16 @@ class _Importing:
     def _read(self, planned: PlannedFile) -> ImportedDocuments:
         digest = self._digests[planned.name]
         if planned.companion is None:
-            return importing.import_file(planned, self._context.blob(digest), FileDigests(digest), self._request)
+            return files.import_file(planned, self._context.blob(digest), FileDigests(digest), self._request)
         beside = self._digests[planned.companion]
         digests = FileDigests(digest, beside, planned.companion)
         data, companion = self._context.blob(digest), self._context.blob(beside)
-        return importing.import_file(planned, data, digests, self._request, companion)
+        return files.import_file(planned, data, digests, self._request, companion)
 
     def _read_request(self) -> ImportRequest:
         """The options in the words of the readers, with the skeleton the clips must use."""
         params = self._params
-        options = importing.import_options(params.model_dump())
+        options = files.import_options(params.model_dump())
         if params.skeleton is None:
             return ImportRequest(options, params.subject, params.licence, params.capture_system)
         try:

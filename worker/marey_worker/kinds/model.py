@@ -20,7 +20,7 @@ from marey_schemas.jobs import PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_schemas.modelling import ModelParams
 from marey_worker.context import Context, JobRefused
-from marey_worker.kinds.matching_clips import refusing_motion_errors
+from marey_worker.job_io.matching_clips import refusing_motion_errors
 from marey_worker.kinds.model_report import write_model_report
 
 OPTIONS = set(DEFAULT_OPTIONS.as_tree())

@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from marey_motion.alignment.aligned import AlignedSet
-from marey_motion.modelling.figures import ModelSubject, draw_alignment_figures, draw_model_figures
-from marey_motion.modelling.report import render_model_report
-from marey_motion.modelling.search_check import SearchCheck, check_search
+from marey_motion.modelling.search.check import SearchCheck, check_search
 from marey_motion.modelling.training import TrainedPrimitive
 from marey_motion.rigs import map_joints
+from marey_reports.models.figures import ModelSubject, draw_alignment_figures, draw_model_figures
+from marey_reports.models.page import render_model_report
 from marey_schemas.modelling import ModelParams
 from marey_schemas.reports import ModelReport
 from marey_worker.context import Context
-from marey_worker.kinds.stored_reports import store_report
+from marey_worker.job_io.stored_reports import store_report
 
 
 def write_model_report(

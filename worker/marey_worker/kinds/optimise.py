@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from marey_motion.evaluation.optimise import OptimisationOptions, OptimisationStep, optimise
-from marey_motion.evaluation.resimulation import Resimulation
-from marey_motion.evaluation.selection import joined, same_skeleton, source_of
-from marey_motion.evaluation.suggestion_documents import optimisation_to_tree
+from marey_motion.evaluation.improvement.optimise import OptimisationOptions, OptimisationStep, optimise
+from marey_motion.evaluation.improvement.resimulation import Resimulation
+from marey_motion.evaluation.improvement.selection import joined, same_skeleton, source_of
+from marey_motion.evaluation.improvement.suggestion_documents import optimisation_to_tree
 from marey_motion.matching.database import MatchingDatabase
 from marey_schemas.improvement import OptimiseParams
 from marey_worker.context import Context, JobRefused
-from marey_worker.kinds.candidates import Candidates, read_candidates
-from marey_worker.kinds.evaluated_set import EvaluatedSet, objective_of, read_evaluated_set, store_document
-from marey_worker.kinds.matching_clips import refusing_motion_errors
+from marey_worker.job_io.candidates import Candidates, read_candidates
+from marey_worker.job_io.evaluated_set import EvaluatedSet, objective_of, read_evaluated_set, store_document
+from marey_worker.job_io.matching_clips import refusing_motion_errors
 
 
 def run(context: Context, params: OptimiseParams) -> dict[str, Any]:

@@ -12,10 +12,10 @@ from marey_schemas.documents import Check, ClipInfo, Motion, RevisionRef, Source
 from marey_schemas.jobs import PinnedInput, RetargetParams, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_worker.context import Context, JobRefused, NoSuchThing
-from marey_worker.kinds.refusals import UNUSABLE, Refusals, present
-from marey_worker.kinds.result_places import ResultPlaces
-from marey_worker.kinds.rigged import Rig, plan_between, read_rigged
-from marey_worker.kinds.staged_results import StagedResults
+from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
+from marey_worker.job_io.result_places import ResultPlaces
+from marey_worker.job_io.skeleton_cache import Rig, plan_between, read_rigged
+from marey_worker.job_io.staged_results import StagedResults
 
 
 def run(context: Context, params: RetargetParams) -> dict[str, Any]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from marey_motion.evaluation.suggest import SuggestionOptions, Suggestions, suggest
-from marey_motion.evaluation.suggestion_documents import suggestions_to_tree
+from marey_motion.evaluation.improvement.suggest import SuggestionOptions, Suggestions, suggest
+from marey_motion.evaluation.improvement.suggestion_documents import suggestions_to_tree
 from marey_schemas.improvement import SuggestParams
 from marey_worker.context import Context
-from marey_worker.kinds.candidates import read_candidates
-from marey_worker.kinds.evaluated_set import objective_of, read_evaluated_set, store_document
-from marey_worker.kinds.matching_clips import refusing_motion_errors
+from marey_worker.job_io.candidates import read_candidates
+from marey_worker.job_io.evaluated_set import objective_of, read_evaluated_set, store_document
+from marey_worker.job_io.matching_clips import refusing_motion_errors
 
 
 def run(context: Context, params: SuggestParams) -> dict[str, Any]:

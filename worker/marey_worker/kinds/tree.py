@@ -6,16 +6,16 @@ import time
 from typing import Any
 
 from marey_motion.modelling.primitive_documents import primitive_from_tree
-from marey_motion.modelling.sample_tree_documents import sample_tree_to_tree
-from marey_motion.modelling.tree import END_EFFECTORS, TreeOptions, build_tree
-from marey_schemas.canonical import document_digest
+from marey_motion.modelling.search.tree import END_EFFECTORS, TreeOptions, build_tree
+from marey_motion.modelling.search.tree_documents import sample_tree_to_tree
 from marey_schemas.documents import RevisionRef
+from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
 from marey_schemas.kinds import Kind
 from marey_schemas.sample_trees import TreeParams
 from marey_worker.context import Context, JobRefused
-from marey_worker.kinds.matching_clips import refusing_motion_errors
-from marey_worker.kinds.rigged import Rig, read_rigged
+from marey_worker.job_io.matching_clips import refusing_motion_errors
+from marey_worker.job_io.skeleton_cache import Rig, read_rigged
 
 
 def run(context: Context, params: TreeParams) -> dict[str, Any]:

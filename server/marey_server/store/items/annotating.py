@@ -120,7 +120,7 @@ def prepare_annotation(clip: AnnotatedClip, given: AnnotationImport) -> ItemCrea
     """The annotation that a document of the predecessor makes of a clip, beside it. Raises `Invalid`."""
     from marey_motion import documents
     from marey_motion.errors import MotionError
-    from marey_motion.formats.predecessor_annotation import layer_of_document
+    from marey_motion.formats.predecessor.annotation import layer_of_document
 
     try:
         layer = layer_of_document(

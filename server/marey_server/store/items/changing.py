@@ -12,6 +12,7 @@ from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import FieldError
 from marey_server.errors import Conflict, Invalid
 from marey_server.store import collections, documents, projects
+from marey_server.store.database.violations import taken
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.items.drafts import Draft
 from marey_server.store.items.publishing import publish
@@ -22,7 +23,6 @@ from marey_server.store.projects import ProjectRow
 from marey_server.store.revs import ExpectedRev, change_row, is_expected, moved_on
 from marey_server.store.tables import item, item_tag
 from marey_server.store.transaction import Transaction
-from marey_server.store.violations import taken
 
 
 def prepare_parts(kind: Kind, parts: dict[str, Any]) -> dict[str, PreparedDocument]:

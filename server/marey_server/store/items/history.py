@@ -11,7 +11,7 @@ from marey_schemas.items import Lineage, LineageEdge, Page, Revision, Staleness
 from marey_schemas.kinds import Kind
 from marey_server.errors import NotFound
 from marey_server.store import listing, projects
-from marey_server.store.clock import datetime_of
+from marey_server.store.database.clock import datetime_of
 from marey_server.store.items.reading import find_item, read_parts
 from marey_server.store.tables import item, job, lineage, project, revision, user
 from marey_server.store.transaction import Transaction

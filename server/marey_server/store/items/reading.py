@@ -13,9 +13,9 @@ from marey_schemas.items import Item, PartSummary
 from marey_schemas.kinds import Kind
 from marey_server.errors import Invalid, NotFound
 from marey_server.store import documents, projects
-from marey_server.store.clock import datetime_of
+from marey_server.store.database.clock import datetime_of
+from marey_server.store.database.prepared import Prepared
 from marey_server.store.items.slices import slice_motion
-from marey_server.store.prepared import Prepared
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import collection, document, item, item_tag, revision_part
 from marey_server.store.transaction import Transaction

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_schemas import blocks
-from marey_schemas.arrays import EncodedArray
+from marey_schemas.encoding import blocks
+from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.problems import FieldError
 from marey_schemas.wording import counted
 from marey_server.errors import Invalid

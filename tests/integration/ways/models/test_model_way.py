@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.command_line import CommandLine
 
-from command_line import CommandLine
 from marey_client.errors import JobUnsuccessful, RequestFailed
 from marey_client.models import ModelHandle
 from marey_client.project import ProjectHandle

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.command_line import CommandLine
 
-from command_line import CommandLine
 from marey_client.errors import Invalid, RequestFailed
 from marey_client.models import ModelHandle
 from marey_client.project import ProjectHandle

@@ -1,0 +1,186 @@
+"""`mv`, `rm`, `restore` and `tag`: a project is put in order. What is removed can be restored."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marey_client.cli.addresses import Address
+from marey_client.cli.failures import Refused, WrongUsage, sentence
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.lookup import FOLDER, Thing, require_apart, the_thing
+from marey_client.cli.output import print_json, tell
+from marey_schemas.wording import counted
+
+if TYPE_CHECKING:
+    from marey_client.items import ItemHandle
+    from marey_client.marey import Marey
+
+Places = Annotated[list[str], typer.Argument(help="project/folder/name, project/folder/ or project/id; one or more.")]
+KindOf = Annotated[str | None, typer.Option("--kind", help="Where several things have one name; collection: a folder.")]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    for command in (mv, rm, restore, tag):
+        app.command()(command)
+
+
+def mv(
+    context: typer.Context,
+    places: Annotated[
+        list[str], typer.Argument(help="What moves, and last where to: a new name, or a folder, which ends with /.")
+    ],
+    kind: KindOf = None,
+    as_json: AsJson = False,
+) -> None:
+    """Move or rename items and folders within a project. Ids and history stay."""
+    *sources, target = places
+    if not sources:
+        raise WrongUsage("say what moves, and where to: marey mv lab/raw/walk lab/raw/stroll")
+    to = Address.parse(target)
+    for source in sources:
+        if Address.parse(source).project != to.project:
+            raise WrongUsage(f"{source} cannot move to another project; download it, and upload it to {to.project}")
+    with connect(context) as marey:
+        into_folder = target.endswith("/") or not to.path or len(sources) > 1 or _is_folder(marey, to)
+        things = [the_thing(marey, source, kind) for source in sources]
+        require_apart(things)
+        folder, name = (to.path, None) if into_folder else _parted(to.path)
+
+        def move(thing: Thing) -> Any:
+            was = thing.place
+            moved = thing.move(folder, name or was.rpartition("/")[2])
+            tell(f"{was} is {to.project}/{moved.path} now")
+            return moved
+
+        _do_each(things, move, "moved", as_json)
+
+
+def rm(
+    context: typer.Context,
+    places: Places,
+    kind: KindOf = None,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask, however many items are removed.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Remove items, and folders with all they hold; `marey restore` brings them back."""
+    with connect(context) as marey:
+        things = [the_thing(marey, place, kind) for place in places]
+        require_apart(things)
+        count = sum(thing.count() for thing in things)
+        if count > 1 and not yes:
+            _ask(f"remove {counted(count, 'item')} ({_named(things)})?")
+
+        def remove(thing: Thing) -> Any:
+            thing.delete()
+            tell(f"{thing.place} is removed; marey restore {_typed(thing)} brings it back")
+            return {"id": thing.id, "kind": thing.kind, "place": thing.place}
+
+        _do_each(things, remove, "removed", as_json)
+
+
+def restore(context: typer.Context, places: Places, kind: KindOf = None, as_json: AsJson = False) -> None:
+    """Bring back what was removed, a folder with all that went with it; `marey ls --deleted` shows what can be."""
+    from marey_client.errors import Conflict
+
+    with connect(context) as marey:
+        things = [the_thing(marey, place, kind, deleted=True) for place in places]
+        require_apart(things)
+
+        def bring_back(thing: Thing) -> Any:
+            try:
+                restored = thing.restore()
+            except Conflict as error:
+                error.add_note("move what stands there away first, with marey mv")
+                raise
+            tell(f"{thing.place} is back")
+            return restored
+
+        _do_each(things, bring_back, "restored", as_json)
+
+
+def tag(
+    context: typer.Context,
+    places: Annotated[list[str], typer.Argument(help="Items: project/folder/name, or project/id; one or more.")],
+    add: Annotated[list[str] | None, typer.Option(help="A tag to add; may be repeated.")] = None,
+    remove: Annotated[list[str] | None, typer.Option(help="A tag to take away; may be repeated.")] = None,
+    kind: KindOf = None,
+    as_json: AsJson = False,
+) -> None:
+    """Add tags to items, and take others away; `marey ls --tag` finds by them."""
+    from marey_schemas.items import ItemChange
+
+    added, removed = tuple(add or ()), frozenset(remove or ())
+    if not added and not removed:
+        raise WrongUsage("say which tags: --add NAME, --remove NAME")
+    ItemChange(tags=added)  # a tag that is none is told before anything changes
+    with connect(context) as marey:
+        things = [the_thing(marey, place, kind) for place in places]
+        require_apart(things)
+        for thing in things:
+            if thing.kind == FOLDER:
+                raise WrongUsage(f"{thing.place} is a folder; folders have no tags, name the items in it")
+
+        def put_tags(thing: Any) -> Any:
+            handle: ItemHandle = thing.handle
+            kept = (one for one in (*handle.item.tags, *added) if one not in removed)
+            changed = handle.change(ItemChange(tags=tuple(dict.fromkeys(kept))))
+            tell(f"{thing.place}: {' '.join(changed.tags) or 'no tags'}")
+            return changed
+
+        _do_each(things, put_tags, "changed", as_json)
+
+
+def _is_folder(marey: Marey, address: Address) -> bool:
+    return marey.project(address.project).collections.at(address.path) is not None
+
+
+def _parted(path: str) -> tuple[str, str]:
+    folder, _, name = path.rpartition("/")
+    return folder, name
+
+
+def _typed(thing: Thing) -> str:
+    """A thing as it is typed; a folder with a final stroke."""
+    place = f"{thing.place}/" if thing.kind == FOLDER else thing.place
+    return place if place.isascii() and " " not in place else f"'{place}'"
+
+
+def _named(things: Sequence[Thing]) -> str:
+    first, others = _typed(things[0]), len(things) - 1
+    return f"{first} and {others} more" if others else first
+
+
+def _ask(question: str) -> None:
+    """Go on after a yes. Raises `Refused` after anything else, `WrongUsage` where nobody can answer."""
+    if not sys.stdin.isatty():
+        raise WrongUsage(f"{question} there is no terminal to ask at: say --yes")
+    if not typer.confirm(question, err=True):
+        tell("nothing is removed")
+        raise Refused
+
+
+def _do_each(things: Sequence[Thing], do: Callable[[Thing], Any], done: str, as_json: bool) -> None:
+    """Do something to each; what the server refuses keeps the others from nothing, and is told. Raises `Refused`."""
+    from marey_client.errors import RequestFailed
+
+    results: list[Any] = []
+    refused: dict[str, str] = {}
+    for thing in things:
+        place = thing.place
+        try:
+            results.append(do(thing))
+        except RequestFailed as error:
+            if error.status >= 500 or error.status == 401:
+                raise
+            refused[place] = sentence(error)
+            tell(f"{place}: {refused[place]}")
+    if as_json:
+        report: Mapping[str, Any] = {done: results, "refused": refused}
+        print_json(report)
+    if refused:
+        raise Refused

@@ -1,0 +1,171 @@
+"""Clips that show nearly the same motion: the same poses in the same order, led by a root that goes the same way.
+
+A frame is its pose joints and where the root will be at each horizon, as points in the frame of the root: two walks
+whose poses agree but that turn differently are different. The distance of two clips is that of their best alignment in
+time (`alignment.dtw`): mean distance of the points per frame of the longer clip, in metres. It is 0 for the same frames
+of clips with equal content.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.alignment.dtw import RangeBounds, distance_bound, warped_distance
+from marey_motion.evaluation.improvement.selection import clips_by_source, source_of
+from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
+from marey_motion.matching.database import DatabaseClip, MatchingDatabase
+
+ProgressCallback = Callable[[int, int, str], None]
+
+THRESHOLD_CM = 3.0
+
+
+@dataclass(frozen=True)
+class NearDuplicate:
+    """Two sources that show nearly the same, `second` when `mirrored` after being mirrored.
+
+    Parameters
+    ----------
+    distance_cm : per frame
+    same_content : they are the same frames of equal documents
+    """
+
+    first: str
+    second: str
+    first_name: str
+    second_name: str
+    distance_cm: float
+    same_content: bool
+    mirrored: bool
+
+
+@dataclass(frozen=True)
+class NearDuplicates:
+    """Pairs under the threshold, the nearest first, and how many pairs had to be aligned of all there are."""
+
+    pairs: tuple[NearDuplicate, ...]
+    threshold_cm: float
+    aligned: int
+    compared: int
+
+
+def find_near_duplicates(
+    database: MatchingDatabase,
+    *,
+    threshold_cm: float = THRESHOLD_CM,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+    cancelled: CancelCallback | None = None,
+) -> NearDuplicates:
+    """All pairs of sources whose distance is at most the threshold; exact, whatever is passed over.
+
+    Most pairs are settled by bounds that are never above their distance. Progress counts sources.
+    """
+    families = _Families(database)
+    found: list[NearDuplicate] = []
+    aligned = compared = 0
+
+    def compare(number: int) -> tuple[list[NearDuplicate], int, int]:
+        return families.compared(number, threshold_cm / 100.0)
+
+    with ThreadPoolExecutor(max_workers=threads or os.cpu_count() or 1, thread_name_prefix="pairs") as pool:
+        for number, (pairs, own_aligned, own_compared) in enumerate(pool.map(compare, range(families.count))):
+            found += pairs
+            aligned, compared = aligned + own_aligned, compared + own_compared
+            if progress is not None:
+                progress(number + 1, families.count, families.source(number))
+            if cancelled is not None and cancelled():
+                pool.shutdown(cancel_futures=True)
+                raise EvaluationCancelled(f"stopped with {number + 1} of {families.count} clips compared")
+    found.sort(key=lambda pair: (pair.distance_cm, pair.first, pair.second))
+    return NearDuplicates(tuple(found), threshold_cm, aligned, compared)
+
+
+class _Families:
+    """The clips of a database, those of one source one after another."""
+
+    def __init__(self, database: MatchingDatabase) -> None:
+        families = clips_by_source(database.clips).values()
+        self._clips = [database.clips[index] for own in families for index in own]
+        self._family = np.repeat(np.arange(len(families)), [len(own) for own in families])
+        self._first = np.append(np.flatnonzero(np.diff(self._family, prepend=-1)), len(self._clips))
+        self._points = frame_points(database)
+        starts, stops = (np.array([getattr(clip, end) for clip in self._clips]) for end in ("start", "stop"))
+        self._bounds = RangeBounds(self._points, starts, stops)
+
+    @property
+    def count(self) -> int:
+        return len(self._first) - 1
+
+    def source(self, number: int) -> str:
+        return source_of(self._clips[self._first[number]])
+
+    def compared(self, number: int, limit_m: float) -> tuple[list[NearDuplicate], int, int]:
+        """Near-duplicates of a source's clip among later sources, how many clips were aligned with it, and how many
+        there are.
+
+        That both are mirrored changes no distance, so one side is taken as it is.
+        """
+        one, others = self._first[number], np.arange(self._first[number + 1], len(self._clips))
+        near: dict[int, list[NearDuplicate]] = {}
+        aligned = 0
+        for place in others[self._bounds.between(one, others, limit=limit_m) <= limit_m]:
+            own, theirs = self._frames(one), self._frames(place)
+            if distance_bound(own, theirs) > limit_m:
+                continue
+            aligned += 1
+            distance = warped_distance(own, theirs, limit=limit_m)
+            if distance <= limit_m:
+                pair = _pair(self._clips[one], self._clips[place], distance)
+                near.setdefault(self._family[place], []).append(pair)
+        nearest = [min(pairs, key=lambda pair: pair.distance_cm) for pairs in near.values()]
+        return nearest, aligned, len(others)
+
+    def _frames(self, place: int) -> NDArray[np.float64]:
+        clip = self._clips[place]
+        return self._points[clip.start : clip.stop]
+
+
+def frame_points(database: MatchingDatabase) -> NDArray[np.float64]:
+    """(N, P + H, 3) pose joints and the root at each horizon, metres in the frame of each row's root."""
+    horizons = len(database.options.horizons_s)
+    first = database.features.shape[1] - 4 * horizons
+    ahead = np.zeros((database.row_count, horizons, 3))
+    ahead[..., (0, 2)] = database.features[:, first : first + 2 * horizons].reshape(-1, horizons, 2)
+    return np.concatenate((database.pose_points.astype(np.float64), ahead), axis=1)
+
+
+def spared_sources(
+    database: MatchingDatabase, duplicates: NearDuplicates, ticks: dict[str, int]
+) -> tuple[tuple[str, NearDuplicate], ...]:
+    """Sources to take away so that no pair is left, each with the pair whose other source stays.
+
+    Of a pair that one goes that is displayed less (`ticks` by source), then the shorter, then that of the higher uid.
+    """
+    families = clips_by_source(database.clips)
+    frames = {source: database.clips[own[0]].frame_count for source, own in families.items()}
+    gone: dict[str, NearDuplicate] = {}
+    for pair in duplicates.pairs:
+        if pair.first not in gone and pair.second not in gone:
+            worth = {source: (ticks.get(source, 0), frames[source]) for source in (pair.first, pair.second)}
+            gone[pair.first if worth[pair.first] < worth[pair.second] else pair.second] = pair
+    return tuple(gone.items())
+
+
+def _pair(one: DatabaseClip, other: DatabaseClip, distance: float) -> NearDuplicate:
+    mirrored = (one.mirrored_from is None) != (other.mirrored_from is None)
+    return NearDuplicate(
+        first=source_of(one),
+        second=source_of(other),
+        first_name=one.name,
+        second_name=other.name,
+        distance_cm=100.0 * distance,
+        same_content=distance == 0.0 and one.content == other.content != "" and not mirrored,
+        mirrored=mirrored,
+    )

@@ -1,0 +1,217 @@
+"""Clips of other collections that would fill the holes of a data set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.evaluation.coverage import measure_coverage
+from marey_motion.evaluation.improvement.selection import clips_by_source, same_skeleton
+from marey_motion.evaluation.result import Coverage, EvaluationOptions
+from marey_motion.evaluation.similarity import every_kth, nearest_poses, window_cells, window_rows
+from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
+from marey_motion.matching.database import MatchingDatabase
+
+Floats = NDArray[np.float64]
+ProgressCallback = Callable[[int, int, str], None]
+
+MOST_FRAMES = 200
+"""Of a candidate with more frames in holes every k-th is compared with the set, k the least that leaves no more."""
+
+
+@dataclass(frozen=True)
+class FilledCell:
+    """A cell of the grid that lacks data, and how many of the missing seconds a candidate has."""
+
+    speed_m_s: float
+    turn_rate_deg_s: float
+    filled_s: float
+    deficit_s: float
+
+
+@dataclass(frozen=True)
+class Filling:
+    """A source (with its mirrored twin, where its collection has it) that would fill holes.
+
+    Parameters
+    ----------
+    collection : what its collection was called
+    seconds : of the clip
+    cells : that it helps to fill, most seconds first
+    filled_s : sum over the cells
+    blendable_share : of its frames in these cells, how many come near a frame of the set; None for another skeleton
+    measured : frames compared
+    needs_retarget : it is of another skeleton; its share can be told once it is retargeted
+    score : filled_s times blendable_share; candidates are ranked by it, those without a share last by filled_s
+    coverage_index : of the set with this candidate
+    """
+
+    collection: str
+    source: str
+    name: str
+    seconds: float
+    cells: tuple[FilledCell, ...]
+    filled_s: float
+    blendable_share: float | None
+    measured: int
+    needs_retarget: bool
+    score: float | None
+    coverage_index: float
+
+
+@dataclass(frozen=True)
+class Addition:
+    """One step of filling: what a candidate adds to the set and all candidates before it."""
+
+    filling: Filling
+    filled_s: float
+    coverage_index: float
+
+
+def rank_fillings(
+    database: MatchingDatabase,
+    coverage: Coverage,
+    collections: Mapping[str, MatchingDatabase],
+    options: EvaluationOptions,
+    threshold_m: float,
+    *,
+    most_frames: int = MOST_FRAMES,
+    progress: ProgressCallback | None = None,
+    cancelled: CancelCallback | None = None,
+) -> tuple[Filling, ...]:
+    """All sources of the collections that hold a second of what the set lacks, the best first.
+
+    Parameters
+    ----------
+    coverage : of the set
+    collections : by name; of any skeleton, at the set's rate
+    threshold_m : up to where a frame can be blended, as in `similarity`
+    progress : called as progress(sources done, of how many, name)
+    """
+    seconds = {name: source_seconds(other, options) for name, other in collections.items()}
+    total, done = sum(map(len, seconds.values())), 0
+    found: list[Filling] = []
+    for name, other in collections.items():
+        comparable = same_skeleton(database, other)
+        present = set(clips_by_source(database.clips)) if comparable else set()
+        for source, (own, rows, cells) in seconds[name].items():
+            if cancelled is not None and cancelled():
+                raise EvaluationCancelled(f"stopped with {done} of {total} candidates compared")
+            filled = np.minimum(own, coverage.deficit_s)
+            if source not in present and filled.any():
+                useful = rows[np.isin(cells, np.flatnonzero(filled))]
+                chosen = every_kth(useful, most_frames) if comparable else useful[:0]
+                share = _blendable_share(database, other, chosen, threshold_m) if comparable else None
+                found.append(_filling(name, other, source, own, coverage, options, share, len(chosen)))
+            done += 1
+            if progress is not None:
+                progress(done, total, source)
+    return tuple(sorted(found, key=_rank))
+
+
+def plan_fillings(
+    fillings: Sequence[Filling],
+    coverage: Coverage,
+    collections: Mapping[str, MatchingDatabase],
+    options: EvaluationOptions,
+) -> tuple[Addition, ...]:
+    """The order in which to add candidates: each the best for what the set and those before it lack, until none helps.
+
+    Candidates of another skeleton come after all others.
+    """
+    seconds = {name: source_seconds(other, options) for name, other in collections.items()}
+    missing = coverage.deficit_s.copy()
+    left = list(fillings)
+    steps: list[Addition] = []
+    while left:
+        gains = [float(np.minimum(seconds[one.collection][one.source][0], missing).sum()) for one in left]
+        ranked = sorted(
+            (one.needs_retarget, -gain * (1.0 if one.blendable_share is None else one.blendable_share), number)
+            for number, (one, gain) in enumerate(zip(left, gains, strict=True))
+            if gain > 0.0 and one.blendable_share != 0.0
+        )
+        if not ranked:
+            break
+        number = ranked[0][2]
+        chosen = left.pop(number)
+        missing = _less(missing, seconds[chosen.collection][chosen.source][0], options)
+        steps.append(Addition(chosen, gains[number], float(np.mean(missing == 0.0))))
+    return tuple(steps)
+
+
+def source_seconds(
+    database: MatchingDatabase, options: EvaluationOptions
+) -> dict[str, tuple[Floats, NDArray[np.int64], NDArray[np.int64]]]:
+    """Per source seconds (V, O) in each cell of the trial grid, and its windows' rows and flat cells."""
+    coverage = measure_coverage(database, options)
+    rows, cells = window_rows(database, coverage), window_cells(coverage)
+    found = {}
+    for source, own in clips_by_source(database.clips).items():
+        members = np.isin(coverage.clip, own)
+        counts = np.bincount(cells[members & (cells >= 0)], minlength=coverage.seconds.size)
+        seconds = counts.reshape(coverage.seconds.shape) / database.options.rate_hz
+        found[source] = (seconds, rows[members], cells[members])
+    return found
+
+
+def _less(missing: Floats, seconds: Floats, options: EvaluationOptions) -> Floats:
+    """What is missing of each cell once `seconds` are there; half a frame is rounding."""
+    left = np.maximum(missing - seconds, 0.0)
+    left[left < 0.5 / options.database.rate_hz] = 0.0
+    return left
+
+
+def _blendable_share(
+    database: MatchingDatabase, other: MatchingDatabase, rows: NDArray[np.int64], threshold_m: float
+) -> float:
+    nothing = np.zeros(len(rows), dtype=np.int64)
+    distances = nearest_poses(
+        other.pose_points[rows], nothing, database.pose_points, np.ones(database.row_count, dtype=np.int64)
+    )
+    return float(np.mean(distances <= threshold_m))
+
+
+def _filling(
+    collection: str,
+    other: MatchingDatabase,
+    source: str,
+    own: Floats,
+    coverage: Coverage,
+    options: EvaluationOptions,
+    share: float | None,
+    measured: int,
+) -> Filling:
+    filled = np.minimum(own, coverage.deficit_s)
+    speeds, turn_rates = np.unique(options.grid.speeds_m_s), np.unique(options.grid.turn_rates_deg_s)
+    cells = [
+        FilledCell(float(speeds[v]), float(turn_rates[w]), float(filled[v, w]), float(coverage.deficit_s[v, w]))
+        for v, w in np.argwhere(filled > 0.0).tolist()
+    ]
+    clips = [other.clips[index] for index in clips_by_source(other.clips)[source]]
+    total = float(filled.sum())
+    return Filling(
+        collection=collection,
+        source=source,
+        name=min(clips, key=lambda clip: clip.mirrored_from is not None).name,
+        seconds=clips[0].frame_count / other.options.rate_hz,
+        cells=tuple(sorted(cells, key=lambda cell: (-cell.filled_s, cell.speed_m_s, cell.turn_rate_deg_s))),
+        filled_s=total,
+        blendable_share=share,
+        measured=measured,
+        needs_retarget=share is None,
+        score=None if share is None else total * share,
+        coverage_index=float(np.mean(_less(coverage.deficit_s, own, options) == 0.0)),
+    )
+
+
+def _rank(filling: Filling) -> tuple[bool, float, float, str, str]:
+    return (
+        filling.score is None,
+        -(filling.filled_s if filling.score is None else filling.score),
+        -filling.filled_s,
+        filling.collection,
+        filling.source,
+    )

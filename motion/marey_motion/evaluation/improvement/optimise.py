@@ -1,0 +1,217 @@
+"""A data set made better step by step: clips taken away or added while that lowers an objective.
+
+Every step tries all candidates, each by simulating the trials that it can change, and takes the best one. The objective
+falls with every step, so no set comes twice and the loop ends. The log of the steps is all it takes to go on later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.improvement.filling import source_seconds
+from marey_motion.evaluation.improvement.objective import Objective, headline_means
+from marey_motion.evaluation.improvement.resimulation import NONE, Resimulation, Sources
+
+Action = Literal["start", "remove", "add"]
+ProgressCallback = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class OptimisationOptions:
+    """What to aim for and when to stop.
+
+    Parameters
+    ----------
+    least_gain : metres of objective; a step that gains less is not made, and the loop ends
+    max_steps : at most so many steps
+    max_evaluations : at most so many candidates tried, over all steps; None for any number
+    max_data_s : nothing is added that makes the set longer than this; None for any length
+    consider : at each step, only so many removals (of clips that the fewest trials need) and so many additions (of
+        clips that fill most of what the set lacks) are tried; None for all
+    """
+
+    objective: Objective = field(default_factory=Objective)
+    least_gain: float = 1e-4
+    max_steps: int = 50
+    max_evaluations: int | None = None
+    max_data_s: float | None = None
+    consider: int | None = 20
+
+
+@dataclass(frozen=True)
+class OptimisationStep:
+    """One step, enough to do it again.
+
+    Parameters
+    ----------
+    sources : taken away or added: one, or all at once that no trial needs
+    absent : the sources that are not in the set after the step, in ascending order
+    objective : after the step, metres
+    metrics : headline metrics after the step
+    data_s : seconds of data after the step
+    evaluations : candidates tried up to here, over all steps
+    changed_trials : trials that are not what they were before the step
+    """
+
+    number: int
+    action: Action
+    sources: tuple[str, ...]
+    absent: tuple[str, ...]
+    objective: float
+    metrics: Mapping[str, float]
+    data_s: float
+    evaluations: int
+    changed_trials: int
+
+
+@dataclass(frozen=True)
+class Optimisation:
+    """The steps made, beginning with the set as it was ("start"), and why there are no more."""
+
+    steps: tuple[OptimisationStep, ...]
+    ended: Literal["no gain", "steps", "evaluations"]
+
+
+def optimise(
+    simulation: Resimulation,
+    options: OptimisationOptions,
+    *,
+    absent: Collection[str] = NONE,
+    log: Sequence[OptimisationStep] = (),
+    made: Callable[[OptimisationStep], None] | None = None,
+    progress: ProgressCallback | None = None,
+) -> Optimisation:
+    """Remove and add sources until nothing gains or the budget is spent.
+
+    Parameters
+    ----------
+    simulation : over a database with all clips of the set and all that may be added (`selection.joined`)
+    absent : sources that may be added; the others are the set
+    log : steps made before, to go on from; `absent` is that of its start then
+    made : called with every new step
+    progress : called as progress(candidates tried, of how many in this step, uid)
+
+    Raises `MotionError` for a log that does not come from this database, these trials and this objective.
+    """
+    steps = list(log)
+    if steps:
+        _require_same(simulation, options, steps[-1])
+    else:
+        steps.append(_step(simulation, options, 0, "start", (), frozenset(absent), 0, 0))
+        if made is not None:
+            made(steps[0])
+    search = _Search(simulation, options, steps[-1].evaluations)
+    while len(steps) - 1 < options.max_steps:
+        step = search.best_step(steps[-1], progress)
+        if step is None:
+            return Optimisation(tuple(steps), "evaluations" if search.spent else "no gain")
+        steps.append(step)
+        if made is not None:
+            made(step)
+    return Optimisation(tuple(steps), "steps")
+
+
+def _step(
+    simulation: Resimulation,
+    options: OptimisationOptions,
+    number: int,
+    action: Action,
+    sources: Sequence[str],
+    absent: Sources,
+    evaluations: int,
+    changed_trials: int,
+) -> OptimisationStep:
+    results = simulation.results(absent)
+    seconds = simulation.seconds(absent)
+    return OptimisationStep(
+        number=number,
+        action=action,
+        sources=tuple(sources),
+        absent=tuple(sorted(absent)),
+        objective=options.objective.value(results, seconds),
+        metrics=headline_means(results),
+        data_s=seconds,
+        evaluations=evaluations,
+        changed_trials=changed_trials,
+    )
+
+
+def _require_same(simulation: Resimulation, options: OptimisationOptions, last: OptimisationStep) -> None:
+    value = options.objective.value(simulation.results(last.absent), simulation.seconds(last.absent))
+    if value != last.objective:
+        raise MotionError(
+            f"the objective is {value:.17g} where the log has {last.objective:.17g}; go on with the same clips, "
+            "normaliser, trials and objective, or begin anew",
+            code="log-mismatch",
+            where=f"step {last.number}",
+        )
+
+
+class _Search:
+    """Tries the candidates of one step after another, within the budget."""
+
+    def __init__(self, simulation: Resimulation, options: OptimisationOptions, evaluations: int) -> None:
+        self._simulation, self._options = simulation, options
+        self._evaluations = evaluations
+        self._seconds = {
+            source: own[0] for source, own in source_seconds(simulation.database, simulation.options).items()
+        }
+        self._least = simulation.options.coverage_least_s
+        self.spent = False
+
+    def best_step(self, last: OptimisationStep, progress: ProgressCallback | None) -> OptimisationStep | None:
+        """The candidate that lowers the objective most; None when none gains enough or the budget is spent."""
+        candidates = self._candidates(frozenset(last.absent))
+        best: tuple[float, Action, tuple[str, ...], Sources] | None = None
+        for done, (action, sources, absent) in enumerate(candidates):
+            if self._evaluations == self._options.max_evaluations:
+                self.spent = True
+                return None
+            self._evaluations += 1
+            results = self._simulation.results(absent)
+            value = self._options.objective.value(results, self._simulation.seconds(absent))
+            if best is None or value < best[0]:
+                best = value, action, sources, absent
+            if progress is not None:
+                progress(done + 1, len(candidates), sources[0])
+        if best is None or last.objective - best[0] < self._options.least_gain:
+            return None
+        _, action, sources, absent = best
+        before, after = self._simulation.outcomes(last.absent), self._simulation.outcomes(absent)
+        changed = sum(one.result != other.result for one, other in zip(before, after, strict=True))
+        return _step(
+            self._simulation, self._options, last.number + 1, action, sources, absent, self._evaluations, changed
+        )
+
+    def _candidates(self, absent: Sources) -> list[tuple[Action, tuple[str, ...], Sources]]:
+        simulation = self._simulation
+        outcomes = simulation.outcomes(absent)
+        present = [source for source in simulation.sources if source not in absent]
+        counts = {source: sum(source in outcome.needed for outcome in outcomes) for source in present}
+        unneeded = tuple(source for source in present if counts[source] == 0)
+        removals = sorted((source for source in present if counts[source]), key=lambda source: (counts[source], source))
+        candidates: list[tuple[Action, tuple[str, ...], Sources]] = []
+        if unneeded:
+            candidates.append(("remove", unneeded, absent | set(unneeded)))
+        candidates += [
+            ("remove", (source,), absent | {source})
+            for source in removals[: self._options.consider]
+            if simulation.leaves_rows(absent | {source})
+        ]
+        candidates += [("add", (source,), absent - {source}) for source in self._additions(absent)]
+        return candidates
+
+    def _additions(self, absent: Sources) -> list[str]:
+        """Absent sources that fit into the budget of data, those first that fill most of what is lacking."""
+        limit = self._options.max_data_s
+        room = np.inf if limit is None else limit - self._simulation.seconds(absent)
+        fitting = [source for source in sorted(absent) if self._simulation.seconds_of(source) <= room]
+        covered = sum((own for source, own in self._seconds.items() if source not in absent), np.zeros(()))
+        missing = np.maximum(self._least - covered, 0.0)
+        filled = {source: float(np.minimum(self._seconds[source], missing).sum()) for source in fitting}
+        return sorted(fitting, key=lambda source: (-filled[source], source))[: self._options.consider]

@@ -1,0 +1,69 @@
+"""Suggestions in sentences for the person who owns the clips."""
+
+from __future__ import annotations
+
+from marey_motion.evaluation.improvement.duplicates import NearDuplicate
+from marey_motion.evaluation.improvement.filling import Addition, FilledCell, Filling
+from marey_motion.evaluation.improvement.redundancy import Removal
+from marey_motion.evaluation.improvement.unused import UnusedClip, UnusedRange
+
+NOTICEABLE_M = 0.0005
+"""Smaller changes of the mean distance from the path are called none."""
+
+
+def why_unused_clip(clip: UnusedClip) -> str:
+    """Why a clip can go."""
+    return f"No trial ever needs “{clip.name}”: without its {clip.seconds:.1f} s every trial stays exactly the same."
+
+
+def why_unused_range(part: UnusedRange) -> str:
+    """Why a stretch of a clip can go; a recording that is cut there is filtered anew, so nothing exact is promised."""
+    return (
+        f"“{part.name}” is never needed from {part.start_s:.2f} s to {part.stop_s:.2f} s: "
+        f"when these {part.seconds:.1f} s are cut off, trials stay nearly the same."
+    )
+
+
+def why_redundant(removal: Removal, trials: int) -> str:
+    """What leaving a clip out does."""
+    change = removal.changes["offset_mean"]
+    if abs(change) < NOTICEABLE_M:
+        effect = "the mean distance from the path stays the same to the millimetre"
+    else:
+        effect = f"the mean distance from the path {'grows' if change > 0 else 'shrinks'} by {100 * abs(change):.1f} cm"
+    return (
+        f"Without “{removal.name}” ({removal.seconds:.1f} s, needed in {removal.trials} of {trials} trials) {effect}."
+    )
+
+
+def why_duplicate(source: str, pair: NearDuplicate) -> str:
+    """Why one clip of a pair is enough."""
+    gone, stays = (pair.first_name, pair.second_name) if source == pair.first else (pair.second_name, pair.first_name)
+    if pair.same_content:
+        return f"“{gone}” is “{stays}” once more: one of them is enough."
+    alike = "the mirror image of the motion of" if pair.mirrored else "nearly the same motion as"
+    return f"“{gone}” shows {alike} “{stays}” ({pair.distance_cm:.1f} cm apart on average): one of them may be enough."
+
+
+def why_filling(filling: Filling) -> str:
+    """What a clip of another collection would bring."""
+    gain = f"“{filling.name}” from {filling.collection} has {filling.filled_s:.1f} s of what is missing"
+    where = f"most of it at {_cell_in_words(filling.cells[0])}"
+    if filling.needs_retarget:
+        return f"{gain}, {where}; it is of another skeleton and has to be retargeted first."
+    return f"{gain}, {where}; {100 * (filling.blendable_share or 0.0):.0f} % of it can be blended with the set."
+
+
+def why_addition(addition: Addition) -> str:
+    """What a clip brings beside those named before it."""
+    return (
+        f"“{addition.filling.name}” from {addition.filling.collection} then adds {addition.filled_s:.1f} s of what is "
+        f"still missing: {100 * addition.coverage_index:.0f} % of the grid would be covered."
+    )
+
+
+def _cell_in_words(cell: FilledCell) -> str:
+    if cell.turn_rate_deg_s == 0.0:
+        return f"{cell.speed_m_s:g} m/s straight ahead"
+    side = "left" if cell.turn_rate_deg_s > 0.0 else "right"
+    return f"{cell.speed_m_s:g} m/s turning {side} at {abs(cell.turn_rate_deg_s):g}°/s"

@@ -1,0 +1,120 @@
+"""Which used clips a data set could do without: every one left out in turn, and a plan of several removals."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+
+from marey_motion.evaluation.improvement.objective import Objective, headline_changes, headline_means
+from marey_motion.evaluation.improvement.resimulation import NONE, Resimulation
+
+ProgressCallback = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Removal:
+    """What leaving out one source (a clip and its mirrored twin) does.
+
+    Parameters
+    ----------
+    seconds : of data saved
+    trials : how many need the clip; the others stay as they are, to the last bit
+    changes : of the suite's headline metrics, after minus before
+    harm : change of the objective without its price of data, metres; negative where the removal helps
+    harm_per_s : per second of data saved; removals are ranked by it, the least first
+    """
+
+    source: str
+    name: str
+    seconds: float
+    trials: int
+    changes: Mapping[str, float]
+    harm: float
+    harm_per_s: float
+
+
+@dataclass(frozen=True)
+class PlannedRemoval:
+    """One step of a plan: a removal beside all earlier ones, and where it leads.
+
+    Parameters
+    ----------
+    removal : measured against the step before
+    metrics : headline metrics of the suite after this step
+    seconds_left : of data
+    """
+
+    removal: Removal
+    metrics: Mapping[str, float]
+    seconds_left: float
+
+
+def leave_one_out(
+    simulation: Resimulation,
+    objective: Objective,
+    *,
+    removed: Collection[str] = NONE,
+    consider: int | None = None,
+    progress: ProgressCallback | None = None,
+) -> tuple[Removal, ...]:
+    """The effect of leaving out each needed source, the least harm per second of data first.
+
+    Parameters
+    ----------
+    removed : sources that are gone already
+    consider : only so many sources, those that the fewest trials need, then by uid; all when None
+    progress : called as progress(sources done, of how many, uid)
+    """
+    gone = frozenset(removed)
+    outcomes = simulation.outcomes(gone)
+    whole = [outcome.result for outcome in outcomes]
+    before, value = headline_means(whole), objective.value(whole, 0.0)
+    counts = Counter(source for outcome in outcomes for source in outcome.needed)
+    rarest = sorted(counts, key=lambda source: (counts[source], source))
+    candidates = [source for source in rarest if simulation.leaves_rows(gone | {source})][:consider]
+    found = []
+    for done, source in enumerate(candidates):
+        results = simulation.results(gone | {source})
+        seconds = simulation.seconds_of(source)
+        harm = objective.value(results, 0.0) - value
+        changes = headline_changes(before, headline_means(results))
+        name = name_of(simulation, source)
+        found.append(Removal(source, name, seconds, counts[source], changes, harm, harm / seconds))
+        if progress is not None:
+            progress(done + 1, len(candidates), source)
+    return tuple(sorted(found, key=lambda removal: (removal.harm_per_s, removal.source)))
+
+
+def plan_removals(
+    simulation: Resimulation,
+    count: int,
+    objective: Objective,
+    *,
+    removed: Collection[str] = NONE,
+    consider: int | None = None,
+    progress: ProgressCallback | None = None,
+) -> tuple[PlannedRemoval, ...]:
+    """Up to `count` removals, each the least harmful per second once the earlier ones are made.
+
+    Every step is simulated, so that its metrics are those of an evaluation of the clips that are left. Stops early when
+    nothing more can go. Progress counts steps.
+    """
+    gone = frozenset(removed)
+    steps: list[PlannedRemoval] = []
+    while len(steps) < count:
+        ranked = leave_one_out(simulation, objective, removed=gone, consider=consider)
+        if not ranked:
+            break
+        gone |= {ranked[0].source}
+        metrics = headline_means(simulation.results(gone))
+        steps.append(PlannedRemoval(ranked[0], metrics, simulation.seconds(gone)))
+        if progress is not None:
+            progress(len(steps), count, ranked[0].source)
+    return tuple(steps)
+
+
+def name_of(simulation: Resimulation, source: str) -> str:
+    """What people call a source."""
+    clips = [simulation.database.clips[own] for own in simulation.sources[source]]
+    return next((clip.name for clip in clips if clip.mirrored_from is None), clips[0].name)

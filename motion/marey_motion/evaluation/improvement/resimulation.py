@@ -1,0 +1,172 @@
+"""A suite of trials over parts of one database, simulated no more often than needed.
+
+Clips are taken away by making their rows unselectable, which gives the very trials that a database without them gives
+(`selection.without_sources`): a row is displayed only when it was chosen or follows one that was, both within its clip;
+what a trial computes depends on displayed and chosen rows and on the least cost among selectable ones; and since the
+order of rows stays, ties go to the same row.
+
+For the same reason a trial that neither displays nor chooses a row of some clips is, without these clips, the same to
+the last bit: at every search the row that was cheapest is still there and still the first of the cheapest, and what
+the trial did before the search is the same by induction. So only trials that need a clip are run again without it. The
+same holds from any part of the database to a smaller part, which is how results are shared below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.evaluation.improvement.selection import clips_by_source, require_sources, rows_of_sources, source_of
+from marey_motion.evaluation.metrics import measure_trial
+from marey_motion.evaluation.result import EvaluationOptions, TrialResult
+from marey_motion.evaluation.scenario import Trial, reference, suite_trials
+from marey_motion.evaluation.suite import CancelCallback, guide_for, run_suite
+from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.display import switched_rows
+from marey_motion.matching.record import TrialRecord
+from marey_motion.matching.search import Method, SearchIndex, build_index
+
+Sources = frozenset[str]
+NONE: Sources = frozenset()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a trial measured over some clips, and the sources whose rows it displayed or chose."""
+
+    result: TrialResult
+    needed: Sources
+
+
+class Resimulation:
+    """The trials of a suite over the clips of a database that are left when some are taken away.
+
+    Parameters
+    ----------
+    trials : the suite's when None
+    records : of these trials over the whole database, where they are there already
+    threads, cancelled : as in `suite.run_suite`
+
+    `simulated` counts the trials that were run, `sources` has the indices of each source's clips.
+    """
+
+    def __init__(
+        self,
+        database: MatchingDatabase,
+        options: EvaluationOptions,
+        *,
+        trials: Sequence[Trial] | None = None,
+        records: Sequence[TrialRecord] | None = None,
+        threads: int | None = None,
+        cancelled: CancelCallback | None = None,
+    ) -> None:
+        self.database, self.options = database, options
+        self.trials = suite_trials(options) if trials is None else tuple(trials)
+        self.sources = clips_by_source(database.clips)
+        self.simulated = 0
+        self._threads, self._cancelled = threads, cancelled
+        self._source_of_clip = np.array([source_of(clip) for clip in database.clips], dtype=object)
+        self.index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
+        self._known: list[list[tuple[Sources, Outcome]]] = [[] for _ in self.trials]
+        if records is not None:
+            self._keep(NONE, range(len(self.trials)), records, self.index)
+
+    def outcomes(self, removed: Collection[str] = NONE) -> tuple[Outcome, ...]:
+        """One per trial, in their order, without the clips of the sources `removed`.
+
+        Raises `MotionError` for an unknown source and when nothing that can be chosen is left, `EvaluationCancelled`
+        when asked to stop.
+        """
+        gone = frozenset(removed)
+        require_sources(self.sources, gone)
+        found = [self._find(number, gone) for number in range(len(self.trials))]
+        ahead = [number for number, outcome in enumerate(found) if outcome is None]
+        if ahead:
+            index = self._index_without(gone)
+            records = run_suite(
+                self.database,
+                self.options,
+                trials=[self.trials[number] for number in ahead],
+                index=index,
+                threads=self._threads,
+                cancelled=self._cancelled,
+            )
+            self.simulated += len(ahead)
+            for number, outcome in zip(ahead, self._keep(gone, ahead, records, index), strict=True):
+                found[number] = outcome
+        return tuple(outcome for outcome in found if outcome is not None)
+
+    def results(self, removed: Collection[str] = NONE) -> tuple[TrialResult, ...]:
+        """What the trials measured, as `outcomes`."""
+        return tuple(outcome.result for outcome in self.outcomes(removed))
+
+    def needed(self, removed: Collection[str] = NONE) -> Sources:
+        """The sources that at least one trial needs."""
+        return NONE.union(*(outcome.needed for outcome in self.outcomes(removed)))
+
+    def leaves_rows(self, removed: Collection[str]) -> bool:
+        """Whether there is a row to choose without these sources."""
+        return bool(np.any(self.database.selectable & ~rows_of_sources(self.database.clips, removed)))
+
+    def seconds(self, removed: Collection[str] = NONE) -> float:
+        """Seconds of data that are left, mirrored twins not counted."""
+        return sum(self._frames(source) for source in self.sources if source not in removed) / self._rate_hz
+
+    def seconds_of(self, source: str) -> float:
+        """Seconds of one source, whether or not it is there mirrored, too."""
+        return self._frames(source) / self._rate_hz
+
+    @property
+    def _rate_hz(self) -> float:
+        return self.database.options.rate_hz
+
+    def _frames(self, source: str) -> int:
+        return max(self.database.clips[own].frame_count for own in self.sources[source])
+
+    def _find(self, number: int, gone: Sources) -> Outcome | None:
+        for removed, outcome in self._known[number]:
+            if removed <= gone and not outcome.needed & gone:
+                return outcome
+        return None
+
+    def _index_without(self, gone: Sources) -> SearchIndex:
+        if not gone:
+            return self.index
+        selectable = self.database.selectable & ~rows_of_sources(self.database.clips, gone)
+        method: Method = "boxes" if self.index.boxed else "scan"
+        return build_index(self.index.rows, self.database.starts, selectable, method=method)
+
+    def _keep(
+        self, gone: Sources, numbers: Sequence[int], records: Sequence[TrialRecord], index: SearchIndex
+    ) -> list[Outcome]:
+        outcomes = []
+        for number, record in zip(numbers, records, strict=True):
+            trial = self.trials[number]
+            asked = reference(trial, self.database.options.rate_hz)
+            rows = needed_rows(self.database, index, trial, record, self.options)
+            clips = np.unique(self.database.clip_of_row[rows])
+            outcome = Outcome(
+                measure_trial(trial, asked, record, self.options), frozenset(self._source_of_clip[clips].tolist())
+            )
+            self._known[number].append((gone, outcome))
+            outcomes.append(outcome)
+        return outcomes
+
+
+def needed_rows(
+    database: MatchingDatabase, index: SearchIndex, trial: Trial, record: TrialRecord, options: EvaluationOptions
+) -> NDArray[np.int64]:
+    """Rows that a trial displayed or chose. `index` is the one it was run with."""
+    from marey_motion.matching.explain import explain_choice
+
+    chosen = switched_rows(database, record.rows)
+    rows = [record.rows.astype(np.int64), chosen[chosen >= 0]]
+    # What the last search chose is not displayed any more when it was made at the last tick.
+    if not np.isnan(record.match_cost[-1]):
+        asked, last = guide_for(trial, database), len(record.rows) - 1
+        reason = explain_choice(database, index, asked, options.controller, record, last, count=1)
+        rows.append(np.array([reason.chosen]))
+    return np.unique(np.concatenate(rows))

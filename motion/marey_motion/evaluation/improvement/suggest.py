@@ -1,0 +1,189 @@
+"""What to do about a data set after an evaluation: what can go, what is there twice, and what would fill its holes.
+
+Everything is a proposal with its predicted effect; nothing is changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.improvement.duplicates import (
+    THRESHOLD_CM,
+    NearDuplicate,
+    NearDuplicates,
+    find_near_duplicates,
+    spared_sources,
+)
+from marey_motion.evaluation.improvement.filling import Addition, Filling, plan_fillings, rank_fillings
+from marey_motion.evaluation.improvement.objective import Objective
+from marey_motion.evaluation.improvement.redundancy import PlannedRemoval, Removal, leave_one_out, plan_removals
+from marey_motion.evaluation.improvement.resimulation import Resimulation
+from marey_motion.evaluation.improvement.unused import Unused, find_unused
+from marey_motion.evaluation.provenance import provenance_of
+from marey_motion.evaluation.relevance import sum_by_source
+from marey_motion.evaluation.result import EvaluationResult
+from marey_motion.evaluation.similarity import PoseSimilarity, accepted_distance, measure_similarity
+from marey_motion.evaluation.suite import CancelCallback
+from marey_motion.matching.database import MatchingDatabase
+
+ProgressCallback = Callable[[int, int, str], None]
+
+USUAL_BLENDABLE_M = 0.5
+"""Summed over seven joints; taken where a suite made no transition whose cost could tell."""
+
+
+@dataclass(frozen=True)
+class SuggestionOptions:
+    """What to look for.
+
+    Parameters
+    ----------
+    objective : what counts as harm of a removal
+    removals : how many removals to plan; 0 leaves clips out in turn only
+    consider : only so many clips, those that the fewest trials need, are left out in turn; None for all
+    duplicate_cm : up to which distance per frame clips are near-duplicates
+    blendable_m : up to which summed distance poses can be blended; the median pose cost of the suite's transitions
+        when None
+    """
+
+    objective: Objective = field(default_factory=Objective)
+    removals: int = 10
+    consider: int | None = 50
+    duplicate_cm: float = THRESHOLD_CM
+    blendable_m: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Suggestions:
+    """Proposals for one data set, each list with the best first.
+
+    Parameters
+    ----------
+    unused : what can go without changing a trial
+    redundant : every clip tried, ranked by what its removal does per second saved
+    plan : several removals after one another, beginning without the unused clips
+    spared : near-duplicates to take away, each with the pair whose other clip stays
+    fillings, additions : clips of other collections, one by one and after one another
+    tried : how many of the needed clips were left out in turn, and how many there are
+    """
+
+    result: EvaluationResult
+    options: SuggestionOptions
+    unused: Unused
+    redundant: tuple[Removal, ...]
+    plan: tuple[PlannedRemoval, ...]
+    duplicates: NearDuplicates
+    spared: tuple[tuple[str, NearDuplicate], ...]
+    similarity: PoseSimilarity
+    fillings: tuple[Filling, ...]
+    additions: tuple[Addition, ...]
+    tried: tuple[int, int]
+
+
+def suggest(
+    database: MatchingDatabase,
+    result: EvaluationResult,
+    *,
+    collections: Mapping[str, MatchingDatabase] | None = None,
+    options: SuggestionOptions | None = None,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+    cancelled: CancelCallback | None = None,
+) -> Suggestions:
+    """Everything that an evaluation suggests about the set it was made of.
+
+    Parameters
+    ----------
+    database, result : the set, and its evaluation with all records
+    collections : others to look for clips in, by name; of any skeleton
+    progress : called as progress(done, of how many, what)
+
+    Raises `MotionError` when the evaluation is not one of this database, `EvaluationCancelled` when asked to stop.
+    """
+    how, others = options or SuggestionOptions(), dict(collections or {})
+    _require_same(database, result)
+    trials, records = [trial.trial for trial in result.trials], result.records
+    stages = _Stages(progress, cancelled)
+    simulation = Resimulation(
+        database, result.options, trials=trials, records=records, threads=threads, cancelled=cancelled
+    )
+    unused = find_unused(database, trials, records, result.options, index=simulation.index)
+    duplicates = find_near_duplicates(
+        database, threshold_cm=how.duplicate_cm, threads=threads, **stages.watch("duplicates")
+    )
+    ticks = {use.uid: use.ticks for use in sum_by_source(database.clips, result.usage)}
+    threshold = how.blendable_m or accepted_distance(records) or USUAL_BLENDABLE_M
+    similarity = measure_similarity(database, result.coverage, threshold, **stages.watch("similarity"))
+    fillings = rank_fillings(database, result.coverage, others, result.options, threshold, **stages.watch("filling"))
+    gone = frozenset(clip.source for clip in unused.clips)
+    redundant, plan = _redundancy(simulation, how, gone, stages)
+    return Suggestions(
+        result=result,
+        options=how,
+        unused=unused,
+        redundant=redundant,
+        plan=plan,
+        duplicates=duplicates,
+        spared=spared_sources(database, duplicates, ticks),
+        similarity=similarity,
+        fillings=fillings,
+        additions=plan_fillings(fillings, result.coverage, others, result.options),
+        tried=(len(redundant), len(simulation.needed(gone))),
+    )
+
+
+def _redundancy(
+    simulation: Resimulation, how: SuggestionOptions, gone: frozenset[str], stages: _Stages
+) -> tuple[tuple[Removal, ...], tuple[PlannedRemoval, ...]]:
+    """Both lists start from the set without what is unused."""
+    found = leave_one_out(
+        simulation, how.objective, removed=gone, consider=how.consider, progress=stages.within("leaving out")
+    )
+    plan = plan_removals(
+        simulation,
+        how.removals,
+        how.objective,
+        removed=gone,
+        consider=how.consider,
+        progress=stages.within("planning"),
+    )
+    return found, plan
+
+
+def _require_same(database: MatchingDatabase, result: EvaluationResult) -> None:
+    if len(result.records) != len(result.trials):
+        raise MotionError("the evaluation is needed with the records of all its trials", code="records-missing")
+    own = provenance_of(database, result.options, [trial.trial for trial in result.trials])
+    different = [name for name in ("dataset", "normaliser") if getattr(own, name) != getattr(result.provenance, name)]
+    if different:
+        raise MotionError(
+            f"the evaluation is of other data: its {' and '.join(different)} differ; evaluate this set first",
+            code="not-comparable",
+            where=", ".join(different),
+        )
+
+
+class _Stages:
+    """Progress over several stages as one count: a thousand for each."""
+
+    NAMES = ("duplicates", "similarity", "filling", "leaving out", "planning")
+
+    def __init__(self, progress: ProgressCallback | None, cancelled: CancelCallback | None) -> None:
+        self._tell = progress or (lambda _done, _total, _note: None)
+        self._cancelled = cancelled
+
+    def within(self, stage: str) -> ProgressCallback:
+        """The progress callback of a stage."""
+        before = 1000 * self.NAMES.index(stage)
+
+        def tell(done: int, total: int, note: str) -> None:
+            self._tell(before + 1000 * done // max(total, 1), 1000 * len(self.NAMES), f"{stage}: {note}")
+
+        return tell
+
+    def watch(self, stage: str) -> dict[str, Any]:
+        """The callbacks of a stage as keywords."""
+        return {"progress": self.within(stage), "cancelled": self._cancelled}

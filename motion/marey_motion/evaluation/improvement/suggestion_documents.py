@@ -1,0 +1,130 @@
+"""Comparisons, suggestions and logs of optimisations as trees of plain values and arrays that travel and are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from typing import Any
+
+import numpy as np
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.compare import Comparison
+from marey_motion.evaluation.improvement import reasons
+from marey_motion.evaluation.improvement.optimise import Optimisation, OptimisationStep
+from marey_motion.evaluation.improvement.redundancy import PlannedRemoval, Removal
+from marey_motion.evaluation.improvement.suggest import Suggestions
+from marey_motion.evaluation.similarity import PoseSimilarity
+
+COMPARISON_SCHEMA = "marey/comparison@1"
+SUGGESTIONS_SCHEMA = "marey/suggestions@1"
+OPTIMISATION_SCHEMA = "marey/optimisation@1"
+
+Tree = dict[str, Any]
+
+
+def comparison_to_tree(comparison: Comparison) -> Tree:
+    """What changed between two evaluations, which it names by their data sets; they are documents of their own."""
+    sides = {"before": comparison.before, "after": comparison.after}
+    return {
+        "schema": COMPARISON_SCHEMA,
+        **{name: {"dataset": side.provenance.dataset, "clips": len(side.clips)} for name, side in sides.items()},
+        "trials": len(comparison.before.trials),
+        "metrics": [{**asdict(change), "verdict": change.verdict} for change in comparison.metrics],
+        "changed": [asdict(change) for change in comparison.changed],
+        "removed": list(comparison.removed),
+        "added": list(comparison.added),
+        "newly_unused": list(comparison.newly_unused),
+        "coverage_change_s": comparison.coverage_change_s,
+    }
+
+
+def suggestions_to_tree(suggestions: Suggestions) -> Tree:
+    """All proposals with their reasons, in one document."""
+    found = suggestions
+    return {
+        "schema": SUGGESTIONS_SCHEMA,
+        "dataset": found.result.provenance.dataset,
+        "normaliser": found.result.provenance.normaliser,
+        "options": asdict(found.options),
+        "unused": {
+            "clips": [{**asdict(clip), "reason": reasons.why_unused_clip(clip)} for clip in found.unused.clips],
+            "ranges": [
+                {**asdict(part), "seconds": part.seconds, "reason": reasons.why_unused_range(part)}
+                for part in found.unused.ranges
+            ],
+            "seconds": found.unused.seconds,
+        },
+        "redundant": _redundant_to_tree(found),
+        "near_duplicates": {
+            "threshold_cm": found.duplicates.threshold_cm,
+            "pairs": [asdict(pair) for pair in found.duplicates.pairs],
+            "spared": [
+                {"source": source, "reason": reasons.why_duplicate(source, pair)} for source, pair in found.spared
+            ],
+        },
+        "similarity": _similarity_to_tree(found.similarity),
+        "fillings": [{**_plain(one), "reason": reasons.why_filling(one)} for one in found.fillings],
+        "additions": [
+            {
+                "collection": step.filling.collection,
+                "source": step.filling.source,
+                "filled_s": step.filled_s,
+                "coverage_index": step.coverage_index,
+                "reason": reasons.why_addition(step),
+            }
+            for step in found.additions
+        ],
+    }
+
+
+def _redundant_to_tree(suggestions: Suggestions) -> Tree:
+    trials = len(suggestions.result.trials)
+
+    def told(entry: Removal | PlannedRemoval, removal: Removal) -> Tree:
+        return {**_plain(entry), "reason": reasons.why_redundant(removal, trials)}
+
+    return {
+        "tried": suggestions.tried[0],
+        "needed": suggestions.tried[1],
+        "clips": [told(removal, removal) for removal in suggestions.redundant],
+        "plan": [told(step, step.removal) for step in suggestions.plan],
+    }
+
+
+def _similarity_to_tree(similarity: PoseSimilarity) -> Tree:
+    """Cells without a value have 0 there, and 0 in `measured` or fewer than two in `sources`."""
+    values = {field.name: getattr(similarity, field.name) for field in fields(similarity)}
+    return {name: np.nan_to_num(value) if isinstance(value, np.ndarray) else value for name, value in values.items()}
+
+
+def optimisation_to_tree(optimisation: Optimisation) -> Tree:
+    """The log, to keep and to go on from."""
+    return {
+        "schema": OPTIMISATION_SCHEMA,
+        "ended": optimisation.ended,
+        "steps": [_plain(step) for step in optimisation.steps],
+    }
+
+
+def steps_from_tree(tree: Mapping[str, Any]) -> tuple[OptimisationStep, ...]:
+    """The log of `optimisation_to_tree`."""
+    if tree.get("schema") != OPTIMISATION_SCHEMA:
+        raise MotionError(
+            f"a document of schema {OPTIMISATION_SCHEMA} is needed, not {tree.get('schema')}", where="schema"
+        )
+    return tuple(
+        OptimisationStep(**{**step, "sources": tuple(step["sources"]), "absent": tuple(step["absent"])})
+        for step in tree["steps"]
+    )
+
+
+def _plain(value: Any) -> Any:
+    """Dataclasses as dictionaries, tuples as lists."""
+    if hasattr(value, "__dataclass_fields__"):
+        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {key: _plain(member) for key, member in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value

@@ -1,0 +1,131 @@
+"""The same suite under other weights of the feature groups: which of them matter?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+
+import numpy as np
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.improvement.objective import Objective, headline_means
+from marey_motion.evaluation.metrics import measure_trial, pooled_metrics
+from marey_motion.evaluation.result import EvaluationOptions, Metrics
+from marey_motion.evaluation.scenario import Trial, reference, suite_trials
+from marey_motion.evaluation.suite import CancelCallback, run_suite
+from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.features import feature_layout
+from marey_motion.matching.normaliser import UNMATCHED_SCALE
+from marey_motion.matching.options import DatabaseOptions, FeatureWeights
+
+ProgressCallback = Callable[[int, int, str], None]
+
+GROUPS = tuple(field.name for field in fields(FeatureWeights))
+
+
+@dataclass(frozen=True)
+class SweepRow:
+    """One setting: its weights, the suite's pooled metrics, their headlines, and the objective in metres."""
+
+    weights: FeatureWeights
+    metrics: Metrics
+    headlines: dict[str, float]
+    objective: float
+
+
+@dataclass(frozen=True)
+class Influence:
+    """How much the objective depends on one group, among the settings that differ from the first in it alone.
+
+    Parameters
+    ----------
+    spread : largest minus least objective, metres
+    best_weight : with the least objective
+    gain : what that saves against the first setting, metres
+    """
+
+    group: str
+    spread: float
+    best_weight: float
+    gain: float
+
+
+def vary_each_group(options: DatabaseOptions, factors: Sequence[float] = (0.5, 2.0)) -> tuple[FeatureWeights, ...]:
+    """The options' weights, then each group's weight times each factor with all others as they are."""
+    weights = options.weights
+    groups = [group for group in GROUPS if group != "extra_joints" or options.extra_joints]
+    return (
+        weights,
+        *(replace(weights, **{group: getattr(weights, group) * factor}) for group in groups for factor in factors),
+    )
+
+
+def sweep_weights(
+    database: MatchingDatabase,
+    options: EvaluationOptions,
+    settings: Sequence[FeatureWeights],
+    *,
+    objective: Objective | None = None,
+    trials: Sequence[Trial] | None = None,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+    cancelled: CancelCallback | None = None,
+) -> tuple[SweepRow, ...]:
+    """Run the suite under each setting; features and the normaliser's spreads are those of the database.
+
+    Progress counts trials over all settings.
+    """
+    wanted = suite_trials(options) if trials is None else tuple(trials)
+    aim = objective or Objective()
+    tell = progress or (lambda _done, _total, _note: None)
+    rows = []
+    for number, weights in enumerate(settings):
+        weighted = reweighted(database, weights)
+
+        def told(done: int, _total: int, note: str, before: int = number * len(wanted)) -> None:
+            tell(before + done, len(settings) * len(wanted), note)
+
+        records = run_suite(weighted, options, trials=wanted, threads=threads, progress=told, cancelled=cancelled)
+        rate = database.options.rate_hz
+        results = [
+            measure_trial(trial, reference(trial, rate), record, options)
+            for trial, record in zip(wanted, records, strict=True)
+        ]
+        # The price of data is the same for all settings, and left out.
+        rows.append(SweepRow(weights, pooled_metrics(results), headline_means(results), aim.value(results, 0.0)))
+    return tuple(rows)
+
+
+def reweighted(database: MatchingDatabase, weights: FeatureWeights) -> MatchingDatabase:
+    """The database with other weights. Raises `MotionError` for a group whose weight was 0: its scale is not known."""
+    options = replace(database.options, weights=weights)
+    scale = database.normaliser.scale.copy()
+    pairs = zip(database.layout.groups, feature_layout(options, database.body).groups, strict=True)
+    for before, after in pairs:
+        if before.weight == after.weight:
+            continue
+        if before.weight == 0.0:
+            raise MotionError("its weight was 0; start from a database in which it is not", where=before.name)
+        own = slice(before.start, before.stop)
+        scale[own] = scale[own] * (before.weight / after.weight) if after.weight > 0.0 else UNMATCHED_SCALE
+    return replace(database, options=options, normaliser=replace(database.normaliser, scale=scale))
+
+
+def group_influences(rows: Sequence[SweepRow]) -> tuple[Influence, ...]:
+    """For each group that was varied alone, how much that did; the most influential first."""
+    base = asdict(rows[0].weights)
+    found = []
+    for group in GROUPS:
+        own = [row for row in rows if {**asdict(row.weights), group: base[group]} == base]
+        values = np.array([row.objective for row in own])
+        if len({getattr(row.weights, group) for row in own}) > 1:
+            best = own[int(np.argmin(values))]
+            found.append(
+                Influence(
+                    group=group,
+                    spread=float(values.max() - values.min()),
+                    best_weight=getattr(best.weights, group),
+                    gain=rows[0].objective - best.objective,
+                )
+            )
+    return tuple(sorted(found, key=lambda influence: (-influence.spread, influence.group)))

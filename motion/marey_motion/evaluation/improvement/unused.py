@@ -1,0 +1,149 @@
+"""What a suite of trials never needs: whole clips, and stretches of clips that are used elsewhere.
+
+Both can go without changing any trial, to the last bit, as long as the normaliser stays: `resimulation` says why for
+clips. Of a used clip those frames are unneeded that lie farther than `MARGIN_BEFORE_S` before and the look-ahead plus
+`MARGIN_AFTER_S` after every frame that a trial displayed or chose, and beyond the window of frames that a search there
+may not choose. Taking their rows out of the database
+(`selection.without_rows`) leaves the rows that are needed, the ones that follow them and all their features as they
+are. The margins are as wide as filters and differences reach, so that they hold what the features of needed frames
+were made from, too; but a recording that is cut there is sampled and filtered anew, which rounds differently, and its
+frames near the cut look ahead into nothing: that is near the same, not the same, and is not called safe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.evaluation.improvement.resimulation import needed_rows
+from marey_motion.evaluation.improvement.selection import clips_by_source
+from marey_motion.evaluation.result import EvaluationOptions
+from marey_motion.evaluation.scenario import Trial
+from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.record import TrialRecord
+from marey_motion.matching.search import SearchIndex, build_index
+from marey_motion.matching.simulation_root import DIRECTION_WINDOW_S
+
+LEAST_RANGE_S = 0.5
+"""Shorter stretches are not worth a cut."""
+DIFFERENCES_S = 0.05
+MARGIN_BEFORE_S = 0.5 * DIRECTION_WINDOW_S + DIFFERENCES_S
+MARGIN_AFTER_S = MARGIN_BEFORE_S
+
+
+@dataclass(frozen=True)
+class UnusedClip:
+    """A source, with its mirrored twin, that no trial needs."""
+
+    source: str
+    name: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class UnusedRange:
+    """Frames [start, stop), at the database's rate from the clip's first row, that no trial needs of a source.
+
+    They are unneeded in the clip and in its mirrored twin. The times are those of the recording, whose beginning need
+    not be the first row.
+    """
+
+    source: str
+    name: str
+    start: int
+    stop: int
+    start_s: float
+    stop_s: float
+
+    @property
+    def seconds(self) -> float:
+        """Of data saved."""
+        return self.stop_s - self.start_s
+
+
+@dataclass(frozen=True, eq=False)
+class Unused:
+    """What can go without changing a trial: whole sources, frames of others, and the rows (N,) of both."""
+
+    clips: tuple[UnusedClip, ...]
+    ranges: tuple[UnusedRange, ...]
+    rows: NDArray[np.bool_]
+
+    @property
+    def seconds(self) -> float:
+        """Of data saved by all of it, mirrored twins not counted."""
+        return sum(clip.seconds for clip in self.clips) + sum(part.seconds for part in self.ranges)
+
+
+def find_unused(
+    database: MatchingDatabase,
+    trials: Sequence[Trial],
+    records: Sequence[TrialRecord],
+    options: EvaluationOptions,
+    *,
+    index: SearchIndex | None = None,
+) -> Unused:
+    """Sources and frames that none of these trials needs; the longest first. Loops that wrap are kept or go whole.
+
+    `index` is the one the trials were run with, built when None.
+    """
+    needed = _needed(database, trials, records, options, index)
+    rate = database.options.rate_hz
+    # What may not be chosen near a frame must stay in one clip with it: only a clip's own frames are barred.
+    barred = int(np.ceil(options.controller.reselect_window_s * rate)) + 1
+    before = max(barred, int(np.ceil(MARGIN_BEFORE_S * rate)))
+    after = max(barred, int(np.ceil((max(database.options.horizons_s) + MARGIN_AFTER_S) * rate)))
+    clips: list[UnusedClip] = []
+    ranges: list[UnusedRange] = []
+    rows = np.zeros(database.row_count, dtype=np.bool_)
+    for source, members in clips_by_source(database.clips).items():
+        own = [database.clips[index] for index in members]
+        shown = np.any([needed[clip.start : clip.stop] for clip in own], axis=0)
+        name = min(own, key=lambda clip: clip.mirrored_from is not None).name
+        if not shown.any():
+            clips.append(UnusedClip(source, name, len(shown) / rate))
+            spans = [(0, len(shown))]
+        elif any(clip.loop for clip in own) and database.options.end_policy == "loop":
+            continue
+        else:
+            spans = _gaps(shown, before, after, int(np.ceil(LEAST_RANGE_S * rate)))
+            first_s = own[0].first_s
+            ranges += [
+                UnusedRange(source, name, *span, first_s + span[0] / rate, first_s + span[1] / rate) for span in spans
+            ]
+        for clip in own:
+            for start, stop in spans:
+                rows[clip.start + start : clip.start + stop] = True
+    clips.sort(key=lambda clip: (-clip.seconds, clip.source))
+    ranges.sort(key=lambda part: (part.start - part.stop, part.source, part.start))
+    return Unused(tuple(clips), tuple(ranges), rows)
+
+
+def _needed(
+    database: MatchingDatabase,
+    trials: Sequence[Trial],
+    records: Sequence[TrialRecord],
+    options: EvaluationOptions,
+    index: SearchIndex | None,
+) -> NDArray[np.bool_]:
+    if index is None:
+        index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
+    needed = np.zeros(database.row_count, dtype=np.bool_)
+    for trial, record in zip(trials, records, strict=True):
+        needed[needed_rows(database, index, trial, record, options)] = True
+    return needed
+
+
+def _gaps(needed: NDArray[np.bool_], before: int, after: int, least: int) -> list[tuple[int, int]]:
+    """Half-open ranges of at least `least` frames beyond the margins about every needed frame."""
+    count = len(needed)
+    edges = np.zeros(count + 1, dtype=np.int64)
+    frames = np.flatnonzero(needed)
+    np.add.at(edges, np.maximum(frames - before, 0), 1)
+    np.add.at(edges, np.minimum(frames + after + 1, count), -1)
+    free = np.concatenate(([False], np.cumsum(edges[:-1]) == 0, [False]))
+    bounds = np.flatnonzero(np.diff(free.astype(np.int8))).reshape(-1, 2)
+    return [(int(start), int(stop)) for start, stop in bounds if stop - start >= least]

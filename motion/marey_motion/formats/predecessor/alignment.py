@@ -1,0 +1,117 @@
+"""What the predecessor keeps beside an aligned clip: its sections in canonical frames, and its time function.
+
+The time function names a frame of the source for each canonical frame, as whole numbers, so it stands still where the
+source is slower. Some programs wrote it as a text of JSON in the document.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import FormatError
+from marey_motion.formats.document_fields import field_of, number_array
+from marey_motion.formats.predecessor.encoding import decode_document, encode_document
+
+Floats = NDArray[np.float64]
+
+TIME_FUNCTION, SECTIONS = "time_function", "sections"
+LEAST_SLOPE = 0.01
+MOST_FRAME = 2**31 - 1
+
+
+@dataclass(frozen=True, eq=False)
+class PredecessorAlignment:
+    """An alignment that was read.
+
+    Parameters
+    ----------
+    frames : (N,) int64    frame of the source at each canonical frame, as it stands in the document
+    sections : canonical frames [start, end) of each section
+    """
+
+    frames: NDArray[np.int64]
+    sections: tuple[tuple[int, int], ...]
+
+
+def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
+    """Read what is kept beside an aligned clip.
+
+    Raises
+    ------
+    FormatError    naming the field that is wrong
+    """
+    document = decode_document(data, file)
+    frames = number_array(_list(document, TIME_FUNCTION, file), file, TIME_FUNCTION)
+    if frames.ndim != 1 or len(frames) < 2 or (frames != np.floor(frames)).any() or (frames < 0).any():
+        raise FormatError(f"field {TIME_FUNCTION!r} must be a list of two frames or more", file=file)
+    if frames.max() > MOST_FRAME:
+        message = f"field {TIME_FUNCTION!r} names frame {frames.max():g}, which no source has"
+        raise FormatError(message, code="time-function-invalid", file=file)
+    if (np.diff(frames) < 0).any():
+        place = int(np.argmax(np.diff(frames) < 0)) + 1
+        message = f"field {TIME_FUNCTION!r} goes back at canonical frame {place}"
+        raise FormatError(message, code="time-function-invalid", file=file)
+    sections = [
+        (field_of(one, "start_idx", int, file), field_of(one, "end_idx", int, file))
+        for one in (_list(document, SECTIONS, file) if SECTIONS in document else [])
+    ]
+    for start, end in sections:
+        if not 0 <= start < end <= len(frames):
+            message = f"section {start}:{end} is none of the {len(frames)} canonical frames"
+            raise FormatError(message, file=file)
+    return PredecessorAlignment(frames.astype(np.int64), tuple(sections))
+
+
+def write_predecessor_alignment(time_function: Floats, sections: Sequence[tuple[int, int]] = ()) -> bytes:
+    """Write the time function (N,), to the nearest whole frame, and sections [start, end) of canonical frames."""
+    return encode_document(
+        {
+            SECTIONS: [{"start_idx": start, "end_idx": end} for start, end in sections],
+            TIME_FUNCTION: np.rint(time_function).astype(np.int64).tolist(),
+        },
+        "json",
+    )
+
+
+def as_increasing(frames: NDArray[np.int64], source_frames: int) -> Floats:
+    """A time function (N,) that rises strictly from 0 to the last frame of the source, near one of whole frames (N,).
+
+    Where that stands still, time goes on evenly: each frame of the source is passed in the middle of the canonical
+    frames that name it.
+    """
+    if frames.max() >= source_frames:
+        message = f"the time function names frame {int(frames.max())} of a source of {source_frames}"
+        raise FormatError(message, code="time-function-invalid")
+    places = np.arange(len(frames), dtype=np.float64)
+    values, inverse = np.unique(frames, return_inverse=True)
+    middles = np.bincount(inverse, weights=places) / np.bincount(inverse)
+    times = np.interp(places, middles, values.astype(np.float64))
+    times[0], times[-1] = 0.0, source_frames - 1.0
+    least = LEAST_SLOPE * places
+    forward = np.maximum.accumulate(times - least) + least
+    from_end = times[-1] - least[::-1]
+    increasing = np.minimum(forward, from_end)
+    increasing[0] = 0.0
+    return np.asarray(np.maximum(increasing, least))
+
+
+def _list(document: Mapping[str, Any], name: str, file: str) -> list[Any]:
+    """A list that may stand as a text of JSON, even as one in another."""
+    value = document.get(name)
+    for _ in range(2):
+        if isinstance(value, str):
+            try:
+                value = json.loads(value)
+            except (ValueError, RecursionError) as error:
+                raise FormatError(
+                    f"field {name!r} cannot be read: {error}", code="document-damaged", file=file
+                ) from error
+    if not isinstance(value, list):
+        raise FormatError(f"field {name!r} must be a list", file=file)
+    return value

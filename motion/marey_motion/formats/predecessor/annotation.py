@@ -1,0 +1,158 @@
+"""The predecessor's annotations: what its data base keeps beside a clip, and the files it exports.
+
+Three forms: a list of sections, `{"sections": [{"start_idx", "end_idx"}]}`; sections by label,
+`{"sections": {label: [{"start_idx", "end_idx"}]}}`; and the frames of each label, `{"semantic_annotation": {label:
+[frames]}}`. In some programs of the predecessor a section holds its frame `end_idx`, in others it ends before it; the
+documents do not tell which, so the reader is told.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+
+from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
+from marey_motion.errors import AnnotationError, FormatError
+from marey_motion.formats.document_fields import field_of, number_array
+from marey_motion.formats.predecessor.encoding import decode_document, encode_document
+
+EndIndex = Literal["inclusive", "exclusive"]
+AnnotationForm = Literal["labels", "list", "frames"]
+
+SECTIONS, SEMANTIC, KEYFRAMES = "sections", "semantic_annotation", "keyframes"
+
+
+def read_predecessor_annotation(
+    data: bytes,
+    file: str,
+    frame_count: int,
+    *,
+    end_index: EndIndex = "inclusive",
+    labels: Sequence[str] | None = None,
+) -> Layer:
+    """Read an annotation of a clip of so many frames, in any of its forms.
+
+    Parameters
+    ----------
+    end_index : whether sections hold their frame `end_idx`. Inclusive, as the predecessor's editor writes and shows
+        them; its time warping reads them as exclusive.
+    labels : read only these, as where those of a document overlap and must become several layers. Sections of a list
+        have no label and are called "section 1" and so on.
+
+    Raises
+    ------
+    FormatError    naming the label and section; also where sections overlap or go beyond the clip
+    """
+    return layer_of_document(decode_document(data, file), file, frame_count, end_index=end_index, labels=labels)
+
+
+def layer_of_document(
+    document: Mapping[str, Any],
+    file: str,
+    frame_count: int,
+    *,
+    end_index: EndIndex = "inclusive",
+    labels: Sequence[str] | None = None,
+) -> Layer:
+    """As `read_predecessor_annotation`, of a document that was decoded."""
+    if isinstance(document.get(SEMANTIC), dict):
+        found = _frames_by_label(document[SEMANTIC], file)
+    else:
+        sections = document.get(SECTIONS)
+        found = _sections(_parsed(sections, file) if isinstance(sections, str) else sections, end_index, file)
+    keyframes = field_of(document, KEYFRAMES, dict, file) if KEYFRAMES in document else {}
+    marks = [Keyframe(label, frame) for label, given in keyframes.items() for frame in _frames(given, label, file)]
+    wanted = [one for one in found if labels is None or one.label in labels]
+    try:
+        return Layer(frame_count, tuple(wanted), tuple(marks))
+    except AnnotationError as error:
+        hint = ""
+        if end_index == "inclusive" and _only_shares_ends(wanted):
+            hint = "; each section ends where the next one starts, so it seems to end before its end_idx: exclusive"
+        raise FormatError(f"{error}{hint}", code=error.code, file=file) from error
+
+
+def write_predecessor_annotation(
+    layer: Layer, *, form: AnnotationForm = "labels", end_index: EndIndex = "inclusive"
+) -> bytes:
+    """Write an annotation as JSON. The forms know no keyframes; they stand under `keyframes`, which others pass over.
+
+    The list loses the labels. The frames of a label do not tell where two of its segments touch.
+    """
+    past = 1 if end_index == "inclusive" else 0
+    document: dict[str, Any] = {}
+    if form == "list":
+        document[SECTIONS] = [{"start_idx": one.start, "end_idx": one.end - past} for one in layer.segments]
+    elif form == "labels":
+        by_label: dict[str, list[dict[str, int]]] = {}
+        for one in layer.segments:
+            by_label.setdefault(one.label, []).append({"start_idx": one.start, "end_idx": one.end - past})
+        document[SECTIONS] = by_label
+    else:
+        frames: dict[str, list[int]] = {}
+        for one in layer.segments:
+            frames.setdefault(one.label, []).extend(range(one.start, one.end))
+        document[SEMANTIC] = frames
+    marks: dict[str, list[int]] = {}
+    for keyframe in layer.keyframes:
+        marks.setdefault(keyframe.label, []).append(keyframe.frame)
+    if marks:
+        document[KEYFRAMES] = marks
+    return encode_document(document, "json")
+
+
+def _parsed(text: str, file: str) -> Any:
+    """Sections that stand as a text in the document."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"field {SECTIONS!r} cannot be read: {error}", code="document-damaged", file=file) from error
+
+
+def _sections(sections: Any, end_index: EndIndex, file: str) -> list[Segment]:
+    if isinstance(sections, list):
+        return [_section(one, f"section {number}", end_index, file) for number, one in enumerate(sections, start=1)]
+    if isinstance(sections, Mapping):
+        return [
+            _section(one, label, end_index, file) for label in sections for one in field_of(sections, label, list, file)
+        ]
+    raise FormatError(
+        f"the document has neither {SECTIONS!r}, a list or an object by label, nor {SEMANTIC!r}, an object by label",
+        code="document-unknown",
+        file=file,
+    )
+
+
+def _section(section: Any, label: str, end_index: EndIndex, file: str) -> Segment:
+    start, end = (field_of(section, name, int, file) for name in ("start_idx", "end_idx"))
+    return Segment(label, start, end + (end_index == "inclusive"))
+
+
+def _frames_by_label(by_label: Mapping[str, Any], file: str) -> list[Segment]:
+    """Unbroken runs of each label's frames."""
+    found: list[Segment] = []
+    for label, given in by_label.items():
+        frames = np.unique(np.array(_frames(given, label, file), dtype=np.int64))
+        breaks = np.flatnonzero(np.diff(frames) > 1) + 1
+        unbroken = (run for run in np.split(frames, breaks) if len(run))
+        found += [Segment(label, int(run[0]), int(run[-1]) + 1) for run in unbroken]
+    return found
+
+
+def _frames(given: Any, label: str, file: str) -> list[int]:
+    if not isinstance(given, list) or any(isinstance(one, bool) for one in given):
+        raise FormatError(f"field {label!r} must be a list of frames", file=file)
+    numbers = number_array(given, file, label)
+    if numbers.ndim != 1 or (numbers != np.floor(numbers)).any() or (np.abs(numbers) > 2**53).any():
+        raise FormatError(f"field {label!r} must be a list of frames, which are whole numbers", file=file)
+    return [int(one) for one in numbers]
+
+
+def _only_shares_ends(segments: Sequence[Segment]) -> bool:
+    """Whether no segments would overlap if each ended a frame earlier."""
+    ordered = sorted(segments, key=lambda one: (one.start, one.end))
+    return all(before.end - 1 <= after.start for before, after in pairwise(ordered))

@@ -1,0 +1,150 @@
+"""The predecessor's clip documents: reading and writing, as stored in its data base.
+
+Lengths are centimetres. Stored clips are mirrored in x for a left-handed engine: a translation (x, y, z) stands as
+(-x, y, z) and a rotation (w, x, y, z) as (-w, -x, y, z), so the same map reads and writes. The root's translation is
+added to the root's offset. A clip names its joints but not their hierarchy: it needs its skeleton document.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.clip import Clip
+from marey_motion.errors import FormatError
+from marey_motion.formats.document_fields import field_of, number_array, text_list
+from marey_motion.formats.frame_times import frame_rate_of
+from marey_motion.formats.predecessor.encoding import Encoding, decode_document, encode_document
+from marey_motion.formats.predecessor.skeleton import (
+    CENTIMETRE_M,
+    MIRROR_ROTATION,
+    MIRROR_VECTOR,
+    SkeletonForm,
+    read_skeleton_document,
+    skeleton_document,
+)
+from marey_motion.formats.quaternion_rows import as_rotations
+from marey_motion.importing.source import SourceMotion
+from marey_motion.skeleton import Skeleton
+
+ClipForm = Literal["poses", "frames"]
+
+
+def read_predecessor(
+    data: bytes,
+    file: str,
+    *,
+    skeleton: bytes | None = None,
+    skeleton_file: str = "the skeleton document",
+    frame_rate_hz: float | None = None,
+) -> SourceMotion:
+    """Read a clip document with its skeleton document, or a skeleton document alone.
+
+    Raises
+    ------
+    FormatError    naming the field, and the joint where there is one
+    """
+    document = decode_document(data, file)
+    if "poses" not in document and "frames" not in document:
+        return read_skeleton_document(document, file)
+    if skeleton is None:
+        raise FormatError(
+            "a clip document names its joints but not their hierarchy; import it together with its skeleton document",
+            code="skeleton-missing",
+            file=file,
+        )
+    source = read_skeleton_document(decode_document(skeleton, skeleton_file), skeleton_file)
+    names, poses, frame_time_s = _clip_fields(document, file)
+    _fill_motion(source, names, poses, file)
+    source.declared_frame_time_s = frame_time_s
+    source.frame_rate_hz = frame_rate_hz or frame_rate_of(frame_time_s, file, source.warnings)
+    return source
+
+
+def write_predecessor_clip(clip: Clip, *, form: ClipForm = "poses", encoding: Encoding = "bson.bz2") -> bytes:
+    """Write a clip document: rows of numbers ("poses") or the engine's objects ("frames").
+
+    Raises
+    ------
+    FormatError    for joints below the root that move against their parents, which the format cannot hold
+    """
+    skeleton = clip.skeleton
+    if clip.translated_joints:
+        raise FormatError(
+            "the predecessor's clips hold rotations alone; this joint also moves against its parent",
+            code="translations-unsupported",
+            joint=skeleton.joint_names[clip.translated_joints[0]],
+        )
+    root = (clip.root_translations.astype(np.float64) - skeleton.offsets[0]) / CENTIMETRE_M * MIRROR_VECTOR
+    rotations = clip.rotations.astype(np.float64) * MIRROR_ROTATION
+    frame_time_s = 1.0 / clip.frame_rate_hz
+    if form == "poses":
+        rows = np.concatenate([root, rotations.reshape(clip.frame_count, -1)], axis=1)
+        return encode_document(
+            {"poses": rows.tolist(), "frame_time": frame_time_s, "joint_sequence": list(skeleton.joint_names)}, encoding
+        )
+    frames = [
+        {
+            "rootTranslation": dict(zip("xyz", translation, strict=True)),
+            "rotations": [dict(zip("wxyz", rotation, strict=True)) for rotation in pose],
+        }
+        for translation, pose in zip(root.tolist(), rotations.tolist(), strict=True)
+    ]
+    document = {"frames": frames, "frameTime": frame_time_s, "jointSequence": list(skeleton.joint_names)}
+    return encode_document(document, encoding)
+
+
+def write_predecessor_skeleton(
+    skeleton: Skeleton, *, form: SkeletonForm = "database", encoding: Encoding = "json"
+) -> bytes:
+    """Write a skeleton document, as the data base holds it or as files do."""
+    return encode_document(skeleton_document(skeleton, form=form), encoding)
+
+
+def _clip_fields(document: dict[str, Any], file: str) -> tuple[list[str], NDArray[np.float64], float]:
+    """Joint names, (F, 3 + 4·J) rows in the order w, x, y, z, and the frame time, of either form of a clip."""
+    if "poses" in document:
+        names = text_list(document, "joint_sequence", file)
+        poses = number_array(document["poses"], file, "poses")
+        frame_time_s = field_of(document, "frame_time", (int, float), file)
+    else:
+        names = text_list(document, "jointSequence", file)
+        poses = _engine_rows(field_of(document, "frames", list, file), file)
+        frame_time_s = field_of(document, "frameTime", (int, float), file)
+    if len(set(names)) != len(names):
+        raise FormatError("the joint sequence names a joint twice", file=file)
+    width = 3 + 4 * len(names)
+    if poses.ndim != 2 or len(poses) == 0 or poses.shape[1] < width:
+        raise FormatError(f"poses of shape {poses.shape}; {len(names)} joints need rows of {width} numbers", file=file)
+    # Some writers counted the tips of chains as joints and filled their columns with zeros.
+    if poses[:, width:].any():
+        raise FormatError(f"{poses.shape[1]} columns for {len(names)} joints, which need {width}", file=file)
+    return names, poses[:, :width], float(frame_time_s)
+
+
+def _engine_rows(frames: list[Any], file: str) -> NDArray[np.float64]:
+    try:
+        rows = [
+            [frame["rootTranslation"][axis] for axis in "xyz"]
+            + [rotation[part] for rotation in frame["rotations"] for part in "wxyz"]
+            for frame in frames
+        ]
+    except (KeyError, TypeError) as error:
+        message = f"a frame needs rootTranslation {{x, y, z}} and rotations [{{x, y, z, w}}]: {error!r}"
+        raise FormatError(message, file=file) from error
+    return number_array(rows, file, "frames")
+
+
+def _fill_motion(source: SourceMotion, names: list[str], poses: NDArray[np.float64], file: str) -> None:
+    """Put the rows into the skeleton's joints; joints that the clip leaves out keep their rest rotation."""
+    indices = {name: joint for joint, name in enumerate(source.joint_names)}
+    unknown = next((name for name in names if name not in indices), None)
+    if unknown is not None:
+        raise FormatError("the skeleton has no such joint; is this the clip's skeleton?", file=file, joint=unknown)
+    given = poses[:, 3:].reshape(len(poses), len(names), 4) * MIRROR_ROTATION
+    rotations = np.tile(source.rest_rotations, (len(poses), 1, 1))
+    rotations[:, [indices[name] for name in names]] = as_rotations(given, tuple(names), file, source.warnings)
+    source.rotations = rotations.astype(np.float32)
+    source.root_positions = poses[:, :3] * MIRROR_VECTOR + source.offsets[0]

@@ -1,0 +1,138 @@
+"""The predecessor's graphs of models: nodes by action and by the model's id in its data base, and where they begin.
+
+`{"nodes": {action: {model id: {"name", "type", "transitions": {"action:model": {"action_name", "model_name",
+"model_id"}}}}}, "start_node": [action, model]}`; some programs write `startNode`. A transition and the start name a
+model by its id or by its name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from marey_motion.errors import FormatError
+from marey_motion.formats.document_fields import field_of
+from marey_motion.formats.predecessor.encoding import Encoding, encode_document
+
+TYPES = ("start", "standard", "end", "idle", "single", "cycle_end")
+START_FIELDS = ("start_node", "startNode")
+
+Place = tuple[str, str]
+"""Action and name of a primitive."""
+
+
+@dataclass(frozen=True)
+class GraphNode:
+    """A primitive of an action.
+
+    Parameters
+    ----------
+    model_id : in the data base that the graph comes from, or goes to
+    type : one of `TYPES`
+    transitions : what may follow
+    """
+
+    model_id: str
+    type: str
+    transitions: tuple[Place, ...]
+
+
+@dataclass(frozen=True)
+class PredecessorGraph:
+    """A graph that was read, or shall be written."""
+
+    nodes: Mapping[Place, GraphNode]
+    start: Place
+
+
+def is_graph(document: Mapping[str, Any]) -> bool:
+    """Whether a document is a graph of models."""
+    return isinstance(document.get("nodes"), Mapping) and any(name in document for name in START_FIELDS)
+
+
+def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGraph:
+    """The graph of a document.
+
+    Raises
+    ------
+    FormatError    naming the node that is wrong
+    """
+    listed: dict[tuple[str, str], Mapping[str, Any]] = {}
+    names: dict[tuple[str, str], Place] = {}
+    nodes = field_of(document, "nodes", dict, file)
+    for action in nodes:
+        for model_id, node in field_of(nodes, action, dict, file).items():
+            place = (action, field_of(node, "name", str, file))
+            if place in names.values():
+                raise FormatError(f"{action}: two nodes are called {place[1]!r}", file=file)
+            listed[action, model_id] = node
+            names[action, model_id] = place
+    known = {**{place: place for place in names.values()}, **names}
+    found = {
+        names[key]: GraphNode(key[1], _type(node, names[key], file), _transitions(node, names[key], known, file))
+        for key, node in listed.items()
+    }
+    return PredecessorGraph(found, _start(document, known, file))
+
+
+def write_predecessor_graph(graph: PredecessorGraph, *, encoding: Encoding = "json") -> bytes:
+    """Write a graph, with its start under both names that programs look for."""
+    nodes: dict[str, dict[str, Any]] = {}
+    for (action, name), node in graph.nodes.items():
+        nodes.setdefault(action, {})[node.model_id] = {
+            "name": name,
+            "type": node.type,
+            "transitions": {
+                f"{other_action}:{other}": {
+                    "action_name": other_action,
+                    "model_name": other,
+                    "model_id": graph.nodes[other_action, other].model_id,
+                }
+                for other_action, other in node.transitions
+            },
+        }
+    action, name = graph.start
+    start = [action, graph.nodes[graph.start].model_id]
+    return encode_document({"nodes": nodes, "start_node": start, "startNode": start}, encoding)
+
+
+def _type(node: Mapping[str, Any], place: Place, file: str) -> str:
+    kind = node.get("type", "standard")
+    if kind not in TYPES:
+        raise FormatError(f"{'/'.join(place)}: {kind!r} is no type; there are {', '.join(TYPES)}", file=file)
+    return str(kind)
+
+
+def _transitions(
+    node: Mapping[str, Any], place: Place, known: Mapping[tuple[str, str], Place], file: str
+) -> tuple[Place, ...]:
+    given = node.get("transitions", {})
+    if not isinstance(given, Mapping):
+        raise FormatError(f"{'/'.join(place)}: 'transitions' must be an object", file=file)
+    found = []
+    for key, told in given.items():
+        action, _, model = key.rpartition(":")
+        wanted = told if isinstance(told, Mapping) else {}
+        action = str(wanted.get("action_name", action))
+        candidates = [(action, str(one)) for one in (wanted.get("model_id"), wanted.get("model_name"), model) if one]
+        other = next((known[one] for one in candidates if one in known), None)
+        if other is None:
+            raise FormatError(f"{'/'.join(place)}: there is no node {key!r} that follows it", file=file)
+        found.append(other)
+    return tuple(dict.fromkeys(found))
+
+
+def _start(document: Mapping[str, Any], known: Mapping[tuple[str, str], Place], file: str) -> Place:
+    name = next((name for name in START_FIELDS if name in document), None)
+    if name is None:
+        raise FormatError(
+            f"field {START_FIELDS[0]!r} is missing: it names the action and the model to begin with", file=file
+        )
+    given = document[name]
+    if not isinstance(given, list) or len(given) != 2:
+        raise FormatError(f"field {name!r} must be an action and a model", file=file)
+    start = known.get((str(given[0]), str(given[1])))
+    if start is None:
+        raise FormatError(f"field {name!r}: there is no node {given!r}", file=file)
+    return start

@@ -1,0 +1,395 @@
+"""The predecessor's motion primitives, in the four layouts that were published.
+
+Layout 3 has the parts `sspm` (space), `tspm` (time) and `gmm`; layouts 1 and 2 are flat and name space
+`eigen_vectors_spatial` and time `*_temporal_semantic*` or `*_time*`; a static primitive has `spatial_coeffs` alone.
+Right-handed, centimetres, quaternions w, x, y, z; the root's translation is added to the root's offset. Coefficients
+stand in rows (coefficient, channel).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import FormatError, FormatLimit, MotionError
+from marey_motion.formats.conversion import convert
+from marey_motion.formats.document_fields import field_of, number_array, text_list
+from marey_motion.formats.predecessor.encoding import decode_document
+from marey_motion.formats.predecessor.skeleton import CENTIMETRE_M, read_skeleton_document
+from marey_motion.formats.predecessor.time_functions import (
+    DRAWN,
+    SEED,
+    PredecessorTime,
+    TimeForm,
+    as_log_slopes,
+    components_of,
+)
+from marey_motion.importing.source import ImportOptions
+from marey_motion.modelling.mixture import LatentMixture
+from marey_motion.modelling.primitive import MotionPrimitive
+from marey_motion.modelling.splines import DEGREE, SplineBasis
+from marey_motion.skeleton import Skeleton
+
+Layout = Literal["1", "2", "3", "static"]
+Floats = NDArray[np.float64]
+Document = Mapping[str, Any]
+
+DEFAULT_FRAME_TIME_S = 1.0 / 30.0
+MOST_COMPONENTS, MOST_DIMENSIONS, MOST_FRAMES = 100, 2000, 20_000
+MOST_VALUES = 10_000_000
+LARGEST = 1e12
+WEIGHTS_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class PredecessorModel:
+    """A model that was read.
+
+    Parameters
+    ----------
+    primitive : in our convention
+    layout : of the document
+    animated_joints : joints that the document has rotations of; the others of the skeleton rest
+    time_form : how its time function was meant, None where it had none and runs at constant speed
+    time_error_frames : how far the time function of `primitive` is off that of the document, at most
+    """
+
+    primitive: MotionPrimitive
+    layout: Layout
+    animated_joints: tuple[str, ...]
+    time_form: TimeForm | None
+    time_error_frames: float
+
+
+def layout_of(document: Document) -> Layout | None:
+    """Which layout a document has; None where it is no model."""
+    if isinstance(document.get("sspm"), dict) and "gmm" in document:
+        return "3"
+    if "eigen_vectors_spatial" in document:
+        return "1" if "mean_temporal_semantic_vector" in document else "2"
+    return "static" if "spatial_coeffs" in document else None
+
+
+def read_predecessor_model(data: bytes, file: str, *, skeleton: Skeleton | None = None) -> PredecessorModel:
+    """Read a model of any layout, as JSON, BSON or compressed BSON.
+
+    Parameters
+    ----------
+    skeleton : that it moves, where the document does not hold its own
+
+    Raises
+    ------
+    FormatError    naming the field that is wrong
+    """
+    return model_of_document(decode_document(data, file), file, skeleton=skeleton)
+
+
+def model_of_document(document: Document, file: str, *, skeleton: Skeleton | None = None) -> PredecessorModel:
+    """As `read_predecessor_model`, of a document that was decoded."""
+    layout = layout_of(document)
+    if layout is None:
+        message = "the document is no model: it has neither 'sspm', 'eigen_vectors_spatial' nor 'spatial_coeffs'"
+        raise FormatError(message, code="document-unknown", file=file)
+    own = _skeleton(document, file) or skeleton
+    if own is None:
+        message = "the model does not hold its skeleton; name the skeleton of the project that it moves"
+        raise FormatError(message, code="skeleton-missing", file=file)
+    try:
+        return _read(_as_parts(document, layout, file), layout, own, file)
+    except FormatError:
+        raise
+    except MotionError as error:
+        raise FormatError(f"the numbers describe no model: {error}", code="model-invalid", file=file) from error
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """What every layout holds, under one name each."""
+
+    name: str
+    space: Document
+    translation_maxima: Floats
+    time: Document | None
+    time_form: TimeForm
+    mixture: Document | None
+    animated_joints: list[str] | None
+    frame_time_s: float
+    keyframes: Mapping[str, int]
+
+
+def _as_parts(document: Document, layout: Layout, file: str) -> _Parts:
+    if layout == "3":
+        space = field_of(document, "sspm", dict, file)
+        time: Document | None = field_of(document, "tspm", dict, file) if document.get("tspm") else None
+        mixture: Document | None = field_of(document, "gmm", dict, file)
+    elif layout == "static":
+        space = {
+            "mean": field_of(document, "spatial_coeffs", list, file),
+            "knots": field_of(document, "knots", list, file),
+        }
+        time, mixture = None, None
+    else:
+        space = _renamed(document, _FLAT_SPACE)
+        time = _renamed(document, _FLAT_TIME if layout == "2" else _FLAT_TIME_SEMANTIC)
+        mixture = _renamed(document, _FLAT_MIXTURE)
+    time, form = _time_part(time, layout, file)
+    skeleton = document.get("skeleton")
+    rate_sources = (time or {}, document, skeleton if isinstance(skeleton, dict) else {})
+    frame_time_s = next((one["frame_time"] for one in rate_sources if one.get("frame_time")), DEFAULT_FRAME_TIME_S)
+    if not isinstance(frame_time_s, int | float) or not 1e-5 < frame_time_s < 10.0:
+        raise FormatError(f"field 'frame_time' is {frame_time_s!r}; seconds are needed", code="bad-number", file=file)
+    joints = next((one for one in (space, document) if "animated_joints" in one), None)
+    if joints is None and isinstance(skeleton, dict) and isinstance(skeleton.get("animated_joints"), list):
+        joints = skeleton
+    maxima = _numbers(
+        document.get("translation_maxima", space.get("translation_maxima", [1, 1, 1])), file, "translation_maxima"
+    )
+    if maxima.shape != (3,):
+        raise FormatError("field 'translation_maxima' must be three numbers", code="bad-number", file=file)
+    return _Parts(
+        name=str(document.get("name") or ""),
+        space=space,
+        translation_maxima=maxima,
+        time=time,
+        time_form=form,
+        mixture=mixture,
+        animated_joints=None if joints is None else text_list(joints, "animated_joints", file),
+        frame_time_s=float(frame_time_s),
+        keyframes=_keyframes(document, file),
+    )
+
+
+_FLAT_SPACE = {
+    "eigen": "eigen_vectors_spatial",
+    "mean": "mean_spatial_vector",
+    "n_coeffs": "n_basis_spatial",
+    "n_dims": "n_dim_spatial",
+    "knots": "b_spline_knots_spatial",
+    "n_frames": "n_canonical_frames",
+}
+_FLAT_TIME = {
+    "eigen": "eigen_vectors_time",
+    "mean": "mean_time_vector",
+    "n_coeffs": "n_basis_time",
+    "n_dims": "n_dim_time",
+    "knots": "b_spline_knots_time",
+    "n_frames": "n_canonical_frames",
+}
+_FLAT_TIME_SEMANTIC = {
+    "eigen": "eigen_vectors_temporal_semantic",
+    "mean": "mean_temporal_semantic_vector",
+    "n_coeffs": "n_basis_temporal_semantic",
+    "n_dims": "n_dim_temporal_semantic",
+    "knots": "b_spline_knots_temporal_semantic",
+    "n_frames": "n_canonical_frames",
+}
+_FLAT_MIXTURE = {"weights": "gmm_weights", "means": "gmm_means", "covars": "gmm_covars"}
+
+
+def _renamed(document: Document, names: Mapping[str, str]) -> dict[str, Any]:
+    return {ours: document[theirs] for ours, theirs in names.items() if theirs in document}
+
+
+def _time_part(time: Document | None, layout: Layout, file: str) -> tuple[Document | None, TimeForm]:
+    """The time of a model, None where it has none, and how it is meant.
+
+    Layout 2 was written by two trainers. The first one puts a component into each column of its vectors and means
+    increments; the later one puts it into each row, and means coefficients as layout 3 does.
+    """
+    if time is None or not time.get("mean"):
+        return None, "coefficients"
+    count = len(field_of(time, "mean", list, file))
+    if layout != "2":
+        return time, "coefficients"
+    vectors = _numbers(time.get("eigen", []), file, _FLAT_TIME["eigen"])
+    if vectors.ndim == 2 and vectors.shape[1] != count and vectors.shape[0] == count:
+        return {**time, "eigen": vectors.T.tolist()}, "increments"
+    return time, "coefficients"
+
+
+def _keyframes(document: Document, file: str) -> dict[str, int]:
+    if "keyframes" not in document:
+        return {}
+    given = field_of(document, "keyframes", dict, file)
+    for label, frame in given.items():
+        if not isinstance(frame, int) or isinstance(frame, bool) or frame < 0:
+            raise FormatError(f"field 'keyframes': {label!r} is {frame!r}, a frame is needed", file=file)
+    return dict(given)
+
+
+def _skeleton(document: Document, file: str) -> Skeleton | None:
+    if not isinstance(document.get("skeleton"), dict):
+        return None
+    return convert(read_skeleton_document(document["skeleton"], file), file, ImportOptions()).skeleton
+
+
+def _read(parts: _Parts, layout: Layout, skeleton: Skeleton, file: str) -> PredecessorModel:
+    basis, mean, vectors = _functions(parts.space, "space", file)
+    animated = _animated(parts, basis, mean, skeleton, file)
+    spatial_mean, spatial_vectors = _on_skeleton(mean, vectors, parts.translation_maxima, animated, skeleton)
+    frames = basis.frame_count
+    time = _constant_speed(frames) if parts.time is None else _time(parts, frames, file)
+    mixture, temporal_count = _mixture(parts.mixture, len(spatial_vectors), len(time.directions), file)
+    time = PredecessorTime(time.form, time.basis, time.mean, time.directions[:temporal_count])
+    latents = mixture.sample(DRAWN, SEED)
+    spread = _variances(mixture)
+    temporal, error = as_log_slopes(time, latents[:, len(spatial_vectors) :], spread[len(spatial_vectors) :], file)
+    spatial = components_of(basis, spatial_mean, spatial_vectors, spread[: len(spatial_vectors)])
+    if odd := [label for label, frame in parts.keyframes.items() if frame >= frames]:
+        raise FormatError(f"field 'keyframes': {odd[0]!r} is beyond the {frames} canonical frames", file=file)
+    primitive = MotionPrimitive(
+        parts.name, skeleton, 1.0 / parts.frame_time_s, spatial, temporal, 1.0, mixture, parts.keyframes
+    )
+    return PredecessorModel(primitive, layout, tuple(animated), time.form if parts.time else None, error)
+
+
+def _constant_speed(frames: int) -> PredecessorTime:
+    """A frame of the example for each canonical frame."""
+    basis = SplineBasis.clamped(frames, DEGREE + 1)
+    return PredecessorTime("increments", basis, np.zeros(basis.count), np.zeros((0, basis.count)))
+
+
+def _functions(part: Document, what: str, file: str) -> tuple[SplineBasis, Floats, Floats]:
+    """Basis, mean (n, D) and components (k, n, D) of space or time."""
+    basis = _basis(part, what, file)
+    start, stop = basis.span
+    if start != 0.0 or abs(stop - round(stop)) > 1e-6 or stop < 2.0:
+        raise FormatError(f"{what}: the knots span {start:g} to {stop:g}, not 0 to a last frame", file=file)
+    mean = _numbers(field_of(part, "mean", list, file), file, f"{what}: mean")
+    if mean.size % basis.count or mean.size == 0:
+        raise FormatError(f"{what}: a mean of {mean.size} numbers for {basis.count} coefficients", file=file)
+    if part.get("n_coeffs", basis.count) != basis.count:
+        message = f"{what}: n_coeffs is {part['n_coeffs']}, but the knots are those of {basis.count} coefficients"
+        raise FormatError(message, file=file)
+    channels = mean.size // basis.count
+    if part.get("n_dims", channels) != channels:
+        raise FormatError(f"{what}: n_dims is {part['n_dims']}, but the mean has {channels} channels", file=file)
+    given = part.get("eigen") or []
+    vectors = _numbers(given, file, f"{what}: eigen") if given else np.zeros((0, mean.size))
+    if vectors.ndim == 2 and vectors.shape[1] != mean.size and vectors.shape[0] == mean.size:
+        vectors = vectors.T
+    if vectors.ndim != 2 or vectors.shape[1] != mean.size:
+        raise FormatError(f"{what}: eigenvectors of shape {vectors.shape} for a mean of {mean.size} numbers", file=file)
+    shape = (basis.count, channels)
+    return basis, mean.reshape(shape), np.ascontiguousarray(vectors).reshape(len(vectors), *shape)
+
+
+def _basis(part: Document, what: str, file: str) -> SplineBasis:
+    """The basis over the knots; the oldest models tell how many coefficients and frames there are instead."""
+    if "knots" not in part and "n_frames" in part:
+        frames, count = (field_of(part, name, int, file) for name in ("n_frames", "n_coeffs"))
+        if not 2 <= count <= frames <= MOST_FRAMES:
+            raise FormatError(f"{what}: {count} coefficients over {frames} frames", code="model-invalid", file=file)
+        _check_size(frames, count, what, file)
+        return SplineBasis.clamped(frames, count)
+    knots = _numbers(field_of(part, "knots", list, file), file, f"{what}: knots")
+    if knots.ndim != 1 or not 0 < len(knots) <= MOST_FRAMES or np.abs(knots).max() > MOST_FRAMES:
+        raise FormatError(f"{what}: knots must be up to {MOST_FRAMES} numbers as high at most", file=file)
+    degree = part.get("degree", DEGREE)
+    if isinstance(degree, bool) or not isinstance(degree, int) or not 1 <= degree < 10:
+        raise FormatError(f"{what}: degree is {degree!r}, a small whole number is needed", file=file)
+    basis = SplineBasis(knots, degree)
+    _check_size(basis.frame_count, basis.count, what, file)
+    return basis
+
+
+def _check_size(frames: int, coefficients: int, what: str, file: str) -> None:
+    """Refuse splines whose values would fill the memory, however small the document is."""
+    if frames * coefficients > MOST_VALUES:
+        message = f"{what}: {coefficients} coefficients over {frames} frames; their product is at most {MOST_VALUES:,}"
+        raise FormatLimit(message, file=file)
+
+
+def _animated(parts: _Parts, basis: SplineBasis, mean: Floats, skeleton: Skeleton, file: str) -> list[str]:
+    """Joints that the model has rotations of. Raises `FormatError` where they are none of the skeleton's."""
+    animated = parts.animated_joints or list(skeleton.joint_names)
+    if mean.shape[1] != 3 + 4 * len(animated):
+        message = f"{mean.shape[1]} channels, but {len(animated)} joints need {3 + 4 * len(animated)}"
+        raise FormatError(message, code="joints-mismatch", file=file)
+    if len(set(animated)) != len(animated):
+        raise FormatError("field 'animated_joints' names a joint twice", file=file)
+    unknown = next((name for name in animated if name not in skeleton), None)
+    if unknown is not None:
+        raise FormatError("the skeleton has no such joint", code="joints-mismatch", file=file, joint=unknown)
+    if (np.linalg.norm(basis.at_frames @ mean[:, 3:], axis=1) == 0).any():
+        raise FormatError("the mean motion has frames without any rotation", code="model-invalid", file=file)
+    return animated
+
+
+def _on_skeleton(
+    mean: Floats, vectors: Floats, maxima: Floats, animated: list[str], skeleton: Skeleton
+) -> tuple[Floats, Floats]:
+    """Mean (n, 3 + 4·J) and components (k, n, 3 + 4·J) in metres, of all joints; those not animated rest."""
+    rest = np.concatenate((np.zeros(3), skeleton.rest_rotations.ravel()))
+    columns = columns_of(animated, skeleton)
+    whole = np.tile(rest, (len(mean), 1))
+    whole[:, columns] = mean
+    directions = np.zeros((len(vectors), *whole.shape))
+    directions[..., columns] = vectors
+    for values in (whole, directions):
+        values[..., :3] *= maxima * CENTIMETRE_M
+    whole[:, :3] += skeleton.offsets[0]  # B-splines add up to 1
+    return whole, directions
+
+
+def columns_of(animated: list[str] | tuple[str, ...], skeleton: Skeleton) -> NDArray[np.int64]:
+    """Channels of a pose of the skeleton that hold the root's translation and these joints' rotations, in order."""
+    joints = np.array([skeleton.index_of(name) for name in animated], dtype=np.int64)
+    return np.concatenate((np.arange(3), (3 + 4 * joints[:, None] + np.arange(4)).ravel()))
+
+
+def _time(parts: _Parts, frames: int, file: str) -> PredecessorTime:
+    """The time function; where it has channels for semantics beside time, time is the first."""
+    assert parts.time is not None
+    basis, mean, vectors = _functions(parts.time, "time", file)
+    if basis.frame_count != frames:
+        message = f"time spans {basis.frame_count} canonical frames, space {frames}"
+        raise FormatError(message, code="model-invalid", file=file)
+    return PredecessorTime(parts.time_form, basis, mean[:, 0], vectors[..., 0])
+
+
+def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> tuple[LatentMixture, int]:
+    """The mixture, and how many temporal components it covers: some models have a mixture of space alone."""
+    if part is None:
+        dimensions = spatial + temporal
+        return LatentMixture(np.ones(1), np.zeros((1, dimensions)), np.eye(dimensions)[None]), temporal
+    weights, means, covariances = (
+        _numbers(field_of(part, name, list, file), file, f"gmm: {name}") for name in ("weights", "means", "covars")
+    )
+    if means.ndim == 2 and not means.size and not covariances.size:
+        covariances = np.zeros((len(means), 0, 0))  # lists of nothing do not tell how many there are
+    if means.ndim != 2 or covariances.shape != (len(means), *[means.shape[1]] * 2) or weights.shape != (len(means),):
+        shapes = f"{weights.shape}, {means.shape} and {covariances.shape}"
+        raise FormatError(f"gmm: weights, means and covars of shapes {shapes}", code="model-invalid", file=file)
+    if len(means) > MOST_COMPONENTS or means.shape[1] > MOST_DIMENSIONS:
+        raise FormatError(f"gmm: more than {MOST_COMPONENTS} distributions or {MOST_DIMENSIONS} dimensions", file=file)
+    covered = means.shape[1] - spatial
+    if not 0 <= covered <= temporal:
+        message = f"gmm: {means.shape[1]} dimensions, but space has {spatial} components and time {temporal}"
+        raise FormatError(message, code="model-invalid", file=file)
+    if (weights <= 0).any() or abs(float(weights.sum()) - 1.0) > WEIGHTS_TOLERANCE:
+        raise FormatError("gmm: the weights must be positive and add up to 1", code="model-invalid", file=file)
+    symmetric = 0.5 * (covariances + covariances.transpose(0, 2, 1))
+    mixture = LatentMixture(weights / weights.sum(), means, symmetric)
+    if means.shape[1]:
+        _ = mixture.cholesky  # refuses what is no covariance
+    return mixture, covered
+
+
+def _numbers(values: Any, file: str, name: str) -> Floats:
+    """Nested lists as an array; what is made of numbers that no body has could not be computed with."""
+    numbers = number_array(values, file, name)
+    if np.abs(numbers).max(initial=0.0) > LARGEST:
+        raise FormatError(f"field {name!r} holds numbers beyond {LARGEST:g}", code="bad-number", file=file)
+    return numbers
+
+
+def _variances(mixture: LatentMixture) -> Floats:
+    """Variance (L,) of each number of the latent vectors."""
+    mean = mixture.weights @ mixture.means
+    squares = np.diagonal(mixture.covariances, axis1=1, axis2=2) + mixture.means**2
+    return np.asarray(np.maximum(mixture.weights @ squares - mean**2, 0.0))

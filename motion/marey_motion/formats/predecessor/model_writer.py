@@ -1,0 +1,123 @@
+"""Motion primitives in the predecessor's layouts 3 and 2: centimetres, right-handed, frames of canonical time.
+
+Space is written as it is. Time is written in the predecessor's own form (see `predecessor_time`), which holds ours
+nearly, not exactly.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.formats.predecessor.encoding import Encoding, encode_document
+from marey_motion.formats.predecessor.model import columns_of
+from marey_motion.formats.predecessor.skeleton import CENTIMETRE_M, skeleton_document
+from marey_motion.formats.predecessor.time_functions import as_coefficients, as_increments
+from marey_motion.modelling.primitive import MotionPrimitive
+
+Floats = NDArray[np.float64]
+
+
+def write_predecessor_model(
+    primitive: MotionPrimitive,
+    *,
+    layout: Literal["2", "3"] = "3",
+    animated_joints: tuple[str, ...] = (),
+    encoding: Encoding = "json",
+) -> bytes:
+    """Write a primitive.
+
+    Parameters
+    ----------
+    animated_joints : joints whose rotations are written, all of them without; the others rest
+    """
+    joints = animated_joints or primitive.skeleton.joint_names
+    document = model_document(primitive, joints) if layout == "3" else _flat_document(primitive, joints)
+    return encode_document(document, encoding)
+
+
+def model_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...]) -> dict[str, Any]:
+    """The primitive in layout 3."""
+    mean, vectors = _space(primitive, animated_joints)
+    time = as_coefficients(primitive)
+    frame_time_s = 1.0 / primitive.frame_rate_hz
+    skeleton = {**skeleton_document(primitive.skeleton, form="file"), "frame_time": frame_time_s}
+    return {
+        "name": primitive.name,
+        "sspm": {
+            "eigen": vectors.reshape(len(vectors), mean.size).tolist(),
+            "mean": mean.ravel().tolist(),
+            "n_coeffs": len(mean),
+            "n_dims": mean.shape[1],
+            "knots": primitive.spatial.basis.knots.tolist(),
+            "degree": primitive.spatial.basis.degree,
+            "animated_joints": list(animated_joints),
+        },
+        "tspm": {
+            "eigen": time.directions.tolist(),
+            "mean": time.mean.tolist(),
+            "n_coeffs": time.basis.count,
+            "n_dims": 1,
+            "knots": time.basis.knots.tolist(),
+            "degree": time.basis.degree,
+            "semantic_labels": {},
+            "frame_time": frame_time_s,
+        },
+        "gmm": {**_mixture(primitive), "eigen": _roots(primitive.mixture.covariances).tolist()},
+        "skeleton": skeleton,
+        "keyframes": dict(primitive.keyframes),
+    }
+
+
+def _flat_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...]) -> dict[str, Any]:
+    """The primitive in layout 2, by its first trainer's conventions of time."""
+    mean, vectors = _space(primitive, animated_joints)
+    time = as_increments(primitive)
+    mixture = {f"gmm_{name}": values for name, values in _mixture(primitive).items()}
+    return {
+        "name": primitive.name,
+        **mixture,
+        "eigen_vectors_spatial": vectors.reshape(len(vectors), mean.size).tolist(),
+        "mean_spatial_vector": mean.ravel().tolist(),
+        "n_canonical_frames": primitive.frame_count,
+        "translation_maxima": [1.0, 1.0, 1.0],
+        "n_basis_spatial": len(mean),
+        "n_dim_spatial": mean.shape[1],
+        "b_spline_knots_spatial": primitive.spatial.basis.knots.tolist(),
+        "eigen_vectors_time": time.directions.T.tolist(),
+        "mean_time_vector": time.mean.tolist(),
+        "n_basis_time": time.basis.count,
+        "b_spline_knots_time": time.basis.knots.tolist(),
+        "animated_joints": list(animated_joints),
+        "frame_time": 1.0 / primitive.frame_rate_hz,
+        "skeleton": skeleton_document(primitive.skeleton, form="file"),
+        "keyframes": dict(primitive.keyframes),
+    }
+
+
+def _space(primitive: MotionPrimitive, animated_joints: tuple[str, ...]) -> tuple[Floats, Floats]:
+    """Mean (n, D) and components (k, n, D) of these joints, centimetres from the root's offset."""
+    columns = columns_of(animated_joints, primitive.skeleton)
+    mean = primitive.spatial.mean[:, columns].copy()
+    vectors = primitive.spatial.directions[..., columns].copy()
+    mean[:, :3] -= primitive.skeleton.offsets[0]
+    mean[:, :3] /= CENTIMETRE_M
+    vectors[..., :3] /= CENTIMETRE_M
+    return mean, vectors
+
+
+def _mixture(primitive: MotionPrimitive) -> dict[str, Any]:
+    mixture = primitive.mixture
+    return {
+        "weights": mixture.weights.tolist(),
+        "means": mixture.means.tolist(),
+        "covars": mixture.covariances.tolist(),
+    }
+
+
+def _roots(covariances: Floats) -> Floats:
+    """(K, L, L) E with E · Eᵀ = covariance: eigenvectors times the roots of their eigenvalues."""
+    values, vectors = np.linalg.eigh(covariances)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :])

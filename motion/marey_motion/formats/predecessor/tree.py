@@ -1,0 +1,128 @@
+"""The predecessor's cluster trees over samples of a model, nested nodes, and ours made of them and the other way round.
+
+A document holds `data` (samples), `features`, `options` and `root`; a node is `{mean, indices, children}`. Ours keeps
+the samples in the order of the tree and single precision; means follow from them.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import FormatError, MotionError
+from marey_motion.formats.document_fields import field_of, number_array
+from marey_motion.formats.predecessor.encoding import Encoding, decode_document, encode_document
+from marey_motion.modelling.search.tree import SampleTree
+
+Node = Mapping[str, Any]
+Integers = NDArray[np.int64]
+
+MOST_NODES = 1_000_000
+MOST_LEVELS = 64
+
+
+def is_tree(document: Mapping[str, Any]) -> bool:
+    """Whether a document is a cluster tree."""
+    return "data" in document and isinstance(document.get("root"), Mapping) and "indices" in document["root"]
+
+
+def read_predecessor_tree(data: bytes, file: str) -> SampleTree:
+    """Read a cluster tree, as JSON, BSON or compressed BSON.
+
+    Raises
+    ------
+    FormatError    naming the node, by its place from the root, that is wrong
+    """
+    return tree_of_document(decode_document(data, file), file)
+
+
+def tree_of_document(document: Mapping[str, Any], file: str) -> SampleTree:
+    """As `read_predecessor_tree`, of a document that was decoded."""
+    samples = number_array(field_of(document, "data", list, file), file, "data")
+    if samples.ndim != 2 or not len(samples):
+        raise FormatError(f"field 'data' has shape {samples.shape}; a row for each sample is needed", file=file)
+    if np.abs(samples).max(initial=0.0) > np.finfo(np.float32).max:
+        place = int(np.argmax(np.abs(samples).max(axis=1)))
+        message = f"field 'data', row {place}: a number beyond those of single precision, which samples are kept in"
+        raise FormatError(message, code="bad-number", file=file)
+    indices, children = _by_levels(field_of(document, "root", dict, file), len(samples), file)
+    order = _in_tree_order(indices, children)
+    if len(np.unique(order)) != len(samples):
+        raise FormatError("the ends of the tree do not hold each sample once", code="tree-invalid", file=file)
+    sizes = np.array([len(one) for one in indices], dtype=np.int32)
+    try:
+        tree = SampleTree(samples[order].astype(np.float32), sizes, np.array(children, dtype=np.int32))
+    except MotionError as error:
+        raise FormatError(str(error), code="tree-invalid", file=file) from error
+    for number, (start, held) in enumerate(zip(tree.starts.tolist(), indices, strict=True)):
+        if not np.array_equal(np.sort(order[start : start + len(held)]), np.sort(held)):
+            message = f"node {number}, counted level by level, holds other samples than the nodes below it"
+            raise FormatError(message, code="tree-invalid", file=file)
+    return tree
+
+
+def write_predecessor_tree(tree: SampleTree, spatial: int, branching: int, *, encoding: Encoding = "json") -> bytes:
+    """Write a tree.
+
+    Parameters
+    ----------
+    spatial : numbers of a latent vector that tell of space; they are the features
+    branching : children of a node, at most
+    """
+    samples = tree.samples.astype(np.float64)
+    nodes = [
+        {"mean": mean, "indices": list(range(start, start + size)), "children": []}
+        for mean, start, size in zip(tree.means.tolist(), tree.starts.tolist(), tree.sizes.tolist(), strict=True)
+    ]
+    for node, first, count in zip(nodes, tree.first_children.tolist(), tree.children.tolist(), strict=True):
+        node["children"] = nodes[first : first + count]
+    document = {
+        "data": samples.tolist(),
+        "features": samples[:, :spatial].tolist(),
+        "options": {"n_subdivisions": branching, "clustering_method": 0, "use_feature_mean": False},
+        "root": nodes[0],
+    }
+    return encode_document(document, encoding)
+
+
+def _by_levels(root: Node, count: int, file: str) -> tuple[list[Integers], list[int]]:
+    """Samples and number of children of each node, level by level; a child's samples are some of its parent's."""
+    indices: list[Integers] = []
+    children: list[int] = []
+    waiting: deque[tuple[Node, str, int]] = deque([(root, "root", 0)])
+    while waiting:
+        node, place, level = waiting.popleft()
+        below = node.get("children") or [] if isinstance(node, Mapping) else None
+        if not isinstance(below, list) or level > MOST_LEVELS:
+            raise FormatError(f"{place}: a node has a list of children, down to {MOST_LEVELS} levels", file=file)
+        held = number_array(field_of(node, "indices", list, file), file, f"{place}: indices")
+        if held.ndim != 1 or not len(held) or (held != np.floor(held)).any():
+            raise FormatError(f"{place}: indices must name one sample or more", file=file)
+        if held.min() < 0 or held.max() >= count:
+            raise FormatError(f"{place}: indices must lie between 0 and {count - 1}", file=file)
+        indices.append(held.astype(np.int64))
+        children.append(len(below))
+        if len(indices) + len(waiting) + len(below) > MOST_NODES:
+            raise FormatError(f"the tree has more than {MOST_NODES} nodes", code="format-limit", file=file)
+        waiting.extend((child, f"{place}.{number}", level + 1) for number, child in enumerate(below))
+    if len(np.unique(indices[0])) != count or len(indices[0]) != count:
+        raise FormatError(f"root: its indices must name each of the {count} samples once", file=file)
+    return indices, children
+
+
+def _in_tree_order(indices: list[Integers], children: list[int]) -> Integers:
+    """Samples so that those of each node stand side by side: those of the leaves, from the first to the last."""
+    first = np.concatenate(([1], 1 + np.cumsum(children)[:-1]))
+    order: list[Integers] = []
+    path = [0]
+    while path:
+        node = path.pop()
+        if children[node]:
+            path.extend(range(int(first[node]) + children[node] - 1, int(first[node]) - 1, -1))
+        else:
+            order.append(indices[node])
+    return np.concatenate(order)

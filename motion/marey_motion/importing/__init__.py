@@ -1,0 +1,1 @@
+"""From uploaded files to documents of skeletons, clips, and models. Bytes in, documents out."""

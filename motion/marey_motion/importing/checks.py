@@ -1,0 +1,355 @@
+"""What a person should know about a motion before using it: one warning per finding, each with a stable code.
+
+The checks look and never change anything; `without_rest_pose` and `on_the_floor` make a changed clip on request.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.clip import Clip
+from marey_motion.importing.landmarks import Landmarks, common_ancestor, find_landmarks, path_length
+from marey_motion.kinematics import forward_kinematics
+from marey_motion.skeleton import Skeleton
+from marey_schemas.wording import counted
+
+# Every code a warning may carry, and what it means to the reader of an import report.
+CODES = {
+    # What the file says, and what was made of it.
+    "frame-count-mismatch": "The header declares another number of frames than the file holds. The data lines count.",
+    "frames-wrapped": "Frames run over several lines; they were joined by counting values.",
+    "no-frames": "The file holds no motion; its skeleton was imported.",
+    "frame-time-snapped": "The frame time is rounded; the known frame rate it stands for was taken.",
+    "frame-rate-unusual": "The frame rate is near a usual one, but not equal; it was taken as it stands.",
+    "frame-rate-assumed": "The format carries no frame rate; the usual one of its source was assumed.",
+    "frame-number-gap": "Frames are numbered with gaps; they were taken as they follow each other.",
+    "mixed-rotation-orders": "Joints differ in the order of their Euler angles; each was read in its own.",
+    "duplicate-joint-names": "Joint names repeat; they were made unique with the parent's name.",
+    "position-channels": "Joints below the root move against their parents; their translations were kept.",
+    "bones-moved-by-translations": "Retargeting pointed bones where the source's joints are, not as they turn.",
+    "offsets-from-positions": "The file gives its bones no length; they were taken from the position channels.",
+    "position-channels-relative": "Position channels are displacements from the offsets, not positions.",
+    "non-unit-quaternions": "Rotations were not of unit length and were normalised.",
+    "sign-flips-unrolled": "Rotations jumped between a quaternion and its negative; the signs were made continuous.",
+    # What was inferred.
+    "unit-inferred": "The unit of length is not a usual one; it was inferred from the body.",
+    "up-axis-assumed": "Nothing tells which axis points up; y was assumed.",
+    "up-axis-converted": "Another axis than y points up in the file; the motion was turned.",
+    "left-handed": "Left is on the right: the file may be left-handed.",
+    # What the motion shows.
+    "rest-pose-frame": "The motion begins or ends with a rest pose, which spoils means; it can be trimmed.",
+    "floor-offset": "The feet stand above or below height zero.",
+    "floor-penetration": "Feet go below the ground they otherwise stand on.",
+    "foot-skate": "Feet slide while they stand.",
+    "in-place-gait": "The body walks without travelling, as on a treadmill; leave it out of speed coverage.",
+    "teleport": "The root jumps between two frames.",
+    "rotation-jump": "A joint turns implausibly far between two frames.",
+    "dead-joints": "Whole limbs never turn although other joints do.",
+}
+
+REST_TOLERANCE_RAD = 0.01
+FLOOR_TOLERANCE_M = 0.1
+PENETRATION_M = 0.05
+SKATE_HEIGHT_M = 0.025
+SKATE_SPEED_M_S = 0.6
+IN_PLACE_FOOT_SPEED_M_S = 0.4
+TELEPORT_SPEED_M_S = 15.0
+JUMP_RAD = np.radians(60.0)
+_FRAMES_PER_BLOCK = 4096
+
+
+@dataclass(frozen=True)
+class CheckWarning:
+    """One finding about a motion; `CODES` explains every code.
+
+    Parameters
+    ----------
+    code : stable slug
+    message : what was found, in a sentence with its numbers
+    joints : names of the joints concerned
+    frames : half-open range of the frames concerned, None for all of them
+    values : the numbers behind the sentence
+    """
+
+    code: str
+    message: str
+    joints: tuple[str, ...] = ()
+    frames: tuple[int, int] | None = None
+    values: dict[str, Any] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        return {**asdict(self), "joints": list(self.joints), "frames": list(self.frames) if self.frames else None}
+
+
+@dataclass(frozen=True)
+class _Tracks:
+    """Where the points that the checks look at are.
+
+    `positions` (F, k, 3) in metres; `column` finds a joint in them; `soles` are the columns of each foot: the joints
+    and end sites from the ankle down.
+    """
+
+    landmarks: Landmarks
+    positions: NDArray[np.float32]
+    column: dict[int, int]
+    soles: tuple[NDArray[np.intp], ...]
+
+    def of(self, *joints: int) -> NDArray[np.float32]:
+        return self.positions[:, [self.column[joint] for joint in joints]]
+
+    def sole_heights(self) -> NDArray[np.float32]:
+        """(F, 2) height of the lowest point of each foot."""
+        return np.stack([self.positions[:, sole, 1].min(axis=1) for sole in self.soles], axis=1)
+
+    def floor_height(self) -> float:
+        """The height the lower foot rests at."""
+        return float(np.quantile(self.sole_heights().min(axis=1), 0.05))
+
+
+def check_clip(clip: Clip, landmarks: Landmarks | None = None) -> tuple[CheckWarning, ...]:
+    """Everything worth knowing about a clip; `landmarks` of its skeleton, where they are known already."""
+    tracks = _track(clip, landmarks)
+    warnings = [_position_channels(clip), *_rest_poses(clip, tracks)]
+    if tracks.soles:
+        warnings += [_floor_offset(tracks), _floor_penetration(tracks), *_gait(clip, tracks)]
+    warnings += [_teleports(clip), _rotation_jumps(clip), _dead_joints(clip, tracks)]
+    return tuple(warning for warning in warnings if warning is not None)
+
+
+def without_rest_pose(clip: Clip) -> tuple[Clip, tuple[int, int]]:
+    """The clip without a rest pose at its start and end, and how many frames were dropped at each."""
+    start, end = _rest_pose_frames(clip, _track(clip))
+    if start + end == 0 or start == clip.frame_count:
+        return clip, (0, 0)
+    return clip.sliced(start, clip.frame_count - end), (start, end)
+
+
+def on_the_floor(clip: Clip) -> tuple[Clip, float]:
+    """The clip with its ground at height zero, and the metres that were added to every height; itself without feet."""
+    tracks = _track(clip)
+    if not tracks.soles:
+        return clip, 0.0
+    shift_m = -tracks.floor_height()
+    poses = clip.poses.copy()
+    poses[:, 1] += np.float32(shift_m)
+    return replace(clip, poses=poses), shift_m
+
+
+def _track(clip: Clip, landmarks: Landmarks | None = None) -> _Tracks:
+    skeleton = clip.skeleton
+    landmarks = landmarks or find_landmarks(skeleton)
+    soles = tuple(sole_points(skeleton, foot) for foot in landmarks.feet or ())
+    bodies = [joint for pair in (landmarks.hands, landmarks.feet) if pair for joint in pair]
+    points = sorted({0, landmarks.hips or 0, *bodies, *(point for sole in soles for point in sole)})
+    positions = np.empty((clip.frame_count, len(points), 3), np.float32)
+    # In blocks, so that a clip of an hour needs no more memory than its own.
+    for start in range(0, clip.frame_count, _FRAMES_PER_BLOCK):
+        block = slice(start, start + _FRAMES_PER_BLOCK)
+        everything = forward_kinematics(
+            skeleton,
+            clip.poses[block],
+            translations=None if clip.translations is None else clip.translations[block],
+            translated_joints=clip.translated_joints,
+            end_sites=True,
+        )
+        positions[block] = everything[:, points]
+    column = {point: index for index, point in enumerate(points)}
+    return _Tracks(landmarks, positions, column, tuple(np.array([column[p] for p in sole]) for sole in soles))
+
+
+def sole_points(skeleton: Skeleton, foot: int) -> list[int]:
+    """The foot's joints from the ankle down, and its end sites as the points that `end_sites` puts after the joints."""
+    below = {foot}
+    for joint in range(foot + 1, skeleton.joint_count):
+        if int(skeleton.parents[joint]) in below:
+            below.add(joint)
+    tips = [skeleton.joint_count + index for index, site in enumerate(skeleton.end_sites) if site.joint in below]
+    return [*sorted(below), *tips]
+
+
+def _position_channels(clip: Clip) -> CheckWarning | None:
+    if clip.translations is None:
+        return None
+    names = tuple(clip.skeleton.joint_names[joint] for joint in clip.translated_joints)
+    moved = np.linalg.norm(clip.translations - clip.skeleton.offsets[list(clip.translated_joints)], axis=2)
+    return CheckWarning(
+        "position-channels",
+        f"positions of {counted(len(names), 'joint')} below the root change against the parents, "
+        f"{names[int(moved.max(axis=0).argmax())]} by up to {moved.max():.3f} m",
+        joints=names,
+        values={"largest_m": float(moved.max())},
+    )
+
+
+# Rest pose
+
+
+def _rest_poses(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
+    start, end = _rest_pose_frames(clip, tracks)
+    found = []
+    for place, first, last in (("begins", 0, start), ("ends", clip.frame_count - end, clip.frame_count)):
+        if last > first:
+            advice = "" if start == clip.frame_count else "; trim it with --trim-rest-pose (trim_rest_pose)"
+            message = f"the motion {place} with {counted(last - first, 'frame')} of a rest pose{advice}"
+            found.append(CheckWarning("rest-pose-frame", message, frames=(first, last)))
+    return found
+
+
+def _rest_pose_frames(clip: Clip, tracks: _Tracks) -> tuple[int, int]:
+    """How many frames at the start and at the end are a rest pose: every joint at rest, or arms held out in a T."""
+    resting = _at_rest(clip) | _in_t_pose(clip, tracks)
+    if resting.all():
+        return clip.frame_count, 0
+    return int(np.argmin(resting)), int(np.argmin(resting[::-1]))
+
+
+def _at_rest(clip: Clip) -> NDArray[np.bool_]:
+    """(F,) whether the joints below the root, all but one in twenty, are turned as in the skeleton's rest pose."""
+    rotations = clip.rotations[:, 1:]
+    if rotations.shape[1] == 0:
+        return np.zeros(clip.frame_count, np.bool_)
+    rest = clip.skeleton.rest_rotations[1:].astype(np.float32)
+    cosines = np.abs(np.einsum("fjc,jc->fj", rotations, rest))
+    resting: NDArray[np.bool_] = (cosines >= np.cos(REST_TOLERANCE_RAD / 2)).mean(axis=1) >= 0.95
+    return resting
+
+
+def _in_t_pose(clip: Clip, tracks: _Tracks) -> NDArray[np.bool_]:
+    """(F,) whether both arms are stretched out level and the legs are straight."""
+    landmarks = tracks.landmarks
+    if landmarks.hands is None or landmarks.feet is None or landmarks.hips is None:
+        return np.zeros(clip.frame_count, np.bool_)
+    chest = common_ancestor(clip.skeleton.parents, landmarks.hands)
+    span = sum(path_length(clip.skeleton, chest, hand) for hand in landmarks.hands)
+    leg = path_length(clip.skeleton, landmarks.hips, landmarks.feet[0])
+    hands, feet, hips = tracks.of(*landmarks.hands), tracks.of(*landmarks.feet), tracks.of(landmarks.hips)
+    across = hands[:, 0] - hands[:, 1]
+    apart = np.hypot(across[:, 0], across[:, 2]) > 0.9 * span
+    level = np.abs(across[:, 1]) < 0.1 * span
+    straight = hips[:, 0, 1] - feet[..., 1].max(axis=1) > 0.8 * leg
+    result: NDArray[np.bool_] = apart & level & straight
+    return result
+
+
+# Feet and ground
+
+
+def _floor_offset(tracks: _Tracks) -> CheckWarning | None:
+    height = tracks.floor_height()
+    if abs(height) <= FLOOR_TOLERANCE_M:
+        return None
+    return CheckWarning(
+        "floor-offset",
+        f"the feet stand at a height of {height:.2f} m; --align-floor (align_floor) brings them to the ground",
+        values={"floor_height_m": height},
+    )
+
+
+def _floor_penetration(tracks: _Tracks) -> CheckWarning | None:
+    depths = tracks.floor_height() - tracks.sole_heights().min(axis=1)
+    below = np.flatnonzero(depths > PENETRATION_M)
+    if below.size == 0:
+        return None
+    deepest = int(depths.argmax())
+    return CheckWarning(
+        "floor-penetration",
+        f"feet go below their ground in {counted(below.size, 'frame')}, by {depths[deepest]:.2f} m in frame {deepest}",
+        frames=(int(below[0]), int(below[-1]) + 1),
+        values={"deepest_m": float(depths[deepest]), "frame": deepest, "frame_count": int(below.size)},
+    )
+
+
+def _gait(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
+    """Feet that slide under a body that travels (skating) or under one that does not (walking in place).
+
+    The slide of a standing foot is weighted 2 − 2^(h/H) by its height h above the ground up to H = 2.5 cm (Zhang et
+    al., Mode-adaptive neural networks for quadruped control, 2018, section 7.3).
+    """
+    if clip.frame_count < 3:
+        return []
+    soles = tracks.positions[:, np.concatenate(tracks.soles)]
+    heights = soles[1:, :, 1] - tracks.floor_height()
+    weights = 2.0 - 2.0 ** (np.clip(heights, 0.0, SKATE_HEIGHT_M) / SKATE_HEIGHT_M)
+    standing = float(weights.sum())
+    if standing < 2:
+        return []
+    steps = np.linalg.norm(np.diff(soles[..., [0, 2]], axis=0), axis=2)
+    slide_m_s = float((steps * weights).sum()) / standing * clip.frame_rate_hz
+    travel_m_s = _travel_speed(tracks.of(tracks.landmarks.hips or 0)[:, 0], clip.frame_rate_hz)
+    values = {"slide_m_s": slide_m_s, "travel_m_s": travel_m_s}
+    if slide_m_s > IN_PLACE_FOOT_SPEED_M_S and travel_m_s < 0.2 * slide_m_s:
+        message = f"standing feet slide at {slide_m_s:.2f} m/s while the body travels {travel_m_s:.2f} m/s"
+        return [CheckWarning("in-place-gait", message, values=values)]
+    if slide_m_s > SKATE_SPEED_M_S:
+        return [CheckWarning("foot-skate", f"standing feet slide at {slide_m_s:.2f} m/s on average", values=values)]
+    return []
+
+
+def _travel_speed(hips: NDArray[np.float32], frame_rate_hz: float) -> float:
+    """Mean speed on the ground of hips (F, 3) over spans of a second, which leaves out their swaying, m/s."""
+    span = min(max(1, round(frame_rate_hz)), len(hips) - 1)
+    ways = np.linalg.norm(hips[span:, [0, 2]] - hips[:-span, [0, 2]], axis=1)
+    return float(ways.mean()) / span * frame_rate_hz
+
+
+# Continuity
+
+
+def _teleports(clip: Clip) -> CheckWarning | None:
+    speeds = np.linalg.norm(np.diff(clip.root_translations, axis=0), axis=1) * clip.frame_rate_hz
+    jumps = np.flatnonzero(speeds > TELEPORT_SPEED_M_S)
+    if jumps.size == 0:
+        return None
+    fastest = int(speeds.argmax())
+    return CheckWarning(
+        "teleport",
+        f"the root jumps {jumps.size} times, at {speeds[fastest]:.0f} m/s from frame {fastest} to {fastest + 1}",
+        joints=clip.skeleton.joint_names[:1],
+        frames=(int(jumps[0]), int(jumps[-1]) + 2),
+        values={"speed_m_s": float(speeds[fastest]), "frame": fastest + 1, "count": int(jumps.size)},
+    )
+
+
+def _rotation_jumps(clip: Clip) -> CheckWarning | None:
+    angles = 2.0 * np.arccos(np.clip(_step_cosines(clip.rotations), 0.0, 1.0))
+    jumps = angles > JUMP_RAD
+    if not jumps.any():
+        return None
+    frames, joints = np.flatnonzero(jumps.any(axis=1)), np.flatnonzero(jumps.any(axis=0))
+    frame, joint = np.unravel_index(int(angles.argmax()), angles.shape)
+    worst = float(np.degrees(angles[frame, joint]))
+    return CheckWarning(
+        "rotation-jump",
+        f"{counted(joints.size, 'joint')} with jumps, {clip.skeleton.joint_names[joint]} by {worst:.0f}° "
+        f"from frame {frame} to {frame + 1}",
+        joints=tuple(clip.skeleton.joint_names[joint] for joint in joints),
+        frames=(int(frames[0]), int(frames[-1]) + 2),
+        values={"angle_deg": worst, "frame": int(frame) + 1, "count": int(np.count_nonzero(jumps))},
+    )
+
+
+def _dead_joints(clip: Clip, tracks: _Tracks) -> CheckWarning | None:
+    """Limbs none of whose joints ever turns, while other joints do."""
+    landmarks, skeleton = tracks.landmarks, clip.skeleton
+    if clip.frame_count < 2 or not (landmarks.hands and landmarks.feet):
+        return None
+    chest = common_ancestor(skeleton.parents, landmarks.hands)
+    ends = [(chest, hand) for hand in landmarks.hands] + [(landmarks.hips or 0, foot) for foot in landmarks.feet]
+    paths = [skeleton.path_to_root(end)[: skeleton.path_to_root(end).index(top)] for top, end in ends]
+    limbs = [list(path) for path in paths if (clip.rotations[:, path] == clip.rotations[0, path]).all()]
+    dead = sorted(joint for limb in limbs for joint in limb)
+    if not dead or (clip.rotations == clip.rotations[0]).all():
+        return None
+    names = tuple(skeleton.joint_names[joint] for joint in dead)
+    return CheckWarning("dead-joints", f"whole limbs of {counted(len(names), 'joint')} never turn", joints=names)
+
+
+def _step_cosines(rotations: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(F - 1, J) cosine of half the angle between consecutive frames."""
+    cosines: NDArray[np.float32] = np.abs(np.einsum("fjc,fjc->fj", rotations[1:], rotations[:-1]))
+    return cosines

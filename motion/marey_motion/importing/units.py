@@ -1,0 +1,379 @@
+"""The unit of length and the upward axis of a file, from the body it shows; and the record of why.
+
+Files rarely say either. A body does: an adult's leg is about 0.9 m long, heads are above feet, and what touches the
+ground keeps its height. Every finding is kept as a sentence with its numbers; where the findings do not decide, the
+user is asked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import AmbiguousUnits, MotionError
+from marey_motion.importing.checks import CheckWarning
+from marey_motion.importing.landmarks import Landmarks, path_length
+from marey_motion.importing.source import Handedness, ImportOptions, SourceMotion, UpAxis
+from marey_motion.kinematics import forward_kinematics
+
+# Metres per unit: the units that motion files have been seen in. The CMU data base counts in 1/0.45 inch.
+UNITS_M = {
+    "mm": 0.001,
+    "cm": 0.01,
+    "inch": 0.0254,
+    "cmu": 0.0254 / 0.45,
+    "dm": 0.1,
+    "ft": 0.3048,
+    "m": 1.0,
+}
+CONVENTIONAL_UNITS = ("m", "cm", "mm")
+# Adults, from the joint that carries both legs down the bones to the ankle. No length fits two units in these bounds.
+LEG_LENGTH_M = (0.72, 1.2)
+ANIMAL_LEG_LENGTH_M = (0.1, 1.5)
+
+_SAMPLED_FRAMES = 64
+_CLEAR_COSINE = 0.8
+_MIRRORED_COSINE = -0.2
+# Legs and trunk that point the same way: no pose of a body, but bones all put on one line.
+_FOLDED_COSINE = -0.9
+_FOLDED = "rest pose that is none of a body, with legs and trunk pointing the same way"
+_FLAT_GROUND = 0.1
+_CLEARLY_FLATTER = 3.0
+
+
+def unit_in_metres(unit: str | float) -> float:
+    """Metres of a unit given by name (`UNITS_M`) or as its size in metres."""
+    metres = UNITS_M.get(unit.lower()) if isinstance(unit, str) else float(unit)
+    if metres is None or not (np.isfinite(metres) and metres > 0):
+        raise MotionError(
+            f"the unit {unit!r} is none of {', '.join(UNITS_M)} nor a size in metres", code="unit-unknown"
+        )
+    return metres
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """How a file's lengths and axes become metres with Y up, and why."""
+
+    unit_scale_m: float
+    up_axis: UpAxis
+    handedness: Handedness
+    evidence: tuple[str, ...]
+    warnings: tuple[CheckWarning, ...]
+
+
+@dataclass
+class _Body:
+    """What is measured on the file, in its own unit and axes.
+
+    `positions` (F, J, 3) of sampled frames and `rest` (J, 3); `leg` is None without two feet.
+    """
+
+    file: str
+    landmarks: Landmarks
+    positions: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    leg: float | None
+    evidence: list[str] = field(default_factory=list)
+    warnings: list[CheckWarning] = field(default_factory=list)
+
+
+def infer_conversion(source: SourceMotion, landmarks: Landmarks, file: str, options: ImportOptions) -> Conversion:
+    """Decide unit and upward axis: what the options say, else what the format fixes, else what the body shows.
+
+    Parameters
+    ----------
+    landmarks : of the source's skeleton
+    file : its name, for messages
+
+    Raises
+    ------
+    AmbiguousUnits    naming the option to set and the candidates, when the body does not decide
+    """
+    body = _measure(source, landmarks, file)
+    up_axis = _choose_up_axis(source, body, options)
+    unit_scale_m = _choose_unit(source, body, options, up_axis)
+    _look_for_mirroring(source, body, options, up_axis)
+    return Conversion(unit_scale_m, up_axis, options.handedness, tuple(body.evidence), tuple(body.warnings))
+
+
+def _measure(source: SourceMotion, landmarks: Landmarks, file: str) -> _Body:
+    skeleton = source.skeleton
+    rest = skeleton.rest_global_positions
+    positions: NDArray[np.floating[Any]] = rest[None]
+    if source.rotations is not None and source.root_positions is not None:
+        frames = np.unique(np.linspace(0, len(source.rotations) - 1, _SAMPLED_FRAMES).astype(np.int64))
+        rotations = source.rotations[frames].astype(np.float64).reshape(len(frames), -1)
+        translations = None if source.translations is None else source.translations[frames]
+        positions = forward_kinematics(
+            skeleton,
+            np.concatenate([source.root_positions[frames], rotations], axis=1),
+            translations=translations,
+            translated_joints=source.translated_joints,
+        )
+    leg = None
+    if landmarks.feet and landmarks.hips is not None:
+        leg = float(np.mean([path_length(skeleton, landmarks.hips, foot) for foot in landmarks.feet]))
+    return _Body(file, landmarks, positions.astype(np.float64), rest, leg or None)
+
+
+# Up axis
+
+
+def _choose_up_axis(source: SourceMotion, body: _Body, options: ImportOptions) -> UpAxis:
+    if options.up_axis is not None:
+        body.evidence.append(f"up axis {options.up_axis}: given by the user")
+        return options.up_axis
+    if source.up_axis is not None:
+        body.evidence.append(f"up axis {source.up_axis}: fixed by the format")
+        return source.up_axis
+    if body.leg is None:
+        body.evidence.append("up axis y: the usual one, assumed because no feet were found")
+        body.warnings.append(CheckWarning("up-axis-assumed", "no feet tell which way is up; y is assumed"))
+        return "y"
+    standing, flat = _body_axis(body.positions, body.landmarks), _flat_axis(body)
+    if flat is not None and flat[0] != standing[0] and _stands_on_all_fours(body, flat[0]):
+        body.evidence.append(f"up axis {flat[0]}: hands and feet stand below the hips; {flat[1]}")
+        return flat[0]
+    if standing[0] == "y" and standing[1] >= _CLEAR_COSINE:
+        body.evidence.append(
+            f"up axis y: head above feet, mean cosine {standing[1]:.2f} over {len(body.positions)} frames"
+        )
+        return "y"
+    return _settle_up_axis(body, *standing, flat)
+
+
+def _settle_up_axis(body: _Body, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
+    """Decide where the body does not simply stand along y: it may lie or climb, or the file may have another axis."""
+    rest_axis, rest_cosine = _body_axis(body.rest[None], body.landmarks)
+    standing, resting = f"mean direction from feet to head is {axis} with cosine {cosine:.2f}", _FOLDED
+    if rest_cosine > 0.0:
+        resting = f"rest pose points along {rest_axis} with cosine {rest_cosine:.2f}"
+    if cosine == 0.0:
+        standing = f"the motion keeps to a {_FOLDED}"
+    if cosine >= _CLEAR_COSINE and rest_axis == axis and rest_cosine >= _CLEAR_COSINE:
+        body.evidence.append(f"up axis {axis}: {standing}; {resting}")
+        return axis
+    if flat is not None:
+        body.evidence.append(f"up axis {flat[0]}: {flat[1]}; {standing}")
+        return flat[0]
+    if cosine >= _CLEAR_COSINE:
+        grounded = [candidate for candidate in (axis, rest_axis) if _stands_on_origin(body, candidate)]
+        if len(set(grounded)) == 1:
+            body.evidence.append(
+                f"up axis {grounded[0]}: the ground through the origin bears the body; {standing}; {resting}"
+            )
+            return grounded[0]
+    raise AmbiguousUnits(
+        f"which axis points up is not clear: {standing}; {resting}; name it with --up-axis (up_axis), one of "
+        f"{_likely_axes((axis, cosine), (rest_axis, rest_cosine))}",
+        code="up-axis-ambiguous",
+        file=body.file,
+    )
+
+
+def _likely_axes(*axes: tuple[UpAxis, float]) -> str:
+    """The axes that something speaks for, in words, and the usual ones where those leave no choice."""
+    likely = list(dict.fromkeys(axis for axis, cosine in axes if cosine > 0.0))
+    return " or ".join(likely if len(likely) > 1 else dict.fromkeys((*likely, "y", "z")))
+
+
+def _body_axis(positions: NDArray[np.float64], landmarks: Landmarks) -> tuple[UpAxis, float]:
+    """The signed axis nearest to the mean direction from the feet to the head (or hips), and its cosine.
+
+    The cosine is 0 where legs and trunk are folded onto each other, as by a rest pose with all bones on one line.
+    """
+    assert landmarks.feet is not None
+    feet = positions[:, list(landmarks.feet)].mean(axis=1)
+    if landmarks.head is None:
+        mean, folded = _mean_direction(positions[:, landmarks.hips] - feet), False
+    else:
+        head, hips = positions[:, landmarks.head], positions[:, landmarks.hips]
+        mean = _mean_direction(head - feet)
+        folded = float(_mean_direction(head - hips) @ _mean_direction(hips - feet)) < _FOLDED_COSINE
+    axis = int(np.argmax(np.abs(mean)))
+    return _axis_name(axis, mean[axis]), 0.0 if folded else float(abs(mean[axis]))
+
+
+def _mean_direction(ways: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean (3,) of the directions of (F, 3) vectors; those without length count as none."""
+    lengths = np.linalg.norm(ways, axis=1)
+    mean: NDArray[np.float64] = (ways[lengths > 0] / lengths[lengths > 0, None]).sum(axis=0) / len(ways)
+    return mean
+
+
+def _flat_axis(body: _Body) -> tuple[UpAxis, str] | None:
+    """The axis along which the lowest of feet and hands hardly moves while along the others it does."""
+    limbs = [*body.landmarks.ground_joints, *(body.landmarks.hands or ())]
+    assert body.leg is not None
+    below = body.positions[:, limbs]
+    middle = body.positions.mean(axis=1)
+    signs = np.where(np.median(middle - below.mean(axis=1), axis=0) >= 0, 1.0, -1.0)
+    lowest = (below * signs).min(axis=1)
+    spread = lowest.std(axis=0) / body.leg
+    flattest, second = np.argsort(spread)[:2]
+    if spread[flattest] > _FLAT_GROUND or spread[second] < max(_CLEARLY_FLATTER * spread[flattest], _FLAT_GROUND):
+        return None
+    name = _axis_name(int(flattest), signs[flattest])
+    x, y, z = spread
+    return name, f"heights of the lowest limb spread by {x:.2f}, {y:.2f}, {z:.2f} leg lengths along x, y, z"
+
+
+def _stands_on_origin(body: _Body, axis: UpAxis) -> bool:
+    """Whether a ground through the origin, orthogonal to the axis, passes just under the body."""
+    assert body.leg is not None
+    lowest = _heights(body.positions, axis).min(axis=1)
+    return bool(abs(np.quantile(lowest, 0.05)) <= _FLAT_GROUND * body.leg)
+
+
+def _axis_name(axis: int, sign: float) -> UpAxis:
+    names: tuple[UpAxis, ...] = ("x", "y", "z") if sign >= 0 else ("-x", "-y", "-z")
+    return names[axis]
+
+
+def _heights(positions: NDArray[np.float64], up_axis: UpAxis) -> NDArray[np.float64]:
+    heights: NDArray[np.float64] = positions[..., "xyz".index(up_axis[-1])]
+    return -heights if up_axis[0] == "-" else heights
+
+
+# Unit
+
+
+def _choose_unit(source: SourceMotion, body: _Body, options: ImportOptions, up_axis: UpAxis) -> float:
+    hip_height = _hip_height(body, up_axis)
+    if options.unit_scale_m is not None:
+        body.evidence.append(
+            f"unit {options.unit_scale_m:g} m: given by the user{_as_hips(hip_height, options.unit_scale_m)}"
+        )
+        return options.unit_scale_m
+    if source.unit_scale_m is not None and (
+        not source.declared or body.leg is None or _is_leg(body.leg * source.unit_scale_m)
+    ):
+        why = "; ".join(source.declared) or "fixed by the format"
+        body.evidence.append(f"unit {source.unit_scale_m:g} m: {why}{_as_hips(hip_height, source.unit_scale_m)}")
+        return source.unit_scale_m
+    if body.leg is None:
+        raise AmbiguousUnits(
+            "the unit of length is not clear: no two legs were found to measure; "
+            "name it with --unit (unit_scale_m), such as cm",
+            file=body.file,
+        )
+    return _unit_of_leg(body, hip_height, up_axis)
+
+
+def _unit_of_leg(body: _Body, hip_height: float, up_axis: UpAxis) -> float:
+    assert body.leg is not None
+    (low, high), known, reason = LEG_LENGTH_M, tuple(UNITS_M), "legs"
+    if _walks_on_hands(body, up_axis):
+        (low, high), known, reason = ANIMAL_LEG_LENGTH_M, CONVENTIONAL_UNITS, "hands stay on the ground, and legs"
+    elif not body.landmarks.by_names:
+        known, reason = CONVENTIONAL_UNITS, "the build is a body's, and legs"
+    fitting = [name for name in known if low <= body.leg * UNITS_M[name] <= high]
+    if len(fitting) != 1:
+        raise _ambiguous_unit(body, hip_height)
+    scale = UNITS_M[fitting[0]]
+    measured = f"{reason} of {body.leg:.4g} units are {body.leg * scale:.2f} m{_as_hips(hip_height, scale)}"
+    body.evidence.append(f"unit {fitting[0]} ({scale:.5g} m): {measured}")
+    if fitting[0] not in CONVENTIONAL_UNITS or reason != "legs":
+        body.warnings.append(
+            CheckWarning(
+                "unit-inferred",
+                f"the file does not say its unit; taken as {fitting[0]}, because {measured}",
+                values={"unit_scale_m": scale, "leg_length_m": body.leg * scale, "hip_height_m": hip_height * scale},
+            )
+        )
+    return scale
+
+
+def _ambiguous_unit(body: _Body, hip_height: float) -> AmbiguousUnits:
+    assert body.leg is not None
+    by_fit = sorted(UNITS_M, key=lambda name: abs(np.log((body.leg or 1.0) * UNITS_M[name] / 0.9)))
+    listed = [
+        f"{name} (legs {body.leg * UNITS_M[name]:.2f} m, hips {hip_height * UNITS_M[name]:.2f} m)"
+        for name in by_fit[:3]
+    ]
+    low, high = LEG_LENGTH_M
+    return AmbiguousUnits(
+        f"the unit of length is not clear: legs of {body.leg:.4g} units fit no known unit "
+        f"(adults have {low} to {high} m); "
+        f"name it with --unit (unit_scale_m); candidates: {', '.join(listed)}",
+        file=body.file,
+    )
+
+
+def _is_leg(length_m: float) -> bool:
+    return LEG_LENGTH_M[0] <= length_m <= LEG_LENGTH_M[1]
+
+
+def _hip_height(body: _Body, up_axis: UpAxis) -> float:
+    """How high the hips mostly are above the ground, in the file's unit; 0 without feet."""
+    if body.leg is None:
+        return 0.0
+    return float(np.median(hip_heights(body.positions, body.landmarks, up_axis)))
+
+
+def hip_heights(positions: NDArray[np.float64], landmarks: Landmarks, up_axis: UpAxis = "y") -> NDArray[np.float64]:
+    """(F,) heights of the hips above the lowest that feet or toes come, in the unit of `positions` (F, J, 3)."""
+    ground = np.quantile(_heights(positions[:, list(landmarks.ground_joints)], up_axis).min(axis=1), 0.05)
+    heights: NDArray[np.float64] = _heights(positions[:, landmarks.hips], up_axis) - ground
+    return heights
+
+
+def _as_hips(hip_height: float, scale: float) -> str:
+    return f", hips {hip_height * scale:.2f} m above the ground" if hip_height > 0 else ""
+
+
+def _walks_on_hands(body: _Body, up_axis: UpAxis) -> bool:
+    if body.landmarks.hands is None or body.leg is None:
+        return False
+    heights = _heights(body.positions, up_axis)
+    hands = heights[:, list(body.landmarks.hands)].min(axis=1)
+    feet = heights[:, list(body.landmarks.ground_joints)].min(axis=1)
+    return bool(np.median(hands - feet) < 0.25 * body.leg)
+
+
+def _stands_on_all_fours(body: _Body, up_axis: UpAxis) -> bool:
+    """Whether hands and feet stand on one ground well below the hips, as a body's sides never do."""
+    assert body.leg is not None
+    return _walks_on_hands(body, up_axis) and _hip_height(body, up_axis) > 0.5 * body.leg
+
+
+# Handedness
+
+
+def _look_for_mirroring(source: SourceMotion, body: _Body, options: ImportOptions, up_axis: UpAxis) -> None:
+    """Warn where left is on the right: with up and the way the feet point, the left foot must be to the left."""
+    landmarks = body.landmarks
+    if landmarks.feet is None or landmarks.toes is None or options.handedness == "left":
+        return
+    up = np.zeros(3)
+    up["xyz".index(up_axis[-1])] = -1.0 if up_axis[0] == "-" else 1.0
+    left, right = (body.positions[:, _leg_joints(source.parents, landmarks, foot)] for foot in landmarks.feet)
+    leftwards = left.mean(axis=1) - right.mean(axis=1)
+    # The lower foot stands; the other may point anywhere.
+    feet, toes = body.positions[:, list(landmarks.feet)], body.positions[:, list(landmarks.toes)]
+    standing = _heights(feet, up_axis).argmin(axis=1)
+    frames = np.arange(len(feet))
+    expected = np.cross(up, (toes - feet)[frames, standing])
+    scale = float(np.sum(np.linalg.norm(expected, axis=1) * np.linalg.norm(leftwards, axis=1)))
+    cosine = float(np.sum(expected * leftwards)) / scale if scale > 0 else 0.0
+    if cosine < _MIRRORED_COSINE:
+        body.warnings.append(
+            CheckWarning(
+                "left-handed",
+                f"left is on the right (mean cosine {cosine:.2f}): the file may be left-handed; "
+                "if so, import it with the option handedness=left",
+                values={"cosine": cosine},
+            )
+        )
+
+
+def _leg_joints(parents: NDArray[np.int32], landmarks: Landmarks, foot: int) -> list[int]:
+    """The joints from a foot up to, but without, the hips."""
+    joints = [foot]
+    while int(parents[joints[-1]]) != landmarks.hips:
+        joints.append(int(parents[joints[-1]]))
+    return joints

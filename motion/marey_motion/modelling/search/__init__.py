@@ -1,0 +1,1 @@
+"""Search for motions of a model that meet constraints."""

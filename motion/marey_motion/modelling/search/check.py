@@ -1,0 +1,95 @@
+"""How near a model comes to places that real motions reached: targets from examples that it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.alignment.aligned import AlignedSet
+from marey_motion.modelling.options import ModelOptions
+from marey_motion.modelling.reconstruction import CM_PER_M
+from marey_motion.modelling.sample_quality import toe_positions
+from marey_motion.modelling.search.constraints import JointPosition
+from marey_motion.modelling.search.optimise import RefineOptions
+from marey_motion.modelling.search.step_search import search_steps
+from marey_motion.modelling.search.steps import Step
+from marey_motion.modelling.search.tree import TreeOptions, build_tree
+from marey_motion.modelling.training import train_primitive
+
+Floats = NDArray[np.float64]
+
+REACHING = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
+"""Standard joints."""
+
+HELD_OUT_EVERY = 5
+LEAST_EXAMPLES = 10
+MOST_TARGETS = 60
+SAMPLES = 2000
+REFINING = RefineOptions(likelihood_weight=0.01)
+"""What is asked is how near the model can come."""
+
+
+@dataclass(frozen=True, eq=False)
+class SearchCheck:
+    """Searches for places that examples reached, by a model of the other examples.
+
+    Parameters
+    ----------
+    examples, joints : (n,) uid and standard name: whose joint was where the target is
+    frames : (n,) canonical frame: where the places of that joint differ most between examples
+    searched_cm, refined_cm : (n,) what the best sample of the tree misses, and what is left after refining it
+    """
+
+    examples: tuple[str, ...]
+    joints: tuple[str, ...]
+    frames: tuple[int, ...]
+    searched_cm: Floats
+    refined_cm: Floats
+
+
+def check_search(
+    aligned: AlignedSet, standard_joints: Mapping[str, int], options: ModelOptions, *, seed: int
+) -> SearchCheck | None:
+    """Leave every fifth example out, and look for where its hands and feet were.
+
+    Parameters
+    ----------
+    standard_joints : joint index by standard name
+
+    Returns None for fewer than ten examples, and where no hand or foot is known.
+    """
+    joints = {name: standard_joints[name] for name in REACHING if name in standard_joints}
+    if len(aligned.clips) < LEAST_EXAMPLES or not joints:
+        return None
+    others = [clip for clip in aligned.clips if clip.uid != aligned.reference]
+    held_out = others[::HELD_OUT_EVERY]
+    kept = replace(aligned, clips=tuple(clip for clip in aligned.clips if clip not in held_out))
+    quick = replace(options, leave_one_out=False, folds=0, report_samples=0)
+    primitive = train_primitive(kept, quick, seed=seed).primitive
+    tree = build_tree(primitive, seed, TreeOptions(samples=SAMPLES), end_effectors=tuple(joints.values()))
+    frames = _most_varied(aligned, tuple(joints.values()))
+    places = toe_positions(aligned.skeleton, np.stack([clip.motion.poses for clip in held_out]), tuple(joints.values()))
+    wanted = [(example, place) for example in range(len(held_out)) for place in range(len(joints))][:MOST_TARGETS]
+    names, searched, refined = tuple(joints), [], []
+    for example, place in wanted:
+        x, y, z = places[example, frames[place], place].tolist()
+        step = Step(primitive, (JointPosition(names[place], float(frames[place]), (x, y, z)),), standard_joints)
+        found = search_steps([step], [tree], refining=REFINING)
+        searched.append(float(found.sampled.errors[0][0]))
+        refined.append(float(found.measured.errors[0][0]))
+    return SearchCheck(
+        examples=tuple(held_out[example].uid for example, _ in wanted),
+        joints=tuple(names[place] for _, place in wanted),
+        frames=tuple(int(frames[place]) for _, place in wanted),
+        searched_cm=CM_PER_M * np.array(searched),
+        refined_cm=CM_PER_M * np.array(refined),
+    )
+
+
+def _most_varied(aligned: AlignedSet, joints: tuple[int, ...]) -> NDArray[np.int64]:
+    """(k,) canonical frames at which each joint's places are farthest apart."""
+    places = toe_positions(aligned.skeleton, aligned.poses, joints)
+    return np.asarray(places.var(axis=0).sum(axis=-1).argmax(axis=0), dtype=np.int64)

@@ -1,0 +1,115 @@
+"""What a found motion still misses its constraints by, taken out by inverse kinematics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.editing.constraining import Constraint as Constrained
+from marey_motion.editing.finish import finish
+from marey_motion.editing.inverse_kinematics.solving import limb_ending_at
+from marey_motion.editing.inverse_kinematics.targets import LookAtTarget, OrientationTarget, PositionTarget, Target
+from marey_motion.errors import MappingError
+from marey_motion.modelling.search.constraints import (
+    Constraint,
+    JointOrientation,
+    JointPosition,
+    LookDirection,
+    joint_index,
+)
+from marey_motion.modelling.search.found_motions import FoundMotion
+from marey_motion.modelling.search.steps import Step
+from marey_motion.rigs import JointAxes, JointMapping, guess_axes
+
+Floats = NDArray[np.float64]
+
+FAR_AWAY_M = 1000.0
+"""Looking at a point so far away is looking in its direction."""
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """A motion after inverse kinematics.
+
+    Parameters
+    ----------
+    errors : what is left, metres or radians, by step and place of the constraint; those that a solver can meet
+    """
+
+    found: FoundMotion
+    errors: dict[tuple[int, int], float]
+
+
+def finish_motion(steps: Sequence[Step], found: FoundMotion, mapping: JointMapping) -> Finished:
+    """Bring joints exactly to their places, turns and looks at the frames nearest to the constraints' moments.
+
+    Only the limb, or the chain up to the pelvis, moves; where the body stands and when things happen stay as they are.
+    """
+    axes = _axes_if_known(found, mapping)
+    places: list[tuple[int, int]] = []
+    wanted: list[Constrained] = []
+    for number, step in enumerate(steps):
+        for place, constraint in enumerate(step.constraints):
+            one = _constrained(step, number, constraint, found, mapping, axes)
+            if one is not None:
+                places.append((number, place))
+                wanted.append(one)
+    if not wanted:
+        return Finished(found, {})
+    made = finish(found.skeleton, found.motion, wanted)
+    left = dict(zip(places, made.residual_after.tolist(), strict=True))
+    return Finished(replace(found, motion=made.motion), left)
+
+
+def _axes_if_known(found: FoundMotion, mapping: JointMapping) -> dict[str, JointAxes] | None:
+    """Axes of the mapped joints by name; None where the mapping does not suffice for them."""
+    try:
+        return guess_axes(found.skeleton, mapping, found.motion.as_clip(found.skeleton, found.frame_rate_hz))
+    except MappingError:
+        return None
+
+
+def _constrained(
+    step: Step,
+    number: int,
+    constraint: Constraint,
+    found: FoundMotion,
+    mapping: JointMapping,
+    axes: Mapping[str, JointAxes] | None,
+) -> Constrained | None:
+    """A constraint as inverse kinematics has it; None for one that it has no say in."""
+    if not isinstance(constraint, JointPosition | JointOrientation | LookDirection):
+        return None
+    joint = joint_index(step.primitive, constraint.joint, step.standard_joints)
+    chain = _chain(found, joint, step.standard_joints.get("pelvis", 0))
+    if not chain:
+        return None
+    frame = found.frame_of(number, step.primitive, constraint.at)
+    limb = limb_ending_at(found.skeleton, mapping, joint, axes)
+    return Constrained(_target(constraint, joint, frame, found), frame, frame + 1, chain, limb)
+
+
+def _chain(found: FoundMotion, joint: int, pelvis: int) -> tuple[int, ...]:
+    """The joints from one up to below the pelvis, which moves the whole body."""
+    path = found.skeleton.path_to_root(joint)
+    return path[: path.index(pelvis)] if pelvis in path else path[:-1]
+
+
+def _target(
+    constraint: JointPosition | JointOrientation | LookDirection, joint: int, frame: int, found: FoundMotion
+) -> Target:
+    match constraint:
+        case JointPosition(target_m=target):
+            axes = "".join(axis for axis, value in zip("xyz", target, strict=True) if value is not None)
+            return PositionTarget(joint, tuple(value or 0.0 for value in target), axes=axes)  # type: ignore[arg-type]
+        case JointOrientation(rotation=rotation):
+            return OrientationTarget(joint, rotation)
+        case LookDirection(point_m=None, direction=direction):
+            here = found.motion.at_frames(np.array([frame])).positions(found.skeleton)[0, joint]
+            along = np.asarray(direction) / np.linalg.norm(np.asarray(direction))
+            return LookAtTarget(joint, here + FAR_AWAY_M * along, axis=constraint.axis)
+        case LookDirection(point_m=point):
+            return LookAtTarget(joint, point, axis=constraint.axis)  # type: ignore[arg-type]

@@ -1,0 +1,257 @@
+"""How far motions miss constraints: Equation 1 for many latent vectors at once, residuals and slopes for one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.alignment.aligned import Placement
+from marey_motion.errors import MotionError
+from marey_motion.modelling.primitive import MotionPrimitive
+from marey_motion.modelling.search import objective_kernels as kernels
+from marey_motion.modelling.search import slope_kernels
+from marey_motion.modelling.search.constraints import (
+    Constraint,
+    ConstraintError,
+    JointOrientation,
+    JointPosition,
+    KeyframeTime,
+    LookDirection,
+    RootHeading,
+    RootPosition,
+    frame_at,
+    joint_index,
+    tolerance_of,
+)
+from marey_motion.modelling.search.tracking import (
+    Chains,
+    Clocks,
+    Tracked,
+    facing,
+    standing,
+    track_points,
+    track_times,
+)
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+MOST_CONSTRAINTS = 256
+AT_ORIGIN = Placement(0.0, 0.0, 0.0)
+
+
+class Rows(NamedTuple):
+    """Constraints, one a row.
+
+    Parameters
+    ----------
+    kinds : (m,) see `objective_kernels`
+    items : (m,) which tracked point, or which clock
+    targets : (m, 4) place, quaternion, direction, heading or time
+    axes : (m, 3) for positions 1 where the coordinate counts, for directions the joint's own axis
+    """
+
+    kinds: Indices
+    items: Indices
+    targets: Floats
+    axes: Floats
+
+
+class Linearised(NamedTuple):
+    """Constraints about one latent vector, W numbers in all where it is one of several steps.
+
+    Parameters
+    ----------
+    points, point_slopes : (n, 3), (n, 3, W) what is tracked, in the world, and its derivatives
+    residuals, slopes : (3 m,), (3 m, W) errors of the constraints, in tolerances and by the roots of their weights
+    """
+
+    points: Floats
+    point_slopes: Floats
+    residuals: Floats
+    slopes: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """Constraints on the motions of a primitive, ready to be evaluated.
+
+    Parameters
+    ----------
+    constraints : m of them
+    placement : where the canonical frame lies in the world that targets are in
+    """
+
+    primitive: MotionPrimitive
+    constraints: tuple[Constraint, ...]
+    placement: Placement
+    chains: Chains
+    clocks: Clocks
+    rows: Rows
+
+    def errors(self, latents: Floats) -> Floats:
+        """How far each constraint is missed, (n, m), by latent vectors (n, L): metres, radians or seconds."""
+        out = np.empty((len(latents), len(self.constraints)))
+        kernels.errors(self.chains, self.clocks, self.rows, as_row(self.placement), np.ascontiguousarray(latents), out)
+        return out
+
+    def costs(self, latents: Floats) -> Floats:
+        """Equation 1 of latent vectors (n, L), as (n,): the sum of weight times error, each in its tolerance."""
+        out = np.empty(len(latents))
+        kernels.costs(self.prices, self.errors(latents), out)
+        return out
+
+    def linearise(self, stacked: Floats, first: int, placement: Floats, moved: Floats) -> Linearised:
+        """Errors and derivatives by all numbers of a stack of steps.
+
+        Parameters
+        ----------
+        stacked : (W,) latent vectors one after the other, this step's from `first` on
+        placement : (3,) heading, x and z of the canonical frame, in place of that of this objective
+        moved : (3, W) its derivatives
+        """
+        width, items, clocks = len(stacked), len(self.chains.turned), len(self.clocks.weights)
+        points, turns = np.empty((items, 3)), np.empty((items, 4))
+        point_slopes, turn_slopes = np.empty((items, 3, width)), np.empty((items, 3, width))
+        slope_kernels.track(self.chains, placement, moved, stacked, first, points, turns, point_slopes, turn_slopes)
+        times, time_slopes = np.empty(clocks), np.empty((clocks, width))
+        slope_kernels.keep_time(self.clocks, stacked, first + self.primitive.spatial.count, times, time_slopes)
+        residuals, slopes = np.empty((len(self.constraints), 3)), np.empty((len(self.constraints), 3, width))
+        slope_kernels.linearise(
+            self.rows, points, turns, times, point_slopes, turn_slopes, time_slopes, residuals, slopes
+        )
+        scaled, steep = residuals * self._scales[:, None], slopes * self._scales[:, None, None]
+        return Linearised(points, point_slopes, scaled.ravel(), steep.reshape(scaled.size, width))
+
+    @cached_property
+    def _scales(self) -> Floats:
+        return np.array([np.sqrt(one.weight) / tolerance_of(one) for one in self.constraints])
+
+    @cached_property
+    def prices(self) -> Floats:
+        """(m,) weight over tolerance."""
+        return np.array([one.weight / tolerance_of(one) for one in self.constraints])
+
+
+def build_objective(
+    primitive: MotionPrimitive,
+    constraints: Sequence[Constraint],
+    standard_joints: Mapping[str, int],
+    *,
+    placement: Placement = AT_ORIGIN,
+    also: Sequence[Tracked] = (),
+) -> Objective:
+    """Prepare constraints for evaluation.
+
+    Parameters
+    ----------
+    standard_joints : joint index by standard name, as far as they are known
+    placement : where the canonical frame lies in the world that targets are in
+    also : what else is to be tracked, besides what constraints look at; it comes first
+
+    Raises
+    ------
+    ConstraintError    naming the constraint and what is wrong with it
+    """
+    if len(constraints) > MOST_CONSTRAINTS:
+        raise ConstraintError(f"{len(constraints)} constraints are more than {MOST_CONSTRAINTS}", where="constraints")
+    tracked = {one: place for place, one in enumerate(also)}
+    moments: dict[float, int] = {}
+    rows = []
+    for number, constraint in enumerate(constraints):
+        try:
+            rows.append(_row(primitive, constraint, standard_joints, tracked, moments))
+        except MotionError as error:
+            place = ".".join(part for part in (f"constraints[{number}]", error.where) if part)
+            raise ConstraintError(error.message, code=error.code, where=place) from None
+    return Objective(
+        primitive=primitive,
+        constraints=tuple(constraints),
+        placement=placement,
+        chains=track_points(primitive, list(tracked)),
+        clocks=track_times(primitive, list(moments)),
+        rows=_as_rows(rows),
+    )
+
+
+def as_row(placement: Placement) -> Floats:
+    """(3,) heading, x, z."""
+    return np.array((placement.heading_rad, placement.x, placement.z))
+
+
+class _Row(NamedTuple):
+    kind: int
+    item: int
+    target: tuple[float, ...]
+    axis: tuple[float, ...] = ()
+
+
+def _row(
+    primitive: MotionPrimitive,
+    constraint: Constraint,
+    standard_joints: Mapping[str, int],
+    tracked: dict[Tracked, int],
+    moments: dict[float, int],
+) -> _Row:
+    """A constraint in numbers; what it looks at is added to what is tracked, each thing once."""
+    frame = frame_at(primitive, constraint.at)
+
+    def place(one: Tracked) -> int:
+        return tracked.setdefault(one, len(tracked))
+
+    match constraint:
+        case KeyframeTime():
+            _require_possible(primitive, constraint, frame)
+            return _Row(kernels.TIME, moments.setdefault(frame, len(moments)), (constraint.seconds,))
+        case RootHeading():
+            return _Row(kernels.HEADING, place(facing(frame, standard_joints)), (constraint.heading_rad,))
+        case RootPosition():
+            x, z = constraint.target_m
+            return _position_row(place(standing(frame, standard_joints)), (x, None, z))
+        case _:
+            joint = place(Tracked(frame, (joint_index(primitive, constraint.joint, standard_joints),)))
+    match constraint:
+        case JointPosition():
+            return _position_row(joint, constraint.target_m)
+        case JointOrientation():
+            return _Row(kernels.ORIENTATION, joint, _unit(constraint.rotation))
+        case LookDirection(point_m=None, direction=direction):
+            assert direction is not None  # one of the two is there
+            return _Row(kernels.DIRECTION, joint, _unit(direction), _unit(constraint.axis))
+        case LookDirection(point_m=point):
+            assert point is not None
+            return _Row(kernels.POINT, joint, point, _unit(constraint.axis))
+
+
+def _require_possible(primitive: MotionPrimitive, constraint: KeyframeTime, frame: float) -> None:
+    """Raise `ConstraintError` for a time that no motion of the primitive reaches, at a canonical frame."""
+    if primitive.duration_range_s is None:
+        return
+    least, most = primitive.duration_range_s
+    ends = frame == primitive.frame_count - 1
+    if constraint.seconds > most or (ends and constraint.seconds < least):
+        raise ConstraintError(f"motions of {primitive.name} last {least:.2f} to {most:.2f} s", where="seconds")
+
+
+def _position_row(item: int, target: tuple[float | None, ...]) -> _Row:
+    counted = tuple(float(value is not None) for value in target)
+    return _Row(kernels.POSITION, item, tuple(value or 0.0 for value in target), counted)
+
+
+def _unit(values: tuple[float, ...]) -> tuple[float, ...]:
+    array = np.asarray(values)
+    return tuple((array / np.linalg.norm(array)).tolist())
+
+
+def _as_rows(rows: Sequence[_Row]) -> Rows:
+    targets, axes = np.zeros((len(rows), 4)), np.zeros((len(rows), 3))
+    for number, row in enumerate(rows):
+        targets[number, : len(row.target)] = row.target
+        axes[number, : len(row.axis)] = row.axis
+    kinds = np.array([row.kind for row in rows], dtype=np.int64)
+    return Rows(kinds, np.array([row.item for row in rows], dtype=np.int64), targets, axes)

@@ -1,0 +1,130 @@
+"""Looking for the sample of a primitive that meets constraints best (Herrmann et al. 2019, section 3, Equation 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.modelling.search.objective import Objective
+from marey_motion.modelling.search.tree import SampleTree
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+CANDIDATES = 8
+"""Four are the published number; eight come a sixth nearer in a millisecond."""
+
+PASSES = 2
+NARROWING = 0.25
+"""By how much the samples are drawn together for each further pass."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The best samples that a search came upon, the best first.
+
+    Parameters
+    ----------
+    samples : (t,) their places in the tree; -1 for what a further pass found between them
+    latents : (t, L)
+    costs : (t,) Equation 1
+    evaluations : motions that were evaluated
+    """
+
+    samples: Indices
+    latents: Floats
+    costs: Floats
+    evaluations: int
+
+
+def search_tree(objective: Objective, tree: SampleTree, *, candidates: int = CANDIDATES, top: int = 1) -> Found:
+    """Go down a tree with the best nodes of each level, and keep the best samples on the way.
+
+    All children of all candidates of a level are evaluated at once, nodes by the mean of their samples, nodes of one
+    sample and the samples of leaves by themselves. What is returned are samples, never means, which need not be
+    likely motions. Equal costs go by place. With as many candidates as there are nodes it is an exhaustive search.
+
+    Parameters
+    ----------
+    candidates : nodes that are followed from each level to the next
+    top : samples to return
+    """
+    _check(objective, tree, candidates, top)
+    return _descend(objective, tree, candidates, top, lambda latents: latents)
+
+
+def search_closely(
+    objective: Objective, tree: SampleTree, *, candidates: int = CANDIDATES, passes: int = PASSES
+) -> Found:
+    """The best sample, and then what is better close to it: as `search_tree`, several times.
+
+    Each further pass goes down the same tree once more, with all samples drawn together about the best motion so far,
+    so that they are a quarter as far apart as in the pass before. What is found there is about as likely as a sample.
+    """
+    best = search_tree(objective, tree, candidates=candidates)
+    middle = tree.means[0]
+    for number in range(1, passes):
+        share, centre = NARROWING**number, best.latents[0]
+        found = _descend(objective, tree, candidates, 1, lambda latents: centre + share * (latents - middle))  # noqa: B023
+        evaluations = best.evaluations + found.evaluations
+        better = replace(found, samples=np.full(1, -1)) if found.costs[0] < best.costs[0] else best
+        best = replace(better, evaluations=evaluations)
+    return best
+
+
+def _descend(
+    objective: Objective, tree: SampleTree, candidates: int, top: int, drawn: Callable[[Floats], Floats]
+) -> Found:
+    """Go down a tree whose latent vectors are where `drawn` puts them."""
+    frontier = np.zeros(1, dtype=np.intp)
+    seen, costs, evaluations = [], [], 0
+    while frontier.size:
+        nodes = _ranges(tree.first_children[frontier], tree.children[frontier])
+        leaves = frontier[tree.children[frontier] == 0]
+        alone = tree.sizes[nodes] == 1
+        samples = np.concatenate((_ranges(tree.starts[leaves], tree.sizes[leaves]), tree.starts[nodes[alone]]))
+        nodes = nodes[~alone]
+        found = objective.costs(drawn(np.concatenate((tree.means[nodes], tree.samples[samples]))))
+        seen.append(samples)
+        costs.append(found[len(nodes) :])
+        evaluations += len(found)
+        frontier = nodes[_smallest(found[: len(nodes)], nodes, candidates)]
+    best = _best(tree, np.concatenate(seen), np.concatenate(costs), top, evaluations)
+    return replace(best, latents=drawn(best.latents))
+
+
+def search_all(objective: Objective, tree: SampleTree, *, top: int = 1) -> Found:
+    """Evaluate every sample."""
+    _check(objective, tree, 1, top)
+    costs = objective.costs(tree.samples.astype(np.float64))
+    return _best(tree, np.arange(len(costs)), costs, top, len(costs))
+
+
+def _check(objective: Objective, tree: SampleTree, candidates: int, top: int) -> None:
+    if tree.dimensions != objective.primitive.dimensions:
+        held, needed = tree.dimensions, objective.primitive.dimensions
+        raise MotionError(f"the tree has samples of {held} numbers, the model needs {needed}", code="tree-of-another")
+    if candidates < 1 or top < 1:
+        raise MotionError("a search follows at least one candidate and returns at least one sample", where="candidates")
+
+
+def _best(tree: SampleTree, samples: Indices, costs: Floats, top: int, evaluations: int) -> Found:
+    chosen = _smallest(costs, samples, top)
+    return Found(samples[chosen], tree.samples[samples[chosen]].astype(np.float64), costs[chosen], evaluations)
+
+
+def _smallest(costs: Floats, places: Indices, count: int) -> Indices:
+    """Where the smallest costs are, in order; of equal costs the first places."""
+    order: Indices = np.lexsort((places, costs))[:count]
+    return order
+
+
+def _ranges(starts: NDArray[np.int32], counts: NDArray[np.int32]) -> Indices:
+    """The numbers from each start on, as many as its count, one range after the other."""
+    ends = np.cumsum(counts)
+    firsts: Indices = np.repeat(starts - (ends - counts), counts)
+    return firsts + np.arange(len(firsts), dtype=np.intp)

@@ -1,0 +1,109 @@
+"""Finding motions for several steps: each by its tree, where the one before it ended, then all of them together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.alignment.aligned import Placement
+from marey_motion.errors import MotionError
+from marey_motion.modelling.search.constraints import START, JointPosition
+from marey_motion.modelling.search.objective import AT_ORIGIN, build_objective
+from marey_motion.modelling.search.optimise import DEFAULT_REFINING, Refined, RefineOptions, refine
+from marey_motion.modelling.search.samples import CANDIDATES, PASSES, Found, search_closely
+from marey_motion.modelling.search.steps import (
+    DEFAULT_TRANSITIONS,
+    CarriedOn,
+    Measured,
+    SeveralSteps,
+    Step,
+    TransitionOptions,
+)
+from marey_motion.modelling.search.tree import SampleTree
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Sequel:
+    """Motions that were found for several steps.
+
+    Parameters
+    ----------
+    latents : one vector (L,) a step
+    measured : where they take place, and what they miss
+    joints : standard names of the transition joints, whose jumps were measured after that of the pelvis
+    searched : what the search of each tree came upon
+    sampled : what comes of the searches alone
+    refined : how refining them ended, None where it was not asked for
+    """
+
+    latents: tuple[Floats, ...]
+    measured: Measured
+    joints: tuple[str, ...]
+    searched: tuple[Found, ...]
+    sampled: Measured
+    refined: Refined | None
+
+
+def search_steps(
+    steps: Sequence[Step],
+    trees: Sequence[SampleTree],
+    *,
+    start: Placement = AT_ORIGIN,
+    candidates: int = CANDIDATES,
+    passes: int = PASSES,
+    refining: RefineOptions | None = DEFAULT_REFINING,
+    transitions: TransitionOptions = DEFAULT_TRANSITIONS,
+) -> Sequel:
+    """Find a motion for each step.
+
+    Parameters
+    ----------
+    trees : over samples of each step's primitive
+    start : of the first step's canonical frame
+    candidates, passes : see `search_closely`
+    refining : None to keep the samples that were found
+
+    Raises
+    ------
+    ConstraintError    naming step and constraint
+    MotionError    where numbers become too large to compute with
+    """
+    problem = SeveralSteps.of(steps, start, transitions)
+    searched: list[Found] = []
+    for step, tree in zip(steps, trees, strict=True):
+        begun = problem.carried_on([one.latents[0] for one in searched])
+        searched.append(_search_step(step, tree, begun, candidates, passes, transitions))
+    stacked = np.concatenate([one.latents[0] for one in searched])
+    measured = sampled = problem.measure(stacked)
+    refined = None if refining is None else refine(problem, stacked, refining)
+    if refined is not None:
+        stacked = refined.latents
+        measured = problem.measure(stacked)
+    _require_finite(stacked, *measured.errors, *measured.jumps_m)
+    return Sequel(problem.parts(stacked), measured, problem.joints, tuple(searched), sampled, refined)
+
+
+def _require_finite(*found: Floats) -> None:
+    if not all(np.isfinite(numbers).all() for numbers in found):
+        raise MotionError(
+            "what is asked for leads to numbers that are not finite; ask for places nearer to what the model does",
+            code="search-not-finite",
+        )
+
+
+def _search_step(
+    step: Step, tree: SampleTree, begun: CarriedOn, candidates: int, passes: int, transitions: TransitionOptions
+) -> Found:
+    """The best motion of a tree for a step that goes on where another ended."""
+    going_on = tuple(
+        JointPosition(name, START, (x, y, z), transitions.tolerance_m, transitions.weight)
+        for name, (x, y, z) in ((name, point.tolist()) for name, point in begun.joints.items())
+    )
+    constraints = (*step.constraints, *going_on)
+    objective = build_objective(step.primitive, constraints, step.standard_joints, placement=begun.placement)
+    return search_closely(objective, tree, candidates=candidates, passes=passes)

@@ -1,0 +1,253 @@
+"""Several motions one after the other, and what constraints on all of them come to.
+
+Each step's canonical frame is placed so that its first root stands where the step before it ended, and faces that way:
+root and heading are continuous whatever the latent vectors are. Hands, feet and the height of the root are asked to be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.alignment.aligned import Placement
+from marey_motion.errors import MotionError
+from marey_motion.modelling.mixture import LatentMixture
+from marey_motion.modelling.primitive import MotionPrimitive
+from marey_motion.modelling.search import slope_kernels
+from marey_motion.modelling.search.constraints import Constraint, ConstraintError
+from marey_motion.modelling.search.objective import AT_ORIGIN, Linearised, Objective, as_row, build_objective
+from marey_motion.modelling.search.tracking import Chains, Tracked, facing, standing, track_points
+
+Floats = NDArray[np.float64]
+
+MOST_STEPS = 32
+TRANSITION_JOINTS = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
+"""Standard joints that are asked to go on where they were: hands and feet."""
+
+TRANSITION_TOLERANCE_M = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One motion of a sequence, and what it shall do.
+
+    Parameters
+    ----------
+    standard_joints : joint index by standard name; where there are several steps, with hips and shoulders, which tell
+        where the body faces
+    """
+
+    primitive: MotionPrimitive
+    constraints: tuple[Constraint, ...]
+    standard_joints: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class TransitionOptions:
+    """How steps hang together.
+
+    Parameters
+    ----------
+    joints : standard names; those count that the skeletons of all steps have
+    tolerance_m, weight : of the distance that each of them jumps, and of the pelvis' height
+    """
+
+    joints: tuple[str, ...] = TRANSITION_JOINTS
+    tolerance_m: float = TRANSITION_TOLERANCE_M
+    weight: float = 1.0
+
+
+DEFAULT_TRANSITIONS = TransitionOptions()
+
+
+class CarriedOn(NamedTuple):
+    """Where a step begins: its canonical frame, and where the transition joints stand, by standard name."""
+
+    placement: Placement
+    joints: Mapping[str, Floats]
+
+
+class Measured(NamedTuple):
+    """What latent vectors come to.
+
+    Parameters
+    ----------
+    placements : of the steps' canonical frames in the world
+    errors : of each step's constraints (m,): metres, radians or seconds
+    jumps_m : for each transition, how far the pelvis and each transition joint jumps (1 + joints,)
+    """
+
+    placements: tuple[Placement, ...]
+    errors: tuple[Floats, ...]
+    jumps_m: tuple[Floats, ...]
+
+
+class _Link(NamedTuple):
+    """A step in its place among the others.
+
+    Parameters
+    ----------
+    objective : where there are several steps, tracks pelvis, facing and transition joints at the start, then at the end
+    beginning : the first two of these at the start alone
+    first : where its latent vector begins
+    """
+
+    objective: Objective
+    beginning: Chains
+    first: int
+
+
+class _Walked(NamedTuple):
+    """A step in the world; jumps (j, 3) of pelvis and transition joints; derivatives are by all latent vectors."""
+
+    placement: Floats
+    found: Linearised
+    jumps: Floats
+    jump_slopes: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class SeveralSteps:
+    """The constraints on several motions and on how they hang together.
+
+    Parameters
+    ----------
+    joints : the transition joints that all steps have, by standard name
+    start : of the first step's canonical frame
+    """
+
+    links: tuple[_Link, ...]
+    joints: tuple[str, ...]
+    start: Placement
+    transitions: TransitionOptions
+
+    @classmethod
+    def of(
+        cls, steps: Sequence[Step], start: Placement = AT_ORIGIN, transitions: TransitionOptions = DEFAULT_TRANSITIONS
+    ) -> SeveralSteps:
+        """Prepare steps. Raises `ConstraintError`, naming step and constraint."""
+        if not 1 <= len(steps) <= MOST_STEPS:
+            raise ConstraintError(f"{len(steps)} steps are not within 1 to {MOST_STEPS}", where="steps")
+        joints = tuple(name for name in transitions.joints if all(name in step.standard_joints for step in steps))
+        alone = len(steps) == 1
+        links: list[_Link] = []
+        first = 0
+        for number, step in enumerate(steps):
+            try:
+                links.append(_link(step, () if alone else _ends(step, joints), first))
+            except MotionError as error:
+                place = ".".join(part for part in (f"steps[{number}]", error.where) if part)
+                raise ConstraintError(error.message, code=error.code, where=place) from None
+            first += step.primitive.dimensions
+        return cls(tuple(links), joints, start, transitions)
+
+    @property
+    def priors(self) -> Sequence[LatentMixture]:
+        """Those of the steps' primitives."""
+        return tuple(one.objective.primitive.mixture for one in self.links)
+
+    def parts(self, stacked: Floats) -> tuple[Floats, ...]:
+        """The latent vector of each step."""
+        return tuple(np.split(stacked, [one.first for one in self.links[1:]]))
+
+    def linearise(self, stacked: Floats) -> tuple[Floats, Floats]:
+        """Errors of all constraints and all jumps, in tolerances, and their derivatives."""
+        walked = list(self._walk(stacked, len(self.links)))
+        residuals = [part for one in walked for part in (one.found.residuals, self._scale * one.jumps.ravel())]
+        jumps = [self._scale * one.jump_slopes.reshape(one.jumps.size, len(stacked)) for one in walked]
+        slopes = [part for one, jump in zip(walked, jumps, strict=True) for part in (one.found.slopes, jump)]
+        return np.concatenate(residuals), np.concatenate(slopes)
+
+    def carried_on(self, latents: Sequence[Floats]) -> CarriedOn:
+        """Where the step after these begins, as far as its own motion has no say in it."""
+        if not latents:
+            return CarriedOn(self.start, {})
+        *_, last = self._walk(np.concatenate(latents), len(latents))
+        ended = last.found.points[2 + len(self.joints) :]
+        placement = Placement(_heading(ended[1]), float(ended[0, 0]), float(ended[0, 2]))
+        return CarriedOn(placement, dict(zip(self.joints, ended[2:], strict=False)))
+
+    def measure(self, stacked: Floats) -> Measured:
+        """Placements, errors and jumps of stacked latent vectors."""
+        walked = list(self._walk(stacked, len(self.links)))
+        placements = tuple(Placement(*one.placement.tolist()) for one in walked)
+        errors = tuple(
+            replace(link.objective, placement=placement).errors(latent[None])[0]
+            for link, placement, latent in zip(self.links, placements, self.parts(stacked), strict=True)
+        )
+        return Measured(placements, errors, tuple(np.linalg.norm(one.jumps, axis=1) for one in walked[1:]))
+
+    @cached_property
+    def _scale(self) -> float:
+        return float(np.sqrt(self.transitions.weight) / self.transitions.tolerance_m)
+
+    def _walk(self, stacked: Floats, count: int) -> Iterator[_Walked]:
+        """The first `count` steps, each placed where the one before it ended."""
+        ends = 2 + len(self.joints)
+        jumping = [0, *range(2, ends)]
+        placement, moved = as_row(self.start), np.zeros((3, len(stacked)))
+        before: Linearised | None = None
+        for link in self.links[:count]:
+            if before is not None:
+                placement, moved = _carry_on(before.points[ends:], before.point_slopes[ends:], link, stacked)
+            found = link.objective.linearise(stacked, link.first, placement, moved)
+            if before is None:
+                yield _Walked(placement, found, np.zeros((0, 3)), np.zeros((0, 3, len(stacked))))
+            else:
+                ended = [ends + place for place in jumping]
+                jumps = found.points[jumping] - before.points[ended]
+                yield _Walked(placement, found, jumps, found.point_slopes[jumping] - before.point_slopes[ended])
+            before = found
+
+
+def _ends(step: Step, joints: Sequence[str]) -> tuple[Tracked, ...]:
+    """What is tracked where a step begins, and then where it ends. Raises `MappingError`."""
+    return tuple(
+        one
+        for frame in (0.0, float(step.primitive.frame_count - 1))
+        for one in (
+            standing(frame, step.standard_joints),
+            facing(frame, step.standard_joints),
+            *(Tracked(frame, (step.standard_joints[name],)) for name in joints),
+        )
+    )
+
+
+def _link(step: Step, ends: Sequence[Tracked], first: int) -> _Link:
+    objective = build_objective(step.primitive, step.constraints, step.standard_joints, also=ends)
+    return _Link(objective, track_points(step.primitive, ends[:2]), first)
+
+
+def _carry_on(points: Floats, slopes: Floats, link: _Link, stacked: Floats) -> tuple[Floats, Floats]:
+    """The placement (3,) that lets a step begin where root and facing (2, 3) ended, and its derivatives (3, W)."""
+    width = len(stacked)
+    begun, begun_slopes = np.empty((2, 3)), np.empty((2, 3, width))
+    still = np.zeros((3, width))
+    slope_kernels.track(
+        link.beginning, np.zeros(3), still, stacked, link.first, begun, np.empty((2, 4)), begun_slopes,
+        np.empty((2, 3, width)),
+    )  # fmt: skip
+    heading = _heading(points[1]) - _heading(begun[1])
+    heading_slopes = _heading_slopes(points[1], slopes[1]) - _heading_slopes(begun[1], begun_slopes[1])
+    cos, sin = np.cos(heading), np.sin(heading)
+    # About the vertical, (x, z) turn to (cos x + sin z, cos z - sin x).
+    x, z = cos * begun[0, 0] + sin * begun[0, 2], cos * begun[0, 2] - sin * begun[0, 0]
+    x_slopes = cos * begun_slopes[0, 0] + sin * begun_slopes[0, 2] + z * heading_slopes
+    z_slopes = cos * begun_slopes[0, 2] - sin * begun_slopes[0, 0] - x * heading_slopes
+    placement = np.array((heading, points[0, 0] - x, points[0, 2] - z))
+    return placement, np.stack((heading_slopes, slopes[0, 0] - x_slopes, slopes[0, 2] - z_slopes))
+
+
+def _heading(across: Floats) -> float:
+    """Where a body faces whose axis from right to left is this."""
+    return float(np.arctan2(-across[2], across[0]))
+
+
+def _heading_slopes(across: Floats, slopes: Floats) -> Floats:
+    square = across[0] ** 2 + across[2] ** 2
+    return np.asarray((across[2] * slopes[0] - across[0] * slopes[2]) / square)

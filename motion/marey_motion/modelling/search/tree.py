@@ -1,0 +1,182 @@
+"""A tree over samples of a primitive: k-means in k-means, so that a search looks at few of many samples.
+
+Herrmann et al. 2019, section 3. The samples themselves are kept, in single precision and in the order of the tree: a
+tree is valid whatever draws random numbers later, and each node's samples are a range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import MotionError
+from marey_motion.modelling.primitive import MotionPrimitive
+from marey_motion.modelling.search import objective_kernels
+from marey_motion.modelling.search import tree_kernels as kernels
+from marey_motion.modelling.search.tracking import Tracked, track_points
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int32]
+FeatureKind = Literal["latent", "end_effectors"]
+
+END_EFFECTORS = ("left_wrist", "right_wrist", "left_ankle", "right_ankle", "head")
+"""Standard joints."""
+
+MOST_SAMPLES = 1_000_000
+MOST_LEVELS = 64
+
+
+@dataclass(frozen=True)
+class TreeOptions:
+    """How a tree is made.
+
+    Parameters
+    ----------
+    samples : drawn from the primitive
+    branching : children of a node, at most
+    leaf_size : nodes of so many samples or fewer are not split
+    depth : levels below the root, at most
+    features : what is clustered: `latent`, the spatial scores; `end_effectors`, where hands, feet and head are at the
+        keyframes, the middle and the end
+    """
+
+    samples: int = 10_000
+    branching: int = 4
+    leaf_size: int = 1
+    depth: int = MOST_LEVELS
+    features: FeatureKind = "end_effectors"
+
+    def __post_init__(self) -> None:
+        limits = {
+            "samples": (1, MOST_SAMPLES),
+            "branching": (2, 256),
+            "leaf_size": (1, MOST_SAMPLES),
+            "depth": (1, MOST_LEVELS),
+        }
+        for name, (least, most) in limits.items():
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise MotionError(f"{value} is not within {least} to {most}", code="tree-options", where=name)
+
+
+DEFAULT_TREE = TreeOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class SampleTree:
+    """Samples of a primitive, grouped.
+
+    Nodes come level by level from the root; the children of a node follow one another, and each holds a part of its
+    samples. A node without children is a leaf.
+
+    Parameters
+    ----------
+    samples : (n, L) float32 latent vectors, those of a node side by side
+    sizes : (M,) samples of each node
+    children : (M,) child nodes of each node
+    """
+
+    samples: NDArray[np.float32]
+    sizes: Integers
+    children: Integers
+
+    def __post_init__(self) -> None:
+        nodes = len(self.sizes)
+        sound = nodes > 0 and self.samples.ndim == 2 and self.sizes.shape == self.children.shape == (nodes,)
+        if not sound or self.sizes[0] != len(self.samples) or self.sizes.min() < 1 or self.children.min() < 0:
+            raise MotionError("samples, sizes and children of the tree do not belong together", code="tree-invalid")
+        if 1 + int(self.children.sum()) != nodes or (self.first_children > nodes).any():
+            raise MotionError("a node of the tree has no parent, or two", code="tree-invalid")
+        inner = np.flatnonzero(self.children)
+        if (self.first_children[inner] <= inner).any():
+            raise MotionError("a node of the tree comes before its parent", code="tree-invalid")
+        parts = np.add.reduceat(self.sizes, self.first_children[inner]) if inner.size else self.sizes[:0]
+        if inner.size and not np.array_equal(parts[: inner.size], self.sizes[inner]):
+            raise MotionError("children of a node of the tree do not share its samples", code="tree-invalid")
+
+    @property
+    def dimensions(self) -> int:
+        """L."""
+        return int(self.samples.shape[1])
+
+    @cached_property
+    def first_children(self) -> Integers:
+        """(M,) first child of each node, as far as it has any."""
+        return np.asarray(1 + np.cumsum(self.children) - self.children, dtype=np.int32)
+
+    @cached_property
+    def starts(self) -> Integers:
+        """(M,) first sample of each node."""
+        starts = np.zeros(len(self.sizes), dtype=np.int32)
+        kernels.locate(self.sizes, self.children, starts)
+        return starts
+
+    @cached_property
+    def means(self) -> Floats:
+        """(M, L) mean of each node's samples."""
+        means = np.empty((len(self.sizes), self.dimensions))
+        kernels.average(self.samples, self.starts, self.sizes, means)
+        return means
+
+    def most_evaluations(self, candidates: int) -> int:
+        """The motions that going down from the best `candidates` nodes of each level may have to evaluate."""
+        total, start, stop = 0, 0, 1
+        while start < stop:
+            children, sizes = self.children[start:stop], self.sizes[start:stop]
+            looked_at = np.where(children > 0, children, np.where(sizes > 1, sizes, 0)).astype(np.int64)
+            if len(looked_at) > candidates:
+                looked_at = np.partition(looked_at, -candidates)[-candidates:]
+            total += int(looked_at.sum())
+            start, stop = stop, stop + int(children.sum())
+        return total
+
+
+def build_tree(
+    primitive: MotionPrimitive,
+    seed: int,
+    options: TreeOptions = DEFAULT_TREE,
+    *,
+    end_effectors: Sequence[int] = (),
+) -> SampleTree:
+    """Draw samples of a primitive and group them; the same for the same seed.
+
+    Parameters
+    ----------
+    end_effectors : joint indices, for features of that kind
+    """
+    count = options.samples if primitive.dimensions else 1
+    samples = primitive.sample(count, seed).astype(np.float32)
+    features = _features(primitive, samples.astype(np.float64), options, end_effectors)
+    randoms = np.random.Generator(np.random.Philox([seed, count])).random((2 * count, options.branching))
+    order = np.arange(count)
+    starts, sizes, children = (np.zeros(2 * count, dtype=np.int64) for _ in range(3))
+    nodes = kernels.grow(
+        features, randoms, options.branching, options.leaf_size, options.depth, order, starts, sizes, children
+    )
+    return SampleTree(samples[order], sizes[:nodes].astype(np.int32), children[:nodes].astype(np.int32))
+
+
+def feature_frames(primitive: MotionPrimitive) -> list[float]:
+    """The canonical frames at which end effectors are looked at: keyframes, middle and end."""
+    last = primitive.frame_count - 1
+    return sorted({*map(float, primitive.keyframes.values()), 0.5 * last, float(last)})
+
+
+def _features(
+    primitive: MotionPrimitive, samples: Floats, options: TreeOptions, end_effectors: Sequence[int]
+) -> Floats:
+    """(n, D) what is clustered."""
+    if options.features == "latent":
+        return np.ascontiguousarray(samples[:, : primitive.spatial.count])
+    if not end_effectors:
+        raise MotionError("the skeleton's mapping names neither hands nor feet nor head", where="features")
+    frames = feature_frames(primitive)
+    chains = track_points(primitive, [Tracked(frame, (joint,)) for frame in frames for joint in end_effectors])
+    points = np.empty((len(samples), len(chains.turned), 3))
+    objective_kernels.track(chains, np.zeros(3), samples, points)
+    return points.reshape(len(samples), -1)

@@ -1,0 +1,86 @@
+"""How much work a search is, before it is done: about as many nanoseconds of one thread.
+
+Counted from what decides it (samples, moments, joints, nodes of trees, constraints, iterations) and weighed by what was
+measured, so that the same question is always answered, or always refused, whatever else the machine does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import log
+
+from marey_motion.modelling.primitive import MotionPrimitive
+from marey_motion.modelling.search.constraints import JointOrientation, JointPosition, LookDirection
+from marey_motion.modelling.search.found_motions import FoundMotion
+from marey_motion.modelling.search.objective import Objective
+from marey_motion.modelling.search.optimise import RefineOptions
+from marey_motion.modelling.search.steps import SeveralSteps, Step
+from marey_motion.modelling.search.tree import DEFAULT_TREE, SampleTree, TreeOptions, feature_frames
+
+# Nanoseconds, measured on one thread of a server of 2020 and rounded up.
+_PER_NODE, _PER_ROW, _PER_STEP_OF_TIME = 50, 50, 20
+_PER_SLOPE = 30
+_PER_LINEARISED_STEP = 100_000
+_PRODUCTS_AT_ONCE = 8
+_ROUNDS_OF_MEANS = 12
+_PER_SPAN, _PER_NUMBER_OF_SPAN, _ROUNDS_OF_SPANS = 2_000_000, 10, 13
+
+
+def drawing_work(
+    primitive: MotionPrimitive, options: TreeOptions = DEFAULT_TREE, *, end_effectors: Sequence[int] = ()
+) -> float:
+    """Of `build_tree` with the same arguments."""
+    spatial, times = primitive.spatial.count, primitive.frame_count * (primitive.temporal.count + _PER_STEP_OF_TIME)
+    drawn = primitive.dimensions**2 + (0 if primitive.duration_range_s is None else 4 * times)
+    levels = min(options.depth, 1 + log(max(1.0, options.samples / options.leaf_size), options.branching))
+    means = options.branching * levels * _ROUNDS_OF_MEANS
+    if options.features == "latent":
+        return float(options.samples * (drawn + spatial * means))
+    moments = len(feature_frames(primitive))
+    nodes = len({carrier for joint in end_effectors for carrier in primitive.skeleton.path_to_root(joint)})
+    tracked = moments * (spatial * (3 + 4 * nodes) + _PER_NODE * nodes)
+    return float(options.samples * (drawn + tracked + 3 * moments * len(end_effectors) * means))
+
+
+def searching_work(
+    problem: SeveralSteps, trees: Sequence[SampleTree], *, candidates: int, passes: int, refining: RefineOptions | None
+) -> float:
+    """Of `search_steps` with the same arguments."""
+    width = sum(link.objective.primitive.dimensions for link in problem.links)
+    searched = sum(
+        passes * tree.most_evaluations(candidates) * _evaluation_work(link.objective)
+        for link, tree in zip(problem.links, trees, strict=True)
+    )
+    linearised = sum(_slope_work(link.objective, width) for link in problem.links)
+    searched += 0.5 * len(problem.links) * linearised  # each step begins where those before it end
+    if refining is None:
+        return searched
+    rows = 3 * sum(len(link.objective.constraints) + 1 + len(problem.joints) for link in problem.links)
+    priors = sum(mixture.means.size * mixture.dimensions for mixture in problem.priors)
+    products = (rows * width**2 + width**3) / _PRODUCTS_AT_ONCE
+    return searched + refining.iterations * (linearised + priors + products)
+
+
+def finishing_work(steps: Sequence[Step], found: FoundMotion) -> float:
+    """Of `finish_motion` with the same arguments."""
+    kinds = JointPosition | JointOrientation | LookDirection
+    spans = sum(isinstance(constraint, kinds) for step in steps for constraint in step.constraints)
+    rounds = _ROUNDS_OF_SPANS if spans > 1 else 1
+    return float(rounds * spans * (_PER_SPAN + _PER_NUMBER_OF_SPAN * found.motion.rotations.size))
+
+
+def _evaluation_work(objective: Objective) -> float:
+    """Of one motion in a tree."""
+    primitive, chains = objective.primitive, objective.chains
+    times = len(objective.clocks.weights) + (primitive.temporal.count + _PER_STEP_OF_TIME)
+    timed = primitive.frame_count * times if len(objective.clocks.weights) else 0
+    return float(
+        chains.directions.size + _PER_NODE * len(chains.parents) + _PER_ROW * len(objective.constraints) + timed
+    )
+
+
+def _slope_work(objective: Objective, width: int) -> float:
+    """Of one motion and its derivatives by `width` numbers."""
+    timed = objective.primitive.frame_count * width if len(objective.clocks.weights) else 0
+    followed = (len(objective.chains.parents) + len(objective.constraints)) * width
+    return float(_PER_LINEARISED_STEP + objective.chains.directions.size + _PER_SLOPE * followed + timed)

@@ -1,0 +1,1 @@
+"""Pictures and pages for people: figures and reports of evaluations and models. Used by the worker only."""

@@ -1,0 +1,235 @@
+"""Pictures of motion: contact sheets that show takes and what became of them side by side.
+
+Matplotlib is loaded when the first picture is drawn, and only its object interface is used, so that threads may draw
+at the same time.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.clip import Clip
+from marey_motion.errors import MotionError
+from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Body, Camera, Stances, body_of, stances_at
+from marey_schemas.wording import counted
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Floats = NDArray[np.floating[Any]]
+
+MAX_TAKES = 100
+MAX_MOMENTS = 12
+SIDE_COLOURS = {LEFT: "#1f6fb2", CENTRE: "#39414f", RIGHT: "#e07b1a"}
+INK, QUIET, HAIRLINE, TINT, FLOOR = "#1f2430", "#6f7786", "#d5dae1", "#f1f4f8", "#e1e6ec"
+
+# The page, in inches.
+PAGE_WIDTH, MARGIN, HEADER = 15.0, 0.45, 1.10
+TITLE, STAGE, CAPTION, GAP = 0.40, 2.30, 0.30, 0.25
+ROW = TITLE + STAGE + CAPTION + GAP
+DPI = 110
+BONE_POINTS, EDGE_POINTS = 2.6, 5.0
+EDGE_STOPS = 0.07  # inches before a bone's ends
+
+CAMERA_TURN_RAD = np.radians(40.0)  # from where the body faces at first to where it is seen from, to its left
+CAMERA_TILT_RAD = np.radians(12.0)
+FLOOR_SHARE = 0.26  # radius of the spot of floor under a figure, of its height
+HEAD_SHARE = 0.052  # radius of the head, of the body's height
+LONGEST_TITLE = 80
+ARROW = {"arrowstyle": "-|>,head_length=0.35,head_width=0.18", "color": QUIET, "lw": 1.3, "shrinkA": 0, "shrinkB": 0}
+
+
+class TakePair(NamedTuple):
+    """A take before and after: its title, the source clip and the result."""
+
+    title: str
+    source: Clip
+    result: Clip
+
+
+def contact_sheet(takes: Sequence[TakePair], *, heading: str = "Retargeting", moments: int = 6) -> bytes:
+    """A PNG with one row per take: at each moment the source's figure and, on a tinted ground, the result's.
+
+    The figures of a take are drawn at one scale and seen from one side, to the left of where the source faces at first.
+    Each stands over its own spot of the floor y = 0, with an arrow where it faces.
+
+    Parameters
+    ----------
+    takes : what to draw, at most `MAX_TAKES`
+    heading : title of the page
+    moments : how many evenly spaced moments of each take to show, at most `MAX_MOMENTS` and one per frame
+
+    Raises
+    ------
+    MotionError    for no takes or moments, or too many
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    if not (1 <= len(takes) <= MAX_TAKES and 1 <= moments <= MAX_MOMENTS):
+        raise MotionError(
+            f"a sheet shows 1 to {MAX_TAKES} takes at 1 to {MAX_MOMENTS} moments, not {len(takes)} at {moments}",
+            code="figure-size",
+        )
+    rows = [_staged(take, moments) for take in takes]
+    height = HEADER + ROW * len(rows)
+    figure = Figure(figsize=(PAGE_WIDTH, height), dpi=DPI, facecolor="white")
+    FigureCanvasAgg(figure)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, PAGE_WIDTH), ylim=(0.0, height))
+    axes.axis("off")
+    _draw_header(axes, height, heading, len(rows))
+    for number, row in enumerate(rows):
+        _draw_row(axes, row, height - HEADER - number * ROW, (PAGE_WIDTH - 2 * MARGIN) / moments)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    return buffer.getvalue()
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A take made ready for the page: bodies and stances of source and result, and from where they are seen."""
+
+    take: TakePair
+    times_s: Floats
+    actors: tuple[tuple[Body, Stances], tuple[Body, Stances]]
+    camera: Camera
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        """Lowest and highest drawn point; the floor y = 0 is always within."""
+        heights = np.concatenate(
+            [stances.points[:, np.append(body.bones, body.pelvis), 1].ravel() for body, stances in self.actors]
+        )
+        return min(float(heights.min()), 0.0), max(float(heights.max()), 0.0)
+
+
+def _staged(take: TakePair, moments: int) -> _Row:
+    clips = (take.source, take.result)
+    last_s = min((clip.frame_count - 1) / clip.frame_rate_hz for clip in clips)
+    times = np.linspace(0.0, last_s, min(moments, *(clip.frame_count for clip in clips)))
+    actors = []
+    for clip in clips:
+        body = body_of(clip.skeleton)
+        actors.append((body, stances_at(clip, body, np.rint(times * clip.frame_rate_hz).astype(np.intp))))
+    facing = next((stances.facing[0] for _, stances in actors if stances.facing is not None), (0.0, 1.0))
+    camera = Camera(float(np.arctan2(*facing)) + CAMERA_TURN_RAD, CAMERA_TILT_RAD)
+    return _Row(take, times, (actors[0], actors[1]), camera)
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """The place of one figure on the page.
+
+    Parameters
+    ----------
+    left, bottom, width : of its ground, inches
+    centre : where the floor under the pelvis is, inches
+    scale : inches per metre
+    ground : colour behind it
+    """
+
+    left: float
+    bottom: float
+    width: float
+    centre: tuple[float, float]
+    scale: float
+    ground: str
+
+    def placed(self, seen: Floats) -> Floats:
+        """Points (..., 2) on the page of points (..., 3) that a camera sees."""
+        return seen[..., :2] * self.scale + self.centre
+
+
+def _draw_header(axes: Axes, top: float, heading: str, count: int) -> None:
+    line = top - 0.50
+    _write(axes, (MARGIN, line), heading, 21, weight="bold")
+    takes = f"{counted(count, 'take')}, each moment as source (white) and result (tinted)"
+    _write(axes, (MARGIN, line - 0.31), takes, 10.5, QUIET)
+    right, middle = PAGE_WIDTH - MARGIN, line + 0.08
+    for place, (label, side) in enumerate((("left side", LEFT), ("right side", RIGHT))):
+        start = right - 3.75 + 1.30 * place
+        axes.plot([start, start + 0.3], [middle] * 2, color=SIDE_COLOURS[side], lw=3.5, solid_capstyle="round")
+        _write(axes, (start + 0.4, middle), label, 10.5, QUIET, va="center")
+    axes.annotate("", (right - 0.75, middle), (right - 1.15, middle), arrowprops=ARROW)
+    _write(axes, (right - 0.65, middle), "facing", 10.5, QUIET, va="center")
+
+
+def _draw_row(axes: Axes, row: _Row, top: float, cell: float) -> None:
+    """Title, then one cell per moment with both figures over their floor; places in inches."""
+    _draw_titles(axes, row, top)
+    low, high = row.extent_m
+    scale = 0.80 * STAGE / max(high - low, 1e-6)
+    bottom = top - TITLE - STAGE
+    width = 0.5 * cell
+    for moment, time_s in enumerate(row.times_s):
+        left = MARGIN + moment * cell
+        _write(axes, (left + width, bottom - 0.21), f"{time_s:.2f} s", 9.5, QUIET, ha="center")
+        for side, ground in enumerate(("white", TINT)):
+            start = left + side * width
+            centre = (start + 0.5 * width, bottom + 0.12 * STAGE - low * scale)
+            stage = _Stage(start, bottom, width, centre, scale, ground)
+            body, stances = row.actors[side]
+            facing = None if stances.facing is None else stances.facing[moment]
+            _draw_floor(axes, stage, row.camera, facing, FLOOR_SHARE * (high - low))
+            _draw_body(axes, stage, body, row.camera.seen(stances.points[moment]), HEAD_SHARE * (high - low))
+
+
+def _draw_titles(axes: Axes, row: _Row, top: float) -> None:
+    clips = (row.take.source, row.take.result)
+    title = row.take.title if len(row.take.title) <= LONGEST_TITLE else f"{row.take.title[: LONGEST_TITLE - 1]}…"
+    _write(axes, (MARGIN, top - 0.2), title, 12.5, weight="bold")
+    joints = " → ".join(str(clip.skeleton.joint_count) for clip in clips)
+    about = f"{counted(clips[0].frame_count, 'frame')} at {clips[0].frame_rate_hz:g} Hz, {joints} joints"
+    _write(axes, (PAGE_WIDTH - MARGIN, top - 0.2), about, 9.5, QUIET, ha="right")
+
+
+def _draw_floor(axes: Axes, stage: _Stage, camera: Camera, facing: Floats | None, radius_m: float) -> None:
+    """The stage's ground, the floor line, the spot of floor under the figure and an arrow where it faces."""
+    from matplotlib.patches import Ellipse, Rectangle
+
+    size = (stage.width, STAGE)
+    axes.add_patch(Rectangle((stage.left, stage.bottom), *size, facecolor=stage.ground, edgecolor=HAIRLINE, lw=0.6))
+    axes.plot([stage.left, stage.left + stage.width], [stage.centre[1]] * 2, color=HAIRLINE, lw=0.8)
+    diameter = 2.0 * radius_m * stage.scale
+    spot = Ellipse(stage.centre, diameter, diameter * np.sin(camera.tilt_rad), facecolor=FLOOR, edgecolor="none")
+    axes.add_patch(spot)
+    if facing is not None:
+        tip = stage.placed(camera.seen(np.array((facing[0], 0.0, facing[1])) * 1.15 * radius_m))
+        axes.annotate("", tuple(tip), stage.centre, arrowprops=ARROW)
+
+
+def _draw_body(axes: Axes, stage: _Stage, body: Body, seen: Floats, head_m: float) -> None:
+    """Bones from back to front, each with an edge in the colour of the ground that sets it off from those behind."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.patches import Circle
+
+    bones = seen[body.bones]
+    order = np.argsort(bones[..., 2].mean(axis=1), kind="stable")
+    if body.head is not None and body.head[1] < 1.0:
+        order = order[order != body.head[0]]  # the circle stands for it
+    lines = stage.placed(bones[order])
+    # Edges end short of the joints, where they would cut off the neighbouring bones.
+    middle = lines.mean(axis=1, keepdims=True)
+    length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=-1)[:, None, None]
+    edges = middle + (lines - middle) * np.maximum(1.0 - 2.0 * EDGE_STOPS / np.maximum(length, EDGE_STOPS), 0.0)
+    segments = np.stack((edges, lines), axis=1).reshape(-1, 2, 2)
+    colours = [colour for bone in order for colour in (stage.ground, SIDE_COLOURS[int(body.sides[bone])])]
+    widths = [EDGE_POINTS, BONE_POINTS] * len(order)
+    axes.add_collection(LineCollection(list(segments), colors=colours, linewidths=widths, capstyle="round"))
+    if body.head is not None:
+        bone, share = body.head
+        centre = stage.placed(share * bones[bone, 0] + (1.0 - share) * bones[bone, 1])
+        colour = SIDE_COLOURS[CENTRE]
+        circle = Circle(tuple(centre), head_m * stage.scale, facecolor=stage.ground, edgecolor=colour, lw=2.0, zorder=3)
+        axes.add_patch(circle)
+
+
+def _write(axes: Axes, place: tuple[float, float], text: str, size: float, colour: str = INK, **options: Any) -> None:
+    """Text as it is: dollar signs in a title are not mathematics."""
+    axes.text(*place, text, fontsize=size, color=colour, parse_math=False, **options)

@@ -1,0 +1,109 @@
+"""A figure as it is handed out: two pictures, and the numbers that were drawn."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from marey_reports.drawing.paper import to_png, to_svg
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Column = Any
+"""A sequence or an array of numbers, texts or None."""
+Tables = Mapping[str, Mapping[str, Column]]
+"""Tables by name, each with columns of one length by name; a column's name ends with its unit."""
+
+
+class Sketch(NamedTuple):
+    """What a module of figures draws: the page, the numbers on it, and what it shows in one or two sentences."""
+
+    figure: Figure
+    tables: Tables
+    caption: str
+
+
+@dataclass(frozen=True)
+class DrawnFigure:
+    """A figure.
+
+    Parameters
+    ----------
+    name : what it is asked for by
+    number : the paper's number, or "" for those it has not
+    caption : what is to be seen, for people who read it and for those who cannot see it
+    tables : what was drawn, see `Tables`
+    """
+
+    name: str
+    number: str
+    title: str
+    caption: str
+    png: bytes
+    svg: str
+    tables: Tables
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """The tables as a tree of dicts, lists, texts, numbers and None: not-a-number is None."""
+        tables = {
+            name: {column: listed(values) for column, values in table.items()} for name, table in self.tables.items()
+        }
+        return {
+            "figure": self.name,
+            "number": self.number,
+            "title": self.title,
+            "caption": self.caption,
+            "tables": tables,
+        }
+
+    def files(self) -> dict[str, bytes]:
+        """All of it as files by name: PNG, SVG, the data as JSON and one CSV per table."""
+        files = {
+            f"{self.name}.png": self.png,
+            f"{self.name}.svg": self.svg.encode(),
+            f"{self.name}.json": json.dumps(self.data, ensure_ascii=False, allow_nan=False).encode(),
+        }
+        for table, columns in self.tables.items():
+            files[f"{self.name}-{table}.csv"] = as_csv(columns).encode()
+        return files
+
+
+def finish(sketch: Sketch, name: str, number: str, title: str) -> DrawnFigure:
+    """Draw a sketch to both formats."""
+    return DrawnFigure(
+        name=name,
+        number=number,
+        title=title,
+        caption=sketch.caption,
+        png=to_png(sketch.figure),
+        svg=to_svg(sketch.figure, title),
+        tables=sketch.tables,
+    )
+
+
+def listed(values: Column) -> list[Any]:
+    """A column as a list of plain values; None for not-a-number."""
+    rows = values.tolist() if isinstance(values, np.ndarray) else [_plain(value) for value in values]
+    return [None if isinstance(value, float) and not math.isfinite(value) else value for value in rows]
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def as_csv(columns: Mapping[str, Column]) -> str:
+    """A table with a header, lines ended by LF; numbers in the shortest form that reads back the same."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(listed(values) for values in columns.values()), strict=True))
+    return buffer.getvalue()

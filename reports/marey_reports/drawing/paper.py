@@ -1,0 +1,256 @@
+"""The look that all figures share, and how a figure becomes a PNG and an SVG.
+
+Only matplotlib's object interface is used, and its settings are touched for nothing but the few of the SVG writer that
+have no other way, one figure at a time; threads may draw at once.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import threading
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import takewhile
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Colormap
+    from matplotlib.figure import Figure
+
+# These four follow the theme of the page that a figure is shown in; see `marey_reports.drawing.page`.
+INK, QUIET, HAIRLINE, PAPER = "#1f2430", "#5c6472", "#d5dae1", "#ffffff"
+# On coloured ground, in any theme.
+DARK, LIGHT = "#111318", "#fafbfc"
+
+# Okabe and Ito (2008) without yellow and black, which vanish on a light or a dark page.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+REFERENCE = "#8a8f99"
+MARKERS = "os^DvPX*"
+
+# Lightness runs one way in each, so that they read in grey, too.
+MORE_IS_WORSE = "magma_r"
+MORE_IS_DENSER = "viridis"
+CHANGE = "RdBu_r"
+
+TEXT, SMALL, HEADING = 9.0, 8.0, 10.5
+DPI = 144
+LONGEST_NAME = 30
+
+_SVG_SETTINGS = {"svg.hashsalt": "marey", "svg.fonttype": "none", "svg.image_inline": True, "svg.id": None}
+_svg_writer = threading.Lock()
+_LINES = re.compile(r"<path[^>]* d=\"[^\"]*\"")
+_FINER = re.compile(r"(?<=\.\d\d)\d+")
+
+
+class Place(NamedTuple):
+    """A rectangle on the page, in inches from its lower left corner."""
+
+    left: float
+    bottom: float
+    width: float
+    height: float
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty page."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_in, height_in), dpi=DPI, facecolor=PAPER)
+
+
+def add_panel(figure: Figure, place: Place, *, title: str = "", x: str = "", y: str = "", grid: bool = True) -> Axes:
+    """Axes at a place, in the house's look, with their labels."""
+    width, height = figure.get_size_inches()
+    left, bottom, across, up = place
+    axes = figure.add_axes((left / width, bottom / height, across / width, up / height), facecolor="none")
+    axes.tick_params(colors=QUIET, labelsize=SMALL, length=3, width=0.6)
+    for name, spine in axes.spines.items():
+        spine.set_visible(name in ("left", "bottom"))
+        spine.set_color(HAIRLINE)
+    axes.set_axisbelow(True)
+    if grid:
+        axes.grid(visible=True, color=HAIRLINE, lw=0.5)
+    axes.set_xlabel(x, fontsize=TEXT, color=INK, labelpad=4)
+    axes.set_ylabel(y, fontsize=TEXT, color=INK, labelpad=4)
+    axes.set_title(plain(title), fontsize=HEADING, color=INK, loc="left", fontweight="bold", parse_math=False, pad=7)
+    return axes
+
+
+def add_colour_bar(
+    figure: Figure, mappable: ScalarMappable, place: Place, label: str, ticks: NDArray[np.float64] | None = None
+) -> Axes:
+    """A colour bar at a place, upright when it is higher than wide."""
+    width, height = figure.get_size_inches()
+    left, bottom, across, up = place
+    axes = figure.add_axes((left / width, bottom / height, across / width, up / height))
+    upright = up > across
+    bar = figure.colorbar(mappable, cax=axes, orientation="vertical" if upright else "horizontal")
+    bar.outline.set_visible(False)
+    axes.tick_params(colors=QUIET, labelsize=SMALL, length=3, width=0.6)
+    bar.set_label(label, fontsize=TEXT, color=INK)
+    if ticks is not None:
+        bar.set_ticks(ticks.tolist(), labels=[f"{tick:,.6g}" for tick in ticks])
+    return axes
+
+
+def write(axes: Axes, place: tuple[float, float], text: str, **options: Any) -> None:
+    """Text as it is: dollar signs in a name are not mathematics."""
+    look: dict[str, Any] = {"fontsize": SMALL, "color": INK, "parse_math": False, "va": "center", **options}
+    axes.text(*place, plain(text), **look)
+
+
+def add_keys(axes: Axes, **options: Any) -> None:
+    """A legend without a frame, names as they are."""
+    legend = axes.legend(frameon=False, fontsize=SMALL, **options)
+    for text in legend.get_texts():
+        text.set_color(INK)
+        text.set_parse_math(False)
+
+
+def name_ticks(axes: Axes, places: Sequence[float], names: Sequence[str], others: Sequence[str] = ()) -> None:
+    """Names of clips down the vertical axis, `others` that are no clips below them."""
+    labels = [plain(label) for label in (*labels_of(names), *others)]
+    axes.set_yticks(list(places), labels, parse_math=False)
+    axes.tick_params(axis="y", length=0, labelcolor=INK)
+
+
+def tick_whole_numbers(axis: Axis) -> None:
+    """Ticks at whole numbers only, of what is counted."""
+    from matplotlib.ticker import MaxNLocator
+
+    axis.set_major_locator(MaxNLocator(nbins="auto", integer=True, steps=[1, 2, 5, 10]))
+
+
+def plain(text: str) -> str:
+    """A name on one line, without signs that cannot be drawn or written to an SVG."""
+    return "".join(sign if sign.isprintable() else "�" for sign in text)
+
+
+def without_shared_folder(names: Sequence[str]) -> list[str]:
+    """Names as they read within the folder that all of them lie in."""
+    places = [name.split("/") for name in names]
+    levels = zip(*(folders for *folders, _ in places), strict=False)
+    shared = sum(1 for _ in takewhile(lambda level: len(set(level)) == 1, levels))
+    return ["/".join(place[shared:]) for place in places]
+
+
+def told_apart(names: Sequence[str]) -> list[str]:
+    """Names as they read within the folder that all of them lie in, and without the words that all begin with."""
+    within = without_shared_folder(names)
+    words = [re.split(r"(?<=[ _-])", name) for name in within]
+    shared = sum(1 for _ in takewhile(lambda each: len(set(each)) == 1, zip(*words, strict=False)))
+    return ["".join(own[shared:]) for own in words] if all(len(own) > shared for own in words) else within
+
+
+def labels_of(names: Sequence[str], longest: int = LONGEST_NAME) -> list[str]:
+    """Names of clips as short as `longest` signs, by which those that differ can be told apart.
+
+    Folders are left out where the takes in them have names of their own, and what all names begin with where one is
+    too long. Where cutting the middle would make several alike, the beginning that they share is cut instead.
+    """
+    takes = [name.rpartition("/")[2] for name in names]
+    apart = takes if len(set(takes)) == len(set(names)) else without_shared_folder(names)
+    if any(len(name) > longest for name in apart):
+        apart = told_apart(apart)
+    labels = [shortened(name, longest) for name in apart]
+    for label in [label for label, count in Counter(labels).items() if count > 1]:
+        places = [place for place, other in enumerate(labels) if other == label]
+        signs = zip(*(apart[place] for place in places), strict=False)
+        shared = sum(1 for _ in takewhile(lambda each: len(set(each)) == 1, signs))
+        for place in places:
+            if len(apart[place]) > longest:
+                differing = apart[place][shared:]
+                labels[place] = f"…{differing}" if len(differing) < longest else f"…{differing[: longest - 2]}…"
+    return labels
+
+
+def shortened(name: str, longest: int = LONGEST_NAME) -> str:
+    """A name cut in its middle, where names of takes differ least."""
+    if len(name) <= longest:
+        return name
+    tail = (longest - 1) // 2
+    return f"{name[: longest - 1 - tail]}…{name[-tail:]}"
+
+
+def reach(values: NDArray[np.floating[Any]], wanted: float) -> float:
+    """How far an axis of magnitudes goes: all values, unless a few lie beyond twice what is wanted to be seen."""
+    if not len(values):
+        return wanted
+    most = float(np.quantile(values, 0.98))
+    return max(wanted, min(float(values.max()), max(1.3 * wanted, 1.1 * most), 2.0 * wanted))
+
+
+def nice_ceiling(value: float) -> float:
+    """The next number of the form 1, 1.5, 2, 3, 4, 5, 6 or 8 times a power of ten; 1 for what is not above zero."""
+    if not value > 0.0 or not np.isfinite(value):
+        return 1.0
+    scale = 10.0 ** np.floor(np.log10(value))
+    return float(next(step * scale for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if value <= step * scale * (1 + 1e-9)))
+
+
+def warm_colours() -> Colormap:
+    """From a yellow that is told from an empty page to brown."""
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(colormaps["YlOrBr"](np.linspace(0.12, 1.0, 256)))
+
+
+def square_root_ticks(ceiling: float) -> NDArray[np.float64]:
+    """Ticks for a colour bar whose colours follow the square root of the value, which is 0 to `ceiling`."""
+    return ceiling * np.array((0.0, 0.05, 0.25, 0.5, 1.0))
+
+
+def nice_levels(largest: float) -> NDArray[np.float64]:
+    """At most 11 levels from 0 to the first at or above `largest`, at steps of 1, 2 or 5 times a power of ten."""
+    reach = largest if largest > 0.0 and np.isfinite(largest) else 1.0
+    scale = 10.0 ** np.floor(np.log10(reach / 10.0))
+    step = next(factor * scale for factor in (1, 2, 5, 10, 20) if reach <= 10 * factor * scale * (1 + 1e-9))
+    return np.asarray(np.arange(round(np.ceil(reach / step * (1 - 1e-9))) + 1) * step, dtype=np.float64)
+
+
+def luminance(colours: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Relative luminance in [0, 1] of sRGB colours (..., 3 or 4), to choose the text on them."""
+    linear = np.where(
+        colours[..., :3] <= 0.04045, colours[..., :3] / 12.92, ((colours[..., :3] + 0.055) / 1.055) ** 2.4
+    )
+    return np.asarray(linear @ (0.2126, 0.7152, 0.0722), dtype=np.float64)
+
+
+def to_png(figure: Figure) -> bytes:
+    """The same bytes for the same figure and version of matplotlib."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def to_svg(figure: Figure, title: str) -> str:
+    """The same text for the same figure and version of matplotlib; letters stay letters."""
+    buffer = io.StringIO()
+    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    with _svg_settings():
+        figure.savefig(buffer, format="svg", dpi=DPI, metadata={"Title": plain(title), **nothing})
+    # A hundredth of a point is finer than anything that shows it; lines are most of a drawing.
+    return _LINES.sub(lambda line: _FINER.sub("", line[0]), buffer.getvalue())
+
+
+@contextmanager
+def _svg_settings() -> Iterator[None]:
+    import matplotlib
+
+    with _svg_writer:
+        settings: Any = matplotlib.rcParams
+        before = {name: settings[name] for name in _SVG_SETTINGS}
+        settings.update(_SVG_SETTINGS)
+        try:
+            yield
+        finally:
+            settings.update(before)

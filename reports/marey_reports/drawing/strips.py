@@ -1,0 +1,251 @@
+"""Strips of small figures: motions at the same moments, one motion or one set of motions per row.
+
+All cells of a column look at the same spot of the floor, so that what differs between rows is seen where it happens.
+The lines of a body are joined to one shape per side, which keeps a drawing of a hundred bodies light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_reports.drawing.paper import COLOURS, HAIRLINE, INK, PAPER, QUIET, REFERENCE, TEXT, new_figure, write
+from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Body, Camera, Indices, runs_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
+    from matplotlib.path import Path
+
+Floats = NDArray[np.float64]
+
+SIDE_COLOURS = {LEFT: COLOURS[0], CENTRE: INK, RIGHT: COLOURS[1]}
+CAMERA_TILT_RAD = np.radians(10.0)
+
+# In inches.
+MARGIN, HEADER, MOMENT, GAP = 0.10, 0.42, 0.40, 0.10
+RIM_STOPS = 0.05  # before a bone's ends
+FLOOR_SHARE = 0.09  # of a cell's height: the floor's distance from its lower edge
+FILLED = 0.84  # of a cell's height, by the highest point
+HEAD_SHARE = 0.055  # radius of the head, of the height of the highest point
+LINE_POINTS = 1.7
+
+
+@dataclass(frozen=True, eq=False)
+class StripRow:
+    """What one row shows.
+
+    Parameters
+    ----------
+    label, note : to its left, the note in small letters below
+    bodies : (m, T, P, 3) points of m motions at T moments, metres, drawn on top of each other
+    ways : (m, N, 3) where the root goes, drawn on the floor; N may be 0
+    ghost : (T, P, 3) points of a motion to compare with, drawn in grey behind
+    """
+
+    label: str
+    note: str
+    bodies: Floats
+    ways: Floats
+    ghost: Floats | None = None
+
+
+class Moments(NamedTuple):
+    """The columns of a strip: where each looks at, (T, 2) x and z of its middle in metres, and what it is called."""
+
+    middles: Floats
+    names: Sequence[str]
+    labels: Sequence[str]
+
+
+def draw_strips(
+    body: Body,
+    rows: Sequence[StripRow],
+    moments: Moments,
+    direction_rad: float,
+    *,
+    cell_in: tuple[float, float],
+    legend: Sequence[tuple[str, str]] = (),
+) -> Figure:
+    """A page of strips, seen from `direction_rad` about +Y (0 looks from +z).
+
+    Parameters
+    ----------
+    cell_in : width and height of a cell, inches
+    legend : names and colours of what is drawn besides the two sides
+    """
+    width, height = cell_in
+    columns = len(moments.names)
+    labels = _label_width(rows)
+    page = (labels + columns * width + MARGIN, HEADER + len(rows) * (height + GAP) + MOMENT)
+    figure = new_figure(*page)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, page[0]), ylim=(0.0, page[1]))
+    axes.axis("off")
+    camera = Camera(direction_rad, float(CAMERA_TILT_RAD))
+    scale = _scale(body, rows, moments, camera, cell_in)
+    shapes = _shapes(body, rows)
+    _draw_legend(axes, labels, page[1], legend)
+    for number, row in enumerate(rows):
+        bottom = page[1] - HEADER - (number + 1) * (height + GAP) + GAP
+        _draw_label(axes, row, bottom + 0.5 * height)
+        for column in range(columns):
+            stage = _Stage((labels + column * width, bottom), cell_in, moments.middles[column], camera, scale)
+            _draw_cell(axes, stage, shapes, row, column)
+    for column, (name, label) in enumerate(zip(moments.names, moments.labels, strict=True)):
+        middle = labels + (column + 0.5) * width
+        write(axes, (middle, MOMENT - 0.10), name, ha="center", color=QUIET)
+        write(axes, (middle, MOMENT - 0.26), label, ha="center", color=INK)
+    return figure
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """A cell: its lower left corner and its size in inches, and what it looks at, `scale` inches per metre."""
+
+    corner: tuple[float, float]
+    size: tuple[float, float]
+    middle: Floats
+    camera: Camera
+    scale: float
+
+    def placed(self, points: Floats) -> Floats:
+        """Points (..., 3) as (right, up, towards the viewer) in inches on the page."""
+        seen = self.camera.seen(points - np.array((self.middle[0], 0.0, self.middle[1]))) * self.scale
+        below = np.array((self.corner[0] + 0.5 * self.size[0], self.corner[1] + FLOOR_SHARE * self.size[1], 0.0))
+        return np.asarray(seen + below, dtype=np.float64)
+
+
+def _scale(
+    body: Body, rows: Sequence[StripRow], moments: Moments, camera: Camera, cell_in: tuple[float, float]
+) -> float:
+    """Inches per metre: the highest point fits, and most figures fit from side to side."""
+    middles = np.stack((moments.middles[:, 0], np.zeros(len(moments.middles)), moments.middles[:, 1]), axis=1)
+    drawn = np.unique(np.append(body.bones, body.pelvis))
+    seen = np.concatenate([camera.seen(row.bodies[:, :, drawn] - middles[:, None]).reshape(-1, 3) for row in rows])
+    highest = max(float(np.quantile(seen[:, 1], 0.999)), 1e-6)
+    widest = max(2.0 * float(np.quantile(np.abs(seen[:, 0]), 0.995)), 1e-6)
+    return min(FILLED * cell_in[1] / highest, 0.96 * cell_in[0] / widest)
+
+
+def _label_width(rows: Sequence[StripRow]) -> float:
+    """Inches that the labels take."""
+    longest = max([0, *(max(1.15 * len(row.label), 0.9 * len(row.note)) for row in rows)])
+    return 0.2 + 0.078 * longest
+
+
+def _draw_legend(axes: Axes, left: float, top: float, legend: Sequence[tuple[str, str]]) -> None:
+    keys = [("left side", SIDE_COLOURS[LEFT]), ("right side", SIDE_COLOURS[RIGHT]), *legend]
+    start, line = left + 0.05, top - 0.17
+    for name, colour in keys:
+        axes.plot([start, start + 0.26], [line] * 2, color=colour, lw=2.6, solid_capstyle="round")
+        write(axes, (start + 0.34, line), name, color=QUIET)
+        start += 0.34 + 0.072 * len(name) + 0.28
+
+
+def _draw_label(axes: Axes, row: StripRow, middle: float) -> None:
+    write(axes, (0.05, middle + (0.09 if row.note else 0.0)), row.label, fontsize=TEXT, fontweight="bold")
+    if row.note:
+        write(axes, (0.05, middle - 0.10), row.note, color=QUIET)
+
+
+class _Look(NamedTuple):
+    """How a body is drawn; without a colour in those of its sides, with a rim set off from what is behind."""
+
+    width: float
+    alpha: float = 1.0
+    colour: str | None = None
+    rim: bool = False
+
+
+GHOST = _Look(LINE_POINTS, 0.55, REFERENCE)
+
+
+def _draw_cell(axes: Axes, stage: _Stage, shapes: _Shapes, row: StripRow, column: int) -> None:
+    """The floor, the ways on it, the ghost, then the bodies; nothing leaves the cell to its sides."""
+    from matplotlib.patches import Rectangle
+
+    (left, bottom), (width, height) = stage.corner, stage.size
+    floor = bottom + FLOOR_SHARE * height
+    frame = Rectangle((left, bottom - GAP), width, height + 2 * GAP, visible=False)
+    axes.add_artist(frame)
+    axes.plot([left + 0.03, left + width - 0.03], [floor] * 2, color=HAIRLINE, lw=0.8)
+    for way in row.ways:
+        _draw_way(axes, stage.placed(way * (1.0, 0.0, 1.0)), frame)
+    if row.ghost is not None:
+        _draw_body(axes, shapes, stage, row.ghost[column], GHOST, frame)
+    count = len(row.bodies)
+    look = _Look(LINE_POINTS, rim=True) if count == 1 else _Look(0.6 * LINE_POINTS, max(0.25, 1.0 / np.sqrt(count)))
+    for points in row.bodies[:, column]:
+        _draw_body(axes, shapes, stage, points, look, frame)
+
+
+def _draw_way(axes: Axes, way: Floats, frame: Rectangle) -> None:
+    if len(way):
+        (line,) = axes.plot(way[:, 0], way[:, 1], color=QUIET, lw=0.9, alpha=0.8)
+        line.set_clip_path(frame)
+
+
+class _Shapes(NamedTuple):
+    """A body's lines: for each side the runs of points that bones join, and the bones themselves (n, 2)."""
+
+    runs: dict[int, list[Indices]]
+    bones: dict[int, Indices]
+    head: tuple[Indices, float] | None
+    head_m: float
+
+
+def _shapes(body: Body, rows: Sequence[StripRow]) -> _Shapes:
+    shown = np.ones(len(body.bones), dtype=bool)
+    if body.head is not None and body.head[1] < 1.0:
+        shown[body.head[0]] = False  # the circle stands for it
+    sides = sorted({int(side) for side in body.sides})
+    bones = {side: body.bones[shown & (body.sides == side)] for side in sides}
+    heights = np.concatenate([np.ptp(row.bodies[..., body.bones[:, 0], 1], axis=-1).ravel() for row in rows])
+    return _Shapes(
+        {side: runs_of(bones[side]) for side in sides},
+        bones,
+        None if body.head is None else (body.bones[body.head[0]], body.head[1]),
+        HEAD_SHARE * float(np.median(heights)),
+    )
+
+
+def _draw_body(axes: Axes, shapes: _Shapes, stage: _Stage, points: Floats, look: _Look, frame: Rectangle) -> None:
+    """Bones at points (P, 3), each side as one shape, from the far side to the near one."""
+    from matplotlib.patches import Circle, PathPatch
+
+    seen = stage.placed(points)
+    options: dict[str, Any] = {"facecolor": "none", "capstyle": "round", "joinstyle": "round", "clip_path": frame}
+    sides = sorted(shapes.bones, key=lambda side: float(seen[shapes.bones[side], 2].mean()))
+    for place, side in enumerate(sides):
+        if look.rim and place:
+            rim = _path(_middles(seen[shapes.bones[side], :2]))
+            axes.add_artist(PathPatch(rim, edgecolor=PAPER, lw=look.width + 1.8, **{**options, "capstyle": "butt"}))
+        lines = _path([seen[run, :2] for run in shapes.runs[side]])
+        colour = look.colour or SIDE_COLOURS[side]
+        axes.add_artist(PathPatch(lines, edgecolor=colour, lw=look.width, alpha=look.alpha, **options))
+    if shapes.head is not None:
+        (outer, inner), share = shapes.head
+        centre = share * seen[inner, :2] + (1.0 - share) * seen[outer, :2]
+        fill = PAPER if look.rim else "none"
+        circle = Circle(tuple(centre), shapes.head_m * stage.scale, facecolor=fill, edgecolor=look.colour or INK)
+        circle.set(linewidth=0.75 * look.width, alpha=look.alpha, clip_path=frame)
+        axes.add_artist(circle)
+
+
+def _middles(bones: Floats) -> list[Floats]:
+    """Bones (n, 2, 2) short of the joints, where a rim would cut off the neighbouring bones."""
+    middle = bones.mean(axis=1, keepdims=True)
+    length = np.linalg.norm(bones[:, 1] - bones[:, 0], axis=-1)[:, None, None]
+    return list(middle + (bones - middle) * np.maximum(1.0 - 2.0 * RIM_STOPS / np.maximum(length, RIM_STOPS), 0.0))
+
+
+def _path(runs: Sequence[Floats]) -> Path:
+    from matplotlib.path import Path
+
+    codes = [np.append(Path.MOVETO, np.full(len(run) - 1, Path.LINETO)) for run in runs]
+    return Path(np.concatenate(runs), np.concatenate(codes))

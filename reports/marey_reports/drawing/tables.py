@@ -1,0 +1,83 @@
+"""Tables of a report, and numbers as they are written in them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from marey_reports.drawing.markup import Content, Html, element
+
+
+class Number(NamedTuple):
+    """A number in a table: its value, which rows are sorted by, and how it is written."""
+
+    value: float | None
+    written: str
+    look: str = ""
+
+
+Cell = Number | Content
+
+
+def number(value: float | None, digits: int = 2, *, signed: bool = False, look: str = "") -> Number:
+    """A number with so many decimals; a dash for none."""
+    if value is None or not math.isfinite(value):
+        return Number(None, "–")
+    written = round(value, digits) + 0.0  # not -0.00
+    return Number(value, f"{written:{'+' if signed else ''},.{digits}f}", look)
+
+
+def share(value: float) -> Number:
+    """A share in percent."""
+    return Number(value, f"{100 * value:.1f} %")
+
+
+def table(
+    caption: str, heads: Sequence[str], rows: Iterable[Sequence[Cell]], *, numbers: Sequence[int], sortable: bool = True
+) -> Html:
+    """A table whose first column names its rows.
+
+    Parameters
+    ----------
+    numbers : columns that hold numbers, which stand to the right
+    sortable : by a click on a column's head
+    """
+    look = dict.fromkeys(numbers, "number")
+    head = element(
+        "tr", [element("th", text, scope="col", class_=look.get(column)) for column, text in enumerate(heads)]
+    )
+    body = [element("tr", [_cell(cell, column) for column, cell in enumerate(row)]) for row in rows]
+    content = element("caption", caption), element("thead", head), element("tbody", body)
+    return element(
+        "div",
+        element("table", *content, class_="sortable" if sortable else None),
+        class_="table",
+        tabindex="0",
+        role="group",
+        aria_label=caption,
+    )
+
+
+def _cell(cell: Cell, column: int) -> Html:
+    if isinstance(cell, Number):
+        look = f"number {cell.look}".strip()
+        value = "" if cell.value is None else f"{cell.value:.6g}"
+        return element("td", cell.written, class_=look, data_value=value)
+    if column == 0:
+        return element("th", cell, scope="row")
+    return element("td", cell)
+
+
+def facts(pairs: Iterable[tuple[str, Content, str]]) -> Html:
+    """The few numbers that a report begins with: what, how much, and a note below."""
+    tiles = [
+        element("div", element("dt", name), element("dd", value), element("dd", note, class_="note") if note else None)
+        for name, value, note in pairs
+    ]
+    return element("dl", tiles, class_="tiles")
+
+
+def folded(summary: str, content: Content) -> Html:
+    """Something that is opened by a click."""
+    return element("details", element("summary", summary), content)

@@ -1,0 +1,259 @@
+"""The chapters of the report of one evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from marey_motion.evaluation.judgement import is_followed, judge, strain
+from marey_motion.evaluation.relevance import SourceUsage, recorded_rows, sum_by_source
+from marey_motion.evaluation.result import EvaluationResult, TrialResult
+from marey_motion.evaluation.scenario import demand
+from marey_reports.drawing.markup import Content, Html, element, joined
+from marey_reports.drawing.page import Section, shown
+from marey_reports.drawing.tables import Cell, Number, facts, folded, number, share, table
+from marey_reports.drawing.words import amount, duration
+from marey_reports.evaluation.definitions import METRICS
+from marey_reports.evaluation.figures import DrawnFigure
+from marey_reports.evaluation.words import find_holes
+
+Figures = Mapping[str, DrawnFigure]
+
+WORST_TRIALS = 10
+LOAD_CLIPS = 15
+MOST_HOLES = 15
+MOST_NAMES = 40  # more unused clips than this are folded away
+
+
+def headline(result: EvaluationResult) -> Html:
+    """The numbers that answer most questions."""
+    judgement, coverage = judge(result), result.coverage
+    sources = sum_by_source(result.clips, result.usage)
+    used = sum(1 for source in sources if source.ticks)
+    base = result.baseline
+    beside = "" if base is None else f"{_written(base, 'offset_mean')} with generated clips that cover everything"
+    held = recorded_rows(result.clips, result.usage) / result.options.database.rate_hz
+    covered = int(np.count_nonzero(coverage.deficit_s <= 0.0))
+    return facts(
+        (
+            ("trajectories followed", f"{judgement.followed} of {judgement.trials}", judgement.grade),
+            ("distance from the path", _written(result, "offset_mean"), beside),
+            ("speeds and turns covered", f"{covered} of {coverage.deficit_s.size}", f"{duration(held)} of clips"),
+            ("clips used", f"{used} of {len(sources)}", _mirroring(result)),
+            ("left-right symmetry", f"{coverage.symmetry:.2f}", "of the data: 1 is alike, 0 one-sided"),
+        )
+    )
+
+
+def coverage_chapter(result: EvaluationResult, figures: Figures) -> Section:
+    """What the clips hold."""
+    coverage = result.coverage
+    short = [result.clips[index].name for index in coverage.too_short]
+    text = element(
+        "p",
+        f"The clips hold {duration(len(coverage.clip) / result.options.database.rate_hz)} of motion in windows of one "
+        f"second. {100 * coverage.index:.0f} % of the speeds and turn rates that the trials ask for have at least "
+        f"{result.options.coverage_least_s:g} s of it.",
+    )
+    too_short = element("p", f"Shorter than a second, and so no part of this: {_listed(short)}.") if short else None
+    return Section("coverage", "What is covered", (text, too_short, shown(figures, "density", "points", "directions")))
+
+
+def error_chapter(result: EvaluationResult, figures: Figures) -> Section:
+    """Where the character goes wrong, the worst trials first."""
+    worst = sorted(result.trials, key=lambda each: (-strain(each).worst, each.trial.name))[:WORST_TRIALS]
+    lost = sum(not is_followed(each) for each in result.trials)
+    text = (
+        "Every trajectory is followed."
+        if not lost
+        else f"{amount(lost, 'trajectory')} of {len(result.trials)} {'is' if lost == 1 else 'are'} not followed."
+    )
+    rows = [_trial_row(each) for each in worst]
+    listing = table("The worst trials; what is beyond its limit is marked", TRIAL_HEADS, rows, numbers=range(1, 8))
+    pictures = (
+        shown(figures, "offsets"),
+        listing,
+        element("div", shown(figures, "scenario-circle", "scenario-switching"), class_="pair"),
+        shown(figures, "transition-cost", "errors"),
+    )
+    return Section("errors", "Where the errors are", (element("p", text), pictures))
+
+
+def load_chapter(result: EvaluationResult, figures: Figures) -> Section:
+    """Which clips carry the load."""
+    used = _by_use(result)
+    half, total = 0, 0.0
+    while half < len(used) and total < 0.5:
+        total += used[half].share
+        half += 1
+    text = (
+        f"{amount(half, 'clip')} of {len(used)} used {'makes' if half == 1 else 'make'} up half of what was displayed."
+        if used
+        else "No clip was displayed."
+    )
+    rows = [_use_row(source, result) for source in used[:LOAD_CLIPS]]
+    listing = table("The clips displayed most", USE_HEADS, rows, numbers=range(1, 5)) if rows else None
+    return Section(
+        "load",
+        "Which clips carry the load",
+        (element("p", text), listing, shown(figures, "usage", "frame-use", "clip-graph")),
+    )
+
+
+def unused_chapter(result: EvaluationResult) -> Section:
+    """Which clips were never displayed."""
+    sources = sum_by_source(result.clips, result.usage)
+    unused = [source for source in sources if not source.ticks]
+    if not unused:
+        return Section("unused", "Which clips are never used", element("p", "Every clip was used at least once."))
+    seconds = sum(len(source.popularity) for source in unused) / result.options.database.rate_hz
+    text = element(
+        "p",
+        f"{amount(len(unused), 'clip')} of {len(sources)}, {duration(seconds)} of motion, "
+        f"{'was' if len(unused) == 1 else 'were'} displayed in no trial. Without "
+        f"{'it' if len(unused) == 1 else 'them'} these trials stay the same to the bit, when the normaliser is kept; "
+        "trials of other kinds may need them.",
+    )
+    names = element("ul", [element("li", source.name) for source in unused], class_="names")
+    content: Content = names if len(unused) <= MOST_NAMES else folded(f"All {len(unused)} names", names)
+    return Section("unused", "Which clips are never used", (text, content))
+
+
+def recording_chapter(result: EvaluationResult, figures: Figures) -> Section:
+    """What to record next, in words."""
+    holes = find_holes(result.coverage)
+    if not holes:
+        text = element("p", "Nothing: every speed and turn rate that the trials ask for has enough data.")
+        return Section("record", "What to record next", (text, shown(figures, "holes")))
+    missing = float(result.coverage.deficit_s.sum())
+    rest = sum(hole.missing_s for hole in holes[MOST_HOLES:])
+    items = [element("li", hole.words, ": ", element("b", f"{duration(hole.missing_s)} missing")) for hole in holes]
+    more = element("p", f"and {duration(rest)} in {amount(len(holes) - MOST_HOLES, 'smaller hole')}.") if rest else None
+    return Section(
+        "record",
+        "What to record next",
+        (
+            element(
+                "p",
+                f"At least {duration(missing)} of motion, so that each of {result.coverage.deficit_s.size} cells has "
+                f"{result.options.coverage_least_s:g} s. The largest holes first:",
+            ),
+            element("ol", items[:MOST_HOLES]),
+            more,
+            shown(figures, "holes"),
+        ),
+    )
+
+
+def baseline_chapter(result: EvaluationResult) -> Section:
+    """The suite's numbers, beside those of generated clips that own every cell."""
+    base = result.baseline
+    heads = ["measure", "this dataset", *(["generated baseline"] if base is not None else []), "unit"]
+    rows: list[Sequence[Cell]] = []
+    for name, metric in METRICS.items():
+        if name not in result.suite:
+            continue
+        row: list[Cell] = [metric.label, number(result.suite[name], metric.digits)]
+        if base is not None:
+            row.append(number(base.suite.get(name), metric.digits))
+        rows.append([*row, metric.unit])
+    about = (
+        f"{HOW_POOLED} The baseline is the same suite over generated clips, one for each speed and turn rate: "
+        "what this way of following reaches when nothing is missing."
+        if base is not None
+        else f"{HOW_POOLED} No baseline was evaluated beside them."
+    )
+    listing = table("The suite in numbers", heads, rows, numbers=range(1, len(heads) - 1), sortable=False)
+    return Section("numbers", "In numbers", (element("p", about), listing))
+
+
+def appendix_chapter(result: EvaluationResult) -> Section:
+    """Every trial and every clip."""
+    trials = table("All trials", TRIAL_HEADS, map(_trial_row, result.trials), numbers=range(1, 7))
+    clips = table(
+        "All clips",
+        USE_HEADS,
+        (_use_row(source, result) for source in _by_use(result, unused=True)),
+        numbers=range(1, 5),
+    )
+    return Section(
+        "all",
+        "All trials and clips",
+        (
+            element("p", "A click on the head of a column sorts by it."),
+            folded(f"All {len(result.trials)} trials", trials),
+            folded(f"All {len(sum_by_source(result.clips, result.usage))} clips", clips),
+        ),
+    )
+
+
+HOW_POOLED = "Means over all trials; of largest distances the largest, of counts the sum."
+BEYOND = "bad"
+TRIAL_HEADS = (
+    "trial",
+    "distance (m)",
+    "largest (m)",
+    "speed error (m/s)",
+    "turn rate error (deg/s)",
+    "transitions (1/s)",
+    "response (s)",
+)
+USE_HEADS = ("clip", "share of frames", "length (s)", "frames shown at all", "times entered")
+
+
+def _trial_row(outcome: TrialResult) -> list[Cell]:
+    metrics, marks = outcome.metrics, [BEYOND if part > 1.0 else "" for part in strain(outcome)]
+    name = element("span", demand(outcome.trial), title=outcome.trial.name)
+    return [
+        name,
+        number(metrics.get("offset_mean"), look=marks[0]),
+        number(metrics.get("offset_max")),
+        number(metrics.get("se_v"), signed=True, look=marks[1]),
+        number(metrics.get("se_omega_deg"), 1, signed=True, look=marks[2]),
+        number(metrics.get("transitions_per_s")),
+        number(metrics.get("response_s")) if outcome.trial.family == "switching" else Number(None, ""),
+    ]
+
+
+def _use_row(source: SourceUsage, result: EvaluationResult) -> list[Cell]:
+    shown_at_all = float(np.mean(source.popularity > 0)) if len(source.popularity) else 0.0
+    return [
+        element("span", source.name, title=source.uid),
+        share(source.share),
+        number(len(source.popularity) / result.options.database.rate_hz, 1),
+        share(shown_at_all),
+        Number(source.entries, f"{source.entries:,}"),
+    ]
+
+
+def _by_use(result: EvaluationResult, *, unused: bool = False) -> list[SourceUsage]:
+    sources = [source for source in sum_by_source(result.clips, result.usage) if unused or source.ticks]
+    return sorted(sources, key=lambda source: (-source.ticks, source.uid))
+
+
+def _written(result: EvaluationResult, name: str) -> str:
+    metric, value = METRICS[name], result.suite.get(name)
+    return "–" if value is None else f"{value:.{metric.digits}f} {metric.unit}"
+
+
+def _mirroring(result: EvaluationResult) -> str:
+    return {
+        "none": "not mirrored",
+        "add": "each also mirrored, counted once",
+        "only": "all mirrored",
+    }[result.options.database.mirroring]
+
+
+def _listed(names: Iterable[str], most: int = 12) -> str:
+    known = list(names)
+    more = f" and {len(known) - most} more" if len(known) > most else ""
+    return ", ".join(known[:most]) + more
+
+
+def notes(result: EvaluationResult) -> Html | None:
+    """What the evaluation had to say about its clips."""
+    if not result.notes:
+        return None
+    listing = element("ul", [element("li", note) for note in result.notes])
+    return joined((element("h3", "Notes"), listing))

@@ -1,0 +1,194 @@
+"""The report of two evaluations of the same trials: what changed, and whether it helped."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from marey_motion.evaluation.compare import Comparison, MetricChange
+from marey_motion.evaluation.judgement import Judgement, is_followed, judge
+from marey_motion.evaluation.relevance import sum_by_source
+from marey_motion.evaluation.result import EvaluationResult, TrialResult
+from marey_motion.evaluation.scenario import demand
+from marey_reports.drawing.markup import Content, Html, element
+from marey_reports.drawing.page import Section, shown
+from marey_reports.drawing.tables import Cell, Number, facts, folded, number, table
+from marey_reports.drawing.words import amount
+from marey_reports.evaluation.definitions import METRICS
+from marey_reports.evaluation.figures import DrawnFigure
+
+Figures = Mapping[str, DrawnFigure]
+
+MOST_TRIALS = 15
+MOST_NAMES = 40
+LEAST_SHIFT_M = 0.005  # what is written as 0.00 is neither good nor bad
+
+
+def compared(before: EvaluationResult, after: EvaluationResult) -> str:
+    """Whether the change helped, in one sentence."""
+    first, second = judge(before), judge(after)
+    pairs = paired(before, after)
+    gained = sum(is_followed(new) and not is_followed(old) for old, new in pairs)
+    lost = sum(is_followed(old) and not is_followed(new) for old, new in pairs)
+    if second.followed == first.followed:
+        start, parts = "Neither better nor worse", [f"the character follows {_share(second)} trajectories as before"]
+    else:
+        start = "Better" if second.followed > first.followed else "Worse"
+        parts = [f"the character follows {_share(second)} trajectories, {first.followed} before"]
+    if gained or lost:
+        parts.append(f"{amount(gained, 'trajectory')} gained and {lost} lost")
+    offsets = before.suite.get("offset_mean"), after.suite.get("offset_mean")
+    if offsets[0] is not None and offsets[1] is not None:
+        parts.append(f"it is {offsets[1]:.2f} m from its path on average, {offsets[0]:.2f} m before")
+    return f"{start}: {'; '.join(parts)}."
+
+
+def paired(before: EvaluationResult, after: EvaluationResult) -> list[tuple[TrialResult, TrialResult]]:
+    """The trials that both have, in the order of the first."""
+    known = {each.trial.name: each for each in after.trials}
+    return [(each, known[each.trial.name]) for each in before.trials if each.trial.name in known]
+
+
+def headline_of_two(before: EvaluationResult, after: EvaluationResult, labels: tuple[str, str]) -> Html:
+    """The numbers that answer most questions, old and new."""
+    first, second = judge(before), judge(after)
+    cells = before.coverage, after.coverage
+    sources = [sum_by_source(each.clips, each.usage) for each in (before, after)]
+    used = [sum(1 for source in own if source.ticks) for own in sources]
+    enough = [f"{each.options.coverage_least_s:g} s" for each in (before, after)]
+    return facts(
+        (
+            ("trajectories followed", f"{first.followed} → {_share(second)}", " → ".join(labels)),
+            ("distance from the path (m)", _arrow(*(_written(each, "offset_mean") for each in (before, after))), ""),
+            (
+                "speeds and turns covered",
+                _arrow(*(f"{100 * each.index:.0f} %" for each in cells)),
+                "" if enough[0] == enough[1] else f"where {enough[0]} and {enough[1]} are enough: not comparable",
+            ),
+            ("clips used", _arrow(str(used[0]), str(used[1])), f"of {len(sources[0])} and {len(sources[1])}"),
+        )
+    )
+
+
+def metric_chapter(
+    before: EvaluationResult, after: EvaluationResult, comparison: Comparison | None, labels: tuple[str, str]
+) -> Section:
+    """How the suite's numbers changed, with intervals where they were computed."""
+    changes = {change.metric: change for change in comparison.metrics} if comparison is not None else {}
+    heads = ["measure", *labels, "change", *(["between", "verdict"] if comparison else []), "unit"]
+    rows: list[Sequence[Cell]] = []
+    for name, metric in METRICS.items():
+        known = changes.get(name)
+        old, new = (known.before, known.after) if known else (before.suite.get(name), after.suite.get(name))
+        if old is None and new is None:
+            continue
+        change = known.change if known else new - old if old is not None and new is not None else None
+        digits = metric.digits if known is None else max(metric.digits, 1)  # the mean of a count is no whole number
+        row: list[Cell] = [metric.label, *(number(value, digits) for value in (old, new))]
+        row.append(number(change, digits, signed=True, look=_look(known)))
+        if comparison is not None:
+            row += [_interval(known, digits), known.verdict if known else ""]
+        rows.append([*row, metric.unit])
+    text = "Of the whole suite."
+    if comparison is not None:
+        text = (
+            "Means over the trials that both define, also of what each trial has as its largest distance or counts; "
+            "the report of one evaluation has the largest and the sum of all trials there. The mean change lies "
+            "between the two bounds with 95 % confidence, by resampling the trials."
+        )
+    listing = table(
+        "The suite in numbers", heads, rows, numbers=(1, 2, 3, 4) if comparison else (1, 2, 3), sortable=False
+    )
+    return Section("numbers", "What changed", (element("p", text), listing))
+
+
+def trial_chapter(
+    before: EvaluationResult, after: EvaluationResult, comparison: Comparison | None, figures: Figures
+) -> Section:
+    """Where it changed: trials gained and lost, the largest changes first."""
+    pairs = [(old, new) for old, new in paired(before, after) if old.metrics != new.metrics]
+    pairs.sort(key=lambda pair: (-abs(_shift(*pair)), pair[0].trial.name))
+    changed = sum(not each.same_motion for each in comparison.changed) if comparison is not None else len(pairs)
+    text = f"{amount(changed, 'trial')} of {len(before.trials)} went another way."
+    if comparison is not None and (others := len(comparison.changed) - changed):
+        text += f" {others} more went the same way with other clips."
+    heads = ("trial", "distance before (m)", "after (m)", "change (m)", "followed before", "after")
+    listing: Content = None
+    if pairs:
+        rows = [_trial_row(old, new) for old, new in pairs]
+        listing = table("The largest changes", heads, rows[:MOST_TRIALS], numbers=(1, 2, 3))
+        if len(rows) > MOST_TRIALS:
+            everything = table("All changed trials", heads, rows, numbers=(1, 2, 3))
+            listing = (listing, folded(f"All {len(rows)} changed trials", everything))
+    pictures = shown(figures, "offsets", "scenario-circle", "scenario-switching", "transition-cost", "errors")
+    return Section("trials", "Where it changed", (element("p", text), listing, pictures))
+
+
+def clip_chapter(before: EvaluationResult, after: EvaluationResult, figures: Figures) -> Section:
+    """Which clips came, went, and lost or found use."""
+    names = {clip.uid: clip.name for result in (after, before) for clip in result.clips}
+    held = [{clip.uid for clip in result.clips} for result in (before, after)]
+    used = [{result.clips[usage.clip].uid for usage in result.usage if usage.ticks} for result in (before, after)]
+    lists = (
+        ("Clips that came", held[1] - held[0]),
+        ("Clips that went", held[0] - held[1]),
+        ("Clips no longer used", (used[0] - used[1]) & held[1]),
+        ("Clips used now", (used[1] - used[0]) & held[0]),
+    )
+    content = [_names(title, sorted(uids), names) for title, uids in lists if uids]
+    if not content:
+        content = [element("p", "Both have the same clips and use the same ones.")]
+    return Section("clips", "Clips", (content, shown(figures, "usage", "frame-use", "clip-graph")))
+
+
+def coverage_of_two_chapter(figures: Figures) -> Section:
+    """What is covered now."""
+    return Section("coverage", "Coverage", shown(figures, "density", "points", "holes", "directions"))
+
+
+def _names(title: str, uids: Sequence[str], names: Mapping[str, str]) -> Html:
+    listing = element("ul", [element("li", element("span", names[uid], title=uid)) for uid in uids], class_="names")
+    heading = f"{title} ({len(uids)})"
+    return folded(heading, listing) if len(uids) > MOST_NAMES else element("div", element("h3", heading), listing)
+
+
+def _trial_row(old: TrialResult, new: TrialResult) -> list[Cell]:
+    offsets = [each.metrics.get("offset_mean") for each in (old, new)]
+    shift = _shift(old, new)
+    look = "" if abs(shift) < LEAST_SHIFT_M else "good" if shift < 0.0 else "bad"
+    return [
+        element("span", demand(old.trial), title=old.trial.name),
+        *(number(offset) for offset in offsets),
+        number(shift if None not in offsets else None, signed=True, look=look),
+        *("yes" if is_followed(each) else "no" for each in (old, new)),
+    ]
+
+
+def _shift(old: TrialResult, new: TrialResult) -> float:
+    """Change of the mean offset in metres; 0 where one of the two is not defined."""
+    first, second = old.metrics.get("offset_mean"), new.metrics.get("offset_mean")
+    return 0.0 if first is None or second is None else second - first
+
+
+def _interval(change: MetricChange | None, digits: int) -> Number:
+    if change is None:
+        return Number(None, "–")
+    low, high = (number(bound, digits, signed=True).written for bound in (change.low, change.high))
+    return Number(change.low, f"{low} and {high}")
+
+
+def _look(change: MetricChange | None) -> str:
+    verdict = change.verdict if change is not None else ""
+    return {"better": "good", "worse": "bad"}.get(verdict, "")
+
+
+def _share(judgement: Judgement) -> str:
+    return f"{judgement.followed} of {judgement.trials}"
+
+
+def _arrow(old: str, new: str) -> str:
+    return f"{old} → {new}"
+
+
+def _written(result: EvaluationResult, name: str) -> str:
+    value = result.suite.get(name)
+    return "–" if value is None else f"{value:.{METRICS[name].digits}f}"

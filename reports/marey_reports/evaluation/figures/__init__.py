@@ -1,0 +1,116 @@
+"""The figures of an evaluation: those of Abichequer Sangalli et al. (2022) and a few more, of one result or of two.
+
+matplotlib is loaded when the first figure is drawn. The same result gives the same bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.result import EvaluationResult
+from marey_motion.evaluation.scenario import Family
+from marey_reports.drawing.drawn import DrawnFigure, Sketch, finish
+from marey_reports.evaluation.figures.clip_graph import draw_clip_graph
+from marey_reports.evaluation.figures.clip_usage import draw_usage
+from marey_reports.evaluation.figures.coverage_points import draw_points
+from marey_reports.evaluation.figures.density import draw_density, draw_directions
+from marey_reports.evaluation.figures.errors import draw_errors
+from marey_reports.evaluation.figures.frame_use import draw_frame_use
+from marey_reports.evaluation.figures.holes import draw_holes
+from marey_reports.evaluation.figures.offsets import draw_offsets
+from marey_reports.evaluation.figures.scenarios import draw_circle, draw_switching
+from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
+from marey_reports.evaluation.figures.transition_costs import draw_transition_costs
+
+__all__ = ["FIGURES", "DrawnFigure", "FigureKind", "FigureOptions", "draw_figure", "draw_figures"]
+
+
+class FigureKind(NamedTuple):
+    """A figure that can be drawn.
+
+    Parameters
+    ----------
+    number : in the paper, or ""
+    trials : "one" when it shows one trial, "any" when it shows the suite or one trial, "none" when always the suite
+    families : those whose trials it can show
+    draw : makes the page of one or two subjects
+    """
+
+    number: str
+    title: str
+    trials: str
+    draw: Callable[[Sequence[Subject], str | None, FigureOptions], Sketch]
+    families: tuple[Family, ...] = ("circle", "switching")
+
+
+FIGURES = {
+    "points": FigureKind("1", "Speeds and turn rates of every clip", "none", draw_points),
+    "scenario-circle": FigureKind("4a", "A trial at constant speed", "one", draw_circle, ("circle",)),
+    "scenario-switching": FigureKind("4b", "A trial whose speed switches", "one", draw_switching, ("switching",)),
+    "offsets": FigureKind("5", "Distance from the path", "none", draw_offsets),
+    "density": FigureKind("6", "Where the data is", "none", draw_density),
+    "transition-cost": FigureKind("7", "Cost of transitions over a trial", "one", draw_transition_costs),
+    "errors": FigureKind("8", "Errors of speed and turn rate", "one", draw_errors),
+    "usage": FigureKind("9", "Usage of the clips", "any", draw_usage),
+    "clip-graph": FigureKind("10", "Frames and transitions", "any", draw_clip_graph),
+    "directions": FigureKind("", "Forward, backward and sideways", "none", draw_directions),
+    "holes": FigureKind("", "What is missing", "none", draw_holes),
+    "frame-use": FigureKind("", "Which parts of the clips are used", "any", draw_frame_use),
+}
+"""Every figure by the name it is asked for."""
+
+
+def draw_figure(
+    name: str,
+    result: EvaluationResult,
+    *,
+    trial: str | None = None,
+    other: EvaluationResult | None = None,
+    labels: tuple[str, str] = ("before", "after"),
+    options: FigureOptions | None = None,
+) -> DrawnFigure:
+    """Draw one figure of a result, or of two results on shared scales.
+
+    Parameters
+    ----------
+    name : one of `FIGURES`
+    trial : name of the trial to show, such as "switching v=1.5 w=-50". Without it, figures of one trial show the one
+        that was followed worst, and the others the whole suite
+    other : the result to compare with, drawn second
+    labels : what the two are called in a comparison
+
+    Raises
+    ------
+    MotionError    for a figure or a trial that there is not, or a trial without its record
+    """
+    kind = FIGURES.get(name)
+    if kind is None:
+        raise MotionError(f"there is no figure {name!r}; choose from {', '.join(FIGURES)}", code="unknown-figure")
+    if trial is not None and kind.trials == "none":
+        raise MotionError(f"the figure {name!r} shows the whole suite, not a trial", code="figure-without-trial")
+    subjects = [Subject("", result)] if other is None else [Subject(labels[0], result), Subject(labels[1], other)]
+    return finish(kind.draw(subjects, trial, options or FigureOptions()), name, kind.number, kind.title)
+
+
+def draw_figures(
+    result: EvaluationResult,
+    *,
+    other: EvaluationResult | None = None,
+    labels: tuple[str, str] = ("before", "after"),
+    options: FigureOptions | None = None,
+) -> dict[str, DrawnFigure]:
+    """Every figure that can be drawn of a result, or of two, by name.
+
+    Left out are those of trials that there are not, and those that need records where these were not kept.
+    """
+    results = [result] if other is None else [result, other]
+    names = set.intersection(*({each.trial.name for each in one.trials} for one in results))
+    families = {each.trial.family for each in result.trials if each.trial.name in names}
+    with_records = all(one.records for one in results)
+    return {
+        name: draw_figure(name, result, other=other, labels=labels, options=options)
+        for name, kind in FIGURES.items()
+        if kind.trials != "one" or (with_records and families.intersection(kind.families))
+    }

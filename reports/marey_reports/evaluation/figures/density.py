@@ -1,0 +1,225 @@
+"""Figure 6: where the data is dense, as seconds of data; and the same over forward and sideways speed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.evaluation.result import Coverage
+from marey_reports.drawing.drawn import Sketch
+from marey_reports.drawing.paper import (
+    LIGHT,
+    MORE_IS_DENSER,
+    Place,
+    add_colour_bar,
+    add_panel,
+    new_figure,
+    nice_ceiling,
+    reach,
+    square_root_ticks,
+    write,
+)
+from marey_reports.evaluation.figures.axes import SPEED, TURN_RATE
+from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+FINE = 144  # cells of the drawn map per axis
+BANDWIDTH = 0.35  # standard deviation of the smoothing, in cells of the trial grid
+NOTICED_M_S = 0.1  # slower than this a body stands, whichever way it sways
+DIRECTION_CELL_M_S = 0.25
+
+
+class _Plane(NamedTuple):
+    """Two quantities of the windows, what they are called, and the size of the cell that seconds are counted in."""
+
+    x: Callable[[Coverage], Floats]
+    y: Callable[[Coverage], Floats]
+    labels: tuple[str, str]
+    names: tuple[str, str]
+    cell: Callable[[Coverage], tuple[float, float]]
+    cell_label: str
+    about: str
+
+
+def _grid_cell(coverage: Coverage) -> tuple[float, float]:
+    return (
+        float(np.median(np.diff(coverage.turn_rate_edges_deg_s))),
+        float(np.median(np.diff(coverage.speed_edges_m_s))),
+    )
+
+
+SPEEDS = _Plane(
+    x=lambda coverage: np.degrees(coverage.turn_rate_rad_s),
+    y=lambda coverage: coverage.speed_m_s,
+    labels=(TURN_RATE, SPEED),
+    names=("turn_rate_deg_s", "speed_m_s"),
+    cell=_grid_cell,
+    cell_label="seconds of data around one trial",
+    about="Brighter is where the clips hold more seconds. The frame is the grid of trials.",
+)
+DIRECTIONS = _Plane(
+    x=lambda coverage: coverage.strafe_m_s,
+    y=lambda coverage: coverage.forward_m_s,
+    labels=("sideways (m/s, left positive)", "forward (m/s, backward negative)"),
+    names=("strafe_m_s", "forward_m_s"),
+    cell=lambda _: (DIRECTION_CELL_M_S, DIRECTION_CELL_M_S),
+    cell_label="seconds of data per 0.25 x 0.25 m/s",
+    about="Which way the body moves as seen from where it faces; a speed alone hides backward and sideways motion.",
+)
+
+
+def draw_density(subjects: Sequence[Subject], _trial: str | None, _options: FigureOptions) -> Sketch:
+    """Figure 6: over turn rate and speed."""
+    return _draw(subjects, SPEEDS)
+
+
+def draw_directions(subjects: Sequence[Subject], _trial: str | None, _options: FigureOptions) -> Sketch:
+    """Over sideways and forward speed."""
+    return _draw(subjects, DIRECTIONS)
+
+
+def _draw(subjects: Sequence[Subject], plane: _Plane) -> Sketch:
+    edges = _edges(subjects, plane)
+    cell = plane.cell(subjects[0].result.coverage)
+    maps = [_seconds(subject, plane, edges, cell) for subject in subjects]
+    two = len(subjects) > 1
+    width, height, gap = (2.62, 2.7, 0.3) if two else (5.9, 3.9, 0.3)
+    figure = new_figure(9.6 if two else 7.6, height + (1.75 if two else 0.75))
+    bottom = 1.3 if two else 0.58
+    ceiling = nice_ceiling(max(float(each.max()) for each in maps))
+    for number, (subject, each) in enumerate(zip(subjects, maps, strict=True)):
+        place = Place(0.68 + number * (width + gap), bottom, width, height)
+        x, y = plane.labels
+        panel = add_panel(figure, place, title=subject.label, x=x, y=y if number == 0 else "", grid=False)
+        panel.tick_params(labelleft=number == 0)
+        drawn = panel.pcolormesh(
+            *edges, each, cmap=MORE_IS_DENSER, norm=_norm(ceiling), rasterized=True, shading="flat"
+        )
+        _frame(panel, subject.result.coverage, plane)
+        if not each.any():
+            write(
+                panel, (0.5, 0.5), "no clip of a second or longer", transform=panel.transAxes, ha="center", color=LIGHT
+            )
+    if two:
+        add_colour_bar(
+            figure, drawn, Place(0.68, 0.52, 2 * width + gap, 0.12), plane.cell_label, square_root_ticks(ceiling)
+        )
+        _draw_change(figure, Place(0.68 + 2 * (width + gap), bottom, width, height), plane, edges, maps)
+    else:
+        add_colour_bar(
+            figure,
+            drawn,
+            Place(0.68 + width + 0.15, bottom, 0.14, height),
+            plane.cell_label,
+            square_root_ticks(ceiling),
+        )
+    return Sketch(figure, {"density": _table(subjects, plane, edges, maps)}, _caption(subjects, plane))
+
+
+def _edges(subjects: Sequence[Subject], plane: _Plane) -> tuple[Floats, Floats]:
+    """Edges of the fine cells along both axes: the grid of trials and the windows, but for a few far ones."""
+    spans = []
+    for axis, values in enumerate((plane.x, plane.y)):
+        found = np.concatenate([values(subject.result.coverage) for subject in subjects])
+        targets = [_target(subject.result.coverage, plane)[axis] for subject in subjects]
+        high = 1.03 * reach(np.maximum(found, 0.0), max(float(each[1]) for each in targets))
+        low = -1.03 * reach(np.maximum(-found, 0.0), max(-float(each[0]) for each in targets))
+        if axis == 0:
+            low, high = -max(-low, high), max(-low, high)  # left and right alike
+        spans.append(np.linspace(low, high, FINE + 1))
+    return spans[0], spans[1]
+
+
+def _target(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float], tuple[float, float]]:
+    """What has to be seen even without data there, along both axes."""
+    fastest = float(coverage.speed_edges_m_s[-1])
+    if plane is DIRECTIONS:
+        return (-1.0, 1.0), (-1.0, fastest)
+    turn = coverage.turn_rate_edges_deg_s
+    return (float(turn[0]), float(turn[-1])), (0.0, fastest)
+
+
+def _seconds(subject: Subject, plane: _Plane, edges: tuple[Floats, Floats], cell: tuple[float, float]) -> Floats:
+    """(FINE, FINE) seconds of data that a trial's cell around each fine cell would hold, smoothed for display."""
+    from scipy.ndimage import gaussian_filter
+
+    coverage = subject.result.coverage
+    counts, _, _ = np.histogram2d(plane.y(coverage), plane.x(coverage), bins=[edges[1], edges[0]])
+    fine = np.array([float(edges[1][1] - edges[1][0]), float(edges[0][1] - edges[0][0])])
+    sizes = np.array(cell[::-1]) / fine
+    smooth = gaussian_filter(counts, BANDWIDTH * sizes, mode="constant", truncate=4.0)
+    return np.asarray(smooth * subject.seconds_per_row * sizes.prod(), dtype=np.float64)
+
+
+def _norm(ceiling: float) -> Any:
+    """Square roots, so that little data is told from none."""
+    from matplotlib.colors import PowerNorm
+
+    return PowerNorm(0.5, vmin=0.0, vmax=ceiling)
+
+
+def _frame(panel: Axes, coverage: Coverage, plane: _Plane) -> None:
+    """The outline of the grid of trials, or where forward and sideways speed are zero."""
+    look: dict[str, Any] = {"color": LIGHT, "lw": 0.8, "alpha": 0.8}
+    if plane is DIRECTIONS:
+        panel.axhline(0.0, **look)
+        panel.axvline(0.0, **look)
+        return
+    left, right = coverage.turn_rate_edges_deg_s[[0, -1]]
+    low, high = coverage.speed_edges_m_s[[0, -1]]
+    panel.plot([left, right, right, left, left], [low, low, high, high, low], ls=(0, (4, 3)), **look)
+
+
+def _draw_change(
+    figure: Figure, place: Place, plane: _Plane, edges: tuple[Floats, Floats], maps: Sequence[Floats]
+) -> None:
+    from matplotlib.colors import SymLogNorm
+
+    change = maps[1] - maps[0]
+    largest = nice_ceiling(float(np.abs(change).max()))
+    panel = add_panel(figure, place, title="change", x=plane.labels[0], grid=False)
+    panel.tick_params(labelleft=False)
+    norm = SymLogNorm(linthresh=0.1 * largest, linscale=1.0, vmin=-largest, vmax=largest)
+    drawn = panel.pcolormesh(*edges, change, cmap="PuOr", norm=norm, rasterized=True, shading="flat")
+    bar = add_colour_bar(figure, drawn, Place(place.left, 0.52, place.width, 0.12), "seconds more (violet) or less")
+    bar.set_xticks([-largest, -0.1 * largest, 0.1 * largest, largest])
+    bar.set_xticklabels([f"{value:+g}" for value in (-largest, -0.1 * largest, 0.1 * largest, largest)])
+    bar.minorticks_off()
+
+
+def _table(
+    subjects: Sequence[Subject], plane: _Plane, edges: tuple[Floats, Floats], maps: Sequence[Floats]
+) -> dict[str, object]:
+    x, y = (0.5 * (each[:-1] + each[1:]) for each in edges)
+    table: dict[str, object] = {plane.names[0]: np.tile(x, len(y)), plane.names[1]: np.repeat(y, len(x))}
+    for subject, each in zip(subjects, maps, strict=True):
+        table[subject.column("seconds_s")] = each.ravel()
+    return table
+
+
+def _caption(subjects: Sequence[Subject], plane: _Plane) -> str:
+    parts = []
+    for subject in subjects:
+        coverage = subject.result.coverage
+        held = len(coverage.clip) * subject.seconds_per_row
+        if plane is SPEEDS:
+            parts.append(
+                f"{subject.prefix}{held:.0f} s of data, {100 * coverage.index:.0f} % of the trials have enough of it, "
+                f"left-right symmetry {coverage.symmetry:.2f}."
+            )
+        else:
+            strafe, forward = np.abs(coverage.strafe_m_s), np.abs(coverage.forward_m_s)
+            backward = float(np.mean(coverage.forward_m_s < -NOTICED_M_S)) if held else 0.0
+            sideways = float(np.mean((strafe > forward) & (strafe > NOTICED_M_S))) if held else 0.0
+            parts.append(
+                f"{subject.prefix}{100 * backward:.0f} % of the time backward, {100 * sideways:.0f} % mainly sideways."
+            )
+    return f"{plane.about} {' '.join(parts)}"

@@ -1,0 +1,212 @@
+"""Figure 5: how far from the wished path the character was, over the grid of speeds and turn rates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_reports.drawing.drawn import Sketch
+from marey_reports.drawing.paper import (
+    CHANGE,
+    DARK,
+    LIGHT,
+    MORE_IS_WORSE,
+    SMALL,
+    Place,
+    add_colour_bar,
+    add_panel,
+    luminance,
+    new_figure,
+    nice_levels,
+    write,
+)
+from marey_reports.evaluation.figures.axes import SPEED, TURN_RATE
+from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+FAMILY_TITLES = {"circle": "Constant speed", "switching": "Switching speed"}
+
+
+class _Field(NamedTuple):
+    """Mean offset of the trials of one family on their grid; NaN where there is no trial."""
+
+    turn_rates_deg_s: Floats
+    speeds_m_s: Floats
+    offset_m: Floats
+
+
+def draw_offsets(subjects: Sequence[Subject], _trial: str | None, _options: FigureOptions) -> Sketch:
+    """A row per family of trials; two subjects share the scale, and a third column shows the change."""
+    families = [family for family in subjects[0].result.options.families if family in FAMILY_TITLES]
+    fields = [[_field(subject, family) for subject in subjects] for family in families]
+    levels = nice_levels(max(_largest(field) for row in fields for field in row))
+    if len(subjects) == 1:
+        figure = _draw_one(families, [row[0] for row in fields], levels)
+    else:
+        figure = _draw_two(subjects, families, fields, levels)
+    return Sketch(figure, {"offsets": _table(subjects, families, fields)}, _caption(subjects, families, fields))
+
+
+def _field(subject: Subject, family: str) -> _Field:
+    trials = [each for each in subject.result.trials if each.trial.family == family]
+    speeds = np.unique([each.trial.speed_m_s for each in trials])
+    turn_rates = np.unique([np.round(np.degrees(each.trial.turn_rate_rad_s), 9) for each in trials])
+    offset = np.full((len(speeds), len(turn_rates)), np.nan)
+    for each in trials:
+        row = np.searchsorted(speeds, each.trial.speed_m_s)
+        column = np.searchsorted(turn_rates, np.round(np.degrees(each.trial.turn_rate_rad_s), 9))
+        value = each.metrics.get("offset_mean")
+        offset[row, column] = np.nan if value is None else value
+    return _Field(turn_rates, speeds, offset)
+
+
+def _largest(field: _Field) -> float:
+    """Offset or change of it, whatever its sign; 0 where nothing is known."""
+    return float(np.abs(np.nan_to_num(field.offset_m)).max(initial=0.0))
+
+
+def _draw_one(families: Sequence[str], fields: Sequence[_Field], levels: Floats) -> Figure:
+    width, height = 3.75, 3.3
+    figure = new_figure(0.7 + len(families) * (width + 0.35) + 0.75, height + 1.05)
+    drawn = None
+    for number, (family, field) in enumerate(zip(families, fields, strict=True)):
+        place = Place(0.62 + number * (width + 0.35), 0.58, width, height)
+        labels = {"x": TURN_RATE, "y": SPEED if number == 0 else ""}
+        drawn = _draw_field(figure, place, field, FAMILY_TITLES[family], labels, levels, MORE_IS_WORSE) or drawn
+    if drawn is not None:
+        bar = Place(0.62 + len(families) * (width + 0.35) - 0.12, 0.58, 0.14, height)
+        add_colour_bar(figure, drawn, bar, "mean offset (m)", levels)
+    return figure
+
+
+def _draw_two(
+    subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]], levels: Floats
+) -> Figure:
+    width, height, gap = 2.54, 2.3, 0.42
+    figure = new_figure(9.6, len(families) * (height + 0.85) + 0.95)
+    changes = [_change(*row) for row in fields]
+    upward = nice_levels(max(_largest(change) for change in changes))
+    both_ways = np.concatenate((-upward[:0:-1], upward))
+    shared, changed = None, None
+    for number, (family, row, change) in enumerate(zip(families, fields, changes, strict=True)):
+        bottom = 1.3 + (len(families) - 1 - number) * (height + 0.85)
+        last = number == len(families) - 1
+        titles = [subject.label for subject in subjects] if number == 0 else ["", ""]
+        for column, field in enumerate(row):
+            place = Place(0.85 + column * (width + gap), bottom, width, height)
+            labels = {"x": TURN_RATE if last else "", "y": f"{FAMILY_TITLES[family]}\n{SPEED}" if column == 0 else ""}
+            shared = _draw_field(figure, place, field, titles[column], labels, levels, MORE_IS_WORSE) or shared
+        place = Place(0.85 + 2 * (width + gap), bottom, width, height)
+        labels = {"x": TURN_RATE if last else "", "y": ""}
+        title = "change" if number == 0 else ""
+        changed = _draw_field(figure, place, change, title, labels, both_ways, CHANGE) or changed
+    if shared is not None:
+        add_colour_bar(figure, shared, Place(0.85, 0.52, 2 * width + gap, 0.12), "mean offset (m)", levels)
+    if changed is not None:
+        place = Place(0.85 + 2 * (width + gap), 0.52, width, 0.12)
+        add_colour_bar(
+            figure,
+            changed,
+            place,
+            "change of the mean offset (m), blue is better",
+            np.concatenate((-upward[:0:-1], upward))[:: max(1, (len(upward) - 1) // 2)],
+        )
+    return figure
+
+
+def _change(before: _Field, after: _Field) -> _Field:
+    """after - before on the grid points that both have."""
+    turn_rates = np.intersect1d(before.turn_rates_deg_s, after.turn_rates_deg_s)
+    speeds = np.intersect1d(before.speeds_m_s, after.speeds_m_s)
+    first, second = (
+        field.offset_m[np.ix_(np.isin(field.speeds_m_s, speeds), np.isin(field.turn_rates_deg_s, turn_rates))]
+        for field in (before, after)
+    )
+    return _Field(turn_rates, speeds, second - first)
+
+
+def _draw_field(
+    figure: Figure,
+    place: Place,
+    field: _Field,
+    title: str,
+    labels: dict[str, str],
+    levels: Floats,
+    colours: str,
+) -> Any:
+    """Filled contours and one dot per trial; dots alone where trials span no area. None for no trials."""
+    panel = add_panel(figure, place, title=title, grid=False, **labels)
+    known = np.isfinite(field.offset_m)
+    if not known.any():
+        write(panel, (0.5, 0.5), "no trials", transform=panel.transAxes, ha="center")
+        return None
+    turn, speed = np.meshgrid(field.turn_rates_deg_s, field.speeds_m_s)
+    drawn: Any = None
+    if min(field.offset_m.shape) > 1 and np.all(known):
+        drawn = panel.contourf(turn, speed, field.offset_m, levels=levels, cmap=colours, extend="neither")
+    dots = panel.scatter(
+        turn[known], speed[known], c=field.offset_m[known], s=16, cmap=colours, vmin=levels[0], vmax=levels[-1], lw=0.6,
+        zorder=4, clip_on=False,
+    )  # fmt: skip
+    colours_of_dots = dots.cmap(dots.norm(field.offset_m[known]))
+    dots.set_edgecolor([DARK if light else LIGHT for light in luminance(np.asarray(colours_of_dots)) > 0.3])
+    _mark_extreme(panel, field, signed=bool(levels[0] < 0.0))
+    panel.set_xticks(field.turn_rates_deg_s[:: max(1, len(field.turn_rates_deg_s) // 4)])
+    if not labels["y"]:
+        panel.tick_params(labelleft=False)
+    panel.margins(0.02)
+    return drawn or dots
+
+
+def _mark_extreme(panel: Axes, field: _Field, signed: bool) -> None:
+    """The value of the dot that is farthest from zero, beside it."""
+    row, column = np.unravel_index(np.nanargmax(np.abs(field.offset_m)), field.offset_m.shape)
+    right, up = column <= field.offset_m.shape[1] // 2, row <= field.offset_m.shape[0] // 2
+    panel.annotate(
+        f"{field.offset_m[row, column]:{'+' if signed else ''}.2f} m",
+        (float(field.turn_rates_deg_s[column]), float(field.speeds_m_s[row])),
+        (6 if right else -6, 6 if up else -6),
+        textcoords="offset points",
+        fontsize=SMALL,
+        fontweight="bold",
+        color=DARK,
+        ha="left" if right else "right",
+        va="bottom" if up else "top",
+        bbox={"facecolor": LIGHT, "alpha": 0.75, "lw": 0, "pad": 1.5},
+        zorder=5,
+    )
+
+
+def _table(
+    subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]]
+) -> dict[str, list[object]]:
+    names = ("dataset", "family", "speed_m_s", "turn_rate_deg_s", "offset_mean_m")
+    table: dict[str, list[object]] = {name: [] for name in names}
+    for family, row in zip(families, fields, strict=True):
+        for subject, field in zip(subjects, row, strict=True):
+            for speed, values in zip(field.speeds_m_s, field.offset_m, strict=True):
+                for turn_rate, value in zip(field.turn_rates_deg_s, values, strict=True):
+                    for name, entry in zip(
+                        names, (subject.label, family, float(speed), float(turn_rate), float(value)), strict=True
+                    ):
+                        table[name].append(entry)
+    return table
+
+
+def _caption(subjects: Sequence[Subject], families: Sequence[str], fields: Sequence[Sequence[_Field]]) -> str:
+    parts = []
+    for family, row in zip(families, fields, strict=True):
+        for subject, field in zip(subjects, row, strict=True):
+            if np.isfinite(field.offset_m).any():
+                name = f"{subject.label}, {FAMILY_TITLES[family].lower()}" if subject.label else FAMILY_TITLES[family]
+                low, middle, high = np.nanquantile(field.offset_m, (0.0, 0.5, 1.0))
+                parts.append(f"{name}: {low:.2f} to {high:.2f} m, median {middle:.2f} m")
+    return "Mean distance to the wished place over each trial; dots are trials. " + "; ".join(parts) + "."

@@ -1,0 +1,154 @@
+"""Figures 4a and 4b: a trial seen from above, its sections numbered, and where the character went."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.evaluation.scenario import Family, Reference, Trial, reference
+from marey_reports.drawing.drawn import Sketch
+from marey_reports.drawing.paper import COLOURS, INK, PAPER, REFERENCE, SMALL, Place, add_keys, add_panel, new_figure
+from marey_reports.evaluation.figures.subjects import FigureOptions, Subject, choose_trial, find_record
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Floats = NDArray[np.float64]
+
+SIDE, GAP = 3.9, 0.75
+# Where within a section its number may stand, the middle first.
+NUMBER_PLACES = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)
+
+
+def draw_circle(subjects: Sequence[Subject], trial: str | None, _options: FigureOptions) -> Sketch:
+    """Figure 4a: one speed throughout."""
+    return _draw(subjects, trial, "circle")
+
+
+def draw_switching(subjects: Sequence[Subject], trial: str | None, _options: FigureOptions) -> Sketch:
+    """Figure 4b: the speed switches from section to section."""
+    return _draw(subjects, trial, "switching")
+
+
+def _draw(subjects: Sequence[Subject], name: str | None, family: Family) -> Sketch:
+    trial = choose_trial(subjects, name, (family,))
+    guide = reference(trial, look_ahead_s=0.0)
+    sections = _sections(trial, guide.tick_count, guide.rate_hz)
+    followed = [_followed(subject, trial) for subject in subjects]
+    limits = _limits([guide.positions, *(path for path in followed if path is not None)])
+    figure = new_figure(0.75 + len(subjects) * (SIDE + GAP), SIDE + (1.15 if len(subjects) > 1 else 0.9))
+    for number, (subject, path) in enumerate(zip(subjects, followed, strict=True)):
+        place = Place(0.7 + number * (SIDE + GAP), 0.72, SIDE, SIDE)
+        panel = add_panel(
+            figure, place, title=subject.label, x="x (m, left positive)", y="z (m)" if number == 0 else ""
+        )
+        if path is not None:
+            panel.plot(*path.T, color=COLOURS[number], lw=1.1, alpha=0.85, zorder=2, label="recorded")
+        panel.plot(*guide.positions.T, color=REFERENCE, lw=1.8, zorder=3, label="asked for")
+        panel.plot(0.0, 0.0, "o", color=INK, ms=5, zorder=4)
+        _number_sections(panel, guide.positions, sections, limits)
+        panel.set(xlim=limits[0][::-1], ylim=limits[1])
+        add_keys(panel, loc="upper center", bbox_to_anchor=(0.5, -0.115), ncols=2)
+    tables = {"sections": _section_table(trial, sections, guide.rate_hz), "paths": _paths(guide, subjects, followed)}
+    return Sketch(figure, tables, _caption(trial, sections, guide.rate_hz))
+
+
+def _followed(subject: Subject, trial: Trial) -> Floats | None:
+    """Where the character went, when the record was kept."""
+    return find_record(subject, trial.name).positions if subject.result.records else None
+
+
+def _sections(trial: Trial, ticks: int, rate_hz: float) -> list[tuple[int, int, float]]:
+    """First and end tick of each section and its speed; the first is the approach."""
+    bounds = [0.0, trial.approach_s]
+    end_s = ticks / rate_hz
+    if trial.family == "switching":
+        bounds += list(np.arange(trial.approach_s + trial.switch_every_s, end_s - 1e-9, trial.switch_every_s))
+    edges = [*(round(bound * rate_hz) for bound in bounds), ticks]
+    speeds = [
+        trial.switch_speed_m_s if trial.family == "switching" and number >= 2 and number % 2 == 0 else trial.speed_m_s
+        for number in range(len(bounds))
+    ]
+    return [
+        (start, stop, speed) for start, stop, speed in zip(edges[:-1], edges[1:], speeds, strict=True) if stop > start
+    ]
+
+
+def _limits(paths: Sequence[Floats]) -> tuple[tuple[float, float], tuple[float, float]]:
+    """A square that holds all paths, the same for both panels."""
+    low = np.min([path.min(axis=0) for path in paths], axis=0)
+    high = np.max([path.max(axis=0) for path in paths], axis=0)
+    centre, half = 0.5 * (low + high), 0.56 * max(float((high - low).max()), 0.5)
+    return (float(centre[0] - half), float(centre[0] + half)), (float(centre[1] - half), float(centre[1] + half))
+
+
+def _number_sections(
+    panel: Axes,
+    path: Floats,
+    sections: Sequence[tuple[int, int, float]],
+    limits: tuple[tuple[float, float], tuple[float, float]],
+) -> None:
+    """Each number on its section, as far from the numbers before as its section allows."""
+    span = limits[0][1] - limits[0][0]
+    placed: list[Floats] = []
+    for number, (start, stop, _) in enumerate(sections, start=1):
+        candidates = [path[min(round(start + share * (stop - start)), len(path) - 1)] for share in NUMBER_PLACES]
+        free = [_room(candidate, placed) for candidate in candidates]
+        enough = next((index for index, room in enumerate(free) if room > 0.12 * span), int(np.argmax(free)))
+        spot = candidates[enough]
+        placed.append(spot)
+        panel.text(
+            float(spot[0]),
+            float(spot[1]),
+            str(number),
+            fontsize=SMALL,
+            color=INK,
+            ha="center",
+            va="center",
+            zorder=6,
+            fontweight="bold",
+            bbox={"boxstyle": "circle,pad=0.25", "facecolor": PAPER, "edgecolor": REFERENCE, "linewidth": 0.8},
+        )
+
+
+def _room(spot: Floats, placed: Sequence[Floats]) -> float:
+    return min((float(np.linalg.norm(spot - other)) for other in placed), default=np.inf)
+
+
+def _section_table(trial: Trial, sections: Sequence[tuple[int, int, float]], rate_hz: float) -> dict[str, object]:
+    turn_rate = float(np.degrees(trial.turn_rate_rad_s))
+    return {
+        "section": list(range(1, len(sections) + 1)),
+        "start_s": [start / rate_hz for start, _, _ in sections],
+        "stop_s": [stop / rate_hz for _, stop, _ in sections],
+        "speed_m_s": [speed for _, _, speed in sections],
+        "turn_rate_deg_s": [0.0 if number == 0 else turn_rate for number in range(len(sections))],
+    }
+
+
+def _paths(guide: Reference, subjects: Sequence[Subject], followed: Sequence[Floats | None]) -> dict[str, object]:
+    table: dict[str, object] = {
+        "time_s": np.arange(len(guide.positions)) / guide.rate_hz,
+        "reference_x_m": guide.positions[:, 0],
+        "reference_z_m": guide.positions[:, 1],
+    }
+    for subject, path in zip(subjects, followed, strict=True):
+        if path is not None:
+            table[subject.column("x_m")], table[subject.column("z_m")] = path[:, 0], path[:, 1]
+    return table
+
+
+def _caption(trial: Trial, sections: Sequence[tuple[int, int, float]], rate_hz: float) -> str:
+    turn = np.degrees(trial.turn_rate_rad_s)
+    straight = sections[0][1] / rate_hz
+    text = f"Seen from above, from the dot: {straight:g} s straight at {trial.speed_m_s:g} m/s (1), "
+    side = "straight on" if turn == 0 else f"to the {'left' if turn > 0 else 'right'} at {abs(turn):g} deg/s"
+    if trial.family == "switching":
+        return (
+            f"{text}then {side}, switching between {trial.speed_m_s:g} and {trial.switch_speed_m_s:g} m/s every "
+            f"{trial.switch_every_s:g} s (2 to {len(sections)})."
+        )
+    return f"{text}then {side} at the same speed for {trial.duration_s:g} s (2)."

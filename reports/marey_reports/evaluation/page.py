@@ -1,0 +1,89 @@
+"""Reports of evaluations for people: one HTML file each, which needs no network and no other file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from marey_motion.evaluation.compare import Comparison
+from marey_motion.evaluation.result import EvaluationResult
+from marey_reports.drawing.markup import element
+from marey_reports.drawing.page import Section, page
+from marey_reports.evaluation.chapters import (
+    appendix_chapter,
+    baseline_chapter,
+    coverage_chapter,
+    error_chapter,
+    headline,
+    load_chapter,
+    notes,
+    recording_chapter,
+    unused_chapter,
+)
+from marey_reports.evaluation.comparison import (
+    clip_chapter,
+    compared,
+    coverage_of_two_chapter,
+    headline_of_two,
+    metric_chapter,
+    trial_chapter,
+)
+from marey_reports.evaluation.definitions import definitions
+from marey_reports.evaluation.figures import DrawnFigure, draw_figures
+from marey_reports.evaluation.provenance import provenance
+from marey_reports.evaluation.verdict import verdict
+
+__all__ = ["compared", "render_comparison", "render_report", "verdict"]
+
+
+def render_report(result: EvaluationResult, *, title: str, figures: Mapping[str, DrawnFigure] | None = None) -> str:
+    """The report of one evaluation as an HTML document.
+
+    Parameters
+    ----------
+    title : heading of the page, for example the name of the dataset
+    figures : by name, as `draw_figures` gives them; drawn when None. Those that are missing leave no gap
+    """
+    drawn = draw_figures(result) if figures is None else figures
+    sections = [
+        coverage_chapter(result, drawn),
+        error_chapter(result, drawn),
+        load_chapter(result, drawn),
+        unused_chapter(result),
+        recording_chapter(result, drawn),
+        baseline_chapter(result),
+        appendix_chapter(result),
+        Section("definitions", "What the numbers mean", definitions()),
+        Section("provenance", "Where this comes from", (provenance([result], ["value"]), notes(result))),
+    ]
+    lead = element("p", verdict(result), class_="verdict"), headline(result)
+    return page(title, lead, sections, f"Written by Marey {result.provenance.code_version}.")
+
+
+def render_comparison(
+    before: EvaluationResult,
+    after: EvaluationResult,
+    *,
+    title: str,
+    comparison: Comparison | None = None,
+    labels: tuple[str, str] = ("before", "after"),
+    figures: Mapping[str, DrawnFigure] | None = None,
+) -> str:
+    """The report of two evaluations as an HTML document.
+
+    Parameters
+    ----------
+    comparison : of the two; it adds intervals of confidence, and says which trials differ in any tick
+    labels : what figures and tables call the two
+    figures : by name, as `draw_figures` gives them for two results; drawn when None
+    """
+    drawn = draw_figures(before, other=after, labels=labels) if figures is None else figures
+    sections = [
+        metric_chapter(before, after, comparison, labels),
+        trial_chapter(before, after, comparison, drawn),
+        clip_chapter(before, after, drawn),
+        coverage_of_two_chapter(drawn),
+        Section("definitions", "What the numbers mean", definitions()),
+        Section("provenance", "Where this comes from", provenance([before, after], labels)),
+    ]
+    lead = element("p", compared(before, after), class_="verdict"), headline_of_two(before, after, labels)
+    return page(title, lead, sections, f"Written by Marey {after.provenance.code_version}.")

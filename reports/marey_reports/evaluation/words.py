@@ -1,0 +1,85 @@
+"""Speeds, turn rates and what is missing as an animator says them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.evaluation.result import Coverage
+from marey_motion.evaluation.scenario import STRAIGHT_DEG_S
+from marey_reports.drawing.words import span
+
+Floats = NDArray[np.float64]
+
+
+class Hole(NamedTuple):
+    """Neighbouring cells of one speed that lack data: what to record there, and how much.
+
+    Parameters
+    ----------
+    turn_rates_deg_s, speeds_m_s : (low, high)
+    missing_s : seconds of data that lack in all
+    """
+
+    turn_rates_deg_s: tuple[float, float]
+    speeds_m_s: tuple[float, float]
+    missing_s: float
+
+    @property
+    def words(self) -> str:
+        """For example "left turns of 75 to 100 degrees a second at 2 to 3 m/s"."""
+        return f"{turning(*self.turn_rates_deg_s)} at {span(*self.speeds_m_s)} m/s"
+
+
+def find_holes(coverage: Coverage) -> list[Hole]:
+    """What is missing as few rectangles of cells, the largest deficit first.
+
+    Cells are joined along the turn rate within one side (left, straight on, right), then runs that are alike along the
+    speed. A rectangle is named by the centres of its outermost cells: they are the trials that it stands for.
+    """
+    lacking = coverage.deficit_s > 0.0
+    speeds, turns = (_centres(edges) for edges in (coverage.speed_edges_m_s, coverage.turn_rate_edges_deg_s))
+    sides = np.where(np.abs(turns) <= STRAIGHT_DEG_S, 0.0, np.sign(turns))
+    done: list[tuple[int, int, int, int]] = []  # first and last column, first and last row
+    for row in range(len(lacking)):
+        for first, last in _runs(lacking[row], sides):
+            before = next((hole for hole in done if hole[:2] == (first, last) and hole[3] == row - 1), None)
+            if before is not None:
+                done[done.index(before)] = (first, last, before[2], row)
+            else:
+                done.append((first, last, row, row))
+    holes = [
+        Hole(
+            (float(turns[first]), float(turns[last])),
+            (float(speeds[low]), float(speeds[high])),
+            float(coverage.deficit_s[low : high + 1, first : last + 1].sum()),
+        )
+        for first, last, low, high in done
+    ]
+    return sorted(holes, key=lambda hole: (-hole.missing_s, hole))
+
+
+def turning(low_deg_s: float, high_deg_s: float) -> str:
+    """A range of turn rates of one side."""
+    least, most = sorted((abs(low_deg_s), abs(high_deg_s)))
+    if most <= STRAIGHT_DEG_S:
+        return "straight ahead"
+    side = "left" if low_deg_s + high_deg_s > 0.0 else "right"
+    return f"{side} turns of {span(least, most)} degrees a second"
+
+
+def _centres(edges: Floats) -> Floats:
+    return np.round(0.5 * (edges[:-1] + edges[1:]), 9)
+
+
+def _runs(lacking: NDArray[np.bool_], sides: Floats) -> list[tuple[int, int]]:
+    """First and last of each run of lacking cells that lie on one side."""
+    runs: list[tuple[int, int]] = []
+    for column in np.flatnonzero(lacking).tolist():
+        if runs and runs[-1][1] == column - 1 and sides[column] == sides[column - 1]:
+            runs[-1] = (runs[-1][0], column)
+        else:
+            runs.append((column, column))
+    return runs

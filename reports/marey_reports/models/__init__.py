@@ -1,0 +1,1 @@
+"""Reports of models, and their figures."""

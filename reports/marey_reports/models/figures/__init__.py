@@ -1,0 +1,70 @@
+"""The figures of a model: how its examples were aligned, what it keeps of them, what it does, and how well.
+
+matplotlib is loaded when the first figure is drawn. The same model and examples give the same bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from marey_motion.alignment.aligned import AlignedSet
+from marey_reports.drawing.drawn import DrawnFigure, Sketch, finish
+from marey_reports.models.figures.alignment_costs import draw_alignment_costs
+from marey_reports.models.figures.components import draw_component, draw_mean
+from marey_reports.models.figures.latent_space import draw_latent_space, draw_likelihood
+from marey_reports.models.figures.samples import draw_paths, draw_samples
+from marey_reports.models.figures.search_errors import draw_search_check, draw_search_errors
+from marey_reports.models.figures.spectrum import draw_criterion, draw_reconstruction, draw_variance
+from marey_reports.models.figures.subjects import ModelSubject
+from marey_reports.models.figures.time_warps import draw_time_warps
+from marey_reports.models.figures.timing import draw_durations, draw_time_components
+
+__all__ = ["DrawnFigure", "ModelSubject", "draw_alignment_figures", "draw_model_figures", "draw_search_errors"]
+
+SWEPT_COMPONENTS = 3
+
+ALIGNMENT_FIGURES: dict[str, tuple[str, Callable[[AlignedSet], Sketch | None]]] = {
+    "time-warps": ("How the clips were aligned in time", draw_time_warps),
+    "alignment-costs": ("What the alignment weighed", draw_alignment_costs),
+}
+MODEL_FIGURES: dict[str, tuple[str, Callable[[ModelSubject], Sketch | None]]] = {
+    "mean": ("The mean motion", draw_mean),
+    "samples": ("Examples and samples", draw_samples),
+    "paths": ("Where hands and feet go", draw_paths),
+    "search-errors": ("How near it comes to what is asked", draw_search_check),
+    "durations": ("How long motions last", draw_durations),
+    "time-components": ("What varies in time", draw_time_components),
+    "variance": ("What the components hold", draw_variance),
+    "reconstruction": ("What the components rebuild", draw_reconstruction),
+    "latent-space": ("The latent space", draw_latent_space),
+    "mixture": ("The choice of the mixture", draw_criterion),
+    "likelihood": ("Which examples fit, and which are odd", draw_likelihood),
+}
+"""Title and maker by name. What a maker has nothing to draw of is left out."""
+
+PUBLISHED = {"samples": "17"}
+"""Their numbers in Herrmann et al. (2019)."""
+
+
+def draw_alignment_figures(aligned: AlignedSet) -> dict[str, DrawnFigure]:
+    """Every figure of an alignment, by name."""
+    return _drawn({name: (title, partial(draw, aligned)) for name, (title, draw) in ALIGNMENT_FIGURES.items()})
+
+
+def draw_model_figures(subject: ModelSubject) -> dict[str, DrawnFigure]:
+    """Every figure of a model, by name; the components one by one, as `component-1` and so on."""
+    swept = {
+        f"component-{number + 1}": (f"Component {number + 1} of the poses", partial(draw_component, subject, number))
+        for number in range(min(SWEPT_COMPONENTS, subject.primitive.spatial.count))
+    }
+    return _drawn(swept | {name: (title, partial(draw, subject)) for name, (title, draw) in MODEL_FIGURES.items()})
+
+
+def _drawn(makers: dict[str, tuple[str, Callable[[], Sketch | None]]]) -> dict[str, DrawnFigure]:
+    sketches = {name: (title, draw()) for name, (title, draw) in makers.items()}
+    return {
+        name: finish(sketch, name, PUBLISHED.get(name, ""), title)
+        for name, (title, sketch) in sketches.items()
+        if sketch is not None
+    }

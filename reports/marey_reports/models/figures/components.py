@@ -1,0 +1,82 @@
+"""What each component of a model does: motions from two deviations below to two above the mean."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_reports.drawing.drawn import Sketch
+from marey_reports.drawing.paper import REFERENCE
+from marey_reports.drawing.strips import StripRow, draw_strips
+from marey_reports.models.figures.subjects import ModelSubject, position_table
+
+Floats = NDArray[np.float64]
+
+DEVIATIONS = (-2.0, -1.0, 0.0, 1.0, 2.0)
+CELL_IN = (1.2, 1.3)
+
+
+def draw_mean(subject: ModelSubject) -> Sketch:
+    """The mean motion."""
+    frames, moments = subject.moments()
+    points = subject.points(subject.mean_poses[frames])
+    duration_s = float(subject.primitive.durations_s(np.zeros((1, subject.primitive.dimensions)))[0])
+    row = StripRow("mean", f"{duration_s:.2f} s", points[None], _ways(subject, subject.mean_poses[None]))
+    figure = draw_strips(subject.body, [row], moments, subject.seen_from_rad, cell_in=(CELL_IN[0], 1.9))
+    caption = (
+        f"What the model makes when nothing varies: {duration_s:.2f} s, at {len(frames)} moments of canonical time, "
+        "seen from its front right. The line on the floor is where the root goes."
+    )
+    return Sketch(figure, {"positions": position_table(subject, frames, [("mean", points)])}, caption)
+
+
+def draw_component(subject: ModelSubject, component: int) -> Sketch:
+    """One spatial component, the mean motion behind every figure in grey."""
+    frames, moments = subject.moments()
+    swept = sweep(subject, component)
+    points = subject.points(swept[:, frames])
+    rows = [
+        StripRow(
+            written(deviation), "", points[[place]], _ways(subject, swept[[place]]), points[2] if deviation else None
+        )
+        for place, deviation in enumerate(DEVIATIONS)
+    ]
+    figure = draw_strips(
+        subject.body, rows, moments, subject.seen_from_rad, cell_in=CELL_IN, legend=[("mean motion", REFERENCE)]
+    )
+    share = float(np.diff(subject.primitive.spatial.energy, prepend=0.0)[component])
+    joint, moved_cm = most_moved(subject, points)
+    caption = (
+        f"What it changes ({100 * share:.0f} % of the variance): from two standard "
+        f"deviations of the examples below the mean to two above it. Most of all it moves {joint}, by up to "
+        f"{moved_cm:.0f} cm from end to end."
+    )
+    named = [(written(deviation), points[place]) for place, deviation in enumerate(DEVIATIONS)]
+    return Sketch(figure, {"positions": position_table(subject, frames, named)}, caption)
+
+
+def sweep(subject: ModelSubject, component: int) -> Floats:
+    """(5, N, 3 + 4·J) poses of the motions along a spatial component."""
+    primitive = subject.primitive
+    latents = np.zeros((len(DEVIATIONS), primitive.dimensions))
+    latents[:, component] = np.array(DEVIATIONS) * np.sqrt(primitive.spatial.variances[component])
+    return primitive.poses(latents)
+
+
+def written(deviation: float) -> str:
+    """A number of deviations as rows are called."""
+    return "mean" if not deviation else f"{'+' if deviation > 0 else '−'}{abs(deviation):g} sd"
+
+
+def most_moved(subject: ModelSubject, points: Floats) -> tuple[str, float]:
+    """The joint that differs most between the first and the last row of (rows, T, P, 3), and by how much, in cm."""
+    joints = subject.primitive.skeleton.joint_names
+    apart = np.linalg.norm(points[-1] - points[0], axis=-1)[:, : len(joints)].max(axis=0)
+    joint = int(np.argmax(apart))
+    return joints[joint], 100.0 * float(apart[joint])
+
+
+def _ways(subject: ModelSubject, poses: Floats) -> Any:
+    return subject.points(poses)[:, :, subject.body.pelvis]

@@ -1,0 +1,64 @@
+"""How well constraints are met: the errors of a search over targets that the model should reach."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_reports.drawing.drawn import Sketch
+from marey_reports.drawing.paper import COLOURS, REFERENCE, Place, add_keys, add_panel, new_figure, tick_whole_numbers
+from marey_reports.drawing.words import amount
+from marey_reports.models.figures.subjects import ModelSubject
+
+Floats = NDArray[np.float64]
+
+BINS = 30
+
+
+def draw_search_check(subject: ModelSubject) -> Sketch | None:
+    """Errors of searches for what examples reached; None where they were not measured."""
+    check = subject.check
+    if check is None:
+        return None
+    examples = amount(len(set(check.examples)), "example")
+    about = f"where hands and feet of {examples} were, by a model made without them"
+    sketch = draw_search_errors(check.searched_cm, check.refined_cm, about=about)
+    whose = {"example": check.examples, "joint": check.joints, "canonical_frame": check.frames}
+    return sketch._replace(tables={"errors": {**whose, **sketch.tables["errors"]}})
+
+
+def draw_search_errors(searched_cm: Floats, refined_cm: Floats, *, about: str = "") -> Sketch:
+    """Errors of the same targets after the search of the tree and after refinement.
+
+    Parameters
+    ----------
+    searched_cm, refined_cm : (n,) distance of the joint from its target, centimetres
+    about : what the targets are, for the caption; a clause that ends without a full stop
+    """
+    ceiling = 1.02 * max(float(np.max(searched_cm, initial=0.0)), float(np.max(refined_cm, initial=0.0)), 0.1)
+    edges = np.linspace(0.0, ceiling, BINS + 1)
+    figure = new_figure(8.2, 3.0)
+    panel = add_panel(figure, Place(0.75, 0.65, 5.2, 1.95), x="distance from the target (cm)", y="targets")
+    drawn: tuple[tuple[str, Floats, str, dict[str, Any]], ...] = (
+        ("after the search", searched_cm, REFERENCE, {"histtype": "stepfilled", "alpha": 0.55}),
+        ("after refinement", refined_cm, COLOURS[0], {"histtype": "step", "lw": 1.6}),
+    )
+    for label, values, colour, look in drawn:
+        panel.hist(values, edges.tolist(), color=colour, label=label, **look)
+    panel.set_xlim(0.0, ceiling)
+    tick_whole_numbers(panel.yaxis)
+    add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    table = {"target": np.arange(len(searched_cm)), "searched_cm": searched_cm, "refined_cm": refined_cm}
+    return Sketch(figure, {"errors": table}, _caption(searched_cm, refined_cm, about))
+
+
+def _caption(searched_cm: Floats, refined_cm: Floats, about: str) -> str:
+    if not len(searched_cm):
+        return "No target was searched for."
+    found = [f"{np.median(values):.1f} cm (worst {values.max():.1f} cm)" for values in (searched_cm, refined_cm)]
+    return (
+        f"How near the model comes to {amount(len(searched_cm), 'target')}{f', {about}' if about else ''}: half of "
+        f"them within {found[0]} by the search of its tree alone, and within {found[1]} after refinement."
+    )

@@ -1,0 +1,164 @@
+"""How many numbers a model needs: what components hold, what they cannot rebuild, and the choice of the mixture."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_reports.drawing.drawn import Sketch, Tables
+from marey_reports.drawing.paper import (
+    COLOURS,
+    INK,
+    QUIET,
+    REFERENCE,
+    Place,
+    add_keys,
+    add_panel,
+    new_figure,
+    tick_whole_numbers,
+    write,
+)
+from marey_reports.drawing.words import amount
+from marey_reports.models.figures.subjects import ModelSubject
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Floats = NDArray[np.float64]
+
+MOST_BARS = 40
+
+
+def draw_variance(subject: ModelSubject) -> Sketch:
+    """The share of the variance that the first 1, 2, ... components hold, of poses and of time."""
+    kinds = {
+        "poses": (subject.report.spatial_energy, subject.primitive.spatial.count),
+        "time": (subject.report.temporal_energy, subject.primitive.temporal.count),
+    }
+    figure = new_figure(9.6, 3.5)
+    for place, (kind, (energy, kept)) in zip((Place(0.7, 0.65, 5.4, 2.4), Place(6.8, 0.65, 2.6, 2.4)), kinds.items(),
+                                             strict=True):  # fmt: skip
+        label = "variance held (%)" if kind == "poses" else ""
+        panel = add_panel(figure, place, title=f"{kind}: {kept} of {len(energy)} kept", x="components", y=label)
+        _draw_bars(panel, energy, kept)
+    tables: Tables = {
+        kind: {"components": np.arange(1, len(energy) + 1), "share": energy, "kept": np.arange(len(energy)) < kept}
+        for kind, (energy, kept) in kinds.items()
+    }
+    held = " ".join(_held(kind, *known) for kind, known in kinds.items())
+    return Sketch(
+        figure, tables, f"How much of what varies the first components hold together; blue ones are kept. {held}"
+    )
+
+
+def _draw_bars(panel: Axes, energy: Floats, kept: int) -> None:
+    shown = energy[:MOST_BARS]
+    if not len(shown):
+        write(panel, (0.5, 0.5), "nothing varies", transform=panel.transAxes, ha="center", color=QUIET)
+        panel.set(xticks=[], yticks=[])
+        return
+    numbers = np.arange(1, len(shown) + 1)
+    for chosen, colour, alpha in ((numbers <= kept, COLOURS[0], 1.0), (numbers > kept, REFERENCE, 0.35)):
+        panel.bar(numbers[chosen], 100.0 * shown[chosen], width=0.8, color=colour, alpha=alpha)
+    panel.set(xlim=(0.3, max(len(shown), 4) + 0.7), ylim=(0.0, 109.0))
+    tick_whole_numbers(panel.xaxis)
+    if kept:
+        write(panel, (kept, 100.0 * shown[min(kept, len(shown)) - 1] + 1.0), f"{100.0 * energy[kept - 1]:.0f} %",
+              ha="center", va="bottom", color=INK)  # fmt: skip
+
+
+def _held(kind: str, energy: Floats, kept: int) -> str:
+    if not len(energy):
+        return f"The {kind} of the examples do not vary." if kind == "poses" else "Their time does not vary."
+    lost = 100.0 * (1.0 - float(energy[kept - 1])) if kept else 100.0
+    whose = "The poses of the examples" if kind == "poses" else "Their time"
+    verb = "vary" if kind == "poses" else "varies"
+    return (
+        f"{whose} {verb} in {amount(len(energy), 'independent way')}; the model keeps {kept} of them, and with them "
+        f"{100.0 - lost:.1f} % of the variance."
+    )
+
+
+def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
+    """Error of rebuilt examples over the number of components; None where it was not measured."""
+    errors = subject.report.reconstruction
+    if errors is None:
+        return None
+    kept = subject.primitive.spatial.count
+    figure = new_figure(8.2, 3.6)
+    panel = add_panel(figure, Place(0.75, 0.65, 5.2, 2.5), x="spatial components", y="mean distance of joints (cm)")
+    low, high = np.quantile(errors.left_out_each_cm, (0.1, 0.9), axis=0)
+    if len(errors.left_out_each_cm) > 1:
+        panel.fill_between(errors.components, low, high, color=COLOURS[1], alpha=0.18, lw=0, label="8 of 10 examples")
+        panel.plot(errors.components, errors.left_out_cm, color=COLOURS[1], marker="s", ms=3.5, lw=1.4,
+                   label="examples it has not seen")  # fmt: skip
+    panel.plot(errors.components, errors.training_cm, color=COLOURS[0], marker="o", ms=3.5, lw=1.4,
+               label="examples it was made of")  # fmt: skip
+    panel.axvline(kept, color=QUIET, lw=0.9, ls=(0, (4, 3)))
+    top = 1.15 * max(float(curve.max()) for curve in (high, errors.left_out_cm, errors.training_cm)) or 1.0
+    panel.set(xlim=(-0.4, max(float(errors.components[-1]), 1.0) + 0.4), ylim=(0.0, top))
+    write(panel, (kept, top), f" kept: {kept}", color=QUIET, va="top")
+    tick_whole_numbers(panel.xaxis)
+    add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    at = min(kept, len(errors.components) - 1)
+    caption = (
+        "How far joints are from where they should be when examples are rebuilt by so many components. With the "
+        f"{kept} that are kept, examples the model was made of are off by {errors.training_cm[at]:.1f} cm on average"
+    )
+    if len(errors.left_out_each_cm) > 1:
+        caption += (
+            f", and examples that were left out by {errors.left_out_cm[at]:.1f} cm: so well does it follow motions "
+            "that it does not know"
+        )
+    tables: Tables = {
+        "errors": {
+            "components": errors.components,
+            "training_cm": errors.training_cm,
+            "left_out_cm": errors.left_out_cm,
+        }
+    }
+    return Sketch(figure, tables, f"{caption}.")
+
+
+def draw_criterion(subject: ModelSubject) -> Sketch | None:
+    """The criterion over the number of components of the mixture; None where there was no choice."""
+    candidates = subject.report.candidates
+    if not candidates:
+        return None
+    chosen = len(subject.primitive.mixture.weights)
+    counts = np.array([each.components for each in candidates])
+    figure = new_figure(6.9, 3.3)
+    panel = add_panel(
+        figure, Place(0.95, 0.65, 3.9, 2.3), x="components of the mixture", y="criterion (less is better)"
+    )
+    for name, colour, marker in (("bic", COLOURS[0], "o"), ("aic", REFERENCE, "^")):
+        values = np.array([getattr(each, name) for each in candidates])
+        panel.plot(counts, values, color=colour, marker=marker, ms=4.5, lw=1.3, label=name.upper())
+    refused = [each for each in candidates if each.refusal]
+    if refused:
+        panel.plot([each.components for each in refused], [each.bic for each in refused], ls="", marker="x", ms=9,
+                   color=COLOURS[1], label="too few examples in one")  # fmt: skip
+    taken = next((each for each in candidates if each.components == chosen), None)
+    if taken is not None:
+        panel.plot([chosen], [taken.bic], ls="", marker="o", ms=11, mfc="none", mec=INK, label=f"taken: {chosen}")
+    tick_whole_numbers(panel.xaxis)
+    panel.set_xlim(counts[0] - 0.5, counts[-1] + 0.5)
+    add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    tables: Tables = {
+        "candidates": {
+            "components": counts,
+            "bic": [each.bic for each in candidates],
+            "aic": [each.aic for each in candidates],
+            "log_likelihood": [each.log_likelihood for each in candidates],
+            "smallest_weight": [each.smallest_weight for each in candidates],
+            "refusal": [each.refusal for each in candidates],
+        }
+    }
+    caption = (
+        f"How many normal distributions the examples are best described by: {chosen}. More describe them better and "
+        "cost more numbers; the criterion weighs one against the other, and the lowest counts unless one of the "
+        "distributions is left with too few examples."
+    )
+    return Sketch(figure, tables, caption)

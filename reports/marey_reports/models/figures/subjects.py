@@ -1,0 +1,144 @@
+"""What figures of a model are drawn of: the model, the examples it was made of, and what drawing needs of both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion import kinematics
+from marey_motion.alignment.aligned import AlignedSet
+from marey_motion.alignment.signs import consistent_poses
+from marey_motion.modelling.primitive import MotionPrimitive
+from marey_motion.modelling.search.check import SearchCheck
+from marey_motion.modelling.training_report import TrainingReport
+from marey_motion.skeleton import Skeleton
+from marey_reports.drawing.paper import shortened, told_apart
+from marey_reports.drawing.stick_figures import Body, body_of
+from marey_reports.drawing.strips import Moments
+
+Floats = NDArray[np.float64]
+
+MOMENTS = 7
+SAMPLES = 16
+LONGEST_LABEL = 18
+
+FROM_ASIDE_RAD, FROM_AHEAD_RAD = float(np.radians(-50.0)), float(np.radians(-25.0))
+"""Where canonical motions, which begin facing +z, are seen from: their front right, so that walks go to the right."""
+
+TRAVELS_M = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class ModelSubject:
+    """A model and its examples.
+
+    Parameters
+    ----------
+    primitive : the model
+    examples : that it was trained on
+    report : how good it is
+    check : how near searches come, if that was measured
+    seed : of the samples that are drawn
+    """
+
+    primitive: MotionPrimitive
+    examples: AlignedSet
+    report: TrainingReport
+    check: SearchCheck | None = None
+    seed: int = 0
+
+    @cached_property
+    def body(self) -> Body:
+        """What to draw of the skeleton."""
+        return body_of(self.primitive.skeleton)
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Of the examples, without what all of them begin with."""
+        return told_apart([clip.name for clip in self.examples.clips])
+
+    @cached_property
+    def poses(self) -> Floats:
+        """(m, N, 3 + 4·J) of the examples, with the signs of the model."""
+        return consistent_poses(self.examples.poses, self.mean_poses)
+
+    @cached_property
+    def latents(self) -> Floats:
+        """(m, L) of the examples."""
+        return self.primitive.latents_of(self.poses, self.examples.time_functions)
+
+    @cached_property
+    def seen_from_rad(self) -> float:
+        """Where strips look from: motions that travel are seen more from the side than those that stay in place."""
+        way = self.mean_poses[[0, -1], :3]
+        return FROM_ASIDE_RAD if np.linalg.norm((way[1] - way[0])[[0, 2]]) > TRAVELS_M else FROM_AHEAD_RAD
+
+    @cached_property
+    def samples(self) -> Floats:
+        """(n, L) drawn from the model."""
+        return self.primitive.sample(SAMPLES, self.seed)
+
+    @cached_property
+    def mean_poses(self) -> Floats:
+        """(N, 3 + 4·J) of the mean motion."""
+        return np.asarray(self.primitive.poses(np.zeros((1, self.primitive.dimensions)))[0], dtype=np.float64)
+
+    def points(self, poses: Floats) -> Floats:
+        """(..., P, 3) where joints, then end sites, of poses (..., 3 + 4·J) are, metres."""
+        return points_of(self.primitive.skeleton, poses)
+
+    def moments(self, count: int = MOMENTS) -> tuple[NDArray[np.int64], Moments]:
+        """The canonical frames that strips show, and their columns; all look at where the mean motion is."""
+        return choose_moments(self, count)
+
+
+def evenly(count: int, most: int) -> NDArray[np.int64]:
+    """Indices of all of so many things, or of at most `most` of them, evenly spread."""
+    return np.unique(np.rint(np.linspace(0, count - 1, min(count, most))).astype(np.int64))
+
+
+def points_of(skeleton: Skeleton, poses: Floats) -> Floats:
+    """(..., P, 3) where joints, then end sites, of poses (..., 3 + 4·J) are, metres."""
+    flat = np.ascontiguousarray(poses).reshape(-1, poses.shape[-1])
+    points = kinematics.forward_kinematics(skeleton, flat, end_sites=True)
+    return np.asarray(points.reshape(*poses.shape[:-1], -1, 3), dtype=np.float64)
+
+
+def choose_moments(subject: ModelSubject, count: int) -> tuple[NDArray[np.int64], Moments]:
+    """Evenly spaced canonical frames; a keyframe takes the place of the one that is nearest to it."""
+    last = subject.primitive.frame_count - 1
+    frames = np.unique(np.rint(np.linspace(0, last, count)).astype(np.int64))
+    labels = [""] * len(frames)
+    for label, frame in sorted(subject.primitive.keyframes.items(), key=lambda each: each[1]):
+        free = [place for place in range(len(frames)) if not labels[place] and frame not in frames[:place]]
+        ends = {0: 0, len(frames) - 1: last}
+        places = [place for place in free if ends.get(place, frame) == frame]
+        if places:
+            place = min(places, key=lambda place: abs(int(frames[place]) - frame))
+            frames[place], labels[place] = frame, shortened(label, LONGEST_LABEL)
+    order = np.argsort(frames, kind="stable")
+    frames, labels = frames[order], [labels[place] for place in order]
+    middles = subject.points(subject.mean_poses[frames])[:, subject.body.pelvis][:, [0, 2]]
+    names = [f"{100 * frame / max(last, 1):.0f} %" for frame in frames]
+    return frames, Moments(middles, names, labels)
+
+
+def position_table(
+    subject: ModelSubject, frames: NDArray[np.int64], rows: Sequence[tuple[str, Floats]]
+) -> dict[str, object]:
+    """Positions (T, P, 3) of the joints by row as columns of a table, metres in the canonical frame."""
+    joints = subject.primitive.skeleton.joint_names
+    cells = len(frames) * len(joints)
+    places = np.concatenate([points[:, : len(joints)].reshape(-1, 3) for _, points in rows])
+    return {
+        "row": [name for name, _ in rows for _ in range(cells)],
+        "canonical_frame": np.tile(np.repeat(frames, len(joints)), len(rows)),
+        "joint": list(joints) * (len(frames) * len(rows)),
+        "x_m": places[:, 0],
+        "y_m": places[:, 1],
+        "z_m": places[:, 2],
+    }

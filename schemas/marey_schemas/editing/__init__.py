@@ -1,0 +1,1 @@
+"""Edits: their commands, and requests to preview them."""

@@ -1,0 +1,187 @@
+"""The array leaf: numpy arrays inside documents, and how each media type writes them.
+
+A leaf is `{"dtype": "<f4", "shape": [frames, columns], "data": ...}` with nested lists in JSON and little-endian
+bytes in MessagePack and BSON; `"encoding": "blocks"` says that the bytes are those of `blocks.encode`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import chain
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
+
+from marey_schemas.encoding import blocks
+from marey_schemas.encoding.arrayspec import DTYPES, ArrayError, ArraySpec, little_endian, require_finite
+
+__all__ = ["DTYPES", "Array", "ArrayError", "ArrayOf", "EncodedArray", "array_from_leaf", "is_leaf", "nested_lists"]
+
+LEAF_KEYS = frozenset({"dtype", "shape", "data"})
+MAX_ARRAY_BYTES = 1 << 28
+_ELEMENT_TYPES: dict[str, set[type]] = {"f": {int, float}, "i": {int}, "u": {int}, "b": {bool}}
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedArray:
+    """A block-encoded array that is passed on without being decoded."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    data: bytes
+
+    @classmethod
+    def of(cls, array: NDArray[Any]) -> "EncodedArray":
+        """Encode `array` in blocks."""
+        spec = ArraySpec.of(array)
+        return cls(spec.dtype, spec.shape, blocks.encode(array))
+
+    def decode(self, *, max_bytes: int = MAX_ARRAY_BYTES) -> NDArray[Any]:
+        """The array itself. Raises `ArrayError` where the bytes disagree with dtype and shape, or are corrupt."""
+        claimed = ArraySpec(self.dtype, self.shape)
+        claimed.require(max_bytes)
+        try:
+            held = blocks.read_spec(self.data)
+            if held != claimed:
+                raise ArrayError("bad-array", f"the leaf says {claimed}, its blocks say {held}")
+            return blocks.decode(self.data)
+        except blocks.BlockError as error:
+            raise ArrayError("bad-array", str(error)) from error
+
+
+def is_leaf(value: Mapping[str, Any]) -> bool:
+    """Whether an object of a parsed document stands for an array."""
+    return value.keys() >= LEAF_KEYS
+
+
+def array_from_leaf(leaf: Mapping[str, Any], *, max_bytes: int = MAX_ARRAY_BYTES) -> NDArray[Any]:
+    """Array of a leaf in any of its three forms; writable, C-contiguous, finite.
+
+    Raises `ArrayError` where data does not match dtype and shape, and before allocating more than `max_bytes`.
+    """
+    unknown = sorted(leaf.keys() - LEAF_KEYS - {"encoding"})
+    if unknown:
+        raise ArrayError("bad-array", f"an array has no member {unknown[0]!r}")
+    spec = ArraySpec.parse(leaf["dtype"], leaf["shape"])
+    spec.require(max_bytes)
+    data = leaf["data"]
+    if "encoding" in leaf:
+        if leaf["encoding"] != "blocks" or not isinstance(data, bytes):
+            raise ArrayError("bad-array", 'the only encoding of an array is "blocks", with bytes as its data')
+        array = EncodedArray(spec.dtype, spec.shape, data).decode(max_bytes=max_bytes)
+    elif isinstance(data, bytes):
+        array = _from_bytes(data, spec)
+    else:
+        array = _from_lists(data, spec)
+    return require_finite(array)
+
+
+def _from_bytes(data: bytes, spec: ArraySpec) -> NDArray[Any]:
+    dtype = np.dtype(spec.dtype)
+    expected = dtype.itemsize * int(np.prod(spec.shape, dtype=np.int64))
+    if len(data) != expected:
+        raise ArrayError("bad-array", f"{len(data)} bytes of data; {spec.dtype} {list(spec.shape)} takes {expected}")
+    raw = np.frombuffer(data, np.uint8)
+    if spec.dtype == "|b1" and raw.size and raw.max() > 1:
+        raise ArrayError("bad-array", "a boolean is stored as neither 0 nor 1")
+    return raw.view(dtype).reshape(spec.shape).copy()
+
+
+def _from_lists(data: object, spec: ArraySpec) -> NDArray[Any]:
+    """Nested lists, checked level by level: numpy would truncate, cast and guess silently."""
+    level: list[Any] = [data]
+    for axis, size in enumerate(spec.shape):
+        for item in level:
+            if type(item) is not list or len(item) != size:
+                found = f"a list of {len(item)}" if type(item) is list else type(item).__name__
+                raise ArrayError("bad-array", f"axis {axis} must be a list of {size}, not {found}")
+        level = list(chain.from_iterable(level))
+    wrong = set(map(type, level)) - _ELEMENT_TYPES[np.dtype(spec.dtype).kind]
+    if wrong:
+        names = ", ".join(sorted(found.__name__ for found in wrong))
+        raise ArrayError("bad-array", f"elements of type {names} in an array of dtype {spec.dtype}")
+    try:
+        with np.errstate(over="ignore"):  # what overflows a float32 becomes infinite and is refused as such
+            return np.array(level, dtype=spec.dtype).reshape(spec.shape)
+    except OverflowError as error:
+        raise ArrayError("out-of-range", f"an element does not fit in dtype {spec.dtype}") from error
+
+
+def nested_lists(array: NDArray[Any]) -> Any:
+    """`data` of a JSON leaf: nested lists whose numbers read back to the same bits."""
+    return (_short_decimals(array) if array.dtype == np.float32 else array).tolist()
+
+
+def _short_decimals(array: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Doubles that print with at most nine digits and round to the same float32: 0.1, not 0.10000000149011612."""
+    exact = array.astype(np.float64)
+    short = exact.copy()
+    size = np.abs(exact)
+    usable = (size > 1e-12) & (size < 1e15)  # where the power of ten below is exact
+    exponent = np.floor(np.log10(size, where=usable, out=np.zeros_like(size)))
+    for digits in (9, 8, 7):
+        scale = 10.0 ** np.clip(digits - 1 - exponent, 0, 22)
+        rounded = np.rint(exact * scale) / scale
+        short = np.where(usable & (rounded.astype(np.float32) == array), rounded, short)
+    return short
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayOf:
+    """Pydantic annotation of an array field: `Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=2)]`.
+
+    Accepts an ndarray or a leaf; an ndarray of another dtype is refused, not cast. Values must be finite.
+    `columns` fixes the size of the last axis.
+    """
+
+    dtype: str | None = None
+    ndim: int | None = None
+    columns: int | None = None
+
+    def validate(self, value: object) -> NDArray[Any]:
+        """The array, or `ArrayError` saying which of dtype, dimensions, columns or values is wrong."""
+        if isinstance(value, EncodedArray):
+            array = require_finite(value.decode())
+        elif isinstance(value, np.ndarray):
+            array = require_finite(little_endian(value))
+        elif isinstance(value, Mapping) and is_leaf(value):
+            array = array_from_leaf(value)
+        else:
+            raise ArrayError("bad-array", "expected an array: an ndarray, or an object with dtype, shape and data")
+        if self.dtype is not None and array.dtype.str != self.dtype:
+            raise ArrayError("bad-dtype", f"expected dtype {self.dtype}, not {array.dtype.str}")
+        if self.ndim is not None and array.ndim != self.ndim:
+            raise ArrayError("bad-shape", f"expected {self.ndim} dimensions, not shape {list(array.shape)}")
+        if self.columns is not None and array.shape[-1:] != (self.columns,):
+            raise ArrayError("bad-shape", f"expected {self.columns} columns, not shape {list(array.shape)}")
+        return array
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(
+            self.validate,
+            serialization=core_schema.plain_serializer_function_ser_schema(_leaf, when_used="json"),
+        )
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        dtype: JsonSchemaValue = {"const": self.dtype} if self.dtype else {"type": "string", "enum": list(DTYPES)}
+        shape: JsonSchemaValue = {"type": "array", "items": {"type": "integer", "minimum": 0}}
+        if self.ndim is not None:
+            shape |= {"minItems": self.ndim, "maxItems": self.ndim}
+        return {
+            "type": "object",
+            "title": "Array",
+            "description": "An array; data is nested lists in JSON, little-endian bytes in MessagePack and BSON.",
+            "properties": {"dtype": dtype, "shape": shape, "data": {"description": "nested lists, or bytes"}},
+            "required": ["dtype", "shape", "data"],
+            "additionalProperties": False,
+        }
+
+
+def _leaf(array: NDArray[Any]) -> dict[str, Any]:
+    return {"dtype": array.dtype.str, "shape": list(array.shape), "data": nested_lists(array)}
+
+
+Array = Annotated[NDArray[Any], ArrayOf()]

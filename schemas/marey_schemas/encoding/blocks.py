@@ -1,0 +1,217 @@
+"""The block codec: an array as compressed tiles of frames and columns, exact to the bit, readable in parts.
+
+The first axis counts frames; all others together are columns. docs/reference/block-format.md is the layout.
+"""
+
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_schemas.encoding import tiles
+from marey_schemas.encoding.arrayspec import ArrayError, ArraySpec, little_endian
+
+MAGIC = b"MRB1"
+BLOCK_FRAMES = 256
+GROUP_COLUMNS = 1024
+NARROW_COLUMNS = 64  # an array with fewer columns gets longer blocks: small tiles compress badly
+MAX_TILE_BYTES = 1 << 24
+MAX_ARRAY_BYTES = 1 << 30
+
+
+class BlockError(ValueError):
+    """Block-encoded bytes are corrupt, truncated or not what they claim to be."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """How an array is cut into tiles: blocks of frames, and each block into groups of columns."""
+
+    spec: ArraySpec
+    block_frames: int
+    group_columns: int
+
+    @property
+    def frames(self) -> int:
+        return self.spec.shape[0] if self.spec.shape else 1
+
+    @property
+    def columns(self) -> int:
+        return math.prod(self.spec.shape[1:])
+
+    @property
+    def blocks(self) -> int:
+        return -(-self.frames // self.block_frames)
+
+    @property
+    def groups(self) -> int:
+        return -(-self.columns // self.group_columns)
+
+    def block(self, index: int) -> slice:
+        """Frames of a block."""
+        return slice(index * self.block_frames, min((index + 1) * self.block_frames, self.frames))
+
+    def group(self, index: int) -> slice:
+        """Columns of a group."""
+        return slice(index * self.group_columns, min((index + 1) * self.group_columns, self.columns))
+
+    def lead(self, group: int) -> int | None:
+        """Columns of a group before its first quaternion; None where the shape rules quaternions out.
+
+        Poses have 3 + 4k columns, a translation and a quaternion per joint; rotations have a last axis of four.
+        """
+        if self.spec.dtype != "<f4":
+            return None
+        start: int = self.group(group).start
+        if len(self.spec.shape) == 2 and self.columns % 4 == 3:
+            return (3 - start) % 4
+        return -start % 4 if self.spec.shape[-1:] == (4,) else None
+
+
+def encode(array: NDArray[Any]) -> bytes:
+    """Encode an array of any shape and travelling dtype; the same array always gives the same bytes.
+
+    Raises `ArrayError` for a dtype or shape that may not travel.
+    """
+    array = little_endian(array)
+    spec = ArraySpec.of(array)
+    longer = NARROW_COLUMNS // max(math.prod(spec.shape[1:]), 1)
+    layout = _Layout(spec, BLOCK_FRAMES * max(longer, 1), GROUP_COLUMNS)
+    table = array.reshape(layout.frames, layout.columns)
+    packed = [
+        tiles.pack(table[layout.block(block), layout.group(group)], layout.lead(group))
+        for block in range(layout.blocks)
+        for group in range(layout.groups)
+    ]
+    head = MAGIC + spec.dtype.encode("ascii")
+    head += struct.pack(f"<B{len(spec.shape)}Q", len(spec.shape), *spec.shape)
+    head += struct.pack(f"<2I{len(packed)}I", layout.block_frames, layout.group_columns, *map(len, packed))
+    return b"".join([head, struct.pack("<I", zlib.crc32(head)), *packed])
+
+
+def read_spec(data: bytes) -> ArraySpec:
+    """Dtype and shape of an encoded array, without decoding it. Raises `BlockError`."""
+    return _read_head(data)[0].spec
+
+
+def decode(
+    data: bytes,
+    *,
+    frames: slice | None = None,
+    columns: NDArray[np.intp] | None = None,
+    max_bytes: int = MAX_ARRAY_BYTES,
+) -> NDArray[Any]:
+    """Decode an array, or some frames and columns of it, touching only the tiles that hold them.
+
+    `columns` are indices into all axes after the first, flattened: the result is then two-dimensional and equals
+    `array.reshape(len(array), -1)[frames][:, columns]`. The result is writable and at most `max_bytes` large.
+    Raises `BlockError`; `IndexError` where numpy's indexing would.
+    """
+    layout, starts = _read_head(data)
+    if not layout.spec.shape and (frames is not None or columns is not None):
+        raise IndexError("an array without axes has no frames or columns to choose from")
+    chosen = range(layout.frames)[frames or slice(None)]
+    rows = chosen if chosen.step > 0 else chosen[::-1]
+    picked = None if columns is None else _column_indices(columns, layout.columns)
+    width = layout.columns if picked is None else len(picked)
+    dtype = np.dtype(layout.spec.dtype)
+    if max(len(rows), 1) * max(width, 1) * dtype.itemsize > max_bytes:
+        raise BlockError(f"{len(rows)} frames of {width} columns are larger than the {max_bytes} bytes allowed")
+    table = np.empty((len(rows), width), dtype)
+    for block, target_rows, tile_rows in _rows_by_block(layout, rows):
+        for group, target_columns, tile_columns in _columns_by_group(layout, picked):
+            tile = block * layout.groups + group
+            part = _unpack(data[starts[tile] : starts[tile + 1]], layout, block, group)
+            table[target_rows, target_columns] = part[tile_rows, tile_columns]
+    if dtype.kind == "b" and (table.view(np.uint8) > 1).any():
+        raise BlockError("a boolean is stored as neither 0 nor 1")
+    if chosen.step < 0:
+        table = np.ascontiguousarray(table[::-1])
+    return table if columns is not None else table.reshape(layout.spec.shape and (len(rows), *layout.spec.shape[1:]))
+
+
+def _read_head(data: bytes) -> tuple[_Layout, list[int]]:
+    """Layout of an encoded array and where each tile starts, followed by where the last one ends."""
+    if data[: len(MAGIC)] != MAGIC:
+        raise BlockError("these bytes are not a block-encoded array")
+    try:
+        dtype = data[4:7].decode("ascii")
+        shape = struct.unpack_from(f"<{data[7]}Q", data, 8)
+        table = 16 + 8 * len(shape)
+        layout = _Layout(ArraySpec(dtype, shape), *struct.unpack_from("<2I", data, table - 8))
+        _require_sane_tiles(layout)
+        count = layout.blocks * layout.groups
+        end = table + 4 * count
+        if end + 4 > len(data):
+            raise BlockError(f"the data ends inside the index of its {count} tiles")
+        (checksum,) = struct.unpack_from("<I", data, end)
+    except (IndexError, struct.error, UnicodeDecodeError, ArrayError) as error:
+        raise BlockError(f"the header is malformed: {error}") from error
+    if checksum != zlib.crc32(data[:end]):
+        raise BlockError("the header is corrupt: its checksum does not match")
+    sizes = np.frombuffer(data, "<u4", count, table)
+    starts = [end + 4, *(end + 4 + np.cumsum(sizes, dtype=np.int64)).tolist()]
+    if starts[-1] != len(data):
+        raise BlockError(f"{len(data)} bytes were given where the index says {starts[-1]}")
+    return layout, starts
+
+
+def _require_sane_tiles(layout: _Layout) -> None:
+    if layout.block_frames < 1 or layout.group_columns < 1:
+        raise BlockError("a tile has no frames or no columns")
+    largest = min(layout.block_frames, layout.frames) * min(layout.group_columns, layout.columns)
+    if largest * np.dtype(layout.spec.dtype).itemsize > MAX_TILE_BYTES:
+        raise BlockError(f"a tile of {largest} elements is larger than {MAX_TILE_BYTES} bytes")
+
+
+def _unpack(packed: bytes, layout: _Layout, block: int, group: int) -> NDArray[Any]:
+    frames, columns = layout.block(block), layout.group(group)
+    try:
+        return tiles.unpack(
+            packed, np.dtype(layout.spec.dtype), frames.stop - frames.start, columns.stop - columns.start
+        )
+    except tiles.TileError as error:
+        where = f"frames {frames.start} to {frames.stop}, columns {columns.start} to {columns.stop}"
+        raise BlockError(f"the tile of {where} is corrupt: {error}") from error
+
+
+def _rows_by_block(layout: _Layout, rows: range) -> Iterator[tuple[int, slice, slice]]:
+    """Per block that holds some of the ascending `rows`: its index, where they go, where they are in the block."""
+    done = 0
+    while done < len(rows):
+        index = rows[done] // layout.block_frames
+        block = layout.block(index)
+        here = len(range(rows[done], block.stop, rows.step)) if rows[-1] >= block.stop else len(rows) - done
+        first = rows[done] - block.start
+        yield index, slice(done, done + here), slice(first, first + (here - 1) * rows.step + 1, rows.step)
+        done += here
+
+
+def _columns_by_group(
+    layout: _Layout, picked: NDArray[np.intp] | None
+) -> Iterator[tuple[int, slice | NDArray[np.intp], slice | NDArray[np.intp]]]:
+    """Per group that holds some of the picked columns: its index, where they go, where they are in the group."""
+    if picked is None:
+        for index in range(layout.groups):
+            yield index, layout.group(index), slice(None)
+        return
+    groups = picked // layout.group_columns
+    for index in np.unique(groups).tolist():
+        targets = np.flatnonzero(groups == index)
+        yield index, targets, picked[targets] - index * layout.group_columns
+
+
+def _column_indices(columns: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """The indices counted from zero. Raises `IndexError`."""
+    picked = np.asarray(columns)
+    if picked.ndim != 1 or (picked.size and picked.dtype.kind not in "iu"):
+        raise IndexError("columns must be one list of integers")
+    outside = picked[(picked < -count) | (picked >= count)]
+    if outside.size:
+        raise IndexError(f"column {outside[0]} is outside an array of {count} columns")
+    return np.where(picked < 0, picked + count, picked).astype(np.intp)

@@ -1,0 +1,94 @@
+"""Names of content: digests of arrays and documents that depend on what they say, not on how it is stored."""
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.encoding.arrayspec import ArraySpec, little_endian
+
+
+def array_digest(array: NDArray[Any] | EncodedArray) -> str:
+    """`sha256:<hex>` of dtype, shape and little-endian bytes, independent of any compression.
+
+    Hashed is the line `<f4 [2,3]` (dtype, space, shape as JSON without spaces) and its line feed, then the raw bytes
+    in C order.
+    """
+    plain = little_endian(array.decode() if isinstance(array, EncodedArray) else array)
+    spec = ArraySpec.of(plain)
+    head = f"{spec.dtype} [{','.join(map(str, spec.shape))}]\n"
+    return _name(head.encode(), plain.reshape(-1).view(np.uint8).data)
+
+
+def canonical_json(tree: Any) -> bytes:
+    """The one JSON text of a tree without arrays: sorted keys, no spaces, UTF-8, one spelling per number.
+
+    JSON has one type of number, and databases and languages keep no other: a whole number below 2**63 is written
+    without a point whether it came as 1 or 1.0 (and -0.0 as 0), any other as the shortest text of its double. Raises
+    `ValueError` for NaN and infinities, `TypeError` for a key that is no string.
+    """
+    return json.dumps(
+        _canonical(tree), sort_keys=True, ensure_ascii=False, separators=(",", ":"), allow_nan=False
+    ).encode()
+
+
+def document_digest(tree: Any) -> str:
+    """`sha256:<hex>` of the canonical JSON of a tree in which each array is replaced by its reference."""
+    return _name(canonical_json(detach_arrays(tree, lambda _digest, _array: None)))
+
+
+def detach_arrays(tree: Any, keep: Callable[[str, NDArray[Any] | EncodedArray], None]) -> Any:
+    """The tree with each array replaced by `{"dtype", "shape", "content": array_digest}`.
+
+    `keep(digest, array)` is called once per array, in document order.
+    """
+    if isinstance(tree, Mapping):
+        return {key: detach_arrays(member, keep) for key, member in tree.items()}
+    if isinstance(tree, list | tuple):
+        return [detach_arrays(item, keep) for item in tree]
+    if isinstance(tree, np.ndarray | EncodedArray):
+        spec = ArraySpec.of(tree) if isinstance(tree, np.ndarray) else ArraySpec(tree.dtype, tree.shape)
+        digest = array_digest(tree)
+        keep(digest, tree)
+        return {"dtype": spec.dtype, "shape": list(spec.shape), "content": digest}
+    return tree
+
+
+def attach_arrays(tree: Any, load: Callable[[str], NDArray[Any] | EncodedArray]) -> Any:
+    """The inverse of `detach_arrays`: each reference is replaced by `load(digest)`."""
+    if isinstance(tree, Mapping):
+        if tree.keys() == {"dtype", "shape", "content"}:
+            return load(tree["content"])
+        return {key: attach_arrays(member, load) for key, member in tree.items()}
+    if isinstance(tree, list | tuple):
+        return [attach_arrays(item, load) for item in tree]
+    return tree
+
+
+def _canonical(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {_text_key(key): _canonical(member) for key, member in value.items()}
+    if isinstance(value, list | tuple):
+        return [_canonical(item) for item in value]
+    if isinstance(value, float) and value.is_integer() and abs(value) < 1 << 63:
+        return int(value)
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 1 << 63:
+        return float(value)
+    return value
+
+
+def _text_key(key: Any) -> str:
+    if not isinstance(key, str):
+        raise TypeError(f"the key {key!r} is not a string")
+    return key
+
+
+def _name(*parts: bytes | memoryview) -> str:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part)
+    return f"sha256:{digest.hexdigest()}"

@@ -1,0 +1,261 @@
+"""Documents as bytes: JSON, MessagePack and BSON carry the same trees, and refuse the same things.
+
+A tree is made of objects (str keys), lists, str, int (64 bit), finite float, bool, None, and arrays. BSON has objects
+only at its top level, so a list or a scalar there is refused in BSON.
+"""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NoReturn
+
+import bson
+import bson.errors
+import msgpack  # type: ignore[import-untyped]
+import numpy as np
+from bson.raw_bson import RawBSONDocument
+from numpy.typing import NDArray
+
+from marey_schemas.encoding.arrays import LEAF_KEYS, EncodedArray, array_from_leaf, nested_lists
+from marey_schemas.encoding.arrayspec import DTYPES, ArrayError, little_endian, require_finite
+
+JSON, MSGPACK, BSON = MEDIA_TYPES = ("application/json", "application/msgpack", "application/bson")
+MAX_BYTES = 1 << 28
+MAX_DEPTH = 64
+MAX_LIST = 1 << 20
+
+ArrayForm = Literal["plain", "blocks"]
+
+
+class CodecError(ValueError):
+    """A document cannot be written or read; `pointer` (RFC 6901) says where, `code` is a stable slug."""
+
+    def __init__(self, code: str, pointer: str, detail: str) -> None:
+        super().__init__(code, pointer, detail)
+        self.code = code
+        self.pointer = pointer
+        self.detail = detail
+
+    def __str__(self) -> str:
+        return f"{self.pointer or 'document'}: {self.detail}"
+
+
+def encode_tree(tree: Any, media_type: str, *, arrays: ArrayForm = "plain") -> bytes:
+    """Write a tree whose leaves may be numpy arrays or `EncodedArray`.
+
+    `arrays="blocks"` (not in JSON) writes every array in the block encoding; an `EncodedArray` is then passed on as
+    it is. Raises `CodecError`.
+    """
+    _require_media_type(media_type)
+    if media_type == JSON and arrays == "blocks":
+        raise CodecError("bad-media-type", "", "JSON cannot carry blocks; use application/msgpack or application/bson")
+
+    def leaf(value: NDArray[Any] | EncodedArray) -> dict[str, Any]:
+        return _leaf_as_json(value) if media_type == JSON else _leaf_as_bytes(value, arrays)
+
+    plain = _Walk(MAX_DEPTH, on_array=leaf).visit(tree)
+    if media_type == JSON:
+        return json.dumps(plain, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
+    if media_type == MSGPACK:
+        packed: bytes = msgpack.packb(plain)
+        return packed
+    return _write_bson(plain)
+
+
+def _write_bson(plain: Any) -> bytes:
+    if not isinstance(plain, dict):
+        raise CodecError("bad-type", "", "a BSON document must be an object; use JSON or MessagePack for lists")
+    try:
+        return bson.encode(plain)
+    except (bson.errors.BSONError, OverflowError) as error:
+        raise CodecError("too-large", "", f"a BSON document is smaller than 2 GiB: {error}") from error
+
+
+def decode_tree(data: bytes, media_type: str, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DEPTH) -> Any:
+    """Read a tree; array leaves become writable numpy arrays.
+
+    `max_bytes` limits the bytes read and, separately, the bytes of all arrays together. Raises `CodecError`.
+    """
+    _require_media_type(media_type)
+    if len(data) > max_bytes:
+        raise CodecError("too-large", "", f"{len(data)} bytes; at most {max_bytes} are read")
+    walk = _Walk(max_depth, array_bytes=max_bytes)
+    try:
+        return walk.visit(_PARSERS[media_type](data))
+    except CodecError:
+        raise
+    except (RecursionError, msgpack.StackError) as error:
+        raise CodecError("too-deep", "", f"nested deeper than {max_depth} levels") from error
+    except (ValueError, bson.errors.BSONError, msgpack.UnpackException) as error:
+        raise CodecError("bad-syntax", walk.pointer, f"not valid {media_type}: {error}") from error
+
+
+def _require_media_type(media_type: str) -> None:
+    if media_type not in MEDIA_TYPES:
+        raise CodecError("bad-media-type", "", f"{media_type!r} is not one of {', '.join(MEDIA_TYPES)}")
+
+
+def _leaf_as_json(value: NDArray[Any] | EncodedArray) -> dict[str, Any]:
+    array = _finite_array(value)
+    return {"dtype": array.dtype.str, "shape": list(array.shape), "data": nested_lists(array)}
+
+
+def _leaf_as_bytes(value: NDArray[Any] | EncodedArray, arrays: ArrayForm) -> dict[str, Any]:
+    if arrays == "blocks":
+        encoded = value if isinstance(value, EncodedArray) else EncodedArray.of(require_finite(value))
+        return {"dtype": encoded.dtype, "shape": list(encoded.shape), "encoding": "blocks", "data": encoded.data}
+    array = _finite_array(value)
+    return {"dtype": array.dtype.str, "shape": list(array.shape), "data": array.tobytes()}
+
+
+def _finite_array(value: NDArray[Any] | EncodedArray) -> NDArray[Any]:
+    return require_finite(value.decode() if isinstance(value, EncodedArray) else little_endian(value))
+
+
+def _parse_json(data: bytes) -> Any:
+    return json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_refuse_constant)
+
+
+def _parse_msgpack(data: bytes) -> Any:
+    # The parser allocates what a header claims before it reads on, so claims are limited.
+    return msgpack.unpackb(data, object_pairs_hook=_unique, max_array_len=MAX_LIST, max_map_len=MAX_LIST)
+
+
+def _parse_bson(data: bytes) -> Any:
+    # Read lazily, object by object: an eager read would turn {"$ref", "$id"} into a database reference.
+    if int.from_bytes(data[:4], "little", signed=True) != len(data):
+        raise ValueError(f"its size is not the {len(data)} bytes that were given")
+    return RawBSONDocument(data)
+
+
+_PARSERS: dict[str, Callable[[bytes], Any]] = {JSON: _parse_json, MSGPACK: _parse_msgpack, BSON: _parse_bson}
+
+
+def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+    members = dict(pairs)
+    if len(members) != len(pairs):
+        repeated = Counter(key for key, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"the key {repeated!r} is repeated in one object")
+    return members
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not JSON")
+
+
+# Values of one format only, though Python takes them for a str or a tuple.
+_FOREIGN = (bson.Code, msgpack.ExtType)
+
+
+class _Walk:
+    """One pass over a tree that checks every value and converts every array, in either direction.
+
+    With `on_array` it turns arrays into leaves; without, it turns leaves into arrays.
+    """
+
+    def __init__(
+        self,
+        max_depth: int,
+        *,
+        on_array: Callable[[Any], dict[str, Any]] | None = None,
+        array_bytes: int = 0,
+    ) -> None:
+        self._max_depth = max_depth
+        self._on_array = on_array
+        self._array_bytes = array_bytes
+        self._path: list[str | int] = []
+
+    @property
+    def pointer(self) -> str:
+        """JSON pointer of the value being visited."""
+        return "".join("/" + str(step).replace("~", "~0").replace("/", "~1") for step in self._path)
+
+    def visit(self, value: Any) -> Any:
+        """The checked and converted value. Raises `CodecError`."""
+        if isinstance(value, _FOREIGN):
+            raise self._error("bad-type", f"a value of type {type(value).__name__} cannot travel")
+        if isinstance(value, str):
+            return self._text(value)
+        if value is None or isinstance(value, bool):
+            return value
+        if isinstance(value, int):
+            return self._integer(value)
+        if isinstance(value, float):
+            return self._float(value)
+        if isinstance(value, Mapping):
+            return self._object(value)
+        if isinstance(value, list | tuple):
+            return self._list(value)
+        if isinstance(value, np.ndarray | EncodedArray) and self._on_array is not None:
+            return self._array(self._on_array, value)
+        if isinstance(value, np.generic) and value.dtype.newbyteorder("<").str in DTYPES and self._on_array is not None:
+            return self.visit(value.item())
+        raise self._error("bad-type", f"a value of type {type(value).__name__} cannot travel")
+
+    def _object(self, value: Mapping[Any, Any]) -> Any:
+        self._enter()
+        keys = [self._key(key) for key in value]
+        if LEAF_KEYS.issubset(keys):
+            if self._on_array is not None:
+                raise self._error("reserved-keys", "dtype, shape and data together are an array; pass an ndarray")
+            return self._array(self._take_leaf, value)
+        members = {}
+        for key, member in zip(keys, value.values(), strict=True):
+            self._path.append(key)
+            members[key] = self.visit(member)
+            self._path.pop()
+        return members
+
+    def _list(self, value: list[Any] | tuple[Any, ...]) -> list[Any]:
+        self._enter()
+        if len(value) > MAX_LIST:
+            raise self._error("too-large", f"a list of {len(value)}; above {MAX_LIST} numbers must travel as an array")
+        items = []
+        for index, item in enumerate(value):
+            self._path.append(index)
+            items.append(self.visit(item))
+            self._path.pop()
+        return items
+
+    def _array(self, convert: Callable[[Any], Any], value: Any) -> Any:
+        try:
+            return convert(value)
+        except ArrayError as error:
+            raise self._error(error.code, error.detail) from error
+
+    def _take_leaf(self, leaf: Mapping[str, Any]) -> NDArray[Any]:
+        array = array_from_leaf(leaf, max_bytes=self._array_bytes)
+        self._array_bytes -= array.nbytes
+        return array
+
+    def _key(self, key: object) -> str:
+        if not isinstance(key, str):
+            raise self._error("bad-key", f"the key {key!r} is not a string")
+        if "\0" in key:
+            raise self._error("bad-key", f"the key {key!r} contains NUL")
+        return self._text(key)
+
+    def _text(self, text: str) -> str:
+        try:
+            text.encode()
+        except UnicodeEncodeError as error:
+            raise self._error("bad-text", "a string contains half of a surrogate pair") from error
+        return str.__str__(text)
+
+    def _integer(self, number: int) -> int:
+        if not -(1 << 63) <= number < 1 << 63:
+            raise self._error("out-of-range", "an integer does not fit in 64 bits")
+        return int(number)
+
+    def _float(self, number: float) -> float:
+        if not math.isfinite(number):
+            raise self._error("not-finite", f"{number} cannot travel; only finite numbers may")
+        return float(number)
+
+    def _enter(self) -> None:
+        if len(self._path) >= self._max_depth:
+            raise self._error("too-deep", f"nested deeper than {self._max_depth} levels")
+
+    def _error(self, code: str, detail: str) -> CodecError:
+        return CodecError(code, self.pointer, detail)

@@ -1,0 +1,1 @@
+"""HTTP machinery that every resource uses: declarations, negotiation, preconditions, bodies, and replies."""

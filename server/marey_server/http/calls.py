@@ -1,0 +1,111 @@
+"""One request's work inside one transaction: who asks, what is done, and the answer's bytes.
+
+All of it runs in one thread of the database's pool, so that an ordinary request leaves the event loop once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from marey_schemas.access import Role
+from marey_server.access import scopes
+from marey_server.access.principal import ANONYMOUS, Principal
+from marey_server.errors import Forbidden, Unauthenticated
+from marey_server.http.answer_cache import AnswerCache
+from marey_server.http.declarations import Access, Operation
+from marey_server.http.reply import Form, Rendered, Reply, render
+from marey_server.store import idempotency, projects, tokens
+from marey_server.store.transaction import Transaction
+
+CHALLENGE = {"WWW-Authenticate": 'Bearer realm="marey"'}
+
+
+@dataclass
+class Caller:
+    """The credential of a request, and who it turned out to belong to."""
+
+    token: str | None
+    operation: Operation
+    principal: Principal | None = None
+
+    def identify(self, tx: Transaction) -> Principal:
+        """Look the credential up and check what the operation asks of any caller.
+
+        Roles in a project are checked by the store. Raises `Unauthenticated` or `Forbidden`.
+        """
+        self.principal = ANONYMOUS if self.token is None else tokens.resolve_token(tx, self.token)
+        require_access(self.operation, self.principal)
+        return self.principal
+
+
+def require_access(operation: Operation, principal: Principal) -> None:
+    """Refuse callers who may never do this, whatever it is done to. Raises `Unauthenticated` or `Forbidden`."""
+    access = operation.access
+    guests = access is Access.ANYONE or (access is Access.READER and operation.public)
+    if principal.kind == "anonymous":
+        if not guests:
+            raise Unauthenticated("Send a token: Authorization: Bearer <token>.", headers=CHALLENGE)
+        return
+    if access is Access.ATTEMPT and principal.kind != "attempt":
+        raise Forbidden("Only the token of a running job attempt may do this.", code="attempt-only")
+    if principal.kind == "attempt":
+        if access in (Access.USER, Access.ADMINISTRATOR, Access.WORKER):
+            raise Forbidden("The token of a job attempt may not do this.", code="not-for-attempts")
+        return
+    if access is Access.ADMINISTRATOR and not principal.administrator:
+        raise Forbidden("Only administrators may do this.", code="administrators-only")
+    if operation.scope is not None and not scopes.reaches_somewhere(principal.scopes, operation.scope):
+        raise Forbidden(
+            f"The token lacks the scope {operation.scope!r}.", code="scope-missing", context={"scope": operation.scope}
+        )
+
+
+@dataclass(frozen=True)
+class Call:
+    """What to do in the transaction, and how to answer."""
+
+    caller: Caller
+    form: Form
+    answers: AnswerCache
+    to_reply: Callable[[Any], Reply]
+    function: Callable[..., Any]
+    args: tuple[Any, ...] = ()
+    kwargs: Mapping[str, Any] = field(default_factory=dict)
+    idempotency_key: str | None = None
+    fingerprint: str = ""
+    project: str | None = None
+    """The one that the address names."""
+
+
+def run_call(tx: Transaction, call: Call) -> Rendered:
+    """Do it, once per idempotency key, and render the answer."""
+    tx.principal = call.caller.identify(tx)
+    if call.idempotency_key is not None:
+        stored = idempotency.begin(tx, call.idempotency_key, call.fingerprint)
+        if stored is not None:
+            _require_role(tx, call)
+            headers = {**stored.headers, "Idempotent-Replayed": "true"}
+            return Rendered(stored.status, headers, stored.body)
+    rendered = render(call.to_reply(call.function(tx, *call.args, **call.kwargs)), call.form, call.answers)
+    if call.idempotency_key is not None:
+        idempotency.finish(tx, call.idempotency_key, rendered.status, dict(rendered.headers), rendered.body)
+    return rendered
+
+
+def _require_role(tx: Transaction, call: Call) -> None:
+    """What the first request was allowed: whose role has ended since does not hear its answer again."""
+    operation = call.caller.operation
+    if call.project is not None and operation.access.is_role:
+        projects.require(tx, call.project, Role(operation.access), operation.scope or "read")
+
+
+def only_identify(tx: Transaction) -> None:
+    """Do nothing more than `run_plain` does by itself: look the credential up."""
+
+
+def run_plain(tx: Transaction, caller: Caller, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """Do something on behalf of the caller and hand its result back."""
+    tx.principal = caller.identify(tx)
+    return function(tx, *args, **kwargs)

@@ -1,0 +1,161 @@
+"""The HTTP side of a request, whatever it is about: its id, what answers carry, how it is refused, who has gone."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from typing import Any, ClassVar
+
+from tornado.iostream import StreamClosedError
+from tornado.web import HTTPError, RequestHandler
+
+from marey_server.errors import MareyError, MethodNotAllowed
+from marey_server.http import problem
+from marey_server.http.declarations import Declared, Operation
+from marey_server.http.reply import API, Rendered
+from marey_server.process.observe import request_id
+from marey_server.process.services import Services
+
+LINGER_BYTES = 64 * 2**20
+"""How much of a refused body is read and thrown away, so that its sender gets to read why."""
+_LENGTH = re.compile("[0-9]{1,4300}")
+"""What `int` takes: it refuses longer texts."""
+_SECURITY_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+
+
+class Exchange(RequestHandler):
+    """One request and its answer."""
+
+    path: ClassVar[str]
+    root: ClassVar[str] = API
+    operations: ClassVar[dict[str, Operation]] = {}
+
+    def initialize(self) -> None:
+        """Set up the state of one request."""
+        self.request_id = request_id(self.request.headers.get("X-Request-Id"))
+        self.set_header("X-Request-Id", self.request_id)
+        self.received_bytes = 0
+        self.refused = self.performing = self._gone = False
+
+    @classmethod
+    def template(cls) -> str:
+        """The template of the address, as in `/api/v1/projects/{project}`."""
+        return cls.root + cls.path.replace(":int}", "}")
+
+    @property
+    def services(self) -> Services:
+        """What the server holds."""
+        services: Services = self.application.services  # type: ignore[attr-defined]
+        return services
+
+    # -- the body that comes ------------------------------------------------------------------------------------------
+
+    def declared_length(self) -> int:
+        """The length of the body as its sender says; 0 where it does not, or says what Tornado refuses next."""
+        text = self.request.headers.get("Content-Length", "0").partition(",")[0].strip()  # the same may stand twice
+        return int(text) if _LENGTH.fullmatch(text) else 0
+
+    def expects_body(self) -> bool:
+        """Whether a body follows the headers."""
+        return self.declared_length() > 0 or "Transfer-Encoding" in self.request.headers
+
+    def drop(self) -> None:
+        """Throw away what comes of the body of a refused request; when it does not end, cut the connection."""
+        if self.received_bytes > LINGER_BYTES:
+            self.request.connection.close()  # type: ignore[union-attr]
+
+    # -- the answer that goes -----------------------------------------------------------------------------------------
+
+    def send(self, rendered: Rendered) -> None:
+        """Put status, headers and body of an answer into the response."""
+        self.set_status(rendered.status)
+        for name, value in rendered.headers.items():
+            self.set_header(name, value)
+        if rendered.status not in (204, 304):
+            self.set_header("Content-Length", str(len(rendered.body)))
+            self.write(rendered.body)
+
+    async def flush_within(self, seconds: float) -> None:
+        """Wait until what was written has gone out; who does not take it in time is cut off."""
+        try:
+            await asyncio.wait_for(self.flush(), seconds)
+        except TimeoutError:
+            self.request.connection.close()  # type: ignore[union-attr]
+            raise StreamClosedError from None
+
+    async def refuse(self, error: MareyError) -> None:
+        """Answer before the body is read. The rest of it is read and dropped: closing at once could lose the answer."""
+        self.refused = True
+        self._write_problem(error)
+        if self.request.headers.get("Expect", "").lower() == "100-continue":
+            self.finish()
+        elif self.expects_body():
+            await self.flush()
+
+    def method_not_allowed(self) -> MethodNotAllowed:
+        """The refusal of a method that was not declared."""
+        allowed = ", ".join(sorted({*self.operations, *(["HEAD"] if "GET" in self.operations else [])}))
+        return MethodNotAllowed(f"Here one can {allowed}.", headers={"Allow": allowed})
+
+    def is_awaited(self) -> bool:
+        """Whether an answer still has somebody to go to, and the server time to make one."""
+        return not self._gone and not self.services.draining.is_set()
+
+    # -- what Tornado asks for ----------------------------------------------------------------------------------------
+
+    async def _undeclared(self, **_path: str) -> None:
+        """Methods without a declaration are refused before they are called."""
+
+    get: Declared = _undeclared
+    head: Declared = _undeclared
+    post: Declared = _undeclared
+    put: Declared = _undeclared
+    patch: Declared = _undeclared
+    delete: Declared = _undeclared
+    options: Declared = _undeclared
+
+    def set_default_headers(self) -> None:
+        """Headers of every answer."""
+        self.clear_header("Server")
+        for name, value in _SECURITY_HEADERS.items():
+            self.set_header(name, value)
+
+    def compute_etag(self) -> None:
+        """No tag from the bytes of an answer: tags name states, and hashing an answer costs more than sending it."""
+
+    def write_error(self, status_code: int, **kwargs: Any) -> None:
+        """Any error as a problem document; details of our own faults stay in the log."""
+        if self._headers_written:  # part of an answer is out: only a cut connection says that it is not whole
+            self.request.connection.close()  # type: ignore[union-attr]
+            return
+        exc_info = kwargs.get("exc_info")
+        error = exc_info[1] if exc_info else HTTPError(status_code)
+        if isinstance(error, HTTPError) and error.status_code == 405:  # a method that Tornado itself does not know
+            error = self.method_not_allowed()
+        self.set_header("X-Request-Id", self.request_id)
+        self._write_problem(error)
+        if not self._finished:
+            self.finish()
+
+    def _write_problem(self, error: BaseException) -> None:
+        self.send(problem.render(error, self.request_id))
+
+    def log_exception(self, _type: Any, value: Any, _traceback: Any) -> None:
+        """Faults of ours are logged with their traceback, refusals are not faults."""
+        problem.log_fault(value, self.request_id, self.request.method or "", self.template())
+
+    def on_finish(self) -> None:
+        """The answer is on its way."""
+        self.services.in_flight.discard(self)
+
+    def on_connection_close(self) -> None:
+        """The caller has gone."""
+        super().on_connection_close()
+        self._gone = True
+        if not self.performing:  # a method that runs ends by itself, and a draining server waits for it
+            self.services.in_flight.discard(self)

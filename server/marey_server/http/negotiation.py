@@ -1,0 +1,135 @@
+"""Media types: which form of an answer the caller gets, and in which form a body came (RFC 9110, section 12)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+from marey_schemas.encoding import codecs
+from marey_server.errors import NotAcceptable, Unauthenticated, UnsupportedMediaType
+
+MAX_RANGES = 64
+
+
+@dataclass(frozen=True, slots=True)
+class MediaType:
+    """A form that an answer can take. `form` is its name in ETags."""
+
+    name: str
+    form: str
+    arrays: Literal["plain", "blocks"] = "plain"
+
+    def __str__(self) -> str:
+        return self.name if self.arrays == "plain" else f"{self.name}; arrays={self.arrays}"
+
+
+JSON = MediaType(codecs.JSON, "json")
+MSGPACK = MediaType(codecs.MSGPACK, "msgpack")
+BSON = MediaType(codecs.BSON, "bson")
+MSGPACK_BLOCKS = MediaType(codecs.MSGPACK, "msgpack-blocks", "blocks")
+BSON_BLOCKS = MediaType(codecs.BSON, "bson-blocks", "blocks")
+
+EVENT_STREAM = MediaType("text/event-stream", "events")
+
+MODEL_FORMS = (JSON, MSGPACK, BSON)
+"""What every answer without arrays comes in."""
+
+DOCUMENT_FORMS = (JSON, MSGPACK, BSON, MSGPACK_BLOCKS, BSON_BLOCKS)
+"""What documents come in; `arrays=blocks` passes stored arrays on as they are."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Range:
+    """One element of an Accept header."""
+
+    type: str
+    subtype: str
+    params: frozenset[tuple[str, str]]
+    quality: float
+
+    def specificity(self, offer: MediaType) -> int:
+        """How closely this range names `offer`; 0 if it does not."""
+        main, _, sub = offer.name.partition("/")
+        held = {("arrays", offer.arrays)}
+        if self.type == "*":
+            return 1 if self.subtype == "*" and self.params <= held else 0
+        if self.type != main or not self.params <= held:
+            return 0
+        if self.subtype == "*":
+            return 2
+        return 3 + len(self.params) if self.subtype == sub else 0
+
+
+def choose(accept: str | None, offers: tuple[MediaType, ...]) -> MediaType:
+    """The offer the caller likes best; the first offer wins ties. Raises `NotAcceptable`, listing what is offered."""
+    chosen = _best(accept, offers) if accept else offers[0]
+    if chosen is None:
+        names = ", ".join(map(str, offers))
+        raise NotAcceptable(f"This is offered as {names}.", context={"offered": [str(offer) for offer in offers]})
+    return chosen
+
+
+@lru_cache(maxsize=512)
+def _best(accept: str, offers: tuple[MediaType, ...]) -> MediaType | None:
+    ranges = [found for text in accept.split(",")[:MAX_RANGES] if (found := _parse_range(text)) is not None]
+    best: MediaType | None = None
+    best_quality = 0.0
+    for offer in offers:
+        _, quality = max(((found.specificity(offer), found.quality) for found in ranges), default=(0, 0.0))
+        named = any(found.specificity(offer) for found in ranges)
+        if named and quality > best_quality:
+            best, best_quality = offer, quality
+    return best
+
+
+def _parse_range(text: str) -> _Range | None:
+    name, params = _split_parameters(text)
+    main, slash, sub = name.partition("/")
+    if not slash or not main or not sub:
+        return None
+    try:
+        quality = float(params.pop("q", "1"))
+    except ValueError:
+        return None
+    params.pop("charset", None)
+    return _Range(main, sub, frozenset(params.items()), quality if 0 <= quality <= 1 else 0.0)
+
+
+def _split_parameters(text: str) -> tuple[str, dict[str, str]]:
+    name, *rest = text.split(";")
+    params = {}
+    for part in rest:
+        key, _, value = part.partition("=")
+        params[key.strip().lower()] = value.strip().strip('"').lower()
+    return name.strip().lower(), params
+
+
+def body_type(content_type: str | None, known: tuple[str, ...] = codecs.MEDIA_TYPES) -> str:
+    """The media type of a body; JSON if it names none. Raises `UnsupportedMediaType`, listing what is understood."""
+    if not content_type:
+        return codecs.JSON
+    name, params = _split_parameters(content_type)
+    if name not in known:
+        raise UnsupportedMediaType(
+            f"A body may be {', '.join(known)}, not {name}.", context={"understood": list(known)}
+        )
+    if params.get("charset", "utf-8") not in ("utf-8", "utf8", "us-ascii"):
+        raise UnsupportedMediaType(f"Text is read as UTF-8, not {params['charset']}.")
+    return name
+
+
+def require_plain_encoding(content_encoding: str | None) -> None:
+    """Refuse compressed bodies, so that no small request unfolds into a large one. Raises `UnsupportedMediaType`."""
+    if content_encoding and content_encoding.strip().lower() not in ("", "identity"):
+        raise UnsupportedMediaType(f"Bodies are read as they are; leave out Content-Encoding: {content_encoding}.")
+
+
+def bearer_token(authorization: str | None) -> str | None:
+    """The token of an Authorization header, None without one. Raises `Unauthenticated` where it is malformed."""
+    if authorization is None:
+        return None
+    scheme, _, token = authorization.strip().partition(" ")
+    if scheme.lower() != "bearer" or not token.strip() or len(token) > 1024:
+        raise Unauthenticated("The Authorization header must read: Bearer <token>.", code="bad-authorization")
+    return token.strip()

@@ -1,0 +1,294 @@
+"""The OpenAPI 3.1 document, made from the declarations on the handlers: nothing in it is written twice."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from http import HTTPStatus
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.json_schema import JsonSchemaMode, models_json_schema
+
+from marey_schemas.documents import SCHEMAS
+from marey_schemas.encoding.codecs import MEDIA_TYPES
+from marey_schemas.kinds import PARTS, Kind
+from marey_schemas.problems import MEDIA_TYPE as PROBLEM_TYPE
+from marey_schemas.problems import Problem
+from marey_server.http.declarations import Access, Body, Bytes, Document, Files, Operation
+from marey_server.http.negotiation import DOCUMENT_FORMS
+from marey_server.http.routes import Route
+
+Schema = dict[str, Any]
+
+_REF = "#/components/schemas/{model}"
+_NAME = {"type": "string", "minLength": 1}
+_PART_NAMES = sorted({part for parts in PARTS.values() for part in parts})
+PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
+    "project": ("Name of the project.", _NAME),
+    "user": ("Name of the user.", _NAME),
+    "kind": ("Kind of the items, in the plural.", {"type": "string", "enum": [kind.plural for kind in Kind]}),
+    "item": ("Id of the item.", _NAME),
+    "collection": ("Id of the collection.", _NAME),
+    "part": ("Name of the part.", {"type": "string", "enum": _PART_NAMES}),
+    "figure": ("Name of the figure.", {"type": "string", "pattern": "^[a-z0-9][a-z0-9_-]{0,63}$"}),
+    "revision": ("Number of the revision.", {"type": "integer", "minimum": 1, "maximum": 999_999_999}),
+    "token": ("Id of the token.", _NAME),
+    "upload": ("Id of the upload.", _NAME),
+    "digest": ("Name of the bytes.", {"type": "string", "pattern": "^sha256:[0-9a-f]{64}$"}),
+    "job": ("Id of the job.", _NAME),
+    "job_kind": ("Name of the kind of job.", _NAME),
+    "stream": ("Id of the coverage stream.", _NAME),
+    "fence": ("Fence of the attempt.", {"type": "integer", "minimum": 0, "maximum": 999_999_999}),
+}  # fmt: skip
+_OFFSET = {"type": "integer", "minimum": 0, "maximum": 10**12 - 1}
+_STATE = {"type": "string", "pattern": r'^(\*|"[0-9]{1,9}\.[a-z-]+")$'}
+_HEADER_SCHEMAS: dict[str, Schema] = {
+    "If-Match": _STATE,
+    "If-None-Match": {"type": "string", "const": "*"},
+    "Idempotency-Key": {"type": "string", "pattern": "^[!-~]{1,255}$"},
+    "Upload-Offset": _OFFSET,
+    "Last-Event-ID": _OFFSET,
+}
+_ALWAYS_NEEDED = {"Upload-Offset"}
+_HEADERS = {
+    "If-Match": 'The ETag you read, as in "7.json", or *.',
+    "If-None-Match": "* to create only what is not there.",
+    "Prefer": "wait=20: answer when the job has ended, or after so many seconds.",
+    "Range": "bytes=0-1023: only these bytes.",
+    "If-Range": "The ETag whose bytes the range continues.",
+    "Last-Event-ID": "Number of the last event received, when a stream is taken up again.",
+    "Upload-Offset": "How many bytes the server has; it must be right.",
+    "Idempotency-Key": "A text of your own; the same request with it again gives the same answer, for seven days.",
+}
+_TOKEN_NEEDED: list[Schema] = [{"bearer": []}]
+_TOKEN_OPTIONAL: list[Schema] = [{}, {"bearer": []}]
+
+
+def build_document(routes: Iterable[Route], version: str) -> Schema:
+    """The OpenAPI document of a table of routes."""
+    routes = list(routes)
+    models = _Models(routes)
+    paths: dict[str, Schema] = {}
+    for route in routes:
+        entry = paths.setdefault(route.template, {"parameters": [_path_parameter(name) for name in route.variables]})
+        entry[route.operation.method.lower()] = _operation(route, models)
+    return {
+        "openapi": "3.1.0",
+        "info": {
+            "title": "Marey",
+            "version": version,
+            "summary": "Motion data and model management.",
+            "description": "Documents travel as JSON, MessagePack or BSON; errors are problem documents (RFC 9457).",
+            "license": {"name": "MIT", "identifier": "MIT"},
+        },
+        "servers": [{"url": "/"}],
+        "tags": [{"name": tag} for tag in dict.fromkeys(route.resource.tag for route in routes)],
+        "paths": paths,
+        "components": {
+            "schemas": models.components,
+            "securitySchemes": {"bearer": {"type": "http", "scheme": "bearer", "description": "A token of Marey."}},
+            "responses": {"Problem": _problem_response()},
+        },
+    }
+
+
+class _Models:
+    """The JSON schemas of every model that travels, and references to them."""
+
+    def __init__(self, routes: list[Route]) -> None:
+        wanted: dict[tuple[type[BaseModel], JsonSchemaMode], None] = {(Problem, "serialization"): None}
+        for route in routes:
+            operation = route.operation
+            for answer in (operation.answer, *(model for _, model in operation.also)):
+                if answer is not None and issubclass(answer, BaseModel):
+                    wanted[answer, "serialization"] = None
+            for taken in (operation.body.content, operation.body.alternative) if operation.body else ():
+                if taken is not None and issubclass(taken, BaseModel):
+                    wanted[taken, "validation"] = None
+        wanted |= {(model, "validation"): None for model in SCHEMAS.values()}
+        self._refs, definitions = models_json_schema(list(wanted), ref_template=_REF)
+        self.components: dict[str, Schema] = definitions.get("$defs", {})
+
+    def reading(self, model: type[BaseModel]) -> Schema:
+        """Reference to a model that a caller sends."""
+        return dict(self._refs[model, "validation"])
+
+    def writing(self, model: type[BaseModel]) -> Schema:
+        """Reference to a model that the server answers."""
+        return dict(self._refs[model, "serialization"])
+
+    def partial(self, model: type[BaseModel]) -> Schema:
+        """Reference to a model of which only some fields are there."""
+        name = f"Some{model.__name__}"
+        full = self.components[self.writing(model)["$ref"].rpartition("/")[2]]
+        self.components[name] = {key: value for key, value in full.items() if key != "required"} | {"title": name}
+        return {"$ref": _REF.format(model=name)}
+
+    def document(self) -> Schema:
+        """A document of any known schema; the open one admits those of the others, too."""
+        return {"anyOf": [self.reading(model) for model in SCHEMAS.values()]}
+
+
+def _operation(route: Route, models: _Models) -> Schema:
+    operation = route.operation
+    guests = operation.access is Access.ANYONE or (operation.access is Access.READER and operation.public)
+    entry: Schema = {
+        "operationId": f"{operation.method.lower()}_{_snake(route.resource.__name__)}",
+        "summary": operation.summary,
+        "tags": [route.resource.tag],
+        "parameters": [*_query_parameters(operation), *_header_parameters(operation)],
+        "responses": _responses(operation, models),
+        "security": _TOKEN_OPTIONAL if guests else _TOKEN_NEEDED,
+        "x-access": operation.access.value,
+    }
+    if operation.scope is not None:
+        entry["x-scope"] = operation.scope
+    if operation.description:
+        entry["description"] = operation.description
+    if operation.body is not None:
+        entry["requestBody"] = _request_body(operation.body, models)
+    return entry
+
+
+def _snake(name: str) -> str:
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()
+
+
+def _path_parameter(name: str) -> Schema:
+    description, schema = PATH_VARIABLES[name]
+    return {"name": name, "in": "path", "required": True, "description": description, "schema": schema}
+
+
+def _query_parameters(operation: Operation) -> list[Schema]:
+    if operation.query is None:
+        return []
+    schema = operation.query.model_json_schema(by_alias=True, ref_template=_REF)
+    parameters = []
+    for name, found in schema.get("properties", {}).items():
+        shown = _without_null(found)
+        description = shown.pop("description", "")
+        parameter = {"name": name, "in": "query", "required": name in schema.get("required", ()), "schema": shown}
+        if description:
+            parameter["description"] = description
+        if shown.get("type") == "array":
+            parameter |= {"style": "form", "explode": False}
+        parameters.append(parameter)
+    return parameters
+
+
+def _without_null(schema: Schema) -> Schema:
+    """A parameter that is not there is simply absent: null cannot be sent."""
+    shown = {key: value for key, value in schema.items() if key not in ("title", "default") or schema[key] is not None}
+    shown.pop("title", None)
+    choices = [choice for choice in shown.pop("anyOf", ()) if choice.get("type") != "null"]
+    if len(choices) == 1:
+        shown |= choices[0]
+    elif choices:
+        shown["anyOf"] = choices
+    return shown
+
+
+def _header_parameters(operation: Operation) -> list[Schema]:
+    names = []
+    if operation.precondition != "none":
+        names.append("If-Match")
+    if operation.may_create:
+        names.append("If-None-Match")
+    if operation.idempotency == "key":
+        names.append("Idempotency-Key")
+    needed = _ALWAYS_NEEDED | ({"If-Match"} if operation.precondition == "required" else set())
+    return [
+        {
+            "name": name, "in": "header", "required": name in needed, "description": _HEADERS[name],
+            "schema": {"type": "string"},
+        }
+        for name in (*names, *operation.headers)
+    ]  # fmt: skip
+
+
+def _request_body(body: Body, models: _Models) -> Schema:
+    content: Schema = {}
+    if body.content is Bytes:
+        content["application/octet-stream"] = {}
+    elif body.content is Files:
+        content["multipart/form-data"] = {"schema": {"type": "object", "description": "Files and form fields."}}
+    else:
+        schema = models.document() if body.content is Document else models.reading(body.content)  # type: ignore[arg-type]
+        content |= {name: {"schema": schema} for name in MEDIA_TYPES}
+    if body.alternative is not None:
+        content |= {name: {"schema": models.reading(body.alternative)} for name in MEDIA_TYPES}
+    return {"required": body.required, "content": content}
+
+
+def _responses(operation: Operation, models: _Models) -> Schema:
+    success: Schema = {"description": HTTPStatus(operation.status).phrase}
+    if operation.answer is not None:
+        success["content"] = _answer_content(operation, models)
+    if operation.etag:
+        success["headers"] = {"ETag": {"description": "State and form of the answer.", "schema": {"type": "string"}}}
+    found: Schema = {str(operation.status): success}
+    if operation.etag and operation.method == "GET":
+        found["304"] = {"description": "What you hold is current."}
+    for status, model in operation.also:
+        found[str(status)] = {"description": HTTPStatus(status).phrase}
+        if model is not None:
+            schema = models.writing(model)
+            found[str(status)]["content"] = {name: {"schema": schema} for name in MEDIA_TYPES}
+        elif status >= 400:
+            found[str(status)] = {"$ref": "#/components/responses/Problem"}
+    for status in _refusals(operation):
+        found.setdefault(str(status), {"$ref": "#/components/responses/Problem"})
+    found["default"] = {"$ref": "#/components/responses/Problem"}
+    return found
+
+
+def _answer_content(operation: Operation, models: _Models) -> Schema:
+    answer = operation.answer
+    if answer is Bytes:
+        return {name: {} for name in operation.answer_types or ("application/octet-stream",)}
+    if answer is Document:
+        return {str(form): ({"schema": models.document()} if form.form == "json" else {}) for form in DOCUMENT_FORMS}
+    assert answer is not None
+    assert issubclass(answer, BaseModel)
+    schema = models.writing(answer)
+    if operation.paged:
+        selectable = operation.query is not None and "fields" in operation.query.model_fields
+        schema = _page_schema(models.partial(answer) if selectable else schema)
+    streams: Schema = {"text/event-stream": {}} if operation.stream else {}
+    return {name: {"schema": schema} for name in operation.answer_types or MEDIA_TYPES} | streams
+
+
+def _page_schema(element: Schema) -> Schema:
+    return {
+        "type": "object",
+        "properties": {
+            "items": {"type": "array", "items": element},
+            "next_cursor": {"type": ["string", "null"], "description": "Send it as `cursor` for the next page."},
+            "count": {"type": ["integer", "null"], "description": "Of the whole list, where count=exact was asked."},
+        },
+        "required": ["items", "next_cursor", "count"],
+    }
+
+
+def _refusals(operation: Operation) -> list[int]:
+    found = [400, 406]
+    if operation.access is not Access.ANYONE:
+        found += [401, 403, 404]
+    if operation.precondition != "none":
+        found += [412]
+    if operation.precondition in ("required", "create"):
+        found += [428]
+    if operation.body is not None:
+        found += [413, 415, 422]
+    if operation.method != "GET":
+        found += [409]
+    return sorted(found)
+
+
+def _problem_response() -> Schema:
+    return {
+        "description": "Why it was refused.",
+        "headers": {"X-Request-Id": {"description": "Quote it when asking for help.", "schema": {"type": "string"}}},
+        "content": {PROBLEM_TYPE: {"schema": {"$ref": _REF.format(model="Problem")}}},
+    }

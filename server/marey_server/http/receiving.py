@@ -1,0 +1,46 @@
+"""Bytes on their way in: gathered on the event loop, hashed and written in threads."""
+
+from __future__ import annotations
+
+import asyncio
+
+from marey_server.errors import StorageFull
+from marey_server.process.services import Services
+from marey_server.store.blobs import Spool
+
+BATCH_BYTES = 1024 * 1024
+INLINE_BYTES = 64 * 1024
+
+
+class Receiver:
+    """Takes a stream of bytes into a `Spool`, off the event loop, holding at most `BATCH_BYTES` of it."""
+
+    def __init__(self, services: Services) -> None:
+        self.spool = Spool()
+        self._services = services
+        self._pending = bytearray()
+
+    async def write(self, data: bytes) -> None:
+        """Take the next bytes; waits while a batch is being written."""
+        self._pending += data
+        if len(self._pending) >= BATCH_BYTES:
+            await self._flush()
+
+    async def finish(self) -> Spool:
+        """Everything that came, hashed. The caller closes it."""
+        if len(self._pending) <= INLINE_BYTES:
+            self._write(bytes(self._pending))
+            self._pending.clear()
+        else:
+            await self._flush()
+        return self.spool
+
+    async def _flush(self) -> None:
+        batch, self._pending = bytes(self._pending), bytearray()
+        await asyncio.wrap_future(self._services.compute_threads.submit(self._write, batch))
+
+    def _write(self, batch: bytes) -> None:
+        try:
+            self.spool.write(batch)
+        except OSError as error:
+            raise StorageFull(f"There is no room to take this in: {error.strerror}.") from error

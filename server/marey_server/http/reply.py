@@ -1,0 +1,97 @@
+"""Answers: what a handler says, and the bytes it becomes. Rendering needs no request, so it can run in any thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+from pydantic import BaseModel
+
+from marey_schemas.encoding.codecs import JSON as JSON_NAME
+from marey_schemas.encoding.codecs import encode_tree
+from marey_server.http.answer_cache import AnswerCache
+from marey_server.http.etags import entity_tag, matches
+from marey_server.http.negotiation import MediaType
+
+API = "/api/v1"
+
+
+@dataclass(frozen=True, slots=True)
+class Lasting:
+    """A document that never changes, by its digest; `load` is called where the bytes to send are not at hand."""
+
+    digest: str
+    load: Callable[[], Mapping[str, Any]]
+
+
+Content = BaseModel | Mapping[str, Any] | bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What a handler answers: a model, a document tree, bytes with their media type, or nothing.
+
+    `rev` is the state for the ETag; `location` a path below the API's root.
+    """
+
+    content: Content | Lasting | None = None
+    status: int | None = None
+    rev: int | str | None = None
+    location: str | None = None
+    media_type: str | None = None
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Rendered:
+    """An answer as it goes out."""
+
+    status: int
+    headers: Mapping[str, str]
+    body: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """How the caller wants the answer: media type, what it holds already, and the status of success."""
+
+    media: MediaType
+    if_none_match: str | None
+    status: int
+
+
+def render(reply: Reply, form: Form, answers: AnswerCache) -> Rendered:
+    """The bytes of a reply; 304 without any where the caller holds this state in this form."""
+    headers = {"Vary": "Accept, Accept-Encoding", **reply.headers}
+    if reply.location is not None:
+        headers["Location"] = API + reply.location
+    if reply.rev is not None:
+        headers["ETag"] = entity_tag(reply.rev, form.media.form)
+        headers.setdefault("Cache-Control", "private, no-cache")
+        if matches(form.if_none_match, headers["ETag"]):
+            return Rendered(304, headers, b"")
+    if reply.content is None:
+        return Rendered(reply.status or form.status, headers, b"")
+    if isinstance(reply.content, Lasting):
+        body = answers.get((reply.content.digest, form.media.form), partial(_load, reply.content, form.media))
+    else:
+        body = encode(reply.content, form.media)
+    headers["Content-Type"] = reply.media_type or str(form.media)
+    return Rendered(reply.status or form.status, headers, body)
+
+
+def _load(content: Lasting, media: MediaType) -> bytes:
+    return encode(content.load(), media)
+
+
+def encode(content: Content, media: MediaType) -> bytes:
+    """A model or tree in a media type; bytes as they are."""
+    if isinstance(content, bytes):
+        return content
+    if isinstance(content, BaseModel):
+        if media.name == JSON_NAME:
+            return content.model_dump_json(by_alias=True).encode()
+        content = content.model_dump(mode="json", by_alias=True)
+    return encode_tree(content, media.name, arrays=media.arrays)

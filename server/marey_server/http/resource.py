@@ -1,0 +1,306 @@
+"""The base of every handler: checks what the declaration says, runs the method, sends what it answers.
+
+A resource names its `path` and declares its methods:
+
+    class ProjectResource(Resource):
+        path = "/projects/{project}"
+        tag = "Projects"
+
+        @reads(access=Access.READER, answer=Project, etag=True)
+        async def get(self, project: str) -> Rendered:
+            \"\"\"A project.\"\"\"
+            return await self.answer(projects.read_project, project)
+
+A method gets the path's variables (`{fence:int}` as an int), `query` and `body` as declared. `self.answer` calls a
+function of the store with a transaction, in its own thread, and renders its result there; `self.look_up` and
+`self.change` only call it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import re
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any, ClassVar, Concatenate, ParamSpec, TypeVar
+from urllib.parse import urlencode
+
+from pydantic import BaseModel
+from tornado.web import stream_request_body
+
+from marey_server.access.principal import ANONYMOUS, Principal
+from marey_server.errors import BadRequest, MareyError, TooLarge
+from marey_server.http import negotiation
+from marey_server.http.calls import Call, Caller, only_identify, require_access, run_call, run_plain
+from marey_server.http.declarations import Bytes, Declared, Document, Operation
+from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
+from marey_server.http.exchange import Exchange
+from marey_server.http.reply import Form, Rendered, Reply, render
+from marey_server.http.validation import decode_body, parse_query, validate_body
+from marey_server.store.transaction import Transaction
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+INLINE_BYTES = 32 * 1024
+"""Bodies and answers up to this size are converted on the event loop; larger ones in a thread."""
+EARLY_CHECK_BYTES = 1024 * 1024
+"""Before a larger body is taken in, the credential is looked up."""
+_METHODS = ("get", "post", "put", "patch", "delete")
+_KEY = re.compile(r"[\x21-\x7e]{1,255}")
+
+
+@stream_request_body
+class Resource(Exchange):
+    """A thing with a path and declared methods."""
+
+    tag: ClassVar[str]
+    uneventful = False
+    """Whether this success says nothing that a log should tell: nothing was leased, the server is still alive."""
+
+    operation: Operation
+    caller: Caller
+    media: negotiation.MediaType
+    query: BaseModel | None = None
+    precondition: Precondition = ANY_STATE
+
+    def __init_subclass__(cls) -> None:
+        methods = {name: getattr(cls, name) for name in _METHODS if hasattr(vars(cls).get(name), "operation")}
+        cls.operations = {name.upper(): method.operation for name, method in methods.items()}
+        if "get" in methods:
+            cls.head = cls.get
+
+    def initialize(self) -> None:
+        """Set up the state of one request."""
+        super().initialize()
+        self._received = bytearray()
+
+    @property
+    def principal(self) -> Principal | None:
+        """Who asked, once it is known."""
+        caller: Caller | None = getattr(self, "caller", None)  # absent where the request was refused before
+        return caller.principal if caller is not None else None
+
+    # -- for the methods of resources ---------------------------------------------------------------------------------
+
+    async def look_up(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """What `function(tx, ...)` returns, on behalf of the caller, in a read-only transaction."""
+        future = self.services.database.submit_read(ANONYMOUS, run_plain, self.caller, function, *args, **kwargs)
+        return await asyncio.wrap_future(future)
+
+    async def change(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """What `function(tx, ...)` returns, on behalf of the caller, committed."""
+        future = self.services.database.submit_write(ANONYMOUS, run_plain, self.caller, function, *args, **kwargs)
+        return await asyncio.wrap_future(future)
+
+    async def answer(
+        self,
+        function: Callable[Concatenate[Transaction, P], T],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> Rendered:
+        """The answer that `function(tx, ...)` gives, by the declaration: a model, its ETag, the declared status."""
+        return await self.answer_with(self._declared_reply, function, *args, **kwargs)
+
+    async def answer_with(
+        self,
+        to_reply: Callable[[T], Reply],
+        function: Callable[Concatenate[Transaction, P], T],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> Rendered:
+        """The answer that `to_reply` makes of what `function(tx, ...)` returns, both in the transaction's thread."""
+        key = self._idempotency_key()
+        fingerprint = self._fingerprint() if key else ""
+        answers = self.services.answers
+        project = self.path_kwargs.get("project")
+        call = Call(self.caller, self.answer_form, answers, to_reply, function, args, kwargs, key, fingerprint, project)
+        database = self.services.database
+        submit = database.submit_read if self.operation.method == "GET" else database.submit_write
+        return await asyncio.wrap_future(submit(ANONYMOUS, run_call, call))
+
+    async def compute(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """What `function` returns, computed in a thread away from the event loop."""
+        return await asyncio.wrap_future(self.services.compute_threads.submit(function, *args, **kwargs))
+
+    async def compute_long(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """As `compute`, for what may take seconds: some of the threads are left to others."""
+        async with self.services.compute_threads.long_place():
+            return await self.compute(function, *args, **kwargs)
+
+    def on_finish(self) -> None:
+        """The answer is on its way."""
+        super().on_finish()
+        if self.principal is not None:
+            self.services.note_use(self.principal)
+
+    async def pause(self, seconds: float) -> bool:
+        """Wait; return at once, with True, when the server is stopping."""
+        try:
+            await asyncio.wait_for(self.services.draining.wait(), seconds)
+        except TimeoutError:
+            return False
+        return True
+
+    @property
+    def answer_form(self) -> Form:
+        """How the caller wants the answer."""
+        reading = self.request.method in ("GET", "HEAD")
+        return Form(self.media, self.request.headers.get("If-None-Match") if reading else None, self.operation.status)
+
+    async def _begin(self, **_path: Any) -> None:
+        pass
+
+    begin: Declared = _begin
+    """Called before the first byte of a streamed body, with the path's variables."""
+
+    async def receive(self, chunk: bytes) -> None:
+        """Called with each piece of a streamed body."""
+
+    def _declared_reply(self, outcome: Any) -> Reply:
+        if self.operation.answer is None:
+            return Reply()
+        if self.operation.paged:
+            return Reply(outcome, headers=self._link_to_next(outcome.next_cursor))
+        return Reply(outcome, rev=outcome.rev if self.operation.etag else None)
+
+    def _link_to_next(self, cursor: str | None) -> dict[str, str]:
+        if cursor is None:
+            return {}
+        query = [(name, values[0]) for name, values in self.request.query_arguments.items() if name != "cursor"]
+        return {"Link": f'<{self.request.path}?{urlencode([*query, ("cursor", cursor)])}>; rel="next"'}
+
+    # -- one request, from its headers to its answer ------------------------------------------------------------------
+
+    async def prepare(self) -> None:
+        """Check everything that the headers and the address tell, before any of the body is taken in."""
+        self.services.in_flight.add(self)
+        try:
+            self._check_head()
+            body = self.operation.body
+            if body is not None and body.streamed:
+                self.request.connection.set_body_timeout(self.services.settings.upload_timeout_s)  # type: ignore[union-attr]
+                await self.begin(**self.path_variables)
+            elif self.declared_length() > EARLY_CHECK_BYTES:
+                await self.look_up(only_identify)
+        except MareyError as error:
+            await self.refuse(error)
+
+    def _check_head(self) -> None:
+        method = "GET" if self.request.method == "HEAD" else self.request.method
+        operation = self.operations.get(method or "")
+        if operation is None:
+            raise self.method_not_allowed()
+        self.operation = operation
+        headers = self.request.headers
+        offers = self._offers(operation)
+        chosen_otherwise = operation.answer is Bytes  # by the address: bytes have the one type they have
+        self.media = offers[0] if chosen_otherwise else negotiation.choose(headers.get("Accept"), offers)
+        self.caller = Caller(negotiation.bearer_token(headers.get("Authorization")), operation)
+        if self.caller.token is None:
+            require_access(operation, ANONYMOUS)
+        self.query = parse_query(operation.query, self.request.query_arguments)
+        if operation.precondition == "required" or (
+            operation.precondition != "none" and ("If-Match" in headers or "If-None-Match" in headers)
+        ):
+            self.precondition = write_precondition(
+                headers.get("If-Match"), headers.get("If-None-Match"), may_create=operation.may_create
+            )
+        elif operation.precondition == "create":
+            write_precondition(None, None, may_create=True)
+        self._check_body_head(operation)
+
+    def _offers(self, operation: Operation) -> tuple[negotiation.MediaType, ...]:
+        if operation.answer_types:
+            return (
+                negotiation.MediaType(operation.answer_types[0], "bytes"),
+            )  # what bytes are is not the caller's choice
+        if operation.stream:
+            return (*negotiation.MODEL_FORMS, negotiation.EVENT_STREAM)
+        return negotiation.DOCUMENT_FORMS if operation.answer is Document else negotiation.MODEL_FORMS
+
+    def _check_body_head(self, operation: Operation) -> None:
+        body = operation.body
+        negotiation.require_plain_encoding(self.request.headers.get("Content-Encoding"))
+        if body is None or not self.expects_body():
+            return
+        if self.declared_length() > body.max_bytes:
+            raise TooLarge(f"The body has {self.declared_length()} bytes; at most {body.max_bytes} are taken here.")
+        if body.content is not Bytes and not body.streamed:
+            self.body_type = negotiation.body_type(self.request.headers.get("Content-Type"))
+
+    @property
+    def path_variables(self) -> dict[str, Any]:
+        """The variables of the path, converted."""
+        numbers = set(re.findall(r"\{(\w+):int\}", self.path))
+        return {name: int(text) if name in numbers else text for name, text in self.path_kwargs.items()}
+
+    async def data_received(self, chunk: bytes) -> None:
+        """Take a piece of the body in, or throw it away where the request was refused already."""
+        self.received_bytes += len(chunk)
+        if self.refused:
+            self.drop()
+            return
+        body = self.operation.body
+        try:
+            limit = body.max_bytes if body is not None else 0
+            if self.received_bytes > limit:
+                raise TooLarge(f"The body is longer than the {limit} bytes that are taken here.")
+            if body is not None and body.streamed:
+                await self.receive(chunk)
+            else:
+                self._received += chunk
+        except MareyError as error:
+            await self.refuse(error)
+
+    async def perform(self, method: Callable[..., Awaitable[Reply | Rendered | None]]) -> None:
+        """Run a declared method and send what it answers."""
+        if self.refused:
+            return
+        self.performing = True
+        arguments = self.path_variables
+        if self.query is not None:
+            arguments["query"] = self.query
+        body = self.operation.body
+        if body is not None and not body.streamed:
+            arguments["body"] = await self._read_body()
+        outcome = await method(self, **arguments)
+        if isinstance(outcome, Reply):
+            outcome = render(outcome, self.answer_form, self.services.answers)
+        if outcome is not None:
+            self.send(outcome)
+
+    async def _read_body(self) -> Any:
+        body = self.operation.body
+        assert body is not None
+        data = bytes(self._received)
+        if body.content is Bytes:
+            return data
+        if not data:
+            if body.required:
+                raise BadRequest("A body is needed.", code="body-missing")
+            return None
+        read = partial(_decode, data, self.body_type, body.content)
+        return read() if len(data) <= INLINE_BYTES else await self.compute(read)
+
+    # -- idempotency --------------------------------------------------------------------------------------------------
+
+    def _idempotency_key(self) -> str | None:
+        if self.operation.idempotency != "key":
+            return None
+        key = self.request.headers.get("Idempotency-Key")
+        if key is not None and not _KEY.fullmatch(key):
+            raise BadRequest("An Idempotency-Key has 1 to 255 visible ASCII characters.", code="bad-idempotency-key")
+        return key
+
+    def _fingerprint(self) -> str:
+        digest = hashlib.sha256(f"{self.request.method} {self.request.uri}\n".encode())
+        digest.update(self.request.headers.get("Content-Type", "").encode() + b"\n")
+        digest.update(self._received)
+        return f"sha256:{digest.hexdigest()}"
+
+
+def _decode(data: bytes, media_type: str, content: Any) -> Any:
+    tree = decode_body(data, media_type)
+    return tree if content is Document else validate_body(content, tree)

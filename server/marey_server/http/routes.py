@@ -1,0 +1,118 @@
+"""The table of every route: what is served, what is documented, and what the access test walks through."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote_to_bytes
+
+from tornado.httputil import HTTPMessageDelegate, HTTPServerRequest
+from tornado.routing import Router
+
+from marey_server.errors import NotFound
+from marey_server.http.declarations import Operation
+from marey_server.http.resource import Resource
+
+if TYPE_CHECKING:
+    from marey_server.app import Application
+
+_VARIABLE = re.compile(r"\{(\w+)(?::int)?\}")
+_NUMBER = re.compile(rb"\d{1,9}")
+_CONTROL = re.compile(rb"[\x00-\x1f\x7f]")
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """One operation and the template of its path, as in `/api/v1/projects/{project}`."""
+
+    template: str
+    operation: Operation
+    resource: type[Resource]
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """The names of the path's variables."""
+        return tuple(_VARIABLE.findall(self.template))
+
+
+@dataclass(slots=True)
+class _Node:
+    """One segment of a path: what may follow it."""
+
+    literals: dict[str, _Node] = field(default_factory=dict)
+    variable: _Node | None = None
+    resource: type[Resource] | None = None
+
+
+class UnknownPath(Resource):
+    """What every other address answers."""
+
+    root = ""
+    path = "(unknown)"
+    tag = ""
+
+    def _check_head(self) -> None:
+        raise NotFound("No resource has this address.")
+
+
+class RouteTable(Router):
+    """Finds the resource of an address segment by segment, so that the number of routes does not matter."""
+
+    def __init__(self, application: Application, resources: Iterable[type[Resource]]) -> None:
+        self._application = application
+        self._resources = tuple(resources)
+        self._root = _Node()
+        for resource in self._resources:
+            self._add(resource)
+
+    def __iter__(self) -> Iterator[Route]:
+        for resource in self._resources:
+            for operation in resource.operations.values():
+                yield Route(resource.template(), operation, resource)
+
+    def _add(self, resource: type[Resource]) -> None:
+        node = self._root
+        for segment in _segments(resource.root + resource.path):
+            if _VARIABLE.fullmatch(segment):
+                node.variable = node.variable or _Node()
+                node = node.variable
+            else:
+                node = node.literals.setdefault(segment, _Node())
+        if node.resource is not None:
+            raise ValueError(f"{resource.template()} is served twice")
+        node.resource = resource
+
+    def find_handler(self, request: HTTPServerRequest, **_kwargs: Any) -> HTTPMessageDelegate:
+        """The resource of a request's path, with the values of the path's variables."""
+        resource, values = self._find(request.path or "")
+        names = _VARIABLE.findall(resource.path)
+        return self._application.get_handler_delegate(
+            request, resource, path_kwargs=dict(zip(names, values, strict=True))
+        )
+
+    def _find(self, path: str) -> tuple[type[Resource], list[bytes]]:
+        node = self._root
+        values: list[bytes] = []
+        for segment in _segments(path):
+            following = node.literals.get(segment)
+            if following is None:
+                value = unquote_to_bytes(segment)
+                if node.variable is None or not value or _CONTROL.search(value):
+                    return UnknownPath, []
+                following = node.variable
+                values.append(value)
+            node = following
+        if node.resource is None or not _numbers_fit(node.resource.path, values):
+            return UnknownPath, []
+        return node.resource, values
+
+
+def _segments(path: str) -> list[str]:
+    return path.removeprefix("/").split("/")
+
+
+def _numbers_fit(path: str, values: list[bytes]) -> bool:
+    wanted = [match[0].endswith(":int}") for match in _VARIABLE.finditer(path)]
+    return all(_NUMBER.fullmatch(value) for value, number in zip(values, wanted, strict=True) if number)

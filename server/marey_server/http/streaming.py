@@ -1,0 +1,98 @@
+"""Sending bytes of blobs: whole or a range, piece after piece."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from urllib.parse import quote
+
+from marey_server.errors import Unavailable
+from marey_server.http.declarations import MIB
+from marey_server.http.etags import entity_tag, matches
+from marey_server.http.ranges import ByteRange, parse_range
+from marey_server.http.reply import Rendered
+from marey_server.http.resource import Resource
+from marey_server.store import blobs
+from marey_server.store.transaction import Transaction
+
+PIECE_BYTES = MIB
+IMMUTABLE = "private, max-age=31536000, immutable"
+WRITE_TIMEOUT_S = 60
+"""A caller who takes longer for one piece has gone, or wants to hold us up."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Opened:
+    """A blob about to be sent: its size, the part of it that was asked for, and the first piece."""
+
+    size: int
+    start: int
+    stop: int
+    first: bytes
+
+
+def _open_blob(tx: Transaction, digest: str, wanted: ByteRange | None, *, head: bool) -> _Opened:
+    """Decide what of a blob is sent, and read its first piece unless only the head is asked for."""
+    size = blobs.require_readable(tx, digest)
+    start, stop = wanted.within(size) if wanted is not None else (0, size)
+    first = b"" if head else blobs.read_blob(tx, digest, start, min(stop, start + PIECE_BYTES))
+    return _Opened(size, start, stop, first)
+
+
+def attachment(file_name: str) -> str:
+    """The Content-Disposition of a file (RFC 6266), with a name of any characters."""
+    plain = "".join(sign if " " <= sign <= "~" and sign not in '"\\%' else "_" for sign in file_name)
+    return f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(file_name, safe='')}"
+
+
+class BlobSender(Resource):
+    """Resources that answer with the bytes of a blob."""
+
+    async def send_blob(
+        self,
+        digest: str,
+        *,
+        disposition: str = "attachment",
+        media_type: str = "application/octet-stream",
+        cache_control: str = IMMUTABLE,
+        headers: Mapping[str, str] = MappingProxyType({}),
+    ) -> Rendered | None:
+        """Answer with the blob, as far as Range, If-Range and If-None-Match ask for it. Raises `NotFound`.
+
+        `cache_control` is for addresses that do not name the blob itself; `headers` go with the bytes.
+        """
+        etag = entity_tag(digest.removeprefix("sha256:"), "bytes")
+        wanted = parse_range(self.request.headers.get("Range"), self.request.headers.get("If-Range"), etag)
+        opened = await self.look_up(_open_blob, digest, wanted, head=self.request.method == "HEAD")
+        told = {
+            "ETag": etag,
+            "Cache-Control": cache_control,
+            "Repr-Digest": f"sha-256=:{base64.b64encode(bytes.fromhex(digest[7:])).decode()}:",
+            "Accept-Ranges": "bytes",
+            "Vary": "Accept, Accept-Encoding, Authorization",
+        }
+        if matches(self.request.headers.get("If-None-Match"), etag):
+            return Rendered(304, told, b"")
+        if wanted is not None:
+            told["Content-Range"] = f"bytes {opened.start}-{opened.stop - 1}/{opened.size}"
+        told |= {"Content-Type": media_type, "Content-Disposition": disposition, **headers}
+        await self._send_pieces(digest, opened, Rendered(200 if wanted is None else 206, told, opened.first))
+        return None
+
+    async def _send_pieces(self, digest: str, opened: _Opened, first: Rendered) -> None:
+        """Send piece after piece, each read only when the one before has gone out."""
+        self.send(first)
+        self.set_header("Content-Length", str(opened.stop - opened.start))
+        if self.request.method == "HEAD":
+            return
+        position = opened.start + len(first.body)
+        while position < opened.stop:
+            await self.flush_within(WRITE_TIMEOUT_S)
+            stop = min(opened.stop, position + PIECE_BYTES)
+            piece = await self.look_up(blobs.read_range, digest, position, stop)
+            if len(piece) != stop - position:
+                raise Unavailable(f"Bytes of {digest} are lost.", code="blob-damaged")
+            self.write(piece)
+            position = stop

@@ -1,0 +1,1 @@
+"""Services that compute with motion: importing, exporting, previews, samples, searches, and coverage."""

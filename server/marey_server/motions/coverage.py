@@ -1,0 +1,303 @@
+"""Coverage of performances that come in as streams: what is computed between reading a stream's row and writing it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from marey_schemas.access import Role
+from marey_schemas.coverage_streams import (
+    MOST_FRAME_RATE_HZ,
+    CoverageCell,
+    CoverageFrames,
+    CoverageProgress,
+    CoverageStreamCreate,
+    CoverageStreamState,
+    CoverageTarget,
+    MeasuredCoverage,
+    Performer,
+)
+from marey_schemas.documents import Motion, SkeletonHierarchy, SkeletonMapping
+from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
+from marey_schemas.kinds import Kind
+from marey_schemas.problems import FieldError
+from marey_server.errors import Invalid, NotFound
+from marey_server.store import items, projects
+from marey_server.store.coverage_streams import NewStream, Step, Stream, answered_before, require_offset
+from marey_server.store.transaction import Transaction
+
+if TYPE_CHECKING:  # numeric modules take a second to load: only who measures coverage pays for them
+    from marey_motion.evaluation.online import OnlineCoverage, Target
+    from marey_motion.matching.body import MatchingBody
+
+Tree = dict[str, Any]
+CACHED_BODIES = 32
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """What a new stream refers to: documents and the revisions they are of."""
+
+    skeleton: Tree | None = None
+    rig: bytes | None = None
+    evaluation: Tree | None = None
+    measured: Tree | None = None
+
+
+def read_given(tx: Transaction, project: str, request: CoverageStreamCreate) -> Given:
+    """What a new stream refers to, for who may make one. Raises `NotFound`."""
+    projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    skeleton = rig = evaluation = measured = None
+    if request.skeleton is not None:
+        hierarchy = items.read_part(tx, project, Kind.SKELETON, request.skeleton, "hierarchy")
+        skeleton = {"item": request.skeleton, "revision": hierarchy.revision}
+        mapping = _mapping(tx, project, request.skeleton, hierarchy.revision)
+        rig = encode_tree({"hierarchy": hierarchy.tree, "mapping": mapping}, MSGPACK)
+    if request.evaluation is not None:
+        part = items.read_part(tx, project, Kind.EVALUATION, request.evaluation, "evaluation")
+        evaluation = {"item": request.evaluation, "revision": part.revision}
+        measured = part.tree
+    return Given(skeleton, rig, evaluation, measured)
+
+
+def _mapping(tx: Transaction, project: str, skeleton: str, revision: int) -> Tree | None:
+    try:
+        return items.read_part(tx, project, Kind.SKELETON, skeleton, "mapping", revision=revision).tree
+    except NotFound:  # an optional part: it is then guessed
+        return None
+
+
+def begin(request: CoverageStreamCreate, given: Given) -> tuple[NewStream, Tree]:
+    """A new stream, and the members of `CoverageStreamState` that are computed."""
+    from marey_motion.evaluation.online import OnlineCoverage
+    from marey_motion.evaluation.result import Grid
+
+    grid = Grid()
+    grid = Grid(request.speeds_m_s or grid.speeds_m_s, request.turn_rates_deg_s or grid.turn_rates_deg_s)
+    least_s, seconds = request.least_s or 1.0, None
+    if given.evaluation is not None:
+        with refusing("evaluation"):
+            found = MeasuredCoverage.model_validate(given.measured)
+        grid = Grid(found.options.grid.speeds_m_s, found.options.grid.turn_rates_deg_s)
+        least_s, seconds = found.options.coverage_least_s, found.coverage.seconds
+    with refusing("evaluation"):  # a grid that the request gives has been checked
+        online = OnlineCoverage(request.frame_rate_hz, grid, least_s=least_s, seconds=seconds)
+    with refusing("skeleton"):
+        _load_kernels(None if given.rig is None else body_of(given.rig))
+    settings = {
+        "frame_rate_hz": request.frame_rate_hz,
+        "skeleton": given.skeleton,
+        "evaluation": given.evaluation,
+        "speeds_m_s": np.unique(grid.speeds_m_s).tolist(),
+        "turn_rates_deg_s": np.unique(grid.turn_rates_deg_s).tolist(),
+        "least_s": least_s,
+        "target_count": request.target_count,
+        "path_s": request.path_s,
+    }
+    return NewStream(settings, given.rig, _packed(online)), _state(online, settings)
+
+
+def look(stream: Stream) -> CoverageStreamState:
+    """A stream with its map."""
+    from marey_motion.evaluation.online import OnlineCoverage
+
+    online = OnlineCoverage.from_tree(decode_tree(stream.state, MSGPACK))
+    return CoverageStreamState(**stream.shown(), **_state(online, stream.settings))
+
+
+def advance(held: Stream, frames: CoverageFrames) -> Step | Tree:
+    """Where frames take a stream, or the answer to the same request before.
+
+    Raises `CoverageOffset` where they do not go on where the stream is, `Invalid` where they are no frames of it.
+    """
+    said = _said(frames)
+    if (answer := answered_before(held, said)) is not None:
+        return answer
+    require_offset(held, frames.offset)
+    from marey_motion.evaluation.online import OnlineCoverage
+
+    online = OnlineCoverage.from_tree(decode_tree(held.state, MSGPACK))
+    before = online.counts.copy()
+    windows = 0
+    if frames.poses is not None and frames.frame_count:
+        windows += _add_poses(online, held, frames)
+    if frames.roots is not None:
+        roots = frames.roots.astype(np.float64)
+        with refusing("roots"):
+            windows += len(online.add_roots(roots[:, :2], roots[:, 2]).speed_m_s)
+    if frames.ends_take:
+        windows += len(online.end_take().speed_m_s)
+    progress = CoverageProgress(
+        offset=online.frame_count,
+        windows=windows,
+        changed=_cells(online, np.argwhere(online.counts != before)),
+        **_now(online, held.settings),
+    )
+    return Step(said, progress.model_dump(mode="json"), online.frame_count, _packed(online))
+
+
+def _add_poses(online: OnlineCoverage, held: Stream, frames: CoverageFrames) -> int:
+    """How many windows the poses of a request complete."""
+    from marey_motion.documents import clip_from_document
+
+    if held.rig is None:
+        fault = _fault("/poses", "no-skeleton", "These need a skeleton.")
+        raise Invalid(
+            "The stream was made without a skeleton; send roots, or make one with it.",
+            code="no-skeleton",
+            errors=[fault],
+        )
+    with refusing("poses"):
+        body = body_of(held.rig)
+        motion = {
+            "skeleton": held.settings["skeleton"],
+            "frame_rate_hz": held.settings["frame_rate_hz"],
+            "joints": body.skeleton.joint_names,
+            "poses": _single(frames.poses),
+            "translations": _single(frames.translations),
+            "translated_joints": frames.translated_joints,
+        }
+        clip = clip_from_document(Motion.model_validate(motion), body.skeleton)
+        return len(online.add_frames(body, clip).speed_m_s)
+
+
+def _single(array: NDArray[Any] | None) -> NDArray[np.float32] | None:
+    """In single precision, as clips are kept; what is too large for it becomes infinite and is refused as such."""
+    with np.errstate(over="ignore"):
+        return None if array is None else array.astype(np.float32)
+
+
+@lru_cache(maxsize=CACHED_BODIES)
+def body_of(rig: bytes) -> MatchingBody:
+    """The body of a stream's skeleton. Raises `MotionError` where joints that tell a direction are not mapped."""
+    from marey_motion.documents import mapping_from_document, skeleton_from_document
+    from marey_motion.matching.body import MatchingBody
+    from marey_motion.rigs import map_joints
+
+    tree = decode_tree(rig, MSGPACK)
+    skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(tree["hierarchy"]))
+    if tree["mapping"] is None:
+        return MatchingBody.from_mapping(skeleton, map_joints(skeleton))
+    mapping, _ = mapping_from_document(SkeletonMapping.model_validate(tree["mapping"]), skeleton)
+    return MatchingBody.from_mapping(skeleton, mapping)
+
+
+def _load_kernels(body: MatchingBody | None) -> None:
+    """Load compiled code that the first frames would wait for otherwise."""
+    from marey_motion.clip import Clip
+    from marey_motion.evaluation.online import OnlineCoverage
+
+    trial = OnlineCoverage(MOST_FRAME_RATE_HZ)
+    trial.add_roots(np.zeros((1, 2)), np.zeros(1))
+    if body is not None:
+        pose = np.array([[0.0] * 3 + [1.0, 0.0, 0.0, 0.0] * body.skeleton.joint_count], dtype=np.float32)
+        trial.add_frames(body, Clip(body.skeleton, MOST_FRAME_RATE_HZ, pose))
+    trial.end_take()
+
+
+@contextmanager
+def refusing(field: str) -> Iterator[None]:
+    """Turn what is refused inside the block into an answer about a field of the request."""
+    from marey_motion.errors import MotionError
+
+    try:
+        yield
+    except MotionError as error:
+        raise Invalid(str(error), code=error.code, errors=[_fault(f"/{field}", error.code, str(error))]) from error
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        detail = ": ".join((*map(str, first["loc"]), first["msg"].removeprefix("Value error, ")))
+        raise Invalid(f"{field}: {detail}", errors=[_fault(f"/{field}", "invalid", detail)]) from error
+
+
+def _fault(pointer: str, code: str, detail: str) -> FieldError:
+    return FieldError(pointer=pointer, code=code, detail=detail)
+
+
+def _packed(online: OnlineCoverage) -> bytes:
+    return encode_tree(online.as_tree(), MSGPACK)
+
+
+def _said(frames: CoverageFrames) -> str:
+    """The digest of a request: the same frames at the same offset, in whatever media type they came."""
+    hashed = hashlib.sha256(f"{frames.offset} {frames.ends_take}".encode())
+    hashed.update("/".join(frames.translated_joints).encode())
+    for name in ("poses", "translations", "roots"):
+        given = getattr(frames, name)
+        if given is not None:
+            hashed.update(f" {name} {given.dtype.str} {given.shape} ".encode())
+            hashed.update(given.tobytes())
+    return f"sha256:{hashed.hexdigest()}"
+
+
+# -- numbers as they travel -------------------------------------------------------------------------------------------
+
+
+def _state(online: OnlineCoverage, settings: Tree) -> Tree:
+    return {
+        **_now(online, settings),
+        "seconds": online.seconds.tolist(),
+        "deficit_s": online.deficit_s.tolist(),
+        "delay_s": online.delay_s,
+    }
+
+
+def _now(online: OnlineCoverage, settings: Tree) -> Tree:
+    """The members of `CoverageNow`."""
+    targets = online.targets(settings["target_count"], path_s=settings["path_s"])
+    return {
+        "index": online.index,
+        "missing_s": float(online.deficit_s.sum()),
+        "targets": tuple(map(_target, targets)),
+        "performer": _performer(online),
+    }
+
+
+def _target(target: Target) -> CoverageTarget:
+    hole, path = target.hole, target.path
+    return CoverageTarget(
+        speed_m_s=hole.speed_m_s,
+        turn_rate_deg_s=hole.turn_rate_deg_s,
+        seconds=hole.seconds,
+        deficit_s=hole.deficit_s,
+        path=tuple(map(tuple, np.column_stack((path.positions, path.headings)).tolist())),
+        path_step_s=1.0 / path.rate_hz,
+    )
+
+
+def _cells(online: OnlineCoverage, places: NDArray[np.intp]) -> tuple[CoverageCell, ...]:
+    speeds, turn_rates = np.unique(online.grid.speeds_m_s), np.unique(online.grid.turn_rates_deg_s)
+    seconds, deficits = online.seconds, online.deficit_s
+    return tuple(
+        CoverageCell(
+            speed_m_s=float(speeds[v]),
+            turn_rate_deg_s=float(turn_rates[w]),
+            seconds=float(seconds[v, w]),
+            deficit_s=float(deficits[v, w]),
+        )
+        for v, w in places.tolist()
+    )
+
+
+def _performer(online: OnlineCoverage) -> Performer | None:
+    performer = online.performer
+    if performer is None:
+        return None
+    window = performer.window
+    return Performer(
+        x_m=performer.x_m,
+        z_m=performer.z_m,
+        heading_rad=performer.heading_rad,
+        speed_m_s=None if window is None else float(window.speed_m_s),
+        turn_rate_deg_s=None if window is None else float(np.degrees(window.turn_rate_rad_s)),
+        forward_m_s=None if window is None else float(window.forward_m_s),
+        strafe_m_s=None if window is None else float(window.strafe_m_s),
+    )

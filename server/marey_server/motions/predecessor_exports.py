@@ -1,0 +1,155 @@
+"""Annotations, models with their trees, and graphs as files of the predecessor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal
+
+from marey_schemas.alignment import AlignmentInfo
+from marey_schemas.documents import Annotation, SkeletonHierarchy
+from marey_schemas.graphs import ModelGraph
+from marey_schemas.kinds import Kind
+from marey_schemas.modelling import checked_model, predecessor_origin
+from marey_schemas.originals import StoredOriginal, content_digest
+from marey_schemas.references import RevisionRef
+from marey_schemas.sample_trees import SampleTreeDocument
+from marey_server.errors import Invalid, NotFound
+
+Parts = Mapping[str, dict[str, Any]]
+
+PARTS_OF: dict[Kind, tuple[str, ...]] = {Kind.MODEL: ("model", "tree"), Kind.PROCESSED: ("alignment",)}
+"""Which parts of an item are files of the predecessor of their own."""
+
+
+@dataclass(frozen=True, slots=True)
+class PredecessorOptions:
+    """What the predecessor's formats leave open.
+
+    `end_index` and `form` are of annotations, `layout` of models; no layout is that of the file that a model was
+    imported from, where it has not changed since, and else 3. `part` tells a model from its tree, and what is kept
+    beside an aligned clip from the clip.
+    """
+
+    end_index: Literal["inclusive", "exclusive"] = "inclusive"
+    form: Literal["labels", "list", "frames"] = "labels"
+    part: Literal["model", "tree", "alignment"] | None = None
+    layout: Literal["2", "3"] | None = None
+
+    def require_part_of(self, kind: Kind) -> None:
+        """Raise `Invalid` where a part is asked for that items of a kind do not have."""
+        if self.part is not None and self.part not in PARTS_OF.get(kind, ()):
+            held = " or ".join(PARTS_OF.get(kind, ())) or "none"
+            detail = f"A {kind} has no part {self.part!r} of its own as a file of the predecessor; it has {held}."
+            raise Invalid(detail, code="no-part")
+
+
+def unchanged_original(kind: Kind, parts: Parts, options: PredecessorOptions) -> StoredOriginal | None:
+    """The file that a model, a tree or a graph was imported from, where it says the same as the part that is asked for.
+
+    Arrays of the parts may be references to what is stored.
+    """
+    if options.layout is not None:
+        return None
+    if kind is Kind.GRAPH:
+        known = parts["graph"].get("original")
+        return _if_unchanged("graph", parts["graph"], None if known is None else StoredOriginal.model_validate(known))
+    if kind is Kind.MODEL:
+        origin = predecessor_origin(parts["model"])
+        if options.part == "tree":
+            return _if_unchanged("tree", parts.get("tree"), origin.tree)
+        return _if_unchanged("model", parts["model"], origin.original)
+    return None
+
+
+def _if_unchanged(part: str, document: Mapping[str, Any] | None, known: StoredOriginal | None) -> StoredOriginal | None:
+    if document is None or known is None or known.content != content_digest(part, document):
+        return None
+    return known
+
+
+def write_predecessor(
+    kind: Kind, name: str, parts: Parts, hierarchy: Mapping[str, Any] | None, options: PredecessorOptions
+) -> tuple[str, bytes]:
+    """Name and bytes of a file. Raises `Invalid` where the item has none, `NotFound` for a model without a tree."""
+    from marey_motion.errors import MotionError
+
+    try:
+        ending, data = _written(kind, parts, hierarchy, options)
+    except MotionError as error:
+        raise Invalid(str(error), code="cannot-be-exported") from error
+    return f"{name}{ending}", data
+
+
+def _written(
+    kind: Kind, parts: Parts, hierarchy: Mapping[str, Any] | None, options: PredecessorOptions
+) -> tuple[str, bytes]:
+    if kind is Kind.ANNOTATION:
+        return "_sections.json", _annotation(parts["annotation"], options)
+    if kind is Kind.GRAPH:
+        return ".json", _graph(parts["graph"])
+    if kind is Kind.PROCESSED:
+        return "_alignment.json", _alignment(parts["info"])
+    if kind is Kind.MODEL and hierarchy is not None:
+        if options.part != "tree":
+            return "_mm.json", _model(parts["model"], hierarchy, options.layout or "3")
+        if "tree" not in parts:
+            raise NotFound("The model has no tree.", code="no-part")
+        return "_cluster_tree.json", _tree(parts["model"], parts["tree"])
+    raise Invalid(f"A {kind} is exported as json.", code="no-such-export")
+
+
+def _annotation(part: Mapping[str, Any], options: PredecessorOptions) -> bytes:
+    from marey_motion.documents import layer_from_document
+    from marey_motion.formats.predecessor.annotation import write_predecessor_annotation
+
+    annotation = Annotation.model_validate(part)
+    ends = [segment.end for segment in annotation.segments] + [one.frame + 1 for one in annotation.keyframes]
+    layer = layer_from_document(annotation, max(ends, default=1))
+    return write_predecessor_annotation(layer, form=options.form, end_index=options.end_index)
+
+
+def _alignment(part: Mapping[str, Any]) -> bytes:
+    """The time function, and the sections that keyframes cut the canonical frames into."""
+    from marey_motion.formats.predecessor.alignment import write_predecessor_alignment
+
+    info = AlignmentInfo.model_validate(part)
+    bounds = sorted({0, *info.keyframes.values(), len(info.time_function)})
+    return write_predecessor_alignment(info.time_function, list(pairwise(bounds)))
+
+
+def _model(part: Mapping[str, Any], hierarchy: Mapping[str, Any], layout: Literal["2", "3"]) -> bytes:
+    from marey_motion.documents import skeleton_from_document
+    from marey_motion.formats.predecessor.model_writer import write_predecessor_model
+    from marey_motion.modelling.primitive_documents import primitive_from_tree
+
+    skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
+    primitive = primitive_from_tree(checked_model(part).model_dump(by_alias=True), skeleton)
+    animated = predecessor_origin(part).animated_joints
+    return write_predecessor_model(primitive, layout=layout, animated_joints=animated)
+
+
+def _tree(model: Mapping[str, Any], part: Mapping[str, Any]) -> bytes:
+    from marey_motion.formats.predecessor.tree import write_predecessor_tree
+    from marey_motion.modelling.search.tree_documents import sample_tree_from_tree
+
+    document = SampleTreeDocument.model_validate(part)
+    tree = sample_tree_from_tree(document.model_dump())
+    return write_predecessor_tree(tree, len(checked_model(model).spatial.directions), document.options.branching)
+
+
+def _graph(part: Mapping[str, Any]) -> bytes:
+    from marey_motion.formats.predecessor.graph import GraphNode, PredecessorGraph, write_predecessor_graph
+
+    graph = ModelGraph.model_validate(part)
+    nodes = {
+        (action, name): GraphNode(
+            node.source_id or RevisionRef.model_validate(node.model.model_dump()).item,
+            node.type,
+            tuple((one.action, one.primitive) for one in node.transitions),
+        )
+        for action, group in graph.actions.items()
+        for name, node in group.primitives.items()
+    }
+    return write_predecessor_graph(PredecessorGraph(nodes, (graph.start.action, graph.start.primitive)))

@@ -1,0 +1,152 @@
+"""What an edit would make of a clip: read in one transaction, computed in a thread, never stored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from marey_schemas.documents import Motion, SkeletonHierarchy, SkeletonMapping
+from marey_schemas.editing.edits import EditDocument
+from marey_schemas.editing.previews import EditPreview, EditPreviewRequest
+from marey_schemas.kinds import Kind
+from marey_schemas.problems import FieldError
+from marey_schemas.wording import counted
+from marey_server.errors import Invalid, NotFound, TooLarge
+from marey_server.field_errors import field_errors
+from marey_server.store import items
+from marey_server.store.transaction import Transaction
+
+if TYPE_CHECKING:  # numeric modules take a second to load: only who looks at previews pays for them
+    from marey_motion.clip import Clip
+    from marey_motion.editing.take import EditedBody
+
+Tree = dict[str, Any]
+
+MOST_WORK = 5e9
+"""About nanoseconds of one thread. A job has no such limit."""
+MOST_NUMBERS = 50_000_000
+"""Of any motion on the way."""
+MOST_SHOWN = 5_000_000
+"""Numbers of the answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class PreviewSource:
+    """Everything that a preview needs: commands, motions, and the skeletons and mappings that they move.
+
+    `hierarchies` are by item and revision, `mappings` by item, at its newest revision.
+    """
+
+    edit: EditDocument
+    motion: Tree
+    sources: dict[str, Tree] = field(default_factory=dict)
+    hierarchies: dict[tuple[str, int], Tree] = field(default_factory=dict)
+    mappings: dict[str, Tree] = field(default_factory=dict)
+
+
+def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, request: EditPreviewRequest) -> PreviewSource:
+    """What a preview is made from. Raises `NotFound`, and `TooLarge` for what should be a job."""
+    if kind is not Kind.CLIP:
+        raise NotFound(f"A {kind} is not edited; clips are.", code="not-a-clip")
+    edit = EditDocument(commands=request.commands) if request.edit is None else _read_edit(tx, project, request)
+    motion = items.read_part(tx, project, Kind.CLIP, item_id, "motion", revision=request.revision).tree
+    numbers = _size(motion)
+    source = PreviewSource(edit, motion)
+    for name in edit.sources:
+        source.sources[name] = items.read_part(tx, project, Kind.CLIP, name, "motion").tree
+        numbers += _size(source.sources[name])
+    if numbers > MOST_NUMBERS:
+        raise TooLarge("The motions are too long for a preview; hand in a job.", code="preview-too-large")
+    for one in (motion, *source.sources.values()):
+        skeleton, revision = one["skeleton"]["item"], one["skeleton"]["revision"]
+        hierarchy = items.read_part(tx, project, Kind.SKELETON, skeleton, "hierarchy", revision=revision)
+        source.hierarchies[skeleton, revision] = hierarchy.tree
+        if "mapping" in items.read_item(tx, project, Kind.SKELETON, skeleton).parts:
+            source.mappings[skeleton] = items.read_part(tx, project, Kind.SKELETON, skeleton, "mapping").tree
+    return source
+
+
+def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
+    """The document of the preview. Raises `Invalid` where the commands cannot be applied or there is no such frame."""
+    from marey_motion.documents import clip_to_document, commands_of_edit
+    from marey_motion.editing.registry import edit_clip
+    from marey_motion.errors import MotionError
+    from marey_motion.kinematics import global_positions
+
+    try:
+        clip, body = _clip_of(source, source.motion)
+        sources = {name: _clip_of(source, tree)[0] for name, tree in source.sources.items()}
+        commands = commands_of_edit(source.edit)
+        made = edit_clip(clip, commands, body=body, sources=sources, most_numbers=MOST_NUMBERS, most_work=MOST_WORK)
+    except MotionError as error:
+        if error.code in ("edit-too-large", "edit-too-long"):
+            raise TooLarge(f"{error}; hand in a job.", code="preview-too-large") from error
+        raise _invalid("/commands", error.code, str(error)) from error
+    if request.piece >= len(made):
+        raise _invalid("/piece", "no-piece", f"The edit makes {counted(len(made), 'clip')}, counted from 0.")
+    wanted = made[request.piece]
+    start, stop = request.frames
+    stop = min(wanted.clip.frame_count, wanted.clip.frame_count if stop is None else stop)
+    if start >= stop:
+        raise _invalid("/frames", "no-frames", f"The result has {counted(wanted.clip.frame_count, 'frame')}.")
+    shown = wanted.clip.sliced(start, stop)
+    if shown.poses.size > MOST_SHOWN:
+        raise TooLarge(
+            f"{stop - start} frames are too many for one preview; ask for some of them.", code="preview-too-large"
+        )
+    skeleton = Motion.model_validate(source.motion).skeleton
+    return EditPreview(
+        pieces=len(made),
+        frame_count=wanted.clip.frame_count,
+        frame_rate_hz=shown.frame_rate_hz,
+        frames=(start, stop),
+        motion=clip_to_document(shown, skeleton) if "motion" in request.fields else None,
+        positions=np.asarray(global_positions(shown)) if "positions" in request.fields else None,
+        findings=tuple({"command": one.command, **one.values} for one in wanted.findings)
+        if "findings" in request.fields
+        else (),
+    ).model_dump(by_alias=True, exclude_none=True)
+
+
+def _read_edit(tx: Transaction, project: str, request: EditPreviewRequest) -> EditDocument:
+    assert request.edit is not None
+    named = request.edit
+    tree = items.read_part(tx, project, Kind.EDIT, named.item, "edit", revision=named.revision).tree
+    try:
+        return EditDocument.model_validate(tree)
+    except ValidationError as error:
+        first = field_errors(error, tree)[0]
+        detail = f"The edit cannot be applied: {first.pointer}: {first.detail}"
+        raise _invalid("/edit", "bad-document", detail) from error
+
+
+def _size(motion: Tree) -> int:
+    frames, width = motion["poses"].shape
+    return int(frames * width)
+
+
+def _clip_of(source: PreviewSource, tree: Tree) -> tuple[Clip, EditedBody]:
+    """A clip, and its body; the mapping is looked at when a command asks for it. Raises `MotionError`."""
+    from marey_motion.documents import clip_from_document, mapping_from_document, skeleton_from_document
+    from marey_motion.editing.take import EditedBody
+    from marey_motion.rigs import JointMapping, map_joints, require_trust
+    from marey_motion.skeleton import Skeleton
+
+    ref = tree["skeleton"]
+    hierarchy = SkeletonHierarchy.model_validate(source.hierarchies[ref["item"], ref["revision"]])
+    stored = source.mappings.get(ref["item"])
+
+    def find_mapping(skeleton: Skeleton) -> JointMapping:
+        if stored is None:
+            return require_trust(map_joints(skeleton))
+        return require_trust(mapping_from_document(SkeletonMapping.model_validate(stored), skeleton)[0])
+
+    skeleton = skeleton_from_document(hierarchy)
+    return clip_from_document(Motion.model_validate(tree), skeleton), EditedBody(skeleton, find_mapping)
+
+
+def _invalid(pointer: str, code: str, detail: str) -> Invalid:
+    return Invalid(detail, code=code, errors=[FieldError(pointer=pointer, code=code, detail=detail)])

@@ -1,0 +1,214 @@
+"""What a search found, as it is told: motions, and how far each constraint is missed."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import degrees
+from typing import TYPE_CHECKING, Any
+
+from marey_schemas.documents import RevisionRef
+from marey_schemas.problems import FieldError
+from marey_schemas.search import ConstraintError, FoundStep, SearchAnswer, SearchRequest, StartPlacement
+from marey_server.errors import Invalid, TooLarge
+from marey_server.motions.models import LARGEST_ANSWER_BYTES, SampleFile, SampleFormat
+from marey_server.motions.search_constraints import CM, constraint_of, placement_of
+from marey_server.motions.searching import FoundSearchable, Searchable
+
+if TYPE_CHECKING:
+    from marey_motion.clip import Clip
+    from marey_motion.modelling.search.finishing import Finished
+    from marey_motion.modelling.search.found_motions import FoundMotion
+    from marey_motion.modelling.search.step_search import Sequel
+    from marey_motion.modelling.search.steps import Step
+
+FAR_CM = 5.0
+"""A model that misses a place by more does not reach there: inverse kinematics would hide that."""
+
+MOST_WORK = 3e9
+"""About nanoseconds of one thread: what a search may take."""
+
+UNITS = {
+    "joint_position": "cm", "root_position": "cm", "joint_orientation": "deg", "look_direction": "deg",
+    "root_heading": "deg", "keyframe_time": "s",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class SearchResult:
+    """Motions that were found, in the world and in real time."""
+
+    steps: tuple[Step, ...]
+    sequel: Sequel
+    found: FoundMotion
+    finished: Finished | None
+
+    @property
+    def clip(self) -> Clip:
+        """All steps as one clip."""
+        last = self.found if self.finished is None else self.finished.found
+        return last.motion.as_clip(last.skeleton, last.frame_rate_hz)
+
+
+def search(searchables: Sequence[Searchable], request: SearchRequest) -> SearchResult:
+    """Find the motions that a request asks for.
+
+    Raises `Invalid` that points at the constraint that is wrong, `TooLarge` for what takes more than some seconds.
+    """
+    from marey_motion.errors import MotionError
+    from marey_motion.modelling.search import work as search_work
+    from marey_motion.modelling.search.finishing import finish_motion
+    from marey_motion.modelling.search.found_motions import found_motion
+    from marey_motion.modelling.search.optimise import RefineOptions
+    from marey_motion.modelling.search.step_search import search_steps
+    from marey_motion.modelling.search.steps import SeveralSteps, TransitionOptions
+
+    steps, trees = _steps_of(searchables, request), [one.tree for one in searchables]
+    refining = RefineOptions(request.likelihood_weight, request.iterations) if request.refine else None
+    effort = {"candidates": request.candidates, "passes": request.passes}
+    try:
+        work = search_work.searching_work(SeveralSteps.of(steps), trees, refining=refining, **effort)
+        _require_quick(work)
+        start, tolerance_m = placement_of(request.start), request.transition_tolerance_cm * CM
+        transitions = TransitionOptions(tolerance_m=tolerance_m)
+        sequel = search_steps(steps, trees, start=start, refining=refining, transitions=transitions, **effort)
+        _require_room(steps, sequel)
+        found, finished = found_motion(steps, sequel), None
+        if request.finish:
+            _require_quick(work + search_work.finishing_work(steps, found))
+            finished = finish_motion(steps, found, searchables[0].mapping)
+    except MotionError as error:
+        raise _invalid(request, error) from error
+    return SearchResult(steps, sequel, found, finished)
+
+
+def _require_quick(work: float) -> None:
+    if work > MOST_WORK:
+        raise TooLarge(
+            f"This takes about {work / MOST_WORK:.1f} times as long as a search may; ask for fewer steps, constraints, "
+            "candidates, passes or iterations.",
+            code="search-too-large",
+        )
+
+
+def _require_room(steps: Sequence[Step], sequel: Sequel) -> None:
+    pairs = [(step.primitive, latent[None]) for step, latent in zip(steps, sequel.latents, strict=True)]
+    frames = sum(float(primitive.time_functions(latent)[0, -1]) + 1.5 for primitive, latent in pairs)
+    size = frames * steps[0].primitive.spatial.mean.shape[1] * 4
+    if not size <= LARGEST_ANSWER_BYTES:
+        raise TooLarge(
+            f"What was found lasts {frames:,.0f} frames, too many for an answer; ask for fewer steps.",
+            code="search-too-large",
+        )
+
+
+def _steps_of(searchables: Sequence[Searchable], request: SearchRequest) -> tuple[Step, ...]:
+    from marey_motion.errors import MotionError
+    from marey_motion.modelling.search.constraints import ConstraintError as BadConstraint
+    from marey_motion.modelling.search.steps import Step
+
+    steps = []
+    for number, (one, asked) in enumerate(zip(searchables, request.asked_steps, strict=True)):
+        known = []
+        for place, constraint in enumerate(asked.constraints):
+            try:
+                known.append(constraint_of(constraint))
+            except MotionError as error:
+                where = ".".join(part for part in (f"steps[{number}].constraints[{place}]", error.where) if part)
+                raise _invalid(request, BadConstraint(error.message, code=error.code, where=where)) from error
+        steps.append(Step(one.usable.primitive, tuple(known), one.standard_joints))
+    return tuple(steps)
+
+
+def _invalid(request: SearchRequest, error: Any) -> Invalid:
+    """A refusal with a JSON Pointer to what the error names."""
+    where = str(error.where or "")
+    if not request.steps:
+        where = where.removeprefix("steps[0]").removeprefix(".")
+    pointer = "".join(f"/{part}" for part in where.replace("[", ".").replace("]", "").split(".") if part)
+    problem = FieldError(pointer=pointer, code=error.code, detail=error.message)
+    return Invalid(str(error.message), code=error.code, errors=[problem])
+
+
+# -- telling -----------------------------------------------------------------------------------------------------------
+
+
+def answer_of(
+    result: SearchResult, searchables: Sequence[Searchable], found: Sequence[FoundSearchable], request: SearchRequest
+) -> dict[str, Any]:
+    """The answer as a document."""
+    from marey_motion.documents import clip_to_document
+
+    errors = _errors(result, request)
+    motion = clip_to_document(result.clip, searchables[0].usable.skeleton) if request.motion else None
+    answer = SearchAnswer(
+        steps=tuple(_found_step(result, number, one, found[number]) for number, one in enumerate(searchables)),
+        errors=errors,
+        reached=all(one.reached for one in errors),
+        out_of_reach=tuple(place for place, one in enumerate(errors) if (one.error_cm or 0.0) > FAR_CM),
+        iterations=0 if result.sequel.refined is None else result.sequel.refined.iterations,
+        motion=motion,
+    )
+    return answer.model_dump(by_alias=True, exclude_none=True)
+
+
+def file_of(result: SearchResult, found: Sequence[FoundSearchable], file_format: SampleFormat, unit: str) -> SampleFile:
+    """All steps as one file. Raises `Invalid` where the format cannot hold it."""
+    from marey_motion.errors import MotionError
+    from marey_motion.exporting import write_clip_file
+
+    try:
+        file = write_clip_file(result.clip, file_format, unit=unit)
+    except MotionError as error:
+        raise Invalid(str(error), code="cannot-be-exported") from error
+    name = " ".join(dict.fromkeys(one.model.name for one in found))
+    return SampleFile(f"{name} found{file.suffix}", file.media_type, file.data)
+
+
+def _errors(result: SearchResult, request: SearchRequest) -> tuple[ConstraintError, ...]:
+    told = []
+    for number, step in enumerate(request.asked_steps):
+        refined, sampled = result.sequel.measured.errors[number], result.sequel.sampled.errors[number]
+        for place, constraint in enumerate(step.constraints):
+            unit = UNITS[constraint.type]
+            finished = None if result.finished is None else result.finished.errors.get((number, place))
+            error = _in_unit(float(refined[place]), unit)
+            left = error if finished is None else _in_unit(finished, unit)
+            told.append(
+                ConstraintError(
+                    step=number,
+                    constraint=place,
+                    type=constraint.type,
+                    joint=getattr(constraint, "joint", None),
+                    searched_error=_in_unit(float(sampled[place]), unit),
+                    finished_error=None if finished is None else left,
+                    reached=left <= getattr(constraint, f"tolerance_{unit}"),
+                    **{f"error_{unit}": error},
+                )
+            )
+    return tuple(told)
+
+
+def _in_unit(value: float, unit: str) -> float:
+    return {"cm": value / CM, "deg": degrees(value), "s": value}[unit]
+
+
+def _found_step(result: SearchResult, number: int, one: Searchable, found: FoundSearchable) -> FoundStep:
+    sequel, primitive = result.sequel, one.usable.primitive
+    latent = sequel.latents[number][None]
+    likelihood = float(primitive.log_density(latent)[0])
+    known = one.log_likelihoods
+    placement = sequel.measured.placements[number]
+    jumps = sequel.measured.jumps_m[number - 1] / CM if number else ()
+    return FoundStep(
+        model=RevisionRef(item=found.model.item, revision=found.model.part.revision),
+        tree="stored" if one.stored else "drawn",
+        latent=tuple(latent[0].tolist()),
+        log_likelihood=likelihood,
+        likelihood_percentile=100.0 * bisect_left(known, likelihood) / len(known) if known else None,
+        duration_s=float(primitive.durations_s(latent)[0]),
+        placement=StartPlacement(x=placement.x, z=placement.z, heading_deg=degrees(placement.heading_rad)),
+        jumps_cm=dict(zip(("pelvis", *sequel.joints), map(float, jumps), strict=False)),
+        evaluations=sequel.searched[number].evaluations,
+    )

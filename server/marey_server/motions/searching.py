@@ -1,0 +1,183 @@
+"""Motions of models that meet constraints: models with their trees, kept between requests, and the search itself."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from marey_schemas.documents import SkeletonMapping
+from marey_schemas.kinds import Kind
+from marey_schemas.modelling import log_likelihoods
+from marey_schemas.search import SearchRequest
+from marey_server.errors import Invalid, NotFound, TooLarge
+from marey_server.motions import models
+from marey_server.motions.models import FoundModel, LoadedModel, UsableModel
+from marey_server.store import items
+from marey_server.store.items.reading import FoundPart
+from marey_server.store.transaction import Transaction
+
+if TYPE_CHECKING:
+    from marey_motion.modelling.search.tree import SampleTree
+    from marey_motion.rigs import JointMapping
+
+MOST_KEPT_BYTES = 64 << 20
+
+MOST_DRAWING_WORK = 2e9
+"""For trees of a request that are drawn because models have none: about nanoseconds of one thread."""
+
+Key = tuple[str, str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class FoundSearchable:
+    """A model that the caller may search, its tree, and the mapping of its skeleton, as far as there are any.
+
+    A tree of another state of the model is none of its own.
+    """
+
+    model: FoundModel
+    tree: FoundPart | None
+    mapping: FoundPart | None
+
+    def key(self, seed: int) -> Key:
+        """What names it, with a tree drawn with `seed` where it has none of its own."""
+        tree = f"seed {seed}" if self.tree is None else self.tree.digest
+        return self.model.part.digest, tree, "" if self.mapping is None else self.mapping.digest
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedSearchable:
+    """The documents of it."""
+
+    found: FoundSearchable
+    model: LoadedModel
+    tree: dict[str, Any] | None
+    mapping: dict[str, Any] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Searchable:
+    """A model that can be searched.
+
+    `stored` says whether the tree is that of the model, or was drawn here because it has none, or one of another model.
+    `drawing_work` is what that took, about nanoseconds. `log_likelihoods` are those of the examples, in rising order.
+    """
+
+    usable: UsableModel
+    tree: SampleTree
+    stored: bool
+    drawing_work: float
+    mapping: JointMapping
+    standard_joints: dict[str, int]
+    log_likelihoods: tuple[float, ...]
+
+
+def find_searchables(
+    tx: Transaction, project: str, kind: Kind, item_id: str, request: SearchRequest
+) -> list[FoundSearchable]:
+    """The model of each step. Raises `NotFound`."""
+    if kind is not Kind.MODEL:
+        raise NotFound(f"A {kind} cannot be searched; models can.", code="not-a-model")
+    wanted = [step.model or item_id for step in request.asked_steps]
+    found = {item: _find(tx, project, item) for item in dict.fromkeys(wanted)}
+    return [found[item] for item in wanted]
+
+
+def load_searchable(tx: Transaction, project: str, found: FoundSearchable) -> LoadedSearchable:
+    """Its documents. Raises `NotFound` where its skeleton is gone."""
+    tree, mapping = (
+        None if part is None else items.load_part(tx, part, arrays="decoded") for part in (found.tree, found.mapping)
+    )
+    return LoadedSearchable(found, models.load_model(tx, project, found.model), tree, mapping)
+
+
+def parse_searchable(loaded: LoadedSearchable, seed: int) -> Searchable:
+    """The model itself, with a tree.
+
+    Raises `Invalid` where its numbers describe none, `TooLarge` where drawing a tree takes too long.
+    """
+    from marey_motion.documents import mapping_from_document
+    from marey_motion.errors import MotionError
+    from marey_motion.modelling.search.tree import END_EFFECTORS, build_tree
+    from marey_motion.modelling.search.tree_documents import sample_tree_from_tree
+    from marey_motion.modelling.search.work import drawing_work
+    from marey_motion.rigs import map_joints
+
+    usable = models.parse_model(loaded.model)
+    primitive, skeleton = usable.primitive, usable.primitive.skeleton
+    try:
+        if loaded.mapping is None:
+            mapping = map_joints(skeleton)
+        else:
+            mapping = mapping_from_document(SkeletonMapping.model_validate(loaded.mapping), skeleton)[0]
+        standard_joints = {name: skeleton.index_of(joint) for name, joint in mapping.joints.items()}
+        work = 0.0
+        if loaded.tree is not None:
+            tree = sample_tree_from_tree(loaded.tree)
+        else:
+            known = [standard_joints[name] for name in END_EFFECTORS if name in standard_joints]
+            work = drawing_work(primitive, end_effectors=known)
+            require_drawable(work)
+            tree = build_tree(primitive, seed, end_effectors=known)
+        tree.means, tree.starts  # noqa: B018    computed here, once for all searches
+    except MotionError as error:
+        raise Invalid(f"The model cannot be searched: {error}", code=error.code) from error
+    stored = loaded.tree is not None
+    likelihoods = tuple(sorted(log_likelihoods(loaded.model.model)))
+    return Searchable(usable, tree, stored, work, mapping, standard_joints, likelihoods)
+
+
+def require_drawable(work: float) -> None:
+    """Refuse to draw trees for a request that take more than some seconds. Raises `TooLarge`."""
+    if work > MOST_DRAWING_WORK:
+        raise TooLarge(
+            "Drawing samples of so many keyframes, joints or models takes too long for a search; give each model a "
+            "tree of its own first: a job of the kind `tree`, or `marey tree`.",
+            code="tree-missing",
+        )
+
+
+class SearchableCache:
+    """The searchable models used last, as many as fit into `max_bytes`. Any thread may use it."""
+
+    def __init__(self, max_bytes: int = MOST_KEPT_BYTES) -> None:
+        self._max_bytes = max_bytes
+        self._kept: OrderedDict[Key, tuple[Searchable, int]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: Key) -> Searchable | None:
+        """One that is kept."""
+        with self._lock:
+            if key not in self._kept:
+                return None
+            self._kept.move_to_end(key)
+            return self._kept[key][0]
+
+    def parse(self, key: Key, loaded: LoadedSearchable, seed: int) -> Searchable:
+        """One that is kept from now on. Raises `Invalid`."""
+        made = parse_searchable(loaded, seed)
+        with self._lock:
+            self._kept[key] = (made, _size_bytes(made))
+            while len(self._kept) > 1 and sum(size for _, size in self._kept.values()) > self._max_bytes:
+                self._kept.popitem(last=False)
+        return made
+
+
+def _find(tx: Transaction, project: str, item_id: str) -> FoundSearchable:
+    model = models.find_model(tx, project, Kind.MODEL, item_id, None)
+    ref = items.load_part(tx, model.part, arrays="none")["skeleton"]
+    held = items.read_item(tx, project, Kind.SKELETON, ref["item"]).parts
+    tree = mapping = None
+    if "tree" in items.read_item(tx, project, Kind.MODEL, item_id).parts:
+        found = items.find_part(tx, project, Kind.MODEL, item_id, "tree")
+        if items.load_part(tx, found, arrays="none")["model_digest"] == model.part.digest:
+            tree = found
+    if "mapping" in held:
+        mapping = items.find_part(tx, project, Kind.SKELETON, ref["item"], "mapping")
+    return FoundSearchable(model, tree, mapping)
+
+
+def _size_bytes(made: Searchable) -> int:
+    return models.size_bytes(made.usable.primitive) + made.tree.samples.nbytes + made.tree.means.nbytes

@@ -1,0 +1,1 @@
+"""The server process: settings, shared services, threads, logs, and periodic work."""

@@ -1,0 +1,130 @@
+"""What the server does by itself: takes back overdue leases, serves waiting results, collects garbage.
+
+One process at a time leads; what it does is safe beside others all the same, since every step repeats its conditions
+in the statement that takes it. Each chore is a task of its own, so that one that fails keeps no other from being done.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from typing import Concatenate, ParamSpec, TypeVar
+
+from marey_server.access.principal import SYSTEM
+from marey_server.errors import MareyError, Unavailable
+from marey_server.process.services import Services
+from marey_server.store import leader
+from marey_server.store.garbage import collect_garbage
+from marey_server.store.jobs import reaper
+from marey_server.store.jobs.reaper import StartGrace
+from marey_server.store.transaction import Transaction
+
+P = ParamSpec("P")
+T = TypeVar("T")
+Chore = Callable[[Services, str], Awaitable[None]]
+"""Gets the services and the name under which this process leads."""
+
+log = logging.getLogger(__name__)
+
+LEAD = "housekeeping"
+LEAD_TTL_US = 30_000_000
+LONGEST_TICK_S = 5.0
+GARBAGE_EVERY_S = 3600.0
+FIRST_GARBAGE_S = 60.0
+"""After the start: who runs a server for an hour a day must not keep garbage for ever."""
+
+
+@asynccontextmanager
+async def keeping_house(services: Services) -> AsyncIterator[None]:
+    """Keep house inside the block; at its end, let another process lead."""
+    holder = secrets.token_hex(8)
+    tick_s = min(LONGEST_TICK_S, services.queue_policy.lease_ttl_s / 4)
+    chores = (
+        (tick_s, tick_s, _reap),
+        (tick_s, tick_s, _share_results),
+        (FIRST_GARBAGE_S, GARBAGE_EVERY_S, _collect_garbage),
+    )
+    tasks = [asyncio.create_task(_repeat(services, holder, *chore)) for chore in chores]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await _give_up_lead(services, holder)
+
+
+async def _give_up_lead(services: Services, holder: str) -> None:
+    """Let another process lead at once; without a database it does when the lease has run out."""
+    try:
+        await _write(services, leader.give_up_lead, LEAD, holder)
+    except MareyError as error:
+        log.warning("another process leads only in %d s: %s", LEAD_TTL_US / 1_000_000, error.detail)
+
+
+async def _repeat(services: Services, holder: str, first_s: float, every_s: float, chore: Chore) -> None:
+    """Do a chore now and then. A failure is told and is no reason to stop."""
+    await asyncio.sleep(first_s)
+    while True:
+        try:
+            await chore(services, holder)
+        except MareyError as error:
+            log.warning("housekeeping was interrupted: %s", error.detail)
+        except Exception:
+            log.exception("housekeeping failed")
+        await asyncio.sleep(every_s)
+
+
+async def _reap(services: Services, holder: str) -> None:
+    """Take back every overdue lease, page by page; not before workers have had time to renew them."""
+    try:
+        leads, may_reap = await _write(services, _look_round, holder, services.start_grace)
+        if leads and may_reap:
+            await _reap_pages(services)
+    except Unavailable:
+        services.start_grace.restart()
+        raise
+
+
+def _look_round(tx: Transaction, holder: str, grace: StartGrace) -> tuple[bool, bool]:
+    """Whether this process leads, and whether workers have had time to renew their leases."""
+    return _leads(tx, holder), grace.over(tx.now_us)
+
+
+async def _reap_pages(services: Services) -> None:
+    if await _write(services, reaper.correct_times, services.queue_policy):
+        log.warning("the database's clock was set back; times of leases were corrected")
+    page = await _write(services, reaper.reap_page, services.queue_policy)
+    taken = page.taken
+    while page.after is not None:
+        page = await _write(services, reaper.reap_page, services.queue_policy, page.after)
+        taken += page.taken
+    if taken:
+        log.warning("took %d jobs back from workers that are not heard of any more", taken)
+
+
+async def _share_results(services: Services, holder: str) -> None:
+    """Serve the jobs that wait for a result that is there."""
+    if await _write(services, _leads, holder):
+        while await _write(services, reaper.share_waiting) > 0:
+            pass
+
+
+def _leads(tx: Transaction, holder: str) -> bool:
+    """Whether this process leads."""
+    return leader.take_lead(tx, LEAD, holder, LEAD_TTL_US) is not None
+
+
+async def _collect_garbage(services: Services, holder: str) -> None:
+    if await _write(services, _leads, holder):
+        collected = await asyncio.wrap_future(services.compute_threads.submit(collect_garbage, services.database))
+        log.info("collected garbage: %s", collected)
+
+
+async def _write(
+    services: Services, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs
+) -> T:
+    return await asyncio.wrap_future(services.database.submit_write(SYSTEM, function, *args, **kwargs))

@@ -1,0 +1,78 @@
+"""What one server process holds and every handler may use."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from marey_server.access.limits import TryLimit
+from marey_server.access.principal import SYSTEM, Principal
+from marey_server.http.answer_cache import AnswerCache
+from marey_server.motions.models import ModelCache
+from marey_server.motions.searching import SearchableCache
+from marey_server.process.computing import ComputeThreads
+from marey_server.process.observe import Metrics
+from marey_server.process.settings import Settings
+from marey_server.store import tokens
+from marey_server.store.database.connections import Database
+from marey_server.store.jobs.policy import QueuePolicy
+from marey_server.store.jobs.reaper import StartGrace
+
+SIGN_INS_AT_ONCE = 2
+"""A password takes 32 MiB and 0.1 s to check."""
+
+
+@dataclass(frozen=True)
+class Description:
+    """The API described, as bytes: the OpenAPI document, the page, and a name of this state of both."""
+
+    document: bytes
+    page: bytes
+    tag: str
+
+
+class Services:
+    """Database, threads, metrics and the state of a server that is starting, serving or draining."""
+
+    def __init__(self, settings: Settings, database: Database, description: Callable[[], Description]) -> None:
+        self.settings = settings
+        self.database = database
+        self.description = description
+        self.metrics = Metrics()
+        self.answers = AnswerCache(settings.answer_cache_bytes)
+        self.models = ModelCache()
+        self.searchables = SearchableCache()
+        self.draining = asyncio.Event()
+        self.in_flight: set[Any] = set()
+        self.metrics.in_flight.set_function(lambda: len(self.in_flight))
+        self.sign_in_places = asyncio.Semaphore(SIGN_INS_AT_ONCE)
+        self.compute_threads = ComputeThreads()
+        self._tries_by_name = TryLimit(settings.login_tries_per_minute)
+        self._tries_by_address = TryLimit(10 * settings.login_tries_per_minute)
+        self._tokens_noted: dict[str, float] = {}
+        self.queue_policy = QueuePolicy(settings.lease_ttl_s, settings.heartbeat_s, settings.cancel_grace_s)
+        self.start_grace = StartGrace(self.queue_policy)
+
+    def limit_sign_in(self, name: str, address: str) -> None:
+        """Count one attempt to sign in. Raises `TooManyRequests`."""
+        self._tries_by_address.take(address)
+        self._tries_by_name.take(name)
+
+    def note_use(self, principal: Principal) -> None:
+        """Remember that a token was used, at most once in `NOTE_USE_EVERY_S` for each."""
+        token_id, now = principal.token_id, time.monotonic()
+        if (
+            token_id is None
+            or now - self._tokens_noted.get(token_id, -tokens.NOTE_USE_EVERY_S) < tokens.NOTE_USE_EVERY_S
+        ):
+            return
+        self._tokens_noted[token_id] = now
+        self.database.submit_write(SYSTEM, tokens.note_use, token_id)
+
+    def close(self) -> None:
+        """Wait for transactions that run, then let go of everything."""
+        self.compute_threads.close()
+        self.database.close()

@@ -1,0 +1,307 @@
+"""Connections and transactions, for SQLite and Postgres.
+
+A read sees one snapshot and cannot write. A write is READ COMMITTED on Postgres, so that an UPDATE's conditions are
+checked against what stands there when it gets the row. SQLite has one writer lane: writes run one after another, each
+starting with `BEGIN IMMEDIATE`, and reads run beside it.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import random
+import sqlite3
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+import sqlalchemy
+from sqlalchemy import URL, Connection, Engine, event, exc, make_url
+
+from marey_server.access.principal import Principal
+from marey_server.errors import Invalid, StorageFull, Unavailable
+from marey_server.store import tables
+from marey_server.store.blob_backings import BlobBacking, DatabaseBlobs
+from marey_server.store.database.clock import Clock, DatabaseClock, save_high_water
+from marey_server.store.database.write_lane import WriteLane
+from marey_server.store.transaction import Transaction
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+BUSY_TIMEOUT_MS = 30_000
+PAGE_BYTES = 16_384
+CACHE_KIB = 4096
+WAL_LIMIT_BYTES = 64 * 2**20
+WAL_CHECK_EVERY_S = 5.0
+WAL_PATIENCE_MS = 250
+"""How long a write waits for readers to let the log be written back: most reads are shorter, but a backup is not."""
+WRITE_TRIES = 5
+READ_TRIES = 3
+
+_POSTGRES_SETTINGS = {
+    "statement_timeout": "120s",
+    "lock_timeout": "30s",
+    "idle_in_transaction_session_timeout": "300s",  # a server that was stopped must not hold its locks for ever
+}
+
+
+class Database:
+    """The connections of one server process."""
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        readers: int = 8,
+        clock: Clock | None = None,
+        blobs: BlobBacking | None = None,
+        echo: bool = False,
+    ) -> None:
+        self.url = make_url(url)
+        if self.url.drivername in ("postgresql", "postgres"):
+            self.url = self.url.set(drivername="postgresql+psycopg")
+        self.is_sqlite = self.url.get_backend_name() == "sqlite"
+        if self.is_sqlite:
+            self.engine = _sqlite_engine(self.url, 2, echo, begin="BEGIN IMMEDIATE")
+            self._read_engine = _sqlite_engine(self.url, readers, echo, begin="BEGIN", query_only=True)
+        else:
+            self.engine = _postgres_engine(self.url, readers, echo)
+            self._read_engine = self.engine.execution_options(
+                isolation_level="REPEATABLE READ", postgresql_readonly=True
+            )
+        self.clock: Clock = clock or DatabaseClock()
+        self._high_water_us = 0
+        self.blobs: BlobBacking = blobs or DatabaseBlobs()
+        self._lane: AbstractContextManager[Any] = threading.Lock() if self.is_sqlite else nullcontext()
+        self._wal_checked_s = 0.0
+        self._readers = ThreadPoolExecutor(readers, thread_name_prefix="marey-read")
+        self._write_lane = WriteLane(self.write) if self.is_sqlite else None
+
+    @property
+    def shown(self) -> str:
+        """Where it is, without any password."""
+        if self.is_sqlite:
+            return str(self.url.database)
+        return self.url.set(query={}).render_as_string(hide_password=True)
+
+    # -- running functions in transactions ----------------------------------------------------------------------------
+
+    def read(
+        self,
+        principal: Principal,
+        function: Callable[Concatenate[Transaction, P], T],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> T:
+        """Run `function(tx, ...)` in a read-only transaction of the calling thread; again if the connection breaks."""
+        for attempt in range(READ_TRIES):
+            try:
+                with self._read_engine.connect() as connection, connection.begin():
+                    return function(self._transaction(connection, principal), *args, **kwargs)
+            except _FAILURES as error:
+                if attempt == READ_TRIES - 1 or not _worth_retrying(error):
+                    raise _translated(error) from error
+        raise AssertionError("unreachable")
+
+    def write(
+        self,
+        principal: Principal,
+        function: Callable[Concatenate[Transaction, P], T],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> T:
+        """Run `function(tx, ...)` and commit, in the calling thread.
+
+        Runs again, from the start, when the database asks for it (deadlock, serialisation failure) or the connection
+        breaks before the commit: `function` must have no effect but through its transaction.
+        """
+        for attempt in range(WRITE_TRIES):
+            try:
+                with self._lane, self.engine.connect() as connection:
+                    tx = self._transaction(connection, principal)
+                    answer = self._run_and_commit(tx, function, *args, **kwargs)
+            except _FAILURES as error:
+                if attempt == WRITE_TRIES - 1 or not _worth_retrying(error):
+                    raise _translated(error) from error
+                time.sleep(random.uniform(0, 0.02 * 2**attempt))  # noqa: S311 - spreads retries, no secret
+            else:
+                tx.run_after_commit()
+                return answer
+        raise AssertionError("unreachable")
+
+    def _transaction(self, connection: Connection, principal: Principal) -> Transaction:
+        return Transaction(connection, principal, self.clock, self.blobs)
+
+    def _run_and_commit(
+        self,
+        tx: Transaction,
+        function: Callable[Concatenate[Transaction, P], T],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> T:
+        with tx.connection.begin() as transaction:
+            answer = function(tx, *args, **kwargs)
+            high_water_us = self._high_water_us
+            if self.is_sqlite and tx.now_us >= high_water_us:
+                high_water_us = save_high_water(tx.connection, tx.now_us)
+            try:
+                transaction.commit()
+            except exc.DBAPIError as error:
+                if (
+                    error.connection_invalidated
+                ):  # nobody knows whether it was committed; doing it again could do it twice
+                    raise _no_answer("Whether this was written is not known; look before you try again.") from error
+                raise
+        self._high_water_us = high_water_us
+        if self.is_sqlite:
+            self._keep_wal_short(tx.connection)
+        return answer
+
+    def _keep_wal_short(self, connection: Connection) -> None:
+        """Write a long log back to the file: under steady reads SQLite itself never finds a moment to start it anew.
+
+        Where somebody reads for long, it is tried again later.
+        """
+        now_s = time.monotonic()
+        if now_s - self._wal_checked_s < WAL_CHECK_EVERY_S:
+            return
+        self._wal_checked_s = now_s
+        wal = Path(f"{self.url.database}-wal")
+        if wal.exists() and wal.stat().st_size > WAL_LIMIT_BYTES:
+            driver: sqlite3.Connection = connection.connection.driver_connection  # type: ignore[assignment]
+            driver.execute(f"PRAGMA busy_timeout = {WAL_PATIENCE_MS}")
+            driver.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # answers that it could not, and raises nothing
+            driver.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
+
+    def submit_read(
+        self,
+        principal: Principal,
+        function: Callable[Concatenate[Transaction, P], T],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> Future[T]:
+        """`read` in a thread of the pool, for callers on an event loop."""
+        return self._readers.submit(self.read, principal, function, *args, **kwargs)  # type: ignore[arg-type]
+
+    def submit_write(
+        self,
+        principal: Principal,
+        function: Callable[Concatenate[Transaction, P], T],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> Future[T]:
+        """`write` in a thread of the pool (SQLite: in the writer lane), for callers on an event loop."""
+        if self._write_lane is not None:
+            return self._write_lane.submit(principal, function, *args, **kwargs)
+        return self._readers.submit(self.write, principal, function, *args, **kwargs)  # type: ignore[arg-type]
+
+    def close(self) -> None:
+        """Finish what runs, then close every connection."""
+        if self._write_lane is not None:
+            self._write_lane.close()
+        self._readers.shutdown(wait=True)
+        self._read_engine.dispose()
+        self.engine.dispose()
+
+
+# -- engines ----------------------------------------------------------------------------------------------------------
+
+
+def _dumps(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+
+
+def _sqlite_engine(url: URL, connections: int, echo: bool, *, begin: str, query_only: bool = False) -> Engine:
+    engine = sqlalchemy.create_engine(
+        url,
+        pool_size=connections,
+        max_overflow=4,
+        echo=echo,
+        hide_parameters=True,  # they hold hashes of secrets, and what fails is logged
+        json_serializer=_dumps,
+        connect_args={"timeout": BUSY_TIMEOUT_MS / 1000, "check_same_thread": False, "isolation_level": None},
+        poolclass=sqlalchemy.QueuePool,
+    )
+    # No memory map: it saves 15 us of a read of 150 KB, and counts once per connection as memory of the process.
+    pragmas = [
+        f"page_size = {PAGE_BYTES}",
+        "journal_mode = WAL",
+        f"journal_size_limit = {WAL_LIMIT_BYTES}",
+        "synchronous = FULL",
+        "foreign_keys = ON",
+        f"cache_size = -{CACHE_KIB}",
+        f"query_only = {'ON' if query_only else 'OFF'}",
+    ]
+
+    def configure(connection: sqlite3.Connection, _record: object) -> None:
+        for pragma in pragmas:
+            connection.execute(f"PRAGMA {pragma}")
+
+    event.listen(engine, "connect", configure)
+    event.listen(engine, "begin", lambda connection: connection.exec_driver_sql(begin))
+    return engine
+
+
+def _postgres_engine(url: URL, connections: int, echo: bool) -> Engine:
+    connect_args: dict[str, Any] = {"application_name": "marey", "connect_timeout": 10}
+    if "options" not in url.query:
+        connect_args["options"] = " ".join(f"-c {name}={value}" for name, value in _POSTGRES_SETTINGS.items())
+    return sqlalchemy.create_engine(
+        url,
+        pool_size=connections,
+        max_overflow=4,
+        pool_timeout=30,
+        echo=echo,
+        hide_parameters=True,  # they hold hashes of secrets, and what fails is logged
+        isolation_level="READ COMMITTED",
+        json_serializer=_dumps,
+        connect_args=connect_args,
+    )
+
+
+# -- failures ---------------------------------------------------------------------------------------------------------
+
+_FAILURES = (exc.DBAPIError, exc.TimeoutError, OSError, OverflowError, UnicodeEncodeError)
+
+
+def _worth_retrying(error: Exception) -> bool:
+    if not isinstance(error, exc.DBAPIError):
+        return False
+    constraint = getattr(getattr(error.orig, "diag", None), "constraint_name", None)
+    return (
+        error.connection_invalidated
+        or getattr(error.orig, "sqlstate", None) in _TRY_AGAIN
+        or constraint == tables.ONE_RUNS_PER_KEY
+    )
+
+
+_TRY_AGAIN = ("40001", "40P01")
+"""Serialisation failure, deadlock."""
+
+
+def _translated(error: Exception) -> Exception:
+    """The same failure in the server's own terms, where the caller can do something about it."""
+    if isinstance(error, OSError):
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        return StorageFull("The disk has no room left; nothing was written.") if full else error
+    if isinstance(error, exc.TimeoutError):
+        return _no_answer("All connections to the database are in use; nothing was written.")
+    if isinstance(error, OverflowError | UnicodeEncodeError | exc.DataError):
+        return Invalid("A number or text of the request is beyond what can be stored.", code="bad-value")
+    if not isinstance(error, exc.DBAPIError):
+        return error
+    message = str(error.orig)
+    if "disk is full" in message or getattr(error.orig, "sqlstate", None) == "53100":
+        return StorageFull("The database's disk has no room left; nothing was written.")
+    if isinstance(error, exc.OperationalError) and not message.startswith(("no such", "near ")):  # those are our faults
+        return _no_answer("The database does not answer; nothing was written. Try again.")
+    return error
+
+
+def _no_answer(detail: str) -> Unavailable:
+    return Unavailable(detail, headers={"Retry-After": "2"})

@@ -1,0 +1,120 @@
+"""Writes to SQLite one after another, and those that wait for their turn together in one transaction.
+
+A commit waits for the disk, which takes longer than what most requests write. So a write is answered once a commit has
+it, but need not have one of its own: each runs under a savepoint, and one that is refused takes back only its own part.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+from marey_server.access.principal import SYSTEM, Principal
+from marey_server.errors import MareyError
+from marey_server.store.database.prepared import run_text
+from marey_server.store.transaction import Transaction
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+MOST_TOGETHER = 16
+"""The first of them waits for the last."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Write:
+    """What somebody wants written, and where he waits for what becomes of it."""
+
+    principal: Principal
+    function: Callable[[Transaction], Any]
+    future: Future[Any]
+
+    def end(self, finish: Callable[[], Any]) -> None:
+        """Hand over what `finish` returns or raises."""
+        try:
+            answer = finish()
+        except BaseException as error:  # noqa: BLE001 - for whoever waits
+            self.future.set_exception(error)
+        else:
+            self.future.set_result(answer)
+
+
+class WriteLane:
+    """A thread that writes. `write(principal, function)` runs a function in a transaction and commits."""
+
+    def __init__(self, write: Callable[[Principal, Callable[[Transaction], Any]], Any]) -> None:
+        self._write = write
+        self._waiting: deque[_Write] = deque()
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="marey-write")
+
+    def submit(
+        self,
+        principal: Principal,
+        function: Callable[Concatenate[Transaction, P], T],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> Future[T]:
+        """Run `function(tx, ...)` when its turn comes; the future holds what it returned once that is committed."""
+        one = _Write(principal, lambda tx: function(tx, *args, **kwargs), Future())
+        self._waiting.append(one)
+        self._thread.submit(self._write_waiting)
+        return one.future
+
+    def close(self) -> None:
+        """Write all that waits."""
+        self._thread.shutdown(wait=True)
+
+    def _write_waiting(self) -> None:
+        taken = [self._waiting.popleft() for _ in range(min(len(self._waiting), MOST_TOGETHER))]
+        group = [one for one in taken if one.future.set_running_or_notify_cancel()]
+        if len(group) < 2 or not self._write_together(group):
+            for one in group:
+                one.end(lambda one=one: self._write(one.principal, one.function))  # type: ignore[misc]
+
+    def _write_together(self, group: Sequence[_Write]) -> bool:
+        """Whether it came to a commit. Where a write breaks, instead of being refused, nothing is written."""
+        finishes: list[Callable[[], Any]] = []
+
+        def run_all(tx: Transaction) -> None:
+            finishes[:] = [_run(tx, one) for one in group]
+
+        try:
+            self._write(SYSTEM, run_all)
+        except Exception as failure:  # noqa: BLE001 - for whoever waits
+            if not finishes:
+                return False
+            for one in group:  # the commit failed: to write again could write twice
+                one.future.set_exception(failure)
+            return True
+        for one, finish in zip(group, finishes, strict=True):
+            one.end(finish)
+        return True
+
+
+def _run(tx: Transaction, one: _Write) -> Callable[[], Any]:
+    """Do it; what remains to be done once it is committed. Of a write that is refused nothing is left to commit."""
+    own = tx.beside(one.principal)
+    run_text(tx.connection, "SAVEPOINT this_write")
+    try:
+        answer = one.function(own)
+    except MareyError as refusal:
+        run_text(tx.connection, "ROLLBACK TO this_write")
+        run_text(tx.connection, "RELEASE this_write")
+        return _raiser(refusal)
+    run_text(tx.connection, "RELEASE this_write")
+
+    def finish() -> Any:
+        own.run_after_commit()
+        return answer
+
+    return finish
+
+
+def _raiser(refusal: MareyError) -> Callable[[], Any]:
+    def finish() -> Any:
+        raise refusal
+
+    return finish

@@ -1,0 +1,255 @@
+"""The last word of an attempt: its results are published with everything that follows, or it failed."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import bindparam, exists, select, tuple_, update
+
+from marey_schemas.jobs import (
+    BatchCompletion,
+    BatchCompletionResult,
+    CompleteAnswer,
+    CompleteRequest,
+    FailAnswer,
+    FailRequest,
+    JobOutput,
+    JobState,
+)
+from marey_server import faults
+from marey_server.errors import MareyError, NotFound
+from marey_server.store.database.prepared import Prepared
+from marey_server.store.jobs import staging
+from marey_server.store.jobs.endings import ENDED_COLUMNS, AttemptEnd, Ended, as_ended, end_attempts
+from marey_server.store.jobs.failure import ENDING_COLUMNS, carry_out, judge
+from marey_server.store.jobs.fan_out import release_tasks
+from marey_server.store.jobs.fencing import (
+    HELD,
+    earlier_answer,
+    held,
+    held_parameters,
+    hold,
+    lease_lost,
+    require_attempt,
+)
+from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
+from marey_server.store.jobs.propagation import settle
+from marey_server.store.tables import attempt, job, staged_output
+from marey_server.store.transaction import Transaction
+
+_Place = tuple[str, int]
+"""Job id and fence of an attempt."""
+
+
+def complete(tx: Transaction, job_id: str, fence: int, request: CompleteRequest) -> CompleteAnswer:
+    """End the job with success and publish what the attempt staged. The same `write_id` again: the same answer.
+
+    Raises `LeaseLost` if the attempt does not hold the job, or has ended it with another `write_id`.
+    """
+    require_attempt(tx.principal, job_id, fence)
+    place = (job_id, fence)
+    ended = _complete(tx, {place: request})
+    if place not in ended:
+        return _same_answer(tx, place, request.write_id)
+    settle(tx, [end for end, _ in ended.values()])
+    _pass_fault_points(tx)
+    return ended[place][1]
+
+
+def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> list[BatchCompletionResult]:
+    """Complete many jobs in one transaction, for the worker that claimed them; each is refused by itself."""
+    requests = {(one.job, one.fence): one for one in reversed(completions)}
+    own = _claimed_by_caller(tx, requests)
+    publishing = {place for place in own if any(staging.named_blobs(requests[place].result))} | _staged(tx, own)
+    ended = _complete(tx, {place: requests[place] for place in own - publishing})
+    refused: dict[_Place, MareyError] = {}
+    for place in sorted(publishing):  # what one of them may not publish must not keep the others from it
+        try:
+            with tx.connection.begin_nested():
+                ended |= _complete(tx, {place: requests[place]})
+        except MareyError as error:
+            refused[place] = error
+    settle(tx, [end for end, _ in ended.values()])
+    _pass_fault_points(tx)
+    answers = {place: answer for place, (_, answer) in ended.items()}
+    return [_result(tx, one, answers, refused, own) for one in completions]
+
+
+_WIN = Prepared(
+    update(job)
+    .where(HELD)
+    .values(state="succeeded", finished_us=bindparam("now"), lease_expires_us=None, rev=job.c.rev + 1)
+    .returning(
+        *ENDED_COLUMNS,
+        job.c.fence,
+        job.c.into_path,
+        job.c.author_id,
+        job.c.message,
+        job.c.cache_key,
+        job.c.gathers,
+    )
+)
+
+
+def _complete(
+    tx: Transaction, requests: Mapping[_Place, CompleteRequest]
+) -> dict[_Place, tuple[Ended, CompleteAnswer]]:
+    """End those of the jobs that are still held, and record and publish what they brought."""
+    if not requests:
+        return {}
+    won = tx.run(_WIN, {"now": tx.now_us, **held_parameters(requests)})
+    staged = staging.staged_drafts(tx, [(row.id, row.fence) for row in won]) if won else {}
+    done: dict[_Place, tuple[Ended, CompleteAnswer]] = {}
+    records = []
+    for row in sorted(won, key=lambda row: row.id):
+        request = requests[row.id, row.fence]
+        outputs = staging.publish_drafts(tx, row, staged.get((row.id, row.fence), {}))
+        staging.keep_named_blobs(tx, row.id, set(staging.named_blobs(request.result)))
+        records.append(
+            {
+                "of_job": row.id,
+                "its_result": {**request.result, "outputs": len(outputs)},
+                "its_outputs": outputs,
+                "its_code": request.code_version,
+                "its_environment": request.environment,
+            }
+        )
+        answer = CompleteAnswer(
+            job=row.id, state=JobState.SUCCEEDED, outputs=tuple(JobOutput(**output) for output in outputs)
+        )
+        done[row.id, row.fence] = (as_ended(row), answer)
+    if done:
+        _record(tx, records)
+        unshared = {(row.id, row.fence) for row in won if row.cache_key is None} & staged.keys()
+        if unshared:
+            staging.drop_staged(tx, unshared)
+        if gathered := [row.id for row in won if row.gathers]:
+            release_tasks(tx, gathered)
+        end_attempts(
+            tx,
+            [
+                AttemptEnd(
+                    job_id,
+                    fence,
+                    "succeeded",
+                    write_id=requests[job_id, fence].write_id,
+                    answer=answer.model_dump(mode="json"),
+                )
+                for (job_id, fence), (_, answer) in done.items()
+            ],
+        )
+    return done
+
+
+_RECORD = Prepared(
+    update(job)
+    .where(job.c.id == bindparam("of_job"))
+    .values(
+        result=bindparam("its_result"),
+        outputs=bindparam("its_outputs"),
+        code_version=bindparam("its_code"),
+        environment=bindparam("its_environment"),
+    )
+)
+
+
+def _record(tx: Transaction, records: Sequence[dict[str, Any]]) -> None:
+    """Write down what the jobs brought; this transaction has won them already."""
+    tx.run_each(_RECORD, records)
+
+
+def _pass_fault_points(tx: Transaction) -> None:
+    faults.point("complete.before_commit")
+    tx.after_commit(lambda: faults.point("complete.after_commit"))
+
+
+def _same_answer(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswer:
+    earlier = earlier_answer(tx, *place, write_id)
+    if earlier is None or earlier["state"] != JobState.SUCCEEDED:
+        raise lease_lost(*place)
+    return CompleteAnswer(**earlier)
+
+
+# -- batches ----------------------------------------------------------------------------------------------------------
+
+
+def _claimed_by_caller(tx: Transaction, places: Iterable[_Place]) -> set[_Place]:
+    """The attempts that were claimed with the caller's own token."""
+    statement = select(attempt.c.job_id, attempt.c.fence).where(
+        tuple_(attempt.c.job_id, attempt.c.fence).in_(list(places))
+    )
+    if tx.principal.kind != "system":
+        statement = statement.where(attempt.c.claimed_by == (tx.principal.token_id or ""))
+    return {(row.job_id, row.fence) for row in tx.execute(statement)}
+
+
+def _staged(tx: Transaction, places: Collection[_Place]) -> set[_Place]:
+    """Those of the attempts that have staged something."""
+    columns = (staged_output.c.job_id, staged_output.c.fence)
+    rows = tx.execute(select(*columns).where(tuple_(*columns).in_(list(places))).distinct())
+    return {(row.job_id, row.fence) for row in rows}
+
+
+def _result(
+    tx: Transaction,
+    one: BatchCompletion,
+    answers: Mapping[_Place, CompleteAnswer],
+    refused: Mapping[_Place, MareyError],
+    own: Collection[_Place],
+) -> BatchCompletionResult:
+    place = (one.job, one.fence)
+    try:
+        if place not in own:
+            raise NotFound(f"There is no attempt {one.fence} of {one.job} that you claimed.")
+        if place in refused:
+            raise refused[place]
+        answer = answers.get(place) or _same_answer(tx, place, one.write_id)
+    except MareyError as error:
+        return BatchCompletionResult(job=one.job, fence=one.fence, code=error.error_code, detail=error.detail)
+    return BatchCompletionResult(job=one.job, fence=one.fence, answer=answer)
+
+
+# -- failure ----------------------------------------------------------------------------------------------------------
+
+
+def fail(
+    tx: Transaction, job_id: str, fence: int, request: FailRequest, policy: QueuePolicy = DEFAULT_POLICY
+) -> FailAnswer:
+    """End the attempt without success. The same `write_id` again: the same answer.
+
+    Raises `LeaseLost` if the attempt does not hold the job, or has ended with another `write_id`.
+    """
+    require_attempt(tx.principal, job_id, fence)
+    earlier = earlier_answer(tx, job_id, fence, request.write_id)
+    if earlier is not None:
+        if earlier["state"] == JobState.SUCCEEDED:
+            raise lease_lost(job_id, fence)
+        return FailAnswer(**earlier)
+    row = hold(tx, job_id, fence, *ENDING_COLUMNS)
+    verdict = judge(row, request, policy, poisoned=_is_poisoned(tx, job_id, request.signature))
+    answer = FailAnswer(
+        job=job_id,
+        state=JobState(verdict.state),
+        retry_in_s=None if verdict.rest_us is None else verdict.rest_us / SECOND_US,
+    )
+    end = AttemptEnd(
+        job_id,
+        fence,
+        verdict.outcome,
+        request.detail,
+        request.signature,
+        request.write_id,
+        answer.model_dump(mode="json"),
+    )
+    carry_out(tx, row, held(job_id, fence), verdict, end)
+    faults.point("fail.before_commit")
+    return answer
+
+
+def _is_poisoned(tx: Transaction, job_id: str, signature: str | None) -> bool:
+    """Whether an earlier attempt ended in the same way: trying once more would only take another worker down."""
+    if signature is None:
+        return False
+    seen = exists().where(attempt.c.job_id == job_id, attempt.c.signature == signature)
+    return bool(tx.execute(select(seen)).scalar())

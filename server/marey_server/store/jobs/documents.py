@@ -1,0 +1,151 @@
+"""Rows of jobs as they travel."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+from sqlalchemy import Row, Select, bindparam, func, select
+
+from marey_schemas.jobs import Job, JobState, Progress
+from marey_server.store.database.clock import datetime_of
+from marey_server.store.database.prepared import Prepared
+from marey_server.store.tables import job, job_dependency, project, user
+from marey_server.store.transaction import Transaction
+
+IN_LIST = 1000
+
+
+def select_jobs() -> Select[Any]:
+    """Jobs with the names of their project and author."""
+    return (
+        select(job, project.c.name.label("project_name"), user.c.name.label("author_name"))
+        .join(project, project.c.id == job.c.project_id)
+        .outerjoin(user, user.c.id == job.c.author_id)
+    )
+
+
+_JOBS_BY_ID = Prepared(select_jobs().where(job.c.id.in_(bindparam("ids", expanding=True))))
+
+
+def job_documents(tx: Transaction, ids: Sequence[str]) -> list[Job]:
+    """The documents of these jobs, in this order."""
+    found: dict[str, Job] = {}
+    for start in range(0, len(ids), IN_LIST):
+        rows = tx.run(_JOBS_BY_ID, {"ids": list(ids[start : start + IN_LIST])})
+        found |= {document.id: document for document in as_documents(tx, rows)}
+    return [found[one] for one in ids]
+
+
+_UNSAID = {column.key: None if column.default is None else column.default.arg for column in job.c}  # type: ignore[attr-defined]
+"""What stands in the columns of a new row that it does not name."""
+
+
+def document_of_new(tx: Transaction, project_name: str, row: Mapping[str, Any], after: Collection[str]) -> Job:
+    """The document of a job of the caller's, other than a gathering one, whose row is as it was inserted by this
+    transaction: what `job_documents` would read.
+    """
+    names = {"project_name": project_name, "author_name": tx.principal.user_name}
+    return _document(SimpleNamespace(**{**_UNSAID, **row, **names}), tuple(sorted(after)), {}, None)
+
+
+def as_documents(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Job]:
+    """Rows of `select_jobs` as they travel; gathering jobs with the states of their tasks."""
+    gathering = [row for row in rows if row.size is not None]
+    children = _children(tx, [row.id for row in gathering])
+    at_work = [row for row in gathering if row.state == JobState.RUNNING and row.lease_expires_us is None]
+    progress = _progress_of_tasks(tx, at_work, children)
+    after = _after(tx, rows)
+    return [_document(row, after.get(row.id, ()), children.get(row.id, {}), progress.get(row.id)) for row in rows]
+
+
+_DEPENDENCIES = Prepared(
+    select(job_dependency.c.job_id, job_dependency.c.on_job_id)
+    .where(job_dependency.c.job_id.in_(bindparam("ids", expanding=True)))
+    .order_by(job_dependency.c.on_job_id)
+)
+
+
+def _after(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, tuple[str, ...]]:
+    """The jobs each of these comes after. Whom a job waits to share a result with, it does not need."""
+    shared = {row.id: row.cached_from for row in rows}
+    found: dict[str, tuple[str, ...]] = {}
+    for row in tx.run(_DEPENDENCIES, {"ids": list(shared)}):
+        if row.on_job_id != shared[row.job_id]:
+            found[row.job_id] = (*found.get(row.job_id, ()), row.on_job_id)
+    return found
+
+
+def _children(tx: Transaction, parents: Sequence[str]) -> dict[str, dict[str, int]]:
+    if not parents:
+        return {}
+    statement = (
+        select(job.c.parent_id, job.c.state, func.count().label("count"))
+        .where(job.c.parent_id.in_(parents))
+        .group_by(job.c.parent_id, job.c.state)
+    )
+    counts: dict[str, dict[str, int]] = {}
+    for row in tx.execute(statement):
+        counts.setdefault(row.parent_id, {})[row.state] = row._mapping["count"]
+    return counts
+
+
+def _progress_of_tasks(
+    tx: Transaction, heads: Sequence[Row[Any]], children: Mapping[str, dict[str, int]]
+) -> dict[str, Progress]:
+    """How far gathering jobs are, counted in tasks: those that have ended, and what is done of those that run."""
+    if not heads:
+        return {}
+    running: dict[str, list[Progress]] = {}
+    statement = (
+        select(job.c.parent_id, job.c.progress)
+        .where(job.c.parent_id.in_([head.id for head in heads]), job.c.state == "running")
+        .order_by(job.c.parent_id, job.c.position)
+    )
+    for row in tx.execute(statement):
+        if row.progress is not None:
+            running.setdefault(row.parent_id, []).append(Progress.model_validate(row.progress))
+    told: dict[str, Progress] = {}
+    for head in heads:
+        ended = sum(count for state, count in children.get(head.id, {}).items() if JobState(state).terminal)
+        at_work = running.get(head.id, [])
+        shares = sum(min(1.0, one.done / one.total) for one in at_work if one.total)
+        told[head.id] = Progress(done=ended + shares, total=head.size, note=at_work[0].note if at_work else "")
+    return told
+
+
+def _document(row: Any, after: tuple[str, ...], children: dict[str, int], at_work: Progress | None) -> Job:
+    return Job(
+        id=row.id,
+        project=row.project_name,
+        kind=row.kind,
+        state=row.state,
+        params=row.params,
+        inputs=row.inputs,
+        after=after,
+        into=row.into_path,
+        priority=row.priority,
+        seed=row.seed,
+        attempt=row.attempt,
+        fence=row.fence,
+        max_attempts=row.max_attempts,
+        interruptions=row.interruptions,
+        parent=row.parent_id,
+        position=row.position,
+        size=row.size,
+        children=children,
+        retry_of=row.retry_of,
+        cached_from=row.cached_from,
+        progress=at_work or row.progress,
+        failure=row.failure,
+        result=row.result,
+        cancel_requested=row.cancel_requested_us is not None,
+        publish_conflict=row.publish_conflict,
+        author=row.author_name,
+        created_at=datetime_of(row.created_us),
+        run_at=datetime_of(row.run_at_us),
+        started_at=None if row.started_us is None else datetime_of(row.started_us),
+        finished_at=None if row.finished_us is None else datetime_of(row.finished_us),
+        rev=row.rev,
+    )

@@ -1,0 +1,115 @@
+"""The end of a job: the one transition that is never taken back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import ColumnElement, Row, bindparam, update
+
+from marey_schemas.jobs import FailureReason, JobFailure
+from marey_server.store.database.prepared import Prepared
+from marey_server.store.tables import attempt, job
+from marey_server.store.transaction import Transaction
+
+LONGEST_DETAIL = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """A job that has just ended in this transaction."""
+
+    id: str
+    project_id: str
+    state: str
+    parent_id: str | None
+    failure: dict[str, Any] | None = None
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether its results are there."""
+        return self.state == "succeeded"
+
+
+ENDED_COLUMNS = (job.c.id, job.c.project_id, job.c.state, job.c.parent_id, job.c.failure)
+
+
+def as_ended(row: Row[Any]) -> Ended:
+    """From a row that has `ENDED_COLUMNS`."""
+    return Ended(row.id, row.project_id, row.state, row.parent_id, row.failure)
+
+
+def failure_document(reason: FailureReason, code: str, detail: str) -> dict[str, Any]:
+    """Why a job failed, as it is stored."""
+    return JobFailure(reason=reason, code=code, detail=detail[:LONGEST_DETAIL]).model_dump(mode="json")
+
+
+def dependency_failure(cause: str, state: str) -> dict[str, Any]:
+    """Why a job failed that needed another one to succeed."""
+    detail = f"This job needs {cause} to succeed, and that is {state}."
+    return failure_document(FailureReason.DEPENDENCY_FAILED, "dependency-failed", detail)
+
+
+def end_jobs(tx: Transaction, condition: ColumnElement[bool], state: str, **values: Any) -> list[Ended]:
+    """Bring jobs to a final `state`. The condition says which states and which fences they may leave."""
+    statement = (
+        update(job)
+        .where(condition)
+        .values(state=state, finished_us=tx.now_us, lease_expires_us=None, rev=job.c.rev + 1, **values)
+        .returning(*ENDED_COLUMNS)
+    )
+    return [as_ended(row) for row in tx.execute(statement)]
+
+
+@dataclass(frozen=True, slots=True)
+class AttemptEnd:
+    """How a try at a job ended."""
+
+    job_id: str
+    fence: int
+    outcome: str
+    detail: str | None = None
+    signature: str | None = None
+    write_id: str | None = None
+    answer: dict[str, Any] | None = None
+
+
+_END_ATTEMPT = Prepared(
+    update(attempt)
+    .where(
+        attempt.c.job_id == bindparam("of_job"),
+        attempt.c.fence == bindparam("of_fence"),
+        attempt.c.ended_us.is_(None),
+    )
+    .values(
+        ended_us=bindparam("now"),
+        outcome=bindparam("its_outcome"),
+        detail=bindparam("its_detail"),
+        signature=bindparam("its_signature"),
+        write_id=bindparam("its_write_id"),
+        answer=bindparam("its_answer"),
+    )
+)
+
+
+def end_attempts(tx: Transaction, ends: Sequence[AttemptEnd]) -> None:
+    """Record how attempts ended; one that has ended already keeps its end."""
+    if not ends:
+        return
+    tx.run_each(
+        _END_ATTEMPT,
+        [
+            {
+                "of_job": end.job_id,
+                "of_fence": end.fence,
+                "its_outcome": end.outcome,
+                "its_detail": end.detail,
+                "its_signature": end.signature,
+                "its_write_id": end.write_id,
+                "its_answer": end.answer,
+                "now": tx.now_us,
+            }
+            for end in ends
+        ],
+    )

@@ -1,0 +1,144 @@
+"""What becomes of a job whose attempt ended without success: tried again, failed or cancelled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import ColumnElement, Row, update
+
+from marey_schemas.jobs import FailRequest, FailureReason
+from marey_server.store.jobs import staging
+from marey_server.store.jobs.endings import AttemptEnd, end_attempts, end_jobs, failure_document
+from marey_server.store.jobs.events import emit_job_events, wake_workers
+from marey_server.store.jobs.fencing import lease_lost
+from marey_server.store.jobs.policy import QueuePolicy
+from marey_server.store.jobs.propagation import settle
+from marey_server.store.tables import job
+from marey_server.store.transaction import Transaction
+
+TIME_LIMIT = "time-limit"
+"""The code with which a worker reports that it stopped a job because its time was over."""
+
+ENDING_COLUMNS = (
+    job.c.id,
+    job.c.kind,
+    job.c.fence,
+    job.c.attempt,
+    job.c.max_attempts,
+    job.c.interruptions,
+    job.c.cancel_requested_us,
+    job.c.deadline_us,
+    job.c.lease_expires_us,
+    job.c.time_limit_s,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Where the job goes (`state`), what the attempt is recorded as (`outcome`), how long a queued job rests."""
+
+    state: str
+    outcome: str
+    rest_us: int | None = None
+    failure: dict[str, Any] | None = None
+    counts: bool = True
+    """Whether the attempt counts against `max_attempts`; an interruption has a count of its own."""
+
+
+def judge(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, poisoned: bool) -> Verdict:
+    """The verdict on an attempt whose worker reports a failure. `row` holds `ENDING_COLUMNS`."""
+    if row.cancel_requested_us is not None:
+        return Verdict("cancelled", "cancelled")
+    if request.interrupted:
+        return _interrupted(row, policy)
+    if request.code == TIME_LIMIT:
+        return _over_time(row)
+    if poisoned:
+        detail = f"Two attempts ended in the same way: {request.detail or request.code}"
+        return _failed(FailureReason.POISON, request.code, detail)
+    if not request.retryable:
+        return _failed(FailureReason.ERROR, request.code, request.detail)
+    if row.attempt >= row.max_attempts:
+        detail = f"{row.attempt} attempts failed; the last: {request.detail or request.code}"
+        return _failed(FailureReason.ATTEMPTS_EXHAUSTED, request.code, detail)
+    return Verdict("queued", "failed", policy.backoff_us(row.attempt))
+
+
+def judge_expired(row: Row[Any], policy: QueuePolicy) -> Verdict:
+    """The verdict on an attempt whose lease ran out. The job is queued at once: it has rested for a lease already.
+
+    A lease that was renewed to the last moment allowed belonged to a worker that lived and did not stop in time; one
+    that ended earlier, to a worker that was lost, however late that is noticed.
+    """
+    if row.cancel_requested_us is not None:
+        return Verdict("cancelled", "cancelled")
+    if row.lease_expires_us >= row.deadline_us + policy.end_grace_us:
+        return _over_time(row)
+    if row.attempt >= row.max_attempts:
+        detail = f"{row.attempt} attempts were made; the last worker was not heard of again."
+        return _failed(FailureReason.ATTEMPTS_EXHAUSTED, "worker-lost", detail, outcome="lost")
+    return Verdict("queued", "lost", 0)
+
+
+def _interrupted(row: Row[Any], policy: QueuePolicy) -> Verdict:
+    if row.interruptions >= policy.max_interruptions:
+        detail = f"The job's workers were stopped {row.interruptions + 1} times."
+        return _failed(FailureReason.ATTEMPTS_EXHAUSTED, "interrupted", detail, outcome="interrupted")
+    return Verdict("queued", "interrupted", 0, counts=False)
+
+
+def _over_time(row: Row[Any]) -> Verdict:
+    detail = f"The attempt took longer than its limit of {row.time_limit_s} s."
+    return _failed(FailureReason.TIMEOUT, TIME_LIMIT, detail, outcome="timeout")
+
+
+def _failed(reason: FailureReason, code: str, detail: str, outcome: str = "failed") -> Verdict:
+    return Verdict("failed", outcome, failure=failure_document(reason, code, detail))
+
+
+def carry_out(
+    tx: Transaction, row: Row[Any], condition: ColumnElement[bool], verdict: Verdict, end: AttemptEnd, **values: Any
+) -> None:
+    """Bring the job where the verdict says, if `condition` still holds, and let what follows follow.
+
+    Raises `LeaseLost` if it does not.
+    """
+    if verdict.rest_us is None:
+        failure = {} if verdict.failure is None else {"failure": verdict.failure}
+        ended = end_jobs(tx, condition, verdict.state, **failure, **values)
+        moved = bool(ended)
+    else:
+        ended = []
+        moved = _queue_again(tx, row, condition, verdict, values)
+    if not moved:
+        raise lease_lost(end.job_id, end.fence)
+    end_attempts(tx, [end])
+    staging.drop_staged(tx, [(end.job_id, end.fence)])
+    settle(tx, ended)
+
+
+def _queue_again(
+    tx: Transaction, row: Row[Any], condition: ColumnElement[bool], verdict: Verdict, values: dict[str, Any]
+) -> bool:
+    uncounted = {} if verdict.counts else {"attempt": job.c.attempt - 1, "interruptions": job.c.interruptions + 1}
+    queued = tx.execute(
+        update(job)
+        .where(condition)
+        .values(
+            state="queued",
+            run_at_us=tx.now_us + (verdict.rest_us or 0),
+            lease_expires_us=None,
+            deadline_us=None,
+            progress=None,
+            rev=job.c.rev + 1,
+            **uncounted,
+            **values,
+        )
+        .returning(job.c.project_id)
+    ).scalar_one_or_none()
+    if queued is None:
+        return False
+    emit_job_events(tx, "job.requeued", [(queued, row.id, {"fence": row.fence, "outcome": verdict.outcome})])
+    wake_workers(tx, [row.kind])
+    return True

@@ -1,0 +1,211 @@
+"""From what a job's submission names to the exact revisions it will read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+from sqlalchemy import ColumnElement, bindparam, func, or_, select
+
+from marey_schemas.job_kinds import KindDeclaration
+from marey_schemas.jobs import CollectionInput, InputSpec, ItemInput, JobCreate, JobInput, JobOutputsInput
+from marey_schemas.problems import FieldError
+from marey_server.errors import Invalid
+from marey_server.store.database.prepared import Prepared
+from marey_server.store.projects import ProjectRow
+from marey_server.store.tables import collection, item
+from marey_server.store.transaction import Transaction
+
+MOST_INPUTS = 100_000
+IN_LIST = 1000
+
+Pin = dict[str, Any]
+"""An input as the job keeps it: the fields of `PinnedInput`, or `{job}` as long as that job has yet to make it."""
+
+PinnedInputs = dict[str, list[Pin]]
+
+
+class FoundItem(NamedTuple):
+    """An item as it stands."""
+
+    id: str
+    kind: str
+    name: str
+    head: int
+    path: str
+
+
+_ITEMS = (
+    select(item.c.id, item.c.kind, item.c.name, item.c.head, collection.c.path)
+    .join(collection, collection.c.id == item.c.collection_id)
+    .where(item.c.project_id == bindparam("project_id"), item.c.deleted_us.is_(None))
+)
+_ITEMS_BY_ID = Prepared(_ITEMS.where(item.c.id.in_(bindparam("ids", expanding=True))))
+
+
+def find_items(tx: Transaction, project: ProjectRow, requests: Iterable[JobCreate]) -> dict[str, FoundItem]:
+    """Those items of the project that the requests name one by one, by id."""
+    choices = (choice for request in requests for many in request.inputs.values() for choice in _as_many(many))
+    return items_by_id(tx, project.id, (choice.item for choice in choices if isinstance(choice, ItemInput)))
+
+
+def items_by_id(tx: Transaction, project_id: str, ids: Iterable[str]) -> dict[str, FoundItem]:
+    """Those of the items that are there in the project, by id."""
+    wanted = sorted(set(ids))
+    rows = [
+        FoundItem(row.id, row.kind, row.name, row.head, row.path)
+        for start in range(0, len(wanted), IN_LIST)
+        for row in tx.run(_ITEMS_BY_ID, {"project_id": project_id, "ids": wanted[start : start + IN_LIST]})
+    ]
+    return {row.id: row for row in rows}
+
+
+def pin_inputs(
+    tx: Transaction,
+    project: ProjectRow,
+    kind: KindDeclaration,
+    request: JobCreate,
+    known: dict[str, FoundItem],
+    at: str = "",
+) -> PinnedInputs:
+    """Every input with the revision it has now, or had when it was named; collections become their items. What other
+    jobs make stays to be bound.
+
+    `known` holds what `find_items` found of the request's items.
+    Raises `Invalid`, with a pointer below `at` for each thing that is wrong: an input the kind does not have or lacks,
+    nothing for one that is required, an item or revision that is not in the project, an item of another kind, a
+    collection that holds none.
+    """
+    errors = _misnamed(kind, request, at)
+    pins: PinnedInputs = {}
+    for name, choices in request.inputs.items():
+        spec = kind.inputs.get(name)
+        if spec is not None:
+            pins[name] = _pin_input(tx, project, spec, choices, f"{at}/inputs/{_escaped(name)}", known, errors)
+    if not errors:
+        errors += _missing_revisions(request, known, at)
+    total = sum(map(len, pins.values()))
+    if total > MOST_INPUTS:
+        errors.append(
+            _error(f"{at}/inputs", "too-many", f"{total} inputs are named; at most {MOST_INPUTS} are possible.")
+        )
+    if errors:
+        raise Invalid(f"{errors[0].pointer}: {errors[0].detail}", errors=errors[:100])
+    return pins
+
+
+def _misnamed(kind: KindDeclaration, request: JobCreate, at: str) -> list[FieldError]:
+    unknown = [
+        _error(
+            f"{at}/inputs/{_escaped(name)}",
+            "unknown-input",
+            f"{kind.name} has no input {name!r}; it has {', '.join(map(repr, kind.inputs)) or 'none'}.",
+        )
+        for name in request.inputs
+        if name not in kind.inputs
+    ]
+    lacking = [
+        _error(f"{at}/inputs", "missing-input", f"{kind.name} needs the input {name!r}: {spec.description}")
+        for name, spec in kind.inputs.items()
+        if spec.required and name not in request.inputs
+    ]
+    return unknown + lacking
+
+
+def _pin_input(
+    tx: Transaction,
+    project: ProjectRow,
+    spec: InputSpec,
+    choices: Any,
+    pointer: str,
+    known: dict[str, FoundItem],
+    errors: list[FieldError],
+) -> list[Pin]:
+    single = not isinstance(choices, tuple)
+    if spec.required and not _as_many(choices):
+        errors.append(_error(pointer, "empty-input", f"This input takes at least one {spec.kind.value}; name some."))
+    pins: dict[tuple[str, int], Pin] = {}
+    made: dict[str, Pin] = {}
+    for index, choice in enumerate(_as_many(choices)):
+        place = pointer if single else f"{pointer}/{index}"
+        if isinstance(choice, JobOutputsInput):
+            made[choice.job] = {"job": choice.job}
+            continue
+        if isinstance(choice, CollectionInput):
+            found = _items_below(tx, project, spec, choice.collection)
+            if not found:
+                detail = f"The collection {choice.collection!r} holds no {spec.kind.value}."
+                errors.append(_error(f"{place}/collection", "empty-collection", detail))
+            chosen = [(one, one.head) for one in found]
+        else:
+            one = known.get(choice.item)
+            if one is None or one.kind != spec.kind:
+                detail = f"There is no {spec.kind.value} {choice.item!r} in the project."
+                errors.append(_error(f"{place}/item", "unknown-item", detail))
+                continue
+            chosen = [(one, choice.revision or one.head)]
+        for one, number in chosen:
+            pins.setdefault((one.id, number), pin(one, number))
+    total = len(pins) + len(made)
+    if not errors and not spec.many and total != 1:
+        errors.append(_error(pointer, "one-item", f"This input takes one {spec.kind.value}, not {total}."))
+    return [*pins.values(), *made.values()]
+
+
+def late_inputs(request: JobCreate, at: str = "") -> Iterator[tuple[str, str, str]]:
+    """Those inputs that other jobs make: where the request says so, the input's name, and the job's id."""
+    for name, choices in request.inputs.items():
+        for index, choice in enumerate(_as_many(choices)):
+            if isinstance(choice, JobOutputsInput):
+                place = f"{at}/inputs/{_escaped(name)}" + (f"/{index}" if isinstance(choices, tuple) else "")
+                yield place, name, choice.job
+
+
+def pin(found: FoundItem, number: int) -> Pin:
+    """An item at a revision, as the job keeps it."""
+    return {"item": found.id, "revision": number, "kind": found.kind, "name": found.name, "collection": found.path}
+
+
+# -- looking up -------------------------------------------------------------------------------------------------------
+
+
+def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: str) -> list[FoundItem]:
+    """The items of the input's kind in a collection and below it, by place and name."""
+    statement = _ITEMS.where(item.c.kind == spec.kind.value).limit(MOST_INPUTS + 1)
+    if path:
+        statement = statement.where(_within(path))
+    rows = tx.execute(statement.order_by(collection.c.path, item.c.name, item.c.id), {"project_id": project.id})
+    return [FoundItem(row.id, row.kind, row.name, row.head, row.path) for row in rows]
+
+
+def _within(path: str) -> ColumnElement[bool]:
+    """Compared as text, not with LIKE, which on SQLite takes `A` for `a`."""
+    below = f"{path}/"
+    return or_(collection.c.path == path, func.substr(collection.c.path, 1, len(below)) == below)
+
+
+def _missing_revisions(request: JobCreate, known: dict[str, FoundItem], at: str) -> list[FieldError]:
+    """Revisions that were named by number and do not exist."""
+    asked: list[tuple[str, ItemInput]] = []
+    for name, choices in request.inputs.items():
+        for index, choice in enumerate(_as_many(choices)):
+            if isinstance(choice, ItemInput) and choice.revision is not None:
+                place = f"{at}/inputs/{_escaped(name)}" + (f"/{index}" if isinstance(choices, tuple) else "")
+                asked.append((place, choice))
+    beyond = [(place, choice) for place, choice in asked if (choice.revision or 0) > known[choice.item].head]
+    return [
+        _error(f"{place}/revision", "unknown-revision", f"{choice.item} has no revision {choice.revision}.")
+        for place, choice in beyond
+    ]
+
+
+def _as_many(choices: Any) -> Sequence[JobInput]:
+    return choices if isinstance(choices, tuple) else (choices,)
+
+
+def _escaped(name: str) -> str:
+    return name.replace("~", "~0").replace("/", "~1")
+
+
+def _error(pointer: str, code: str, detail: str) -> FieldError:
+    return FieldError(pointer=pointer, code=code, detail=detail)

@@ -1,0 +1,179 @@
+"""Inputs that other jobs make: once all of those have succeeded, a job gets the very revisions they made.
+
+It happens in the transaction that makes the job ready, with its row locked, and does what a submission does for a job
+whose inputs are there: the job is spread over tasks, gets its cache key, and is queued or shares a result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+from pydantic import ValidationError
+from sqlalchemy import Row, and_, insert, select, update
+
+from marey_schemas.job_kinds import KindDeclaration, UnknownKindError, find_kind
+from marey_schemas.jobs import FailureReason, InputSpec
+from marey_server import faults
+from marey_server.store.jobs import layout, result_cache
+from marey_server.store.jobs.endings import Ended, end_jobs, failure_document
+from marey_server.store.jobs.events import emit_job_events, wake_workers
+from marey_server.store.jobs.fencing import WAITING
+from marey_server.store.jobs.inputs import MOST_INPUTS, Pin, PinnedInputs, items_by_id, pin
+from marey_server.store.jobs.layout import NewJob, Submission
+from marey_server.store.jobs.result_places import find_clash
+from marey_server.store.tables import job
+from marey_server.store.transaction import Transaction
+
+IN_LIST = 1000
+
+
+class UnbindableError(Exception):
+    """Why a job cannot get its inputs: the code and detail of its failure."""
+
+    def __init__(self, code: str, detail: str) -> None:
+        super().__init__(detail)
+        self.code = code
+
+
+def bind(tx: Transaction, ids: Sequence[str]) -> list[Ended]:
+    """Give waiting jobs, all of whose dependencies have succeeded, the inputs these made, and let them go on.
+
+    Returns the jobs that ended by it: those for which nothing was made, and those whose result is there.
+    """
+    if not ids:
+        return []
+    heads: list[NewJob] = []
+    ended: list[Ended] = []
+    for row in _unbound(tx, ids):
+        try:
+            heads.append(_bound(tx, row))
+        except UnbindableError as error:
+            failure = failure_document(FailureReason.ERROR, error.code, str(error))
+            ended += end_jobs(tx, and_(job.c.id == row.id, job.c.state == WAITING), "failed", failure=failure)
+    tasks, sources = layout.lay_out(tx, heads)
+    _write(tx, heads, tasks)
+    everything = [*heads, *tasks]
+    wake_workers(tx, {one.submission.kind.name for one in everything if one.state == "queued"})
+    ended += result_cache.join(tx, [(one, sources[one.id]) for one in everything if one.id in sources])
+    faults.point("bind.before_commit")
+    tx.after_commit(lambda: faults.point("bind.after_commit"))
+    return ended
+
+
+def _unbound(tx: Transaction, ids: Sequence[str]) -> Iterable[Row[Any]]:
+    for start in range(0, len(ids), IN_LIST):
+        chosen = and_(job.c.id.in_(ids[start : start + IN_LIST]), job.c.state == WAITING, job.c.unbound)
+        yield from tx.execute(select(job).where(chosen).order_by(job.c.id).with_for_update()).all()
+
+
+def _bound(tx: Transaction, row: Row[Any]) -> NewJob:
+    """The job with its inputs. The kind is that of now: the server may have been changed since the submission."""
+    try:
+        kind = find_kind(row.kind)
+        params = kind.params.model_validate(row.params)
+    except UnknownKindError as error:
+        raise UnbindableError("unknown-kind", f"This server does not know the kind any more: {error}.") from error
+    except ValidationError as error:
+        detail = f"{kind.name} does not take these parameters any more: {error.errors()[0]['msg']}"
+        raise UnbindableError("invalid-params", detail) from error
+    pins = _pin_outputs(tx, row, kind)
+    if (clash := find_clash(kind, params, pins, row.into_path)) is not None:
+        raise UnbindableError(clash.code, clash.detail)
+    submission = Submission(
+        kind,
+        layout.request_of(row),
+        row.params,
+        pins,
+        1 if kind.task_count is None else kind.task_count(params),
+        row.labels_key,
+        row.author_id,
+        id=row.id,
+    )
+    return NewJob(row.id, row.project_id, submission, pins)
+
+
+def _write(tx: Transaction, heads: Sequence[NewJob], tasks: Sequence[NewJob]) -> None:
+    for one in heads:
+        tx.execute(
+            update(job)
+            .where(job.c.id == one.id, job.c.state == WAITING)
+            .values(**layout.layout_columns(tx, one), rev=job.c.rev + 1)
+        )
+    for start in range(0, len(tasks), IN_LIST):
+        tx.execute(insert(job), [layout.new_row(tx, one) for one in tasks[start : start + IN_LIST]])
+    emit_job_events(tx, "job.bound", [(one.project_id, one.id, {"tasks": one.size or 1}) for one in heads])
+
+
+# -- what the other jobs made -----------------------------------------------------------------------------------------
+
+
+class _Made(NamedTuple):
+    """What a job made, and the place its results went to."""
+
+    into: str
+    pins: list[Pin]
+
+    def below(self, one: Pin) -> str:
+        """Where an output stands below that place; its whole place, where it was moved elsewhere."""
+        path: str = one["collection"]
+        return f"{path}/".removeprefix(f"{self.into}/").rstrip("/") if self.into else path
+
+
+def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> PinnedInputs:
+    pins: PinnedInputs = {}
+    made: dict[str, _Made] = {}
+    for name, entries in row.inputs.items():
+        spec = kind.inputs.get(name)
+        if spec is None:
+            raise UnbindableError("unknown-input", f"{kind.name} has no input {name!r} any more.")
+        chosen: dict[tuple[str, int], Pin] = {}
+        for entry in entries:
+            for one in _resolved(tx, row.project_id, name, spec, entry, made):
+                chosen.setdefault((one["item"], one["revision"]), one)
+        if not chosen and not spec.required:
+            continue
+        if not spec.many and len(chosen) != 1:
+            sources = ", ".join(entry["job"] for entry in entries if "job" in entry)
+            detail = f"The input {name!r} takes one {spec.kind}; {sources} made {len(chosen)}."
+            raise UnbindableError("one-item", detail)
+        pins[name] = list(chosen.values())
+        if len(entries) == 1 and "job" in entries[0]:  # of several makers, things of one name may stand in like places
+            pins[name] = [one | {"below": made[entries[0]["job"]].below(one)} for one in pins[name]]
+    total = sum(map(len, pins.values()))
+    if total > MOST_INPUTS:
+        raise UnbindableError("too-many", f"The job has {total} inputs; at most {MOST_INPUTS} are possible.")
+    return pins
+
+
+def _resolved(
+    tx: Transaction, project_id: str, name: str, spec: InputSpec, entry: dict[str, Any], made: dict[str, _Made]
+) -> list[Pin]:
+    """What one entry of an input stands for: itself, or what the job it names made, which may be nothing only where the
+    input is not required.
+    """
+    if "job" not in entry:
+        return [entry]
+    source: str = entry["job"]
+    if source not in made:
+        made[source] = _outputs(tx, project_id, source)
+    found = [one for one in made[source].pins if one["kind"] == spec.kind]
+    if not found and spec.required:
+        detail = f"{source} made no {spec.kind} that is there, which this job needs as its input {name!r}."
+        raise UnbindableError("no-input", detail)
+    return found
+
+
+def _outputs(tx: Transaction, project_id: str, job_id: str) -> _Made:
+    """What a job, or its tasks, made, in their order, each item at the last revision it was given; deleted ones not."""
+    columns = (job.c.size, job.c.gathers, job.c.outputs, job.c.into_path)
+    row = tx.execute(select(*columns).where(job.c.id == job_id)).one()
+    published = [row.outputs]
+    if row.size is not None and not row.gathers:
+        tasks = select(job.c.outputs).where(job.c.parent_id == job_id).order_by(job.c.position)
+        published = list(tx.execute(tasks).scalars())
+    revisions: dict[str, int] = {}
+    for output in (one for outputs in published for one in outputs or ()):
+        revisions[output["item"]] = max(output["revision"], revisions.get(output["item"], 0))
+    found = items_by_id(tx, project_id, revisions)
+    return _Made(row.into_path, [pin(found[item], number) for item, number in revisions.items() if item in found])

@@ -1,0 +1,213 @@
+"""From a checked submission to the rows of its job: one, or a gathering job and its tasks, each where it belongs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from sqlalchemy import Row
+
+from marey_schemas.job_kinds import KindDeclaration
+from marey_schemas.jobs import JobCreate, Resources
+from marey_server.store.ids import new_id
+from marey_server.store.jobs import result_cache
+from marey_server.store.jobs.endings import Ended
+from marey_server.store.jobs.inputs import PinnedInputs, items_by_id
+from marey_server.store.transaction import Transaction
+
+
+@dataclass(frozen=True)
+class Submission:
+    """A job that was checked."""
+
+    kind: KindDeclaration
+    request: JobCreate
+    params: Mapping[str, Any]
+    pins: PinnedInputs
+    task_count: int
+    labels_key: str
+    author_id: str | None
+    after: tuple[str, ...] = ()
+    """Jobs that must succeed first; those that make its inputs are among them."""
+    unbound: bool = False
+    """Whether some of the pins are still to be made by other jobs."""
+    id: str = field(default_factory=lambda: new_id("job"))
+    retry_of: str | None = None
+
+
+@dataclass
+class NewJob:
+    """A row to be."""
+
+    id: str
+    project_id: str
+    submission: Submission
+    pins: Mapping[str, Any]
+    state: str = "queued"
+    dependencies_left: int = 0
+    failure: dict[str, Any] | None = None
+    parent_id: str | None = None
+    position: int | None = None
+    size: int | None = None
+    gathers: bool = False
+    cache_key: str | None = None
+
+    @property
+    def cache_mode(self) -> str:
+        """Whether a result that is there may serve."""
+        return self.submission.request.cache
+
+    @property
+    def unbound(self) -> bool:
+        """Whether some of its inputs are still to be made."""
+        return self.submission.unbound
+
+    def end(self) -> Ended:
+        """The end of a job that ends before it begins, because one it needs did not succeed."""
+        return Ended(self.id, self.project_id, self.state, self.parent_id, self.failure)
+
+
+def request_of(row: Row[Any]) -> JobCreate:
+    """What a job was asked for with, apart from its inputs and labels and from the jobs it came after."""
+    return JobCreate(
+        kind=row.kind,
+        params=row.params,
+        into=row.into_path,
+        priority=row.priority,
+        on_failure=row.on_failure,
+        concurrency_key=row.concurrency_key,
+        cache=row.cache_mode,
+        seed=row.seed,
+        max_attempts=row.max_attempts,
+        resources=Resources(time_limit_s=row.time_limit_s, memory_limit_mb=row.memory_limit_mb),
+        message=row.message,
+    )
+
+
+def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dict[str, result_cache.Source]]:
+    """Spread jobs whose inputs are known over tasks and give them their cache keys.
+
+    Returns the tasks, and for each job whose result is there or under way, whose that is; such jobs wait for it.
+    """
+    gathering = [one for one in heads if one.submission.kind.gathering is not None]
+    sources = _find_results(tx, gathering)
+    tasks = [task for one in heads if one.id not in sources for task in _spread(one)]
+    single = [one for one in (*heads, *tasks) if one.size is None and one.cache_key is None]
+    return tasks, sources | _find_results(tx, single)
+
+
+def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_cache.Source]:
+    """Give jobs their cache keys; those whose result is there or under way wait for it instead of being queued."""
+    _set_cache_keys(tx, jobs)
+    sources = result_cache.decide(tx, [one for one in jobs if one.state == "queued"])
+    for one in jobs:
+        if one.id in sources:
+            one.state = "waiting"
+    return sources
+
+
+def _spread(head: NewJob) -> list[NewJob]:
+    """The tasks of a job that has several, which makes it a gathering job; they start when it does."""
+    shares = _shares(head.submission)
+    if len(shares) < 2:
+        return []
+    kind = head.submission.kind
+    head.size, head.gathers = len(shares), kind.gathering is not None
+    if kind.fan_out is not None:
+        head.pins = {**head.pins, kind.fan_out: {"count": len(head.pins[kind.fan_out])}}
+    if head.state == "queued":
+        head.state, head.dependencies_left = "running", len(shares)
+    state = {"running": "queued", "failed": "cancelled"}.get(head.state, head.state)
+    return [
+        NewJob(new_id("job"), head.project_id, head.submission, pins, state, parent_id=head.id, position=position)
+        for position, pins in enumerate(shares)
+    ]
+
+
+def _shares(submission: Submission) -> list[PinnedInputs]:
+    """The inputs of each task: some items of the input that is spread, or everything where tasks are counted."""
+    fanned = submission.kind.fan_out
+    if fanned is None:
+        return [submission.pins] * submission.task_count
+    pins, size = submission.pins.get(fanned, []), submission.kind.batch_size
+    return [{**submission.pins, fanned: pins[start : start + size]} for start in range(0, len(pins), size)]
+
+
+def _set_cache_keys(tx: Transaction, jobs: Sequence[NewJob]) -> None:
+    cached = [one for one in jobs if one.cache_mode != "off" and _has_key(one.submission)]
+    parts = result_cache.part_digests(tx, {id(one.submission): one.submission.pins for one in cached}.values())
+    newest = _newest_revisions(tx, cached)
+    for one in cached:
+        submission = one.submission
+        contents = result_cache.input_contents(submission.kind, one.pins, parts)
+        task = None if one.parent_id is None or submission.kind.fan_out else (one.position, submission.task_count)
+        one.cache_key = result_cache.cache_key(
+            submission.kind,
+            submission.params,
+            submission.request.seed,
+            contents,
+            task,
+            into=submission.request.into,
+            newest=newest,
+        )
+
+
+def _has_key(submission: Submission) -> bool:
+    given = [name for name, pins in submission.pins.items() if pins]
+    return result_cache.has_key(submission.kind, submission.params, given)
+
+
+def _newest_revisions(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, int]:
+    """Of the items that the parameters of jobs name; those that are not there in the job's project are left out."""
+    wanted: dict[str, set[str]] = {}
+    for one in jobs:
+        named = result_cache.named_items(one.submission.kind, one.submission.params)
+        wanted.setdefault(one.project_id, set()).update(named)
+    found = (items_by_id(tx, project_id, ids) for project_id, ids in wanted.items())
+    return {item: one.head for items in found for item, one in items.items()}
+
+
+def new_row(tx: Transaction, one: NewJob) -> dict[str, Any]:
+    """The row to insert."""
+    submission, request = one.submission, one.submission.request
+    return {
+        "id": one.id,
+        "project_id": one.project_id,
+        "kind": submission.kind.name,
+        "params": submission.params,
+        "into_path": request.into,
+        "priority": request.priority,
+        "seed": request.seed,
+        "labels_key": submission.labels_key,
+        "time_limit_s": request.resources.time_limit_s,
+        "memory_limit_mb": request.resources.memory_limit_mb,
+        "max_attempts": request.max_attempts,
+        "run_at_us": tx.now_us,
+        "failure": one.failure,
+        "parent_id": one.parent_id,
+        "position": one.position,
+        "on_failure": request.on_failure,
+        "cache_mode": request.cache,
+        "retry_of": submission.retry_of if one.parent_id is None else None,
+        "author_id": submission.author_id,
+        "message": request.message,
+        "created_us": tx.now_us,
+        "finished_us": tx.now_us if one.state in ("failed", "cancelled") else None,
+        **layout_columns(tx, one),
+    }
+
+
+def layout_columns(tx: Transaction, one: NewJob) -> dict[str, Any]:
+    """Those columns of a row that depend on its inputs."""
+    return {
+        "state": one.state,
+        "inputs": one.pins,
+        "unbound": one.unbound,
+        "size": one.size,
+        "gathers": one.gathers,
+        "dependencies_left": one.dependencies_left,
+        "concurrency_key": None if one.size is not None else one.submission.request.concurrency_key,
+        "cache_key": one.cache_key,
+        "started_us": tx.now_us if one.state == "running" else None,
+    }

@@ -1,0 +1,204 @@
+"""What follows from the end of a job, in the same transaction: its dependants move, its gathering job counts, those
+that wait to share its result get it.
+
+Rows are locked downstream: a job before its gathering job and before its dependants.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
+from itertools import islice
+from typing import Any
+
+from sqlalchemy import Row, and_, bindparam, delete, false, select, tuple_, update
+
+from marey_server.store.database.prepared import Prepared
+from marey_server.store.jobs import late_inputs, result_cache
+from marey_server.store.jobs.endings import Ended, dependency_failure, end_jobs
+from marey_server.store.jobs.events import emit_job_events, wake_watchers, wake_workers
+from marey_server.store.jobs.fan_out import gather
+from marey_server.store.jobs.fencing import RUNNING, WAITING
+from marey_server.store.tables import job, job_dependency
+from marey_server.store.transaction import Transaction
+
+PAGE = 1000
+"""Ended jobs looked at in one statement."""
+
+
+def settle(tx: Transaction, ended: Iterable[Ended]) -> None:
+    """Let everything follow that follows from these ends, until nothing more does."""
+    queue = list(ended)
+    while queue:
+        page, queue = queue[:PAGE], queue[PAGE:]
+        _announce(tx, page)
+        queue += _count_tasks(tx, page)
+        queue += _move_dependants(tx, page)
+
+
+def make_ready(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
+    """Let waiting jobs whose dependencies are met go on: into the queue, to their tasks, or to a result that is there.
+    Those whose inputs were to be made get them first.
+
+    The rows hold `READY_COLUMNS`. Returns the jobs that ended by it.
+    """
+    ended = late_inputs.bind(tx, [row.id for row in rows if row.unbound])
+    for row in rows:
+        if row.size is not None:
+            ended += _open_fan_out(tx, row)
+    single = [row for row in rows if row.size is None and not row.unbound]
+    for page in _pages(single):
+        ended += _admit(tx, page)
+    return ended
+
+
+READY_COLUMNS = (job.c.id, job.c.project_id, job.c.kind, job.c.size, job.c.unbound, job.c.cache_key, job.c.cache_mode)
+
+
+def _announce(tx: Transaction, ended: Sequence[Ended]) -> None:
+    for state in sorted({end.state for end in ended}):
+        emit_job_events(
+            tx,
+            f"job.{state}",
+            [(end.project_id, end.id, end.failure or {}) for end in ended if end.state == state],
+        )
+    wake_watchers(tx, [end.id for end in ended])
+
+
+# -- dependants -------------------------------------------------------------------------------------------------------
+
+
+_RELEASE = Prepared(
+    update(job_dependency)
+    .where(job_dependency.c.on_job_id.in_(bindparam("ended", expanding=True)), job_dependency.c.satisfied == false())
+    .values(satisfied=True)
+    .returning(job_dependency.c.job_id, job_dependency.c.on_job_id)
+)
+
+
+def _move_dependants(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
+    ends = {end.id: end for end in ended}
+    upstream: dict[str, list[Ended]] = {}
+    for row in tx.run(_RELEASE, {"ended": list(ends)}):
+        upstream.setdefault(row.job_id, []).append(ends[row.on_job_id])
+    following: list[Ended] = []
+    ids = iter(sorted(upstream))
+    while page := list(islice(ids, PAGE)):
+        following += _move(tx, _waiting(tx, page), upstream)
+    return following
+
+
+def _waiting(tx: Transaction, ids: Sequence[str]) -> Sequence[Row[Any]]:
+    columns = (*READY_COLUMNS, job.c.dependencies_left, job.c.on_failure, job.c.cached_from)
+    statement = select(*columns).where(job.c.id.in_(ids), job.c.state == WAITING).order_by(job.c.id).with_for_update()
+    return tx.execute(statement).all()
+
+
+def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[Ended]]) -> list[Ended]:
+    """Let waiting jobs go on, or end, now that jobs they waited for have ended."""
+    following: list[Ended] = []
+    left: dict[str, int] = {}
+    shared: list[Row[Any]] = []
+    orphans: list[Row[Any]] = []
+    for row in rows:
+        missed = [end for end in upstream[row.id] if not end.succeeded]
+        if row.cached_from is not None:
+            (orphans if missed else shared).append(row)
+        elif missed:
+            following += _doom(tx, row, missed[0])
+        else:
+            left[row.id] = row.dependencies_left - len(upstream[row.id])
+    _store_counts(tx, left)
+    following += make_ready(tx, [row for row in rows if left.get(row.id) == 0])
+    following += result_cache.share(tx, shared)
+    _stop_sharing(tx, orphans)
+    return following + make_ready(tx, orphans)
+
+
+def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
+    if left:
+        statement = update(job).where(job.c.id == bindparam("of_job")).values(dependencies_left=bindparam("left"))
+        tx.execute(statement, [{"of_job": job_id, "left": count} for job_id, count in left.items()])
+
+
+def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
+    """End a waiting job, and its tasks, because `cause` did not succeed: failed, or cancelled if to be skipped."""
+    waits = and_(job.c.id == row.id, job.c.state == WAITING)
+    tasks = end_jobs(tx, and_(job.c.parent_id == row.id, job.c.state == WAITING), "cancelled")
+    if row.on_failure == "skip":
+        return [*tasks, *end_jobs(tx, waits, "cancelled")]
+    return [*tasks, *end_jobs(tx, waits, "failed", failure=dependency_failure(cause.id, cause.state))]
+
+
+# -- fan-out ----------------------------------------------------------------------------------------------------------
+
+
+def _open_fan_out(tx: Transaction, row: Row[Any]) -> list[Ended]:
+    """The gathering job runs from now on, and its tasks may."""
+    tasks = tx.execute(
+        select(*READY_COLUMNS).where(job.c.parent_id == row.id, job.c.state == WAITING).order_by(job.c.position)
+    ).all()
+    tx.execute(
+        update(job)
+        .where(job.c.id == row.id, job.c.state == WAITING)
+        .values(state="running", started_us=tx.now_us, dependencies_left=len(tasks), rev=job.c.rev + 1)
+    )
+    if not tasks:  # every task was cancelled before it could start
+        return gather(tx, row.id)
+    return make_ready(tx, tasks)
+
+
+def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
+    """Count the tasks that ended at their gathering jobs; where it was the last one, the gathering job ends too."""
+    following = _stop_idle_tasks(tx, {end.parent_id for end in ended if end.state == "failed"} - {None})
+    for parent_id, count in sorted(Counter(end.parent_id for end in ended if end.parent_id is not None).items()):
+        left = tx.execute(
+            update(job)
+            .where(job.c.id == parent_id, job.c.state == RUNNING)
+            .values(dependencies_left=job.c.dependencies_left - count, rev=job.c.rev + 1)
+            .returning(job.c.dependencies_left)
+        ).scalar_one_or_none()
+        if left == 0:
+            following += gather(tx, parent_id)
+    return following
+
+
+def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
+    """Cancel tasks that nobody has begun where a worker would gather: with one failed there is nothing to gather."""
+    if not parents:
+        return []
+    gathered = select(job.c.id).where(job.c.id.in_(parents), job.c.gathers)
+    idle = and_(job.c.parent_id.in_(gathered), job.c.state.in_(("queued", "waiting")))
+    tx.execute(select(job.c.id).where(idle).order_by(job.c.id).with_for_update()).all()  # in the order of all others
+    return end_jobs(tx, idle, "cancelled")
+
+
+# -- into the queue ---------------------------------------------------------------------------------------------------
+
+
+def _admit(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
+    decisions = result_cache.decide(tx, rows)
+    queued = [row for row in rows if row.id not in decisions]
+    if queued:
+        tx.execute(
+            update(job)
+            .where(job.c.id.in_([row.id for row in queued]), job.c.state == WAITING)
+            .values(state="queued", dependencies_left=0, rev=job.c.rev + 1)
+        )
+        wake_workers(tx, {row.kind for row in queued})
+    joining = [(row, decisions[row.id]) for row in rows if row.id in decisions]
+    return result_cache.join(tx, joining)
+
+
+def _stop_sharing(tx: Transaction, rows: Sequence[Row[Any]]) -> None:
+    """The job they waited for brought no result: they go on by themselves, the first of them for all."""
+    if rows:
+        ids = [row.id for row in rows]
+        tx.execute(update(job).where(job.c.id.in_(ids)).values(cached_from=None, dependencies_left=0))
+        pairs = [(row.id, row.cached_from) for row in rows]
+        tx.execute(delete(job_dependency).where(tuple_(job_dependency.c.job_id, job_dependency.c.on_job_id).in_(pairs)))
+
+
+def _pages(rows: Sequence[Row[Any]]) -> Iterable[Sequence[Row[Any]]]:
+    for start in range(0, len(rows), PAGE):
+        yield rows[start : start + PAGE]

@@ -1,0 +1,273 @@
+"""Claims and heartbeats: how a job gets a worker and keeps it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Any, NamedTuple
+
+from sqlalchemy import (
+    CTE,
+    BigInteger,
+    ColumnElement,
+    FromClause,
+    Row,
+    and_,
+    bindparam,
+    cast,
+    exists,
+    func,
+    insert,
+    or_,
+    select,
+    update,
+)
+from sqlalchemy.sql.dml import ReturningUpdate
+
+from marey_schemas.access import Role
+from marey_schemas.jobs import (
+    PROTOCOL_VERSION,
+    ClaimRequest,
+    Heartbeat,
+    HeartbeatAnswer,
+    Lease,
+    PinnedInput,
+    Resources,
+)
+from marey_schemas.problems import FieldError
+from marey_server import faults
+from marey_server.access.secret_tokens import IssuedToken, issue_attempt_token
+from marey_server.errors import Forbidden, Invalid
+from marey_server.store.database.prepared import Prepared
+from marey_server.store.jobs.events import emit_job_events
+from marey_server.store.jobs.fencing import QUEUED, RUNNING, earlier, held, lease_lost, require_attempt
+from marey_server.store.jobs.labels import keys_within
+from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
+from marey_server.store.tables import attempt, job, member, project
+from marey_server.store.transaction import Transaction
+
+
+def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_POLICY) -> list[Lease]:
+    """Give the caller up to `request.max` queued jobs, best first, each under a new fence.
+
+    Raises `Forbidden` for a caller that may not work, `Invalid` for another version of the protocol.
+    """
+    if request.protocol != PROTOCOL_VERSION:
+        detail = f"The worker speaks version {request.protocol} of the protocol, the server {PROTOCOL_VERSION}."
+        raise Invalid(detail, errors=[FieldError(pointer="/protocol", code="protocol", detail=detail)])
+    rows = _claim_rows(tx, request, policy)
+    if not rows:
+        return []
+    tokens = [issue_attempt_token() for _ in rows]
+    tx.run_each(
+        _INSERT_ATTEMPT,
+        [
+            {
+                "job_id": row.id,
+                "fence": row.fence,
+                "worker": request.worker,
+                "claimed_by": tx.principal.token_id,
+                "token_hash": token.secret_hash,
+                "started_us": tx.now_us,
+            }
+            for row, token in zip(rows, tokens, strict=True)
+        ],
+    )
+    emit_job_events(tx, "job.started", [(row.project_id, row.id, {"fence": row.fence}) for row in rows])
+    tx.after_commit(lambda: faults.point("claim.after_commit"))
+    sizes = _sizes(tx, rows)
+    return [
+        _lease(row, sizes.get(row.parent_id, row.size), token, policy) for row, token in zip(rows, tokens, strict=True)
+    ]
+
+
+_INSERT_ATTEMPT = Prepared(insert(attempt))
+
+
+def heartbeat(
+    tx: Transaction, job_id: str, fence: int, request: Heartbeat, policy: QueuePolicy = DEFAULT_POLICY
+) -> HeartbeatAnswer:
+    """Extend the lease, even a late one that nobody has taken; never past the grace of a cancel or of the time limit.
+
+    Raises `LeaseLost` if the attempt does not hold the job any more.
+    """
+    require_attempt(tx.principal, job_id, fence)
+    values: dict[str, Any] = {
+        "lease_expires_us": earlier(job.c.deadline_us + policy.end_grace_us, tx.now_us + policy.lease_ttl_us)
+    }
+    if request.progress is not None:
+        values["progress"] = request.progress.model_dump(mode="json")
+    columns = (job.c.lease_expires_us, job.c.cancel_requested_us, job.c.deadline_us)
+    row = tx.execute(update(job).where(held(job_id, fence)).values(**values).returning(*columns)).one_or_none()
+    if row is None:
+        raise lease_lost(job_id, fence)
+    return HeartbeatAnswer(
+        lease_ttl_s=max(0, row.lease_expires_us - tx.now_us) / SECOND_US,
+        cancel_requested=row.cancel_requested_us is not None,
+        deadline_s=max(0, row.deadline_us - tx.now_us) / SECOND_US,
+    )
+
+
+# -- the claim in one statement ----------------------------------------------------------------------------------------
+
+
+def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
+    """Pick and claim."""
+    pick = _pick(restriction)
+    now_us = bindparam("now_us", type_=BigInteger)
+    deadline_us = now_us + cast(job.c.time_limit_s, BigInteger) * SECOND_US
+    return (
+        update(job)
+        .where(job.c.id == pick.c.id)
+        .values(
+            state="running",
+            fence=job.c.fence + 1,
+            attempt=job.c.attempt + 1,
+            lease_expires_us=earlier(deadline_us + bindparam("end_grace"), now_us + bindparam("lease_ttl")),
+            deadline_us=deadline_us,
+            started_us=func.coalesce(job.c.started_us, now_us),
+            progress=None,
+            rev=job.c.rev + 1,
+        )
+        .returning(
+            job.c.id,
+            job.c.project_id,
+            select(project.c.name).where(project.c.id == job.c.project_id).scalar_subquery().label("project_name"),
+            job.c.kind,
+            job.c.params,
+            job.c.inputs,
+            job.c.into_path,
+            job.c.seed,
+            job.c.parent_id,
+            job.c.position,
+            job.c.size,
+            job.c.time_limit_s,
+            job.c.memory_limit_mb,
+            job.c.fence,
+            job.c.attempt,
+            job.c.priority,
+            job.c.run_at_us,
+        )
+    )
+
+
+def _pick(restriction: _Restriction) -> CTE:
+    """The ids to claim: of jobs that share a concurrency key only the first, and none while one runs."""
+
+    def claimable(candidate: FromClause) -> ColumnElement[bool]:
+        conditions = [
+            candidate.c.state == QUEUED,
+            candidate.c.run_at_us <= bindparam("now_us", type_=BigInteger),
+            candidate.c.kind.in_(bindparam("kinds", expanding=True)),
+            candidate.c.labels_key.in_(bindparam("label_keys", expanding=True)),
+            _is_workable(candidate, restriction),
+        ]
+        if restriction.one_job:
+            conditions.append(candidate.c.id == bindparam("one_job"))
+        return and_(*conditions)
+
+    rival = job.alias("rival")
+    same_key = and_(rival.c.project_id == job.c.project_id, rival.c.concurrency_key == job.c.concurrency_key)
+    rival_runs = exists().where(same_key, rival.c.state == RUNNING)
+    first_of_key = (
+        select(rival.c.id).where(same_key, claimable(rival)).order_by(*_order(rival)).limit(1).scalar_subquery()
+    )
+    return (
+        select(job.c.id)
+        .where(claimable(job), or_(job.c.concurrency_key.is_(None), and_(~rival_runs, job.c.id == first_of_key)))
+        .order_by(*_order(job))
+        .limit(bindparam("most"))
+        .with_for_update(skip_locked=True)
+        .cte("pick")
+    )
+
+
+def _order(candidate: FromClause) -> tuple[ColumnElement[Any], ...]:
+    return candidate.c.priority.desc(), candidate.c.run_at_us, candidate.c.id
+
+
+def _pick_order(row: Row[Any]) -> tuple[Any, ...]:
+    return -row.priority, row.run_at_us, row.id
+
+
+def _is_workable(candidate: FromClause, restriction: _Restriction) -> ColumnElement[bool]:
+    """The caller may do the work of the job's project: a worker reads what a project holds and writes in its name.
+
+    Asked row by row, so that no plan begins with the projects instead of the pick order.
+    """
+    conditions = [project.c.id == candidate.c.project_id, project.c.deleted_us.is_(None)]
+    if restriction.named_projects:
+        conditions.append(project.c.name.in_(bindparam("project_names", expanding=True)))
+    if restriction.own_projects:
+        roles = (Role.MAINTAINER.value, Role.OWNER.value)
+        mine = (member.c.project_id == project.c.id, member.c.user_id == bindparam("user"), member.c.role.in_(roles))
+        conditions.append(exists().where(*mine))
+    return exists().where(*conditions)
+
+
+class _Restriction(NamedTuple):
+    """What a claim is limited to, besides kinds and labels."""
+
+    one_job: bool
+    named_projects: bool
+    own_projects: bool
+
+
+_CLAIM_STATEMENTS = {
+    restriction: Prepared(_claim_statement(restriction))
+    for restriction in (_Restriction(*flags) for flags in product((False, True), repeat=3))
+}
+
+
+def _claim_rows(tx: Transaction, request: ClaimRequest, policy: QueuePolicy) -> list[Row[Any]]:
+    caller = tx.principal
+    scopes = [scope for scope in caller.scopes if scope.partition("!")[0] == "work"]
+    if not scopes or caller.kind not in ("user", "system"):
+        raise Forbidden("Claiming jobs needs a user's token with the scope `work`.", code="insufficient-scope")
+    restriction = _Restriction(request.job is not None, "work" not in scopes, not caller.administrator)
+    parameters: dict[str, Any] = {
+        "now_us": tx.now_us,
+        "lease_ttl": policy.lease_ttl_us,
+        "end_grace": policy.end_grace_us,
+        "kinds": list(request.kinds),
+        "label_keys": keys_within(request.labels),
+        "most": request.max,
+    }
+    if restriction.one_job:
+        parameters["one_job"] = request.job
+    if restriction.named_projects:
+        parameters["project_names"] = [scope.partition("=")[2] for scope in scopes]
+    if restriction.own_projects:
+        parameters["user"] = caller.user_id
+    return sorted(tx.run(_CLAIM_STATEMENTS[restriction], parameters), key=_pick_order)
+
+
+# -- answers ----------------------------------------------------------------------------------------------------------
+
+
+def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
+    """How many tasks the gathering jobs have that some of these belong to."""
+    parents = {row.parent_id for row in rows if row.parent_id is not None}
+    if not parents:
+        return {}
+    return {one.id: one.size for one in tx.execute(select(job.c.id, job.c.size).where(job.c.id.in_(parents)))}
+
+
+def _lease(row: Row[Any], size: int | None, token: IssuedToken, policy: QueuePolicy) -> Lease:
+    return Lease(
+        job=row.id,
+        project=row.project_name,
+        kind=row.kind,
+        params=row.params,
+        inputs={name: tuple(PinnedInput(**pin) for pin in pins) for name, pins in row.inputs.items()},
+        into=row.into_path,
+        seed=row.seed,
+        position=row.position,
+        size=size,
+        resources=Resources(time_limit_s=row.time_limit_s, memory_limit_mb=row.memory_limit_mb),
+        fence=row.fence,
+        attempt=row.attempt,
+        attempt_token=token.text,
+        lease_ttl_s=policy.lease_ttl_s,
+        heartbeat_s=policy.heartbeat_s,
+    )

@@ -1,0 +1,219 @@
+"""Jobs as their users see them: read, listed, cancelled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from sqlalchemy import ColumnElement, Row, and_, case, func, select, update
+
+from marey_schemas.access import Role
+from marey_schemas.items import Page
+from marey_schemas.jobs import Attempt, Job, JobOutput, JobState, TaskResult
+from marey_server.access import roles
+from marey_server.errors import Conflict, Forbidden, NotFound
+from marey_server.store import events, listing, projects
+from marey_server.store.database.clock import datetime_of
+from marey_server.store.jobs.documents import as_documents, job_documents, select_jobs
+from marey_server.store.jobs.endings import ENDED_COLUMNS, as_ended
+from marey_server.store.jobs.events import emit_job_events
+from marey_server.store.jobs.fencing import RUNNING, earlier
+from marey_server.store.jobs.logs import MOST_READ_BYTES, LogPage, read_log
+from marey_server.store.jobs.policy import DEFAULT_POLICY, QueuePolicy
+from marey_server.store.jobs.propagation import settle
+from marey_server.store.projects import ProjectRow
+from marey_server.store.tables import attempt, job, user
+from marey_server.store.transaction import Transaction
+
+SORT_KEYS: dict[str, ColumnElement[Any]] = {
+    "id": job.c.id,
+    "created_at": job.c.created_us,
+    "priority": job.c.priority,
+}
+
+UNFINISHED = ("waiting", "queued", "running")
+
+
+@dataclass(frozen=True, slots=True)
+class JobFilters:
+    """Which jobs a list holds; what is empty does not matter."""
+
+    states: tuple[JobState, ...] = ()
+    kinds: tuple[str, ...] = ()
+    parent: str | None = None
+    """Tasks of this gathering job; without it, tasks are left out."""
+    author: str | None = None
+
+
+# -- reading -----------------------------------------------------------------------------------------------------------
+
+
+def read_job(tx: Transaction, job_id: str) -> Job:
+    """A job and how it stands. Raises `NotFound`."""
+    row, _ = find_job(tx, job_id)
+    return as_documents(tx, [row])[0]
+
+
+def list_jobs(
+    tx: Transaction,
+    project: str,
+    filters: JobFilters = JobFilters(),
+    *,
+    sort: str = "-created_at",
+    cursor: str | None = None,
+    limit: int = listing.DEFAULT_LIMIT,
+    count: bool = False,
+) -> Page:
+    """One page of a project's jobs, without the tasks of fan-outs unless they are asked for."""
+    project_row = projects.require(tx, project)
+    order = listing.parse_order(sort, SORT_KEYS)
+    identity = [project_row.id, asdict(filters)]
+    conditions = _conditions(project_row.id, filters)
+    total = None
+    if count:
+        counted = select_jobs().where(*conditions).with_only_columns(func.count(), maintain_column_froms=True)
+        total = tx.execute(counted).scalar_one()
+    rows, next_cursor = listing.read_page(tx, select_jobs().where(*conditions), order, identity, cursor, limit)
+    return Page(items=tuple(as_documents(tx, rows)), next_cursor=next_cursor, count=total)
+
+
+def list_attempts(tx: Transaction, job_id: str) -> Page:
+    """Every try at a job, the first one first."""
+    find_job(tx, job_id)
+    rows = tx.execute(select(attempt).where(attempt.c.job_id == job_id).order_by(attempt.c.fence))
+    return Page(items=tuple(_attempt_document(row) for row in rows))
+
+
+def _attempt_document(row: Row[Any]) -> Attempt:
+    return Attempt(
+        job=row.job_id,
+        fence=row.fence,
+        worker=row.worker,
+        started_at=datetime_of(row.started_us),
+        ended_at=None if row.ended_us is None else datetime_of(row.ended_us),
+        outcome=row.outcome,
+        detail=row.detail,
+    )
+
+
+def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
+    """What a job published; where it is the sum of its tasks, what they published, task by task."""
+    row, _ = find_job(tx, job_id)
+    if row.size is None or row.gathers:
+        return Page(items=tuple(JobOutput(**output) for output in row.outputs or ()))
+    order = listing.parse_order("position", {"position": job.c.position, "id": job.c.id})
+    statement = select(job.c.id, job.c.position, job.c.outputs).where(job.c.parent_id == job_id)
+    tasks, next_cursor = listing.read_page(tx, statement, order, job_id, cursor, limit)
+    outputs = tuple(JobOutput(**output) for task in tasks for output in task.outputs or ())
+    return Page(items=outputs, next_cursor=next_cursor)
+
+
+def list_results(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
+    """What the tasks of a gathering job brought, in their order; empty for other jobs."""
+    find_job(tx, job_id)
+    order = listing.parse_order("position", {"position": job.c.position, "id": job.c.id})
+    statement = select(job.c.id, job.c.position, job.c.state, job.c.result).where(job.c.parent_id == job_id)
+    tasks, next_cursor = listing.read_page(tx, statement, order, job_id, cursor, limit)
+    results = (TaskResult(job=row.id, position=row.position, state=row.state, result=row.result) for row in tasks)
+    return Page(items=tuple(results), next_cursor=next_cursor)
+
+
+def list_job_events(tx: Transaction, job_id: str, after: int = 0, limit: int = 100) -> Page:
+    """What happened to a job, for members of its project."""
+    _, project = find_job(tx, job_id, public=False)
+    return Page(items=tuple(events.list_events(tx, project.name, after=after, limit=limit, subject=job_id)))
+
+
+def read_job_log(tx: Transaction, job_id: str, offset: int = 0, limit: int = MOST_READ_BYTES) -> LogPage:
+    """A piece of what a job's attempts printed, for members of its project."""
+    row, _ = find_job(tx, job_id, public=False)
+    return read_log(tx, row, offset, limit)
+
+
+def _conditions(project_id: str, filters: JobFilters) -> list[ColumnElement[bool]]:
+    conditions = [job.c.project_id == project_id]
+    if filters.parent is None:
+        conditions.append(job.c.parent_id.is_(None))
+    else:
+        conditions.append(job.c.parent_id == filters.parent)
+    if filters.states:
+        conditions.append(job.c.state.in_(filters.states))
+    if filters.kinds:
+        conditions.append(job.c.kind.in_(filters.kinds))
+    if filters.author is not None:
+        conditions.append(user.c.name == filters.author)
+    return conditions
+
+
+# -- cancelling --------------------------------------------------------------------------------------------------------
+
+
+def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLICY) -> Job:
+    """Cancel a job, at once where nobody works on it, else as soon as the worker stops or its grace is over.
+
+    A gathering job is cancelled with its tasks. Cancelling twice is cancelling once.
+    Raises `Conflict` for a job that has succeeded or failed, `Forbidden` for somebody else's job.
+    """
+    row, project = find_job(tx, job_id, "jobs")
+    require_own(tx, row, project, "cancel")
+    of_job = job.c.parent_id == job_id
+    tasks = _cancel(tx, of_job, policy) if row.size is not None else ()
+    whole = _cancel(tx, job.c.id == job_id, policy)
+    if row.unbound:  # it may have got its inputs, and tasks, since it was read
+        tasks = _cancel(tx, of_job, policy)
+    settle(tx, [as_ended(one) for one in (*tasks, *whole) if one.state != "running"])
+    document = job_documents(tx, [job_id])[0]
+    if not whole and document.state != JobState.CANCELLED:
+        raise Conflict(f"The job has {document.state} already; nothing can be cancelled.", code="job-ended")
+    return document
+
+
+def _cancel(tx: Transaction, which: ColumnElement[bool], policy: QueuePolicy) -> Sequence[Row[Any]]:
+    """Cancel those of the jobs that have not ended, in one statement whatever their state, and read how they stand now.
+
+    A running job's time is over with the cancellation, so that its lease cannot outlive the grace. A gathering job has
+    no lease while its tasks are at work, and ends with them.
+    """
+    running = job.c.state == RUNNING
+    leased = and_(running, job.c.lease_expires_us.is_not(None))
+    rows = tx.execute(
+        update(job)
+        .where(which, job.c.state.in_(UNFINISHED))
+        .values(
+            state=case((running, "running"), else_="cancelled"),
+            cancel_requested_us=func.coalesce(job.c.cancel_requested_us, tx.now_us),
+            deadline_us=case((leased, earlier(job.c.deadline_us, tx.now_us)), else_=None),
+            lease_expires_us=case(
+                (leased, earlier(job.c.lease_expires_us, tx.now_us + policy.end_grace_us)), else_=None
+            ),
+            finished_us=case((running, None), else_=tx.now_us),
+            rev=job.c.rev + 1,
+        )
+        .returning(*ENDED_COLUMNS)
+    ).all()
+    told = [row for row in rows if row.state == "running"]
+    emit_job_events(tx, "job.cancel_requested", [(row.project_id, row.id, {}) for row in told])
+    return rows
+
+
+# -- who may -----------------------------------------------------------------------------------------------------------
+
+
+def find_job(tx: Transaction, job_id: str, scope: str = "read", *, public: bool = True) -> tuple[Row[Any], ProjectRow]:
+    """The job and its project, if the caller may read it; a job of a hidden project is as unknown as none."""
+    row = tx.execute(select_jobs().where(job.c.id == job_id)).one_or_none()
+    if row is not None:
+        try:
+            return row, projects.require(tx, row.project_name, Role.READER, scope, public=public)
+        except NotFound:
+            pass
+    raise NotFound(f"There is no job {job_id!r} that you may see.", code="no-job")
+
+
+def require_own(tx: Transaction, row: Row[Any], project: ProjectRow, what: str) -> None:
+    """Contributors act on their own jobs, maintainers on all."""
+    if roles.includes(project.role, Role.MAINTAINER):
+        return
+    if not roles.includes(project.role, Role.CONTRIBUTOR) or row.author_id != tx.principal.user_id:
+        raise Forbidden(f"To {what} somebody else's job needs the role maintainer.", code="insufficient-role")

@@ -1,0 +1,133 @@
+"""Takes back jobs whose lease has run out: from dead workers, and from those that do not stop when told to."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import Any, NamedTuple
+
+from sqlalchemy import Row, and_, select, tuple_, update
+from sqlalchemy.exc import OperationalError
+
+from marey_schemas.jobs import ClaimRequest, Lease
+from marey_server.store.jobs import result_cache
+from marey_server.store.jobs.endings import AttemptEnd
+from marey_server.store.jobs.failure import ENDING_COLUMNS, carry_out, judge_expired
+from marey_server.store.jobs.fencing import QUEUED, RUNNING, held
+from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
+from marey_server.store.jobs.propagation import settle
+from marey_server.store.jobs.queue import claim
+from marey_server.store.tables import job
+from marey_server.store.transaction import Transaction
+
+log = logging.getLogger(__name__)
+
+PAGE = 256
+
+
+class StartGrace:
+    """Holds the reaper back for a whole lease after this process has started or the database has been away.
+
+    Leases run out while nobody can renew them; those who live renew them in this time. A jump of the clock counts as an
+    absence too, and so does a long write that all others waited for: a lease has what a heartbeat leaves of it.
+    """
+
+    def __init__(self, policy: QueuePolicy = DEFAULT_POLICY) -> None:
+        self._ttl_us = policy.lease_ttl_us
+        self._longest_silence_us = policy.lease_ttl_us - round(policy.heartbeat_s * SECOND_US)
+        self._lock = threading.Lock()
+        self._since_us: int | None = None
+        self._seen_us = 0
+
+    def over(self, now_us: int) -> bool:
+        """Whether leases may be taken back; `now_us` is the database's time."""
+        with self._lock:
+            if self._since_us is None or not 0 <= now_us - self._seen_us <= self._longest_silence_us:
+                self._since_us = now_us
+            self._seen_us = now_us
+            return now_us - self._since_us >= self._ttl_us
+
+    def restart(self) -> None:
+        """The database could not be reached."""
+        with self._lock:
+            self._since_us = None
+
+
+class ReapedPage(NamedTuple):
+    """How many jobs were taken back, and where to go on; `after` is None behind the last page."""
+
+    taken: int
+    after: tuple[int, str] | None
+
+
+def reap_page(
+    tx: Transaction,
+    policy: QueuePolicy = DEFAULT_POLICY,
+    after: tuple[int, str] | None = None,
+    limit: int = PAGE,
+) -> ReapedPage:
+    """Take back up to `limit` jobs, longest overdue first, from `after` on.
+
+    Each is moved by an update of its own that repeats fence and overdue lease, so that a heartbeat or a result which
+    comes at the same moment either wins or finds the lease gone. One that cannot be moved keeps no other from it.
+    """
+    overdue = and_(job.c.state == RUNNING, job.c.lease_expires_us <= tx.now_us)
+    statement = (
+        select(*ENDING_COLUMNS)
+        .where(overdue)
+        .order_by(job.c.lease_expires_us, job.c.id)
+        .limit(limit)
+        .with_for_update(skip_locked=True)
+    )
+    if after is not None:
+        statement = statement.where(tuple_(job.c.lease_expires_us, job.c.id) > after)
+    rows = tx.execute(statement).all()
+    taken = sum(_take_back(tx, row, policy) for row in rows)
+    last = rows[-1] if len(rows) == limit else None
+    return ReapedPage(taken, None if last is None else (last.lease_expires_us, last.id))
+
+
+def _take_back(tx: Transaction, row: Row[Any], policy: QueuePolicy) -> bool:
+    """Move one overdue job and all that follows from it; whether that worked."""
+    try:
+        with tx.connection.begin_nested():
+            verdict = judge_expired(row, policy)
+            condition = and_(held(row.id, row.fence), job.c.lease_expires_us <= tx.now_us)
+            end = AttemptEnd(row.id, row.fence, verdict.outcome, "The lease ran out.")
+            carry_out(tx, row, condition, verdict, end, fence=job.c.fence + 1)
+    except OperationalError:  # concerns the database, not this job: the whole page is tried again
+        raise
+    except Exception:
+        log.exception("%s cannot be taken back from a worker that is not heard of any more", row.id)
+        return False
+    return True
+
+
+def claim_after_reaping(
+    tx: Transaction, request: ClaimRequest, grace: StartGrace, policy: QueuePolicy = DEFAULT_POLICY
+) -> list[Lease]:
+    """Claim; where there is nothing to claim, take back what is overdue and look once more."""
+    leases = claim(tx, request, policy)
+    if not leases and grace.over(tx.now_us) and reap_page(tx, policy).taken:
+        leases = claim(tx, request, policy)
+    return leases
+
+
+def correct_times(tx: Transaction, policy: QueuePolicy = DEFAULT_POLICY) -> int:
+    """Shorten leases and rests that end later than any can that began by now: the database's clock was set back."""
+    latest_us = tx.now_us + policy.lease_ttl_us
+    leases = tx.execute(
+        update(job).where(job.c.state == RUNNING, job.c.lease_expires_us > latest_us).values(lease_expires_us=latest_us)
+    )
+    rested_us = tx.now_us + round(policy.longest_backoff_s * SECOND_US)
+    rests = tx.execute(
+        update(job).where(job.c.state == QUEUED, job.c.run_at_us > rested_us).values(run_at_us=tx.now_us)
+    )
+    return leases.rowcount + rests.rowcount
+
+
+def share_waiting(tx: Transaction) -> int:
+    """Serve jobs that wait for a result that is there; how many."""
+    ended = result_cache.share_waiting(tx)
+    settle(tx, ended)
+    return len(ended)

@@ -1,0 +1,272 @@
+"""One computation for identical jobs: a finished one lends its result, a running one lets others wait for it.
+
+Jobs are identical when kind, version of the kind, parameters, seed and inputs are; an input counts with its item, its
+name, its place and the content of those of its documents that the kind reads, since results are named after inputs and
+refer to them. A kind declares what counts besides: the place of the results, the newest revision of an item that the
+parameters name. Jobs that go by how things are while they run have no key. Results are published anew for each job,
+into the collection it names. Caching stays within a project.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from sqlalchemy import and_, delete, insert, or_, select, update
+
+from marey_schemas.encoding.canonical import canonical_json
+from marey_schemas.job_kinds import KindDeclaration
+from marey_server.errors import MareyError
+from marey_server.store import blobs
+from marey_server.store.jobs import staging
+from marey_server.store.jobs.endings import Ended, end_jobs
+from marey_server.store.jobs.events import wake_workers
+from marey_server.store.jobs.fencing import QUEUED, RUNNING, WAITING
+from marey_server.store.jobs.inputs import Pin, PinnedInputs
+from marey_server.store.tables import job, job_dependency, revision_part
+from marey_server.store.transaction import Transaction
+
+SHARED_AT_ONCE = 64
+"""Jobs that get their cached result in the transaction of the submission; the leader serves the others."""
+
+MOST_SHARED_OUTPUTS = 256
+"""Results that are published for them in one transaction; of a job that has more, all are."""
+
+IN_LIST = 1000
+
+
+class Source(NamedTuple):
+    """The job whose result another one shares."""
+
+    id: str
+    finished: bool
+
+
+# -- the key ----------------------------------------------------------------------------------------------------------
+
+
+def cache_key(
+    kind: KindDeclaration,
+    params: Mapping[str, Any],
+    seed: int,
+    inputs: Any,
+    task: tuple[int | None, int] | None = None,
+    *,
+    into: str = "",
+    newest: Mapping[str, int] = MappingProxyType({}),
+) -> str:
+    """The name of a computation. `inputs` as `input_contents` tells them; `task` is which of how many has them; `into`
+    is where the results go; `newest` holds the newest revisions of `named_items`.
+    """
+    tree = {"kind": kind.code_version, "params": params, "seed": seed, "inputs": inputs}
+    if task is not None:
+        tree["task"] = task
+    if kind.place_counts:
+        tree["into"] = into
+    if kind.newest_of:
+        tree["newest"] = [[item, newest.get(item)] for item in named_items(kind, params)]
+    return f"sha256:{hashlib.sha256(canonical_json(tree)).hexdigest()}"
+
+
+def has_key(kind: KindDeclaration, params: Mapping[str, Any], inputs: Collection[str]) -> bool:
+    """Whether a job with these parameters and with inputs of these names depends on nothing but its key."""
+    in_place = kind.in_place is not None and params.get(kind.in_place)
+    return kind.deterministic and not in_place and set(kind.never_cached_without) <= set(inputs)
+
+
+def named_items(kind: KindDeclaration, params: Mapping[str, Any]) -> list[str]:
+    """The ids of the items that the parameters name and whose newest revisions are read."""
+    return [params[name] for name in kind.newest_of if params.get(name)]
+
+
+def part_digests(tx: Transaction, inputs: Iterable[PinnedInputs]) -> dict[tuple[str, int], dict[str, str]]:
+    """Part name to document digest, by item and revision, for everything pinned."""
+    items = sorted({pin["item"] for pins in inputs for many in pins.values() for pin in many})
+    found: dict[tuple[str, int], dict[str, str]] = {}
+    for start in range(0, len(items), IN_LIST):
+        statement = select(revision_part).where(revision_part.c.item_id.in_(items[start : start + IN_LIST]))
+        for row in tx.execute(statement):
+            found.setdefault((row.item_id, row.number), {})[row.part] = row.document_digest
+    return found
+
+
+def input_contents(
+    kind: KindDeclaration, pins: Mapping[str, Any], parts: Mapping[tuple[str, int], dict[str, str]]
+) -> dict[str, Any]:
+    """What the inputs of a job are to it, apart from their revision numbers."""
+    return {
+        name: [_content(pin, kind.inputs[name].parts, parts[pin["item"], pin["revision"]]) for pin in many]
+        for name, many in pins.items()
+    }
+
+
+def _content(pin: Pin, read: Collection[str], parts: Mapping[str, str]) -> list[Any]:
+    place = [pin["collection"], *([pin["below"]] if "below" in pin else ())]
+    return [pin["item"], *place, pin["name"], sorted(item for item in parts.items() if not read or item[0] in read)]
+
+
+# -- deciding ---------------------------------------------------------------------------------------------------------
+
+
+def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, Source]:
+    """For each of `candidates` (`id, project_id, cache_key, cache_mode`) whose result is there or under way: whose.
+
+    Of several identical candidates the first computes and the others share. Submissions to one project that use the
+    cache decide one after another; sources are locked, so that none ends unnoticed.
+    """
+    asking = [one for one in candidates if one.cache_key is not None and one.cache_mode in ("use", "refresh")]
+    if not asking:
+        return {}
+    for project_id in sorted({one.project_id for one in asking}):
+        tx.lock(f"job-cache:{project_id}")
+    known = _known_sources(tx, asking)
+    sources: dict[str, Source] = {}
+    for one in asking:
+        place = (one.project_id, one.cache_key)
+        source = known.get(place)
+        if one.cache_mode == "use" and source is not None:
+            sources[one.id] = source
+        else:
+            known[place] = Source(one.id, finished=False)
+    return sources
+
+
+def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, str], Source]:
+    """The newest finished job of each key, else the oldest that is under way."""
+    keys = sorted({one.cache_key for one in asking if one.cache_mode == "use"})
+    projects = sorted({one.project_id for one in asking})
+    active = or_(job.c.state == QUEUED, job.c.state == RUNNING)
+    finished: dict[tuple[str, str], Source] = {}
+    under_way: dict[tuple[str, str], Source] = {}
+    for start in range(0, len(keys), IN_LIST):
+        rows = tx.execute(
+            select(job.c.id, job.c.project_id, job.c.cache_key, job.c.state)
+            .where(
+                job.c.project_id.in_(projects),
+                job.c.cache_key.in_(keys[start : start + IN_LIST]),
+                job.c.cached_from.is_(None),
+                or_(active, job.c.state == "succeeded"),
+            )
+            .order_by(job.c.id)
+            .with_for_update(read=True)
+        )
+        for row in rows:
+            place = (row.project_id, row.cache_key)
+            if row.state == "succeeded":
+                finished[place] = Source(row.id, finished=True)
+            else:
+                under_way.setdefault(place, Source(row.id, finished=False))
+    return under_way | finished
+
+
+# -- sharing ----------------------------------------------------------------------------------------------------------
+
+
+def join(tx: Transaction, joining: Sequence[tuple[Any, Source]]) -> list[Ended]:
+    """Let waiting jobs (`id`) share the result of their sources: now where it is there, else when it comes."""
+    if not joining:
+        return []
+    for row, source in joining:
+        tx.execute(
+            update(job)
+            .where(job.c.id == row.id, job.c.state == WAITING)
+            .values(cached_from=source.id, dependencies_left=0 if source.finished else 1, rev=job.c.rev + 1)
+        )
+    pending = [{"job_id": row.id, "on_job_id": source.id} for row, source in joining if not source.finished]
+    if pending:
+        tx.execute(insert(job_dependency), pending)
+    return share(tx, [row for row, source in joining if source.finished])
+
+
+def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
+    """Give waiting jobs (`id`) the results of the finished jobs in their `cached_from`; what is too much at once waits
+    for the leader. A job whose result is no longer stored, or cannot be published for it, is queued instead.
+    """
+    ended: list[Ended] = []
+    for row in rows[:SHARED_AT_ONCE]:
+        if tx.shared_outputs >= MOST_SHARED_OUTPUTS:
+            break
+        ended += _share_one(tx, row.id)
+    return ended
+
+
+def share_waiting(tx: Transaction) -> list[Ended]:
+    """Serve jobs whose result is there and who wait for it: up to `SHARED_AT_ONCE` of them."""
+    source = job.alias("source")
+    rows = tx.execute(
+        select(job.c.id)
+        .join(source, source.c.id == job.c.cached_from)
+        .where(job.c.state == WAITING, job.c.cached_from.is_not(None), source.c.state == "succeeded")
+        .order_by(job.c.id)
+        .limit(SHARED_AT_ONCE)
+        .with_for_update(of=job, skip_locked=True)
+    ).all()
+    return share(tx, rows)
+
+
+def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
+    """Give one job the result it waits for. Where that cannot be its own, it is computed after all: what only this job
+    is refused must stop neither the one that brings the result nor others that wait for it.
+    """
+    try:
+        with tx.connection.begin_nested():
+            ended = _publish_anew(tx, job_id)
+    except MareyError:
+        ended = []
+    if not ended:
+        _compute_again(tx, job_id)
+    return ended
+
+
+def _publish_anew(tx: Transaction, job_id: str) -> list[Ended]:
+    """Publish the result that a job waits for as its own; nothing if it is no longer stored. Raises what `publish`
+    raises.
+    """
+    waits = and_(job.c.id == job_id, job.c.state == WAITING)
+    source = job.alias("source")
+    own = (job.c.id, job.c.project_id, job.c.into_path, job.c.author_id, job.c.message, job.c.inputs)
+    shared = (
+        source.c.inputs.label("source_inputs"),
+        source.c.fence,
+        source.c.result,
+        source.c.code_version,
+        source.c.environment,
+    )
+    row = tx.execute(
+        select(*own, source.c.id.label("source_id"), *shared)
+        .join(source, source.c.id == job.c.cached_from)
+        .where(waits)
+    ).one()
+    place = (row.source_id, row.fence)
+    drafts = staging.staged_drafts(tx, [place]).get(place, {})
+    tx.shared_outputs += len(drafts)
+    named = set(staging.named_blobs(row.result))
+    if not staging.take_up_documents(tx, drafts) or named - blobs.hold(tx, named):
+        return []
+    outputs = staging.publish_drafts(tx, row, staging.with_inputs(drafts, row.source_inputs, row.inputs))
+    blobs.keep_for_job(tx, row.id, named)
+    return end_jobs(
+        tx,
+        waits,
+        "succeeded",
+        dependencies_left=0,
+        result=row.result,
+        outputs=outputs,
+        code_version=row.code_version,
+        environment=row.environment,
+    )
+
+
+def _compute_again(tx: Transaction, job_id: str) -> None:
+    """Queue a job that waited to share a result. It does not come after the job that has it: it never needed that."""
+    row = tx.execute(select(job.c.kind, job.c.cached_from).where(job.c.id == job_id)).one()
+    waited = and_(job_dependency.c.job_id == job_id, job_dependency.c.on_job_id == row.cached_from)
+    tx.execute(delete(job_dependency).where(waited))
+    tx.execute(
+        update(job)
+        .where(job.c.id == job_id, job.c.state == WAITING)
+        .values(state="queued", cached_from=None, dependencies_left=0, rev=job.c.rev + 1)
+    )
+    wake_workers(tx, [row.kind])

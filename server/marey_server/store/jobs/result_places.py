@@ -1,0 +1,93 @@
+"""Places of results, looked at before a job is queued: all that can be told without computing anything.
+
+The worker looks again, clip by clip; but each task of a job sees its own share of the inputs only.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from marey_schemas.job_kinds import KindDeclaration
+from marey_server.errors import Invalid
+from marey_server.store import collections
+from marey_server.store.jobs.inputs import Pin, PinnedInputs
+
+
+class Clash(NamedTuple):
+    """Why results cannot go where they should; `place` is where the submission says so."""
+
+    place: str
+    code: str
+    detail: str
+
+
+def find_clash(kind: KindDeclaration, params: Any, pins: PinnedInputs, into: str) -> Clash | None:
+    """What is wrong with the places of a job's results; `params` are checked. Inputs that are yet to be made are not
+    looked at.
+    """
+    unclear = kind.unclear_place(params, into) if kind.unclear_place is not None else None
+    if unclear is not None:
+        return Clash("/into", "ambiguous-place", f"It is not clear where results should go: {unclear}.")
+    if (long := _too_long(kind, pins, into)) is not None:
+        return Clash("/into", *long)
+    if kind.named_after is None or any("job" in pin for many in pins.values() for pin in many):
+        return None
+    found = _same_name(pins.get(kind.named_after, [])) or _over_another_input(kind, params, pins, into)
+    return None if found is None else Clash(f"/inputs/{kind.named_after}", *found)
+
+
+def _too_long(kind: KindDeclaration, pins: PinnedInputs, into: str) -> tuple[str, str] | None:
+    """Results of many inputs lie below `into` as their inputs lie in the project."""
+    kept = [pin for name, spec in kind.inputs.items() if spec.many for pin in pins.get(name, ()) if "job" not in pin]
+    for folder in sorted({"", *map(_folder, kept)}) if into else ():
+        try:
+            collections.check_length(_path(into, folder))
+        except Invalid as error:
+            return error.error_code, f"The results would go to {_path(into, folder)}. {error.detail}"
+    return None
+
+
+def _same_name(named: list[Pin]) -> tuple[str, str] | None:
+    counts = Counter((_folder(pin), pin["name"]) for pin in named)
+    for (folder, name), count in counts.most_common(1):
+        if count > 1:
+            detail = f"{count} results would be called {_path(folder, name)}; name each input at one revision."
+            return "same-name", detail
+    return None
+
+
+def _over_another_input(
+    kind: KindDeclaration, params: Any, pins: Mapping[str, list[Pin]], into: str
+) -> tuple[str, str] | None:
+    """The first result that would become the next revision of something else that the job reads, too."""
+    named = pins.get(kind.named_after or "", [])
+    if kind.in_place is not None and getattr(params, kind.in_place):
+        return None
+    made = set(kind.outputs.values())
+    read = {
+        (pin["kind"], _path(pin["collection"], pin["name"])): pin["item"]
+        for many in pins.values()
+        for pin in many
+        if pin["kind"] in made
+    }
+    for pin in named:
+        place = _path(into, _folder(pin), pin["name"] + getattr(params, "suffix", ""))
+        if read.get((pin["kind"], place), pin["item"]) != pin["item"]:
+            detail = (
+                f"The result of {_path(pin['collection'], pin['name'])} would take the place of {place}, which is an "
+                "input, too; send results into another folder, or give another suffix."
+            )
+            return "own-input", detail
+    return None
+
+
+def _folder(pin: Pin) -> str:
+    """Where below `into` the result of an input goes."""
+    return str(pin.get("below", pin["collection"]))
+
+
+def _path(*names: str) -> str:
+    """Names that are not empty, joined."""
+    return "/".join(filter(None, names))

@@ -1,0 +1,223 @@
+"""Jobs tried again: one that did not succeed, those it needs that did not either, and those that failed with it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import Any
+
+from sqlalchemy import ColumnElement, Row, Select, select
+
+from marey_schemas.access import Role
+from marey_schemas.job_kinds import UnknownKindError, find_kind
+from marey_schemas.jobs import FailureReason, Job, JobState
+from marey_server.access import roles
+from marey_server.errors import Conflict
+from marey_server.store.ids import new_id
+from marey_server.store.jobs.inputs import PinnedInputs
+from marey_server.store.jobs.layout import Submission, request_of
+from marey_server.store.jobs.reading import find_job, require_own
+from marey_server.store.jobs.submission import lock_jobs, submit_checked
+from marey_server.store.projects import ProjectRow
+from marey_server.store.tables import job, job_dependency
+from marey_server.store.transaction import Transaction
+
+MOST_AT_ONCE = 1000
+IN_LIST = 1000
+UNSUCCESSFUL = ("failed", "cancelled")
+
+
+def retry_job(tx: Transaction, job_id: str) -> Job:
+    """Submit a failed or cancelled job again, with the inputs it had, or to get them where it never had any; what its
+    tasks brought is not computed twice.
+
+    Jobs it needs that did not succeed are tried again before it, and those that ended only because it did not succeed
+    after it, as far as the caller may: the rest of a pipeline goes on. The answer is the job that takes its place.
+    Raises `Conflict` for a job that has not ended or has succeeded, and for a task.
+    """
+    row, project = find_job(tx, job_id, "jobs")
+    require_own(tx, row, project, "retry")
+    if row.state not in UNSUCCESSFUL:
+        raise Conflict(
+            f"Only a failed or cancelled job can be tried again; this one is {row.state}.", code="not-failed"
+        )
+    if row.parent_id is not None:
+        raise Conflict(f"This is a task; try {row.parent_id} again, which it belongs to.", code="is-task")
+    family = _Family(tx, project)
+    family.add_with_needed([job_id])
+    family.add_dependants()
+    made = family.submit()
+    return made[job_id]
+
+
+class _Family:
+    """Jobs that are tried again together."""
+
+    def __init__(self, tx: Transaction, project: ProjectRow) -> None:
+        self._tx = tx
+        self._project = project
+        self._rows: dict[str, Row[Any]] = {}
+        self._needs: dict[str, dict[str, str]] = {}
+        """Of each job: the jobs it came after, and which newer try each of them has."""
+
+    def add_with_needed(self, ids: Collection[str]) -> None:
+        """Add jobs, and those they need that did not succeed, and so on."""
+        while ids:
+            rows = _rows(self._tx, ids)
+            for row in rows.values():
+                require_own(self._tx, row, self._project, "retry")
+            self._take(rows, _needs(self._tx, rows))
+            needed = {latest for needs in map(self._needs.__getitem__, rows) for latest in needs.values()}
+            states = _states(self._tx, needed - self._rows.keys())
+            ids = [one for one, state in states.items() if state in UNSUCCESSFUL]
+
+    def add_dependants(self) -> None:
+        """Add the jobs that ended because one of these did not succeed and miss nothing else, and so on."""
+        behind: Collection[str] = list(self._rows)
+        while behind:
+            rows = {row.id: row for row in self._doomed_after(behind)}
+            needs = _needs(self._tx, rows)
+            others = {latest for one in needs.values() for latest in one.values()} - self._rows.keys()
+            missing = {one for one, state in _states(self._tx, others).items() if state in UNSUCCESSFUL}
+            behind = [one for one in rows if not missing & set(needs[one].values())]
+            self._take({one: rows[one] for one in behind}, {one: needs[one] for one in behind})
+
+    def submit(self) -> dict[str, Job]:
+        """Submit them anew; the new jobs by the ids of the old ones."""
+        again = {one: new_id("job") for one in self._rows}
+        outside = {latest for needs in self._needs.values() for latest in needs.values()} - again.keys()
+        upstream = dict.fromkeys(again.values(), JobState.WAITING)
+        upstream |= {one: found.state for one, found in lock_jobs(self._tx, self._project, outside).items()}
+        submissions = []
+        for one, row in self._rows.items():
+            stand_ins = {earlier: again.get(latest, latest) for earlier, latest in self._needs[one].items()}
+            submissions.append(_again(self._tx, row, again[one], stand_ins))
+        made = submit_checked(self._tx, self._project, submissions, upstream)
+        return dict(zip(self._rows, made, strict=True))
+
+    def _take(self, rows: Mapping[str, Row[Any]], needs: Mapping[str, dict[str, str]]) -> None:
+        self._rows |= rows
+        self._needs |= needs
+        if len(self._rows) > MOST_AT_ONCE:
+            detail = f"More than {MOST_AT_ONCE} jobs hang together here; try those again that the others need."
+            raise Conflict(detail, code="too-many")
+
+    def _doomed_after(self, ids: Collection[str]) -> Iterable[Row[Any]]:
+        """Jobs the caller may try again that came after one of these, ended for it, and have not been tried again."""
+        later = job.alias("later")
+        statement = (
+            select(job)
+            .join(job_dependency, job_dependency.c.job_id == job.c.id)
+            .where(
+                job_dependency.c.on_job_id.in_(ids),
+                job.c.state.in_(UNSUCCESSFUL),
+                job.c.cancel_requested_us.is_(None),
+                job.c.parent_id.is_(None),
+                ~select(later.c.id).where(later.c.retry_of == job.c.id).exists(),
+            )
+            .order_by(job.c.id)
+            .limit(MOST_AT_ONCE + 1)
+        )
+        whole = roles.includes(self._project.role, Role.MAINTAINER)
+        for row in self._tx.execute(statement):
+            doomed = row.failure is None or row.failure["reason"] == FailureReason.DEPENDENCY_FAILED
+            if doomed and row.id not in self._rows and (whole or row.author_id == self._tx.principal.user_id):
+                yield row
+
+
+# -- one of them -------------------------------------------------------------------------------------------------------
+
+
+def _again(tx: Transaction, row: Row[Any], new: str, stand_ins: Mapping[str, str]) -> Submission:
+    """A job as it is submitted again under the id `new`, after the jobs that stand in for those it came after."""
+    try:
+        kind = find_kind(row.kind)
+    except UnknownKindError as error:
+        raise Conflict(f"This server does not know the kind any more: {error}.", code="unknown-kind") from error
+    return Submission(
+        kind,
+        request_of(row).model_copy(update={"concurrency_key": _concurrency_key(tx, row)}),
+        row.params,
+        _late_pins(row, stand_ins) if row.unbound else _pins_of(tx, row, kind.fan_out),
+        row.size or 1,
+        row.labels_key,
+        tx.principal.user_id,
+        after=tuple(dict.fromkeys(stand_ins.values())),
+        unbound=row.unbound,
+        id=new,
+        retry_of=row.id,
+    )
+
+
+def _late_pins(row: Row[Any], stand_ins: Mapping[str, str]) -> PinnedInputs:
+    """The inputs of a job that never got them, to be made by the stand-ins."""
+    return {
+        name: [{"job": stand_ins[entry["job"]]} if "job" in entry else entry for entry in entries]
+        for name, entries in row.inputs.items()
+    }
+
+
+def _pins_of(tx: Transaction, row: Row[Any], fanned: str | None) -> PinnedInputs:
+    """The inputs of a job; those of a gathering job are with its tasks."""
+    if row.size is None or fanned is None:
+        return dict(row.inputs)
+    statement = select(job.c.inputs).where(job.c.parent_id == row.id).order_by(job.c.position)
+    pins = [pin for inputs in tx.execute(statement).scalars() for pin in inputs[fanned]]
+    return {**row.inputs, fanned: pins}
+
+
+def _concurrency_key(tx: Transaction, row: Row[Any]) -> str | None:
+    """The key of a job, or of a gathering job's tasks."""
+    key: str | None = row.concurrency_key
+    if row.size is not None:
+        key = tx.execute(select(job.c.concurrency_key).where(job.c.parent_id == row.id).limit(1)).scalar()
+    return key
+
+
+# -- looking up --------------------------------------------------------------------------------------------------------
+
+
+def _rows(tx: Transaction, ids: Collection[str]) -> dict[str, Row[Any]]:
+    rows = _select_in(tx, select(job).order_by(job.c.id), job.c.id, ids)
+    return {row.id: row for row in rows}
+
+
+def _states(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
+    rows = _select_in(tx, select(job.c.id, job.c.state).order_by(job.c.id), job.c.id, ids)
+    return {row.id: row.state for row in rows}
+
+
+def _needs(tx: Transaction, rows: Mapping[str, Row[Any]]) -> dict[str, dict[str, str]]:
+    """The jobs that each of these came after, and the latest try of each. Whom a job shared a result with, it did not
+    need.
+    """
+    needs: dict[str, dict[str, str]] = {one: {} for one in rows}
+    statement = select(job_dependency).order_by(job_dependency.c.on_job_id)
+    for row in _select_in(tx, statement, job_dependency.c.job_id, rows):
+        if row.on_job_id != rows[row.job_id].cached_from:
+            needs[row.job_id][row.on_job_id] = row.on_job_id
+    latest = _latest_tries(tx, {one for named in needs.values() for one in named})
+    return {one: {earlier: latest[earlier] for earlier in named} for one, named in needs.items()}
+
+
+def _latest_tries(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
+    """The newest job that tries each of these again, or tries its try again; itself where nobody has."""
+    latest = {one: one for one in ids}
+    looking: Collection[str] = set(ids)
+    while looking:
+        statement = select(job.c.id, job.c.retry_of).order_by(job.c.id)
+        newer = {row.retry_of: row.id for row in _select_in(tx, statement, job.c.retry_of, looking)}
+        latest = {one: newer.get(last, last) for one, last in latest.items()}
+        looking = set(newer.values())
+    return latest
+
+
+def _select_in(
+    tx: Transaction, statement: Select[Any], column: ColumnElement[str], values: Iterable[str]
+) -> Iterator[Row[Any]]:
+    """The rows whose `column` is among `values`, however many those are; in the order of the statement, page by page.
+
+    A thousand jobs may come after a thousand others each, and databases take only so many parameters.
+    """
+    wanted = sorted(set(values))
+    for start in range(0, len(wanted), IN_LIST):
+        yield from tx.execute(statement.where(column.in_(wanted[start : start + IN_LIST]))).all()

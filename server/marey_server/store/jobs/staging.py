@@ -1,0 +1,244 @@
+"""Results of an attempt: staged while it runs, published when it completes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import bindparam, delete, func, insert, select, tuple_, update
+
+from marey_schemas.jobs import ItemInput, StagedOutput
+from marey_schemas.kinds import PARTS, Kind
+from marey_schemas.problems import FieldError
+from marey_server import faults
+from marey_server.errors import Conflict, Invalid
+from marey_server.store import blobs, documents
+from marey_server.store.database.prepared import Prepared
+from marey_server.store.documents import PreparedDocument
+from marey_server.store.items.drafts import Draft, StoredDocument
+from marey_server.store.items.publishing import publish
+from marey_server.store.jobs.fencing import hold, require_attempt
+from marey_server.store.jobs.inputs import PinnedInputs
+from marey_server.store.projects import find_by_id
+from marey_server.store.tables import document, job, staged_output
+from marey_server.store.transaction import Transaction
+
+MOST_STAGED = 20_000
+IN_LIST = 1000
+_DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
+
+StagedDraft = dict[str, Any]
+"""A draft as it is stored: kind, item_name, collection below `into`, tags, reuse, sources, parts by digest."""
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedOutput:
+    """A staged output whose documents are checked and encoded, which needs no database."""
+
+    output: StagedOutput
+    parts: Mapping[str, PreparedDocument]
+
+
+def prepare_output(output: StagedOutput) -> PreparedOutput:
+    """Check and encode the documents of an output; raises `Invalid`."""
+    specs = PARTS[output.kind]
+    unknown = [part for part in output.parts if part not in specs]
+    if unknown:
+        detail = f"A {output.kind} has no part {unknown[0]!r}; it has {', '.join(specs)}."
+        raise Invalid(
+            detail, code="no-part", errors=[FieldError(pointer=f"/{unknown[0]}", code="no-part", detail=detail)]
+        )
+    parts = {part: documents.prepare_document(tree, schema=specs[part].schema) for part, tree in output.parts.items()}
+    return PreparedOutput(output, parts)
+
+
+def stage(tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOutput]) -> int:
+    """Keep results until the attempt completes; one of the same name replaces the earlier. How many there are now.
+
+    Raises `LeaseLost` if the attempt does not hold the job, `Invalid` for sources that are no inputs of the job.
+    """
+    require_attempt(tx.principal, job_id, fence)
+    pins: PinnedInputs = hold(tx, job_id, fence, job.c.inputs).inputs
+    names = [one.output.name for one in outputs]
+    if len(set(names)) != len(names):
+        raise Invalid("Two results have the same name.", code="duplicate-output")
+    of_attempt = (staged_output.c.job_id == job_id) & (staged_output.c.fence == fence)
+    last = tx.execute(select(func.max(staged_output.c.position)).where(of_attempt)).scalar()
+    replaced = tx.execute(
+        delete(staged_output)
+        .where(of_attempt, staged_output.c.name.in_(names))
+        .returning(staged_output.c.name, staged_output.c.position)
+    )
+    places = {row.name: row.position for row in replaced}
+    position = -1 if last is None else last
+    rows = []
+    for one in outputs:
+        if one.output.name not in places:
+            position += 1
+            places[one.output.name] = position
+        rows.append(
+            {
+                "job_id": job_id,
+                "fence": fence,
+                "name": one.output.name,
+                "position": places[one.output.name],
+                "draft": _staged_draft(tx, one, pins),
+            }
+        )
+    if position >= MOST_STAGED:
+        raise Invalid(f"An attempt can stage at most {MOST_STAGED} results.", code="too-many")
+    tx.execute(insert(staged_output), rows)
+    faults.point("stage.before_commit")
+    return position + 1
+
+
+def _staged_draft(tx: Transaction, prepared: PreparedOutput, pins: PinnedInputs) -> StagedDraft:
+    output = prepared.output
+    return {
+        "kind": output.kind.value,
+        "item_name": output.item_name,
+        "collection": output.collection,
+        "tags": list(output.tags),
+        "reuse": output.reuse,
+        "sources": _pinned_sources(output, pins),
+        "parts": {part: documents.store_document(tx, content) for part, content in prepared.parts.items()},
+    }
+
+
+def _pinned_sources(output: StagedOutput, pins: PinnedInputs) -> dict[str, list[list[Any]]]:
+    """The inputs a result names, or all, as (item, revision); only what the job was given can be a source."""
+    if not output.sources:
+        return {role: [[pin["item"], pin["revision"]] for pin in many] for role, many in pins.items()}
+    return {role: [_pinned_source(role, source, pins) for source in named] for role, named in output.sources.items()}
+
+
+def _pinned_source(role: str, source: ItemInput, pins: PinnedInputs) -> list[Any]:
+    given = [pin["revision"] for pin in pins.get(role, ()) if pin["item"] == source.item]
+    if source.revision is None and len(given) == 1:
+        return [source.item, given[0]]
+    if source.revision in given:
+        return [source.item, source.revision]
+    asked = "" if source.revision is None else f" at revision {source.revision}"
+    known = f"; it is there at {', '.join(map(str, given))}" if given else ""
+    raise Invalid(f"{source.item}{asked} is not among the job's inputs {role!r}{known}.", code="no-input")
+
+
+# -- publishing -------------------------------------------------------------------------------------------------------
+
+
+_BY_ATTEMPTS = tuple_(staged_output.c.job_id, staged_output.c.fence).in_(bindparam("attempts", expanding=True))
+_STAGED = Prepared(select(staged_output).where(_BY_ATTEMPTS).order_by(staged_output.c.job_id, staged_output.c.position))
+_DROP_STAGED = Prepared(delete(staged_output).where(_BY_ATTEMPTS))
+
+
+def staged_drafts(
+    tx: Transaction, attempts: Collection[tuple[str, int]]
+) -> dict[tuple[str, int], dict[str, StagedDraft]]:
+    """What attempts (job id and fence) staged: drafts by name, in the order staged."""
+    drafts: dict[tuple[str, int], dict[str, StagedDraft]] = {}
+    for row in tx.run(_STAGED, {"attempts": list(attempts)}):
+        drafts.setdefault((row.job_id, row.fence), {})[row.name] = row.draft
+    return drafts
+
+
+def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> bool:
+    """Keep the documents of an earlier job's drafts from being collected; whether all are still there."""
+    wanted = sorted({digest for draft in drafts.values() for digest in draft["parts"].values()})
+    kept = 0
+    for start in range(0, len(wanted), IN_LIST):
+        page = document.c.digest.in_(wanted[start : start + IN_LIST])
+        kept += tx.execute(update(document).where(page).values(created_us=tx.now_us)).rowcount
+    return kept == len(wanted)
+
+
+def drop_staged(tx: Transaction, attempts: Collection[tuple[str, int]]) -> None:
+    """Forget what attempts (job id and fence) staged: they ended without success, or no identical job can use it."""
+    tx.run(_DROP_STAGED, {"attempts": list(attempts)})
+
+
+def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: PinnedInputs) -> dict[str, StagedDraft]:
+    """The drafts of an identical job, made from our inputs: the same items, at revisions of the same content."""
+    revisions = {
+        (role, their["item"], their["revision"]): our["revision"]
+        for role, many in theirs.items()
+        for their, our in zip(many, ours[role], strict=True)
+    }
+    return {
+        name: draft
+        | {
+            "sources": {
+                role: [[item, revisions[role, item, revision]] for item, revision in pairs]
+                for role, pairs in draft["sources"].items()
+            }
+        }
+        for name, draft in drafts.items()
+    }
+
+
+def publish_drafts(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> list[dict[str, Any]]:
+    """Publish the results of a job (`id, project_id, into_path, author_id, message`); what became of each."""
+    if not drafts:
+        return []
+    published = publish(
+        tx,
+        find_by_id(tx, row.project_id),
+        [_draft(name, draft, row) for name, draft in drafts.items()],
+        author_id=row.author_id,
+        job_id=row.id,
+    )
+    return [
+        {
+            "name": one.name,
+            "item": one.item,
+            "kind": one.kind.value,
+            "revision": one.revision,
+            "created": one.created,
+        }
+        for one in published
+    ]
+
+
+def _draft(name: str, draft: StagedDraft, row: Any) -> Draft:
+    return Draft(
+        name_in_batch=name,
+        kind=Kind(draft["kind"]),
+        item_name=draft["item_name"],
+        parts={part: StoredDocument(digest) for part, digest in draft["parts"].items()},
+        collection="/".join(filter(None, (row.into_path, draft["collection"]))),
+        tags=draft["tags"],
+        sources={role: [(item, revision) for item, revision in pairs] for role, pairs in draft["sources"].items()},
+        reuse=draft["reuse"],
+        message=row.message,
+    )
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+def named_blobs(tree: Any) -> Iterator[str]:
+    """Digests that stand under a member `blob`, anywhere in parameters or in a result."""
+    if isinstance(tree, Mapping):
+        for name, value in tree.items():
+            if name == "blob" and isinstance(value, str) and _DIGEST.fullmatch(value):
+                yield value
+            else:
+                yield from named_blobs(value)
+    elif isinstance(tree, list | tuple):
+        for value in tree:
+            yield from named_blobs(value)
+
+
+def keep_named_blobs(tx: Transaction, job_id: str, digests: set[str]) -> None:
+    """Keep the blobs a job names, which the caller must be allowed to read.
+
+    Raises `Conflict` (`missing-blobs`) for those he has not sent and may not read.
+    """
+    if not digests:
+        return
+    lacking = digests - blobs.readable(tx, digests)
+    if lacking:
+        detail = "The job names blobs that are not here; send them first."
+        raise Conflict(detail, code="missing-blobs", context={"missing": sorted(lacking)})
+    blobs.keep_for_job(tx, job_id, digests)

@@ -1,0 +1,230 @@
+"""How jobs come to be: checked, pinned, split, and put where they belong, many in one transaction."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from pydantic import ValidationError
+from sqlalchemy import insert, select
+
+from marey_schemas.access import Role
+from marey_schemas.job_kinds import MOST_TASKS, KindDeclaration, UnknownKindError, find_kind
+from marey_schemas.jobs import Job, JobCreate, JobState
+from marey_schemas.problems import FieldError
+from marey_server import faults
+from marey_server.errors import Invalid
+from marey_server.field_errors import field_errors, json_pointer
+from marey_server.store.database.prepared import Prepared
+from marey_server.store.jobs import result_cache, staging
+from marey_server.store.jobs.documents import document_of_new, job_documents
+from marey_server.store.jobs.endings import dependency_failure
+from marey_server.store.jobs.events import emit_job_events, wake_workers
+from marey_server.store.jobs.inputs import FoundItem, find_items, late_inputs, pin_inputs
+from marey_server.store.jobs.labels import labels_key
+from marey_server.store.jobs.late_inputs import bind
+from marey_server.store.jobs.layout import NewJob, Submission, lay_out, new_row
+from marey_server.store.jobs.propagation import settle
+from marey_server.store.jobs.result_places import find_clash
+from marey_server.store.projects import ProjectRow, require
+from marey_server.store.tables import job, job_dependency
+from marey_server.store.transaction import Transaction
+
+IN_LIST = 1000
+_INSERT_JOB = Prepared(insert(job))
+
+
+class Upstream(NamedTuple):
+    """A job that others wait for."""
+
+    kind: str
+    state: JobState
+
+
+def submit(tx: Transaction, project: str, requests: Sequence[JobCreate]) -> list[Job]:
+    """Submit jobs to a project, all or none; the answer is in the order asked.
+
+    Raises `Invalid` with a pointer for each thing that makes no sense, and what `require` raises.
+    """
+    row = require(tx, project, Role.CONTRIBUTOR, "jobs")
+    many = len(requests) > 1
+    return submit_at(tx, row, {f"/jobs/{index}" if many else "": one for index, one in enumerate(requests)})
+
+
+def submit_at(
+    tx: Transaction,
+    project: ProjectRow,
+    requests: Mapping[str, JobCreate],
+    ids: Mapping[str, str] = MappingProxyType({}),
+) -> list[Job]:
+    """Submit what a request asks for at each of these places, as `submit` does.
+
+    `ids` are the ids of jobs to be, by the place that asks for them, where others of the jobs wait for those.
+    """
+    known = find_items(tx, project, requests.values())
+    made = {ids[at]: Upstream(one.kind, JobState.WAITING) for at, one in requests.items() if at in ids}
+    upstream = made | _lock_upstream(tx, project, requests, made)
+    checked = []
+    for at, one in requests.items():
+        submission = _check(tx, project, one, known, at)
+        _check_makers(submission, upstream, made, at)
+        checked.append(replace(submission, id=ids[at]) if at in ids else submission)
+    return submit_checked(tx, project, checked, {one: found.state for one, found in upstream.items()})
+
+
+def submit_checked(
+    tx: Transaction, project: ProjectRow, submissions: Sequence[Submission], upstream: Mapping[str, JobState]
+) -> list[Job]:
+    """Write the rows of checked jobs and let each go as far as it can.
+
+    `upstream` holds the states of the jobs they come after, which must be locked; one that is among the submissions
+    counts as waiting.
+    """
+    heads = [_head(project, one, upstream) for one in submissions]
+    tasks, sources = lay_out(tx, [one for one in heads if not one.unbound])
+    everything = [*heads, *tasks]
+    rows = {one.id: new_row(tx, one) for one in everything}
+    tx.run_each(_INSERT_JOB, list(rows.values()))
+    _insert_dependencies(tx, submissions, upstream)
+    for one in heads:
+        staging.keep_named_blobs(tx, one.id, set(staging.named_blobs(one.submission.params)))
+    events = [(one.project_id, one.id, {"kind": one.submission.kind.name}) for one in heads]
+    emit_job_events(tx, "job.submitted", events)
+    wake_workers(tx, {one.submission.kind.name for one in everything if one.state == "queued"})
+    ended = [one.end() for one in everything if one.state in ("failed", "cancelled")]
+    ended += result_cache.join(tx, [(one, sources[one.id]) for one in everything if one.id in sources])
+    bindable = [one.id for one in heads if one.unbound and one.state == "waiting" and not one.dependencies_left]
+    ended += bind(tx, bindable)
+    settle(tx, ended)
+    faults.point("submit.before_commit")
+    tx.after_commit(lambda: faults.point("submit.after_commit"))
+    if ended or sources or bindable or tasks:  # what was inserted has been changed since, or is not the whole of it
+        return job_documents(tx, [one.id for one in heads])
+    return [document_of_new(tx, project.name, rows[one.id], one.submission.after) for one in heads]
+
+
+# -- checking ---------------------------------------------------------------------------------------------------------
+
+
+def _check(
+    tx: Transaction, project: ProjectRow, request: JobCreate, known: dict[str, FoundItem], at: str
+) -> Submission:
+    try:
+        kind = find_kind(request.kind)
+    except UnknownKindError as error:
+        raise _invalid(f"{at}/kind", "unknown-kind", f"{error}.") from error
+    try:
+        params = kind.params.model_validate(request.params)
+    except ValidationError as error:
+        found = field_errors(error, request.params, lambda steps: f"{at}/params{json_pointer(steps)}")
+        detail = f"These are no parameters of {kind.name}: {found[0].pointer}: {found[0].detail}"
+        raise Invalid(detail, errors=found) from error
+    pins = pin_inputs(tx, project, kind, request, known, at)
+    if (clash := find_clash(kind, params, pins, request.into)) is not None:
+        raise _invalid(f"{at}{clash.place}", clash.code, clash.detail)
+    tasks, plain = _count_tasks(kind, params, at), params.model_dump(mode="json")
+    late = [maker for _, _, maker in late_inputs(request, at)]
+    return Submission(
+        kind,
+        request,
+        plain,
+        pins,
+        tasks,
+        labels_key(request.labels),
+        tx.principal.user_id,
+        after=tuple(dict.fromkeys((*request.after, *late))),
+        unbound=bool(late),
+    )
+
+
+def _count_tasks(kind: KindDeclaration, params: Any, at: str) -> int:
+    count = 1 if kind.task_count is None else kind.task_count(params)
+    if not 1 <= count <= MOST_TASKS:
+        detail = f"These parameters make {count} tasks; {kind.name} takes 1 to {MOST_TASKS}."
+        raise _invalid(f"{at}/params", "too-many-tasks", detail)
+    return count
+
+
+def _invalid(pointer: str, code: str, detail: str) -> Invalid:
+    return Invalid(detail, errors=[FieldError(pointer=pointer, code=code, detail=detail)])
+
+
+def _lock_upstream(
+    tx: Transaction, project: ProjectRow, requests: Mapping[str, JobCreate], to_be: Collection[str]
+) -> dict[str, Upstream]:
+    """Every job that is waited for and is there, locked so that none ends before the waiting is written down.
+
+    Only jobs that exist, or come before in the same request, can be waited for, so that none can wait for itself.
+    """
+    places = {
+        place: one
+        for at, request in requests.items()
+        for place, one in (
+            *((f"{at}/after/{index}", one) for index, one in enumerate(request.after)),
+            *((f"{place}/job", one) for place, _, one in late_inputs(request, at)),
+        )
+        if one not in to_be
+    }
+    found = lock_jobs(tx, project, places.values())
+    for place, one in places.items():
+        if one not in found:
+            raise _invalid(place, "unknown-job", f"There is no job {one!r} in the project.")
+    return found
+
+
+def lock_jobs(tx: Transaction, project: ProjectRow, ids: Iterable[str]) -> dict[str, Upstream]:
+    """Those of the jobs that are there in the project, locked so that none ends before this transaction does."""
+    wanted = sorted(set(ids))
+    found: dict[str, Upstream] = {}
+    for start in range(0, len(wanted), IN_LIST):
+        statement = (
+            select(job.c.id, job.c.kind, job.c.state)
+            .where(job.c.id.in_(wanted[start : start + IN_LIST]), job.c.project_id == project.id)
+            .order_by(job.c.id)
+            .with_for_update(read=True)
+        )
+        found |= {row.id: Upstream(row.kind, JobState(row.state)) for row in tx.execute(statement)}
+    return found
+
+
+def _check_makers(submission: Submission, upstream: Mapping[str, Upstream], to_be: Collection[str], at: str) -> None:
+    """Jobs that are to make an input must be of a kind that makes such things; those to be are told of as steps."""
+    for place, name, maker in late_inputs(submission.request, at):
+        wanted = submission.kind.inputs[name].kind
+        try:
+            makes = find_kind(upstream[maker].kind).outputs.values()
+        except UnknownKindError:
+            continue  # of a kind that this server knew once: what it made counts
+        if wanted not in makes:
+            detail = f"{upstream[maker].kind} makes {', '.join(sorted(set(makes))) or 'nothing'}, and no {wanted}."
+            raise _invalid(f"{place}/{'step' if maker in to_be else 'job'}", "wrong-kind", detail)
+
+
+# -- rows -------------------------------------------------------------------------------------------------------------
+
+
+def _head(project: ProjectRow, submission: Submission, upstream: Mapping[str, JobState]) -> NewJob:
+    head = NewJob(submission.id, project.id, submission, submission.pins)
+    states = {one: upstream[one] for one in submission.after}
+    unfinished = [one for one, state in states.items() if not state.terminal]
+    missed = [one for one, state in states.items() if state.terminal and state != JobState.SUCCEEDED]
+    if missed and submission.request.on_failure == "skip":
+        head.state = "cancelled"
+    elif missed:
+        head.state = "failed"
+        head.failure = dependency_failure(missed[0], states[missed[0]])
+    elif unfinished or submission.unbound:
+        head.state, head.dependencies_left = "waiting", len(unfinished)
+    return head
+
+
+def _insert_dependencies(tx: Transaction, submissions: Sequence[Submission], upstream: Mapping[str, JobState]) -> None:
+    rows = [
+        {"job_id": one.id, "on_job_id": other, "satisfied": upstream[other].terminal}
+        for one in submissions
+        for other in one.after
+    ]
+    for start in range(0, len(rows), IN_LIST):
+        tx.execute(insert(job_dependency), rows[start : start + IN_LIST])

@@ -1,0 +1,65 @@
+"""Two transactions of two connections, the second beginning while the first has written and not committed."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as StillRunning
+from dataclasses import dataclass
+from typing import Any
+
+from marey_server.access.principal import Principal
+from marey_server.errors import MareyError
+from marey_server.store.database.connections import Database
+from marey_server.store.transaction import Transaction
+
+Action = Callable[[Transaction], Any]
+
+HEAD_START_S = 0.1
+"""How long the second transaction may run, or wait for the first one's locks, before the first commits."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one of the two does, over which connection, for whom."""
+
+    database: Database
+    principal: Principal
+    action: Action
+
+
+class Abandoned(Exception):
+    """The first transaction was to be rolled back."""
+
+
+def interleave(first: Step, second: Step, *, commit: bool = True) -> tuple[Any, Any]:
+    """What both answered, or the errors they were refused with. Without `commit`, the first one rolls back."""
+    wrote, may_end = threading.Event(), threading.Event()
+
+    def held_open(tx: Transaction) -> Any:
+        try:
+            answer = first.action(tx)
+        finally:
+            wrote.set()
+        may_end.wait(20)
+        if not commit:
+            raise Abandoned
+        return answer
+
+    with ThreadPoolExecutor(2) as pool:
+        one = pool.submit(first.database.write, first.principal, held_open)
+        assert wrote.wait(20)
+        two = pool.submit(second.database.write, second.principal, second.action)
+        with contextlib.suppress(StillRunning):
+            two.exception(HEAD_START_S)
+        may_end.set()
+        return _outcome(one), _outcome(two)
+
+
+def _outcome(future: Future[Any]) -> Any:
+    try:
+        return future.result(60)
+    except (MareyError, Abandoned) as error:
+        return error

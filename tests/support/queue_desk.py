@@ -1,0 +1,241 @@
+"""A project with a queue, for tests: short words for what submitters and workers do."""
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import pytest
+from tests.support.database_fixtures import AdjustableClock
+
+from marey_schemas import job_kinds
+from marey_schemas.access import ProjectCreate, UserCreate
+from marey_schemas.base import Request
+from marey_schemas.job_kinds import KindDeclaration
+from marey_schemas.jobs import (
+    ClaimRequest,
+    CompleteAnswer,
+    CompleteRequest,
+    FailAnswer,
+    FailRequest,
+    Heartbeat,
+    HeartbeatAnswer,
+    InputSpec,
+    Job,
+    JobCreate,
+    Lease,
+    Progress,
+    StagedOutput,
+)
+from marey_schemas.kinds import Kind
+from marey_server.access.principal import SYSTEM, Principal
+from marey_server.store import projects, tokens, users
+from marey_server.store.database.connections import Database
+from marey_server.store.items.drafts import Draft, Published
+from marey_server.store.items.publishing import publish
+from marey_server.store.jobs import completion, queue, reading, staging, submission
+from marey_server.store.jobs.policy import QueuePolicy
+from marey_server.store.jobs.reaper import reap_page
+
+
+class Params(Request):
+    """Parameters of the kinds below."""
+
+    number: int = 0
+
+
+ERRAND = KindDeclaration(
+    name="errand",
+    description="Does something and makes nothing; every time anew.",
+    params=Params,
+    implementation="tests:errand",
+    version=1,
+    outputs={},
+    deterministic=False,
+)
+SUM = KindDeclaration(
+    name="sum",
+    description="Computes the same from the same.",
+    params=Params,
+    implementation="tests:sum",
+    version=1,
+    outputs={"sums": Kind.STUDY},
+)
+SQUARE = KindDeclaration(
+    name="square",
+    description="Makes one thing of each thing.",
+    params=Params,
+    implementation="tests:square",
+    version=1,
+    inputs={
+        "things": InputSpec(kind=Kind.STUDY, many=True),
+        "ruler": InputSpec(kind=Kind.STUDY, required=False),
+    },
+    outputs={"squares": Kind.STUDY},
+    fan_out="things",
+    batch_size=2,
+)
+SURVEY = KindDeclaration(
+    name="survey",
+    description="Looks at all things in as many parts as its number says, and gathers what it saw.",
+    params=Params,
+    implementation="tests:survey",
+    version=1,
+    inputs={"things": InputSpec(kind=Kind.STUDY, many=True)},
+    outputs={"survey": Kind.STUDY},
+    task_count=lambda params: params.number,
+    gathering="tests:gather",
+)
+KINDS = {kind.name: kind for kind in (*job_kinds.BUILT_IN, ERRAND, SUM, SQUARE, SURVEY)}
+
+
+@dataclass
+class Desk:
+    """Submits and works in the project `lab`."""
+
+    database: Database
+    clock: AdjustableClock
+    policy: QueuePolicy = field(default_factory=lambda: QueuePolicy(random_unit=lambda: 0.0))
+    project: str = "lab"
+    user: Principal = SYSTEM
+    _write_ids: Iterator[int] = field(default_factory=itertools.count)
+
+    def open(self) -> None:
+        """Make the user `ann` and her project."""
+        made = self.database.write(SYSTEM, users.create_user, UserCreate(name="ann"))
+        scopes = ("read", "write", "jobs", "work")
+        self.user = Principal("user", made.id, "ann", scopes=scopes, token_id="token_ann")
+        self.database.write(self.user, projects.create_project, ProjectCreate(name=self.project))
+
+    # -- submitting ----------------------------------------------------------------------------------------------------
+
+    def submit(self, kind: str = "errand", **fields: Any) -> str:
+        """Submit one job; its id."""
+        return self.submit_many(JobCreate(kind=kind, **fields))[0]
+
+    def submit_many(self, *requests: JobCreate) -> list[str]:
+        """Submit jobs at once; their ids."""
+        made = self.database.write(self.user, submission.submit, self.project, requests)
+        return [job.id for job in made]
+
+    def job(self, job_id: str) -> Job:
+        """A job as it stands."""
+        return self.database.read(self.user, reading.read_job, job_id)
+
+    def state(self, job_id: str) -> str:
+        """The state of a job."""
+        return self.job(job_id).state.value
+
+    def cancel(self, job_id: str) -> Job:
+        """Cancel a job."""
+        return self.database.write(self.user, reading.cancel_job, job_id, self.policy)
+
+    def outputs(self, job_id: str) -> list[Any]:
+        """What a job published."""
+        return list(self.database.read(self.user, reading.list_outputs, job_id).items)
+
+    def things(self, count: int, collection: str = "raw") -> list[str]:
+        """Make things to work on; their item ids."""
+        drafts = [
+            Draft(f"thing{n}", Kind.STUDY, f"thing{n}", {"study": document(number=n)}, collection) for n in range(count)
+        ]
+        return [one.item for one in self.publish(*drafts)]
+
+    def publish(self, *drafts: Draft) -> list[Published]:
+        """Publish drafts, as a person would."""
+
+        def act(tx: Any) -> list[Published]:
+            return publish(tx, projects.require(tx, self.project), drafts, author_id=self.user.user_id)
+
+        return self.database.write(self.user, act)
+
+    # -- working -------------------------------------------------------------------------------------------------------
+
+    def claim_many(self, count: int = 256, kinds: tuple[str, ...] = tuple(KINDS), **fields: Any) -> list[Lease]:
+        """Claim jobs as the worker `w`."""
+        request = ClaimRequest(worker="w", kinds=kinds, max=count, **fields)
+        return self.database.write(self.user, queue.claim, request, self.policy)
+
+    def claim(self, **fields: Any) -> Lease:
+        """Claim one job that must be there."""
+        (lease,) = self.claim_many(1, **fields)
+        return lease
+
+    def attempt(self, lease: Lease) -> Principal:
+        """The principal of an attempt, as its token resolves now."""
+        return self.database.read(SYSTEM, tokens.resolve_token, lease.attempt_token)
+
+    def heartbeat(self, lease: Lease, progress: Progress | None = None) -> HeartbeatAnswer:
+        """Say that the worker lives."""
+        return self.database.write(
+            _as_attempt(lease), queue.heartbeat, lease.job, lease.fence, Heartbeat(progress=progress), self.policy
+        )
+
+    def stage(self, lease: Lease, *names: str, **fields: Any) -> int:
+        """Stage a small document under each name."""
+        outputs = [staging.prepare_output(output(name, **fields)) for name in names]
+        return self.database.write(self._attempt_of(lease), staging.stage, lease.job, lease.fence, outputs)
+
+    def complete(self, lease: Lease, *, write_id: str | None = None, **fields: Any) -> CompleteAnswer:
+        """Complete the attempt."""
+        request = CompleteRequest(write_id=write_id or self.write_id(), **fields)
+        return self.database.write(self._attempt_of(lease), completion.complete, lease.job, lease.fence, request)
+
+    def fail(self, lease: Lease, code: str = "broken", *, write_id: str | None = None, **fields: Any) -> FailAnswer:
+        """End the attempt without success."""
+        request = FailRequest(write_id=write_id or self.write_id(), code=code, **fields)
+        return self.database.write(
+            self._attempt_of(lease), completion.fail, lease.job, lease.fence, request, self.policy
+        )
+
+    def reap(self) -> int:
+        """Take back what is overdue."""
+        return self.database.write(SYSTEM, reap_page, self.policy).taken
+
+    def write_id(self) -> str:
+        """A new one."""
+        return f"write-{next(self._write_ids):06}"
+
+    def _attempt_of(self, lease: Lease) -> Principal:
+        project_id = self.database.read(self.user, projects.require, self.project).id
+        return Principal(
+            "attempt",
+            self.user.user_id,
+            "ann",
+            scopes=("read",),
+            job_id=lease.job,
+            fence=lease.fence,
+            project_id=project_id,
+        )
+
+
+def _as_attempt(lease: Lease) -> Principal:
+    return Principal("attempt", job_id=lease.job, fence=lease.fence, scopes=("read",))
+
+
+def document(**facts: Any) -> dict[str, Any]:
+    """A small open document."""
+    return {"schema": "marey/document@1", **facts}
+
+
+def output(
+    name: str, *, collection: str = "", facts: Mapping[str, Any] = MappingProxyType({}), **fields: Any
+) -> StagedOutput:
+    """A staged result that is a small document."""
+    parts = {"study": document(name=name, **facts)}
+    return StagedOutput(name=name, kind=Kind.STUDY, item_name=name, collection=collection, parts=parts, **fields)
+
+
+@pytest.fixture
+def test_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kinds of this module besides the built-in ones."""
+    monkeypatch.setattr(job_kinds, "job_kinds", lambda: KINDS)
+
+
+@pytest.fixture
+def desk(database: Database, clock: AdjustableClock, test_kinds: None) -> Desk:
+    """A fresh project with a queue, on SQLite and on Postgres."""
+    opened = Desk(database, clock)
+    opened.open()
+    return opened

@@ -1,0 +1,111 @@
+"""A server for tests: the real application on a real socket, in a thread, over a database of its own."""
+
+import asyncio
+import contextlib
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from marey_schemas.access import MemberChange, ProjectCreate, Role, TokenCreate, UserCreate
+from marey_server.access.principal import SYSTEM, Principal
+from marey_server.app import Application, create_app, listening
+from marey_server.process.settings import Settings
+from marey_server.store import members, projects, tokens, users
+from marey_server.store.database.connections import Database
+
+ALL_SCOPES = ("read", "write", "jobs", "work", "admin")
+USER_SCOPES = ("read", "write", "jobs")
+
+
+@dataclass
+class Server:
+    """A running server, and the people who use it."""
+
+    address: str
+    app: Application
+    database: Database
+    stop: Any
+    _clients: dict[str | None, httpx.Client] = field(default_factory=dict)
+
+    @property
+    def api(self) -> str:
+        return f"{self.address}/api/v1"
+
+    def client(self, token: str | None = None) -> httpx.Client:
+        """A client that shows `token`."""
+        if token not in self._clients:
+            headers = {"Authorization": f"Bearer {token}"} if token else {}
+            self._clients[token] = httpx.Client(base_url=self.api, headers=headers, timeout=60)
+        return self._clients[token]
+
+    def make_user(self, name: str, *, administrator: bool = False, scopes: tuple[str, ...] = USER_SCOPES) -> str:
+        """A user and a token of his."""
+        made = self.database.write(SYSTEM, users.create_user, UserCreate(name=name, administrator=administrator))
+        return self.make_token(made.id, name, administrator=administrator, scopes=scopes)
+
+    def make_token(self, user_id: str, name: str, *, administrator: bool = False, scopes: tuple[str, ...]) -> str:
+        principal = Principal("user", user_id, name, administrator, ALL_SCOPES)
+        return self.database.write(principal, tokens.create_token, TokenCreate(name="test", scopes=scopes)).secret
+
+    def make_project(self, name: str = "lab", *, owner: str = "olga", **others: Role) -> str:
+        """A project, its owner's token; `others` are made members."""
+        token = self.make_user(owner)
+        person = self.database.read(SYSTEM, tokens.resolve_token, token)
+        self.database.write(person, projects.create_project, ProjectCreate(name=name))
+        for member, role in others.items():
+            self.database.write(person, members.put_member, name, member, MemberChange(role=role))
+        return token
+
+    def close(self) -> None:
+        for client in self._clients.values():
+            client.close()
+        self.stop()
+
+
+@contextlib.contextmanager
+def running(database: Database, folder: Path, **settings: Any) -> Iterator[Server]:
+    """Serve a database until the block ends."""
+    started: dict[str, Any] = {}
+    ready = threading.Event()
+
+    async def main() -> None:
+        stop = asyncio.Event()
+        app = create_app(Settings(data=folder, port=0, drain_s=5, **settings), database)
+        try:
+            async with listening(app) as listener:
+                loop = asyncio.get_running_loop()
+                started.update(app=app, address=listener.address, stop=lambda: loop.call_soon_threadsafe(stop.set))
+                ready.set()
+                await stop.wait()
+        finally:
+            ready.set()
+
+    thread = threading.Thread(target=lambda: asyncio.run(main()), name="marey-test-server")
+    thread.start()
+    assert ready.wait(20), "the server did not start"
+    assert started, "the server failed to start"
+    server = Server(started["address"], started["app"], database, started["stop"])
+    try:
+        yield server
+    finally:
+        server.close()
+        thread.join(20)
+        assert not thread.is_alive(), "the server did not stop"
+
+
+@pytest.fixture
+def server(database: Database, tmp_path: Path) -> Iterator[Server]:
+    """A running server, on SQLite and on Postgres."""
+    with running(database, tmp_path) as one:
+        yield one
+
+
+@pytest.fixture
+def owner(server: Server) -> httpx.Client:
+    """The owner of the project `lab`."""
+    return server.client(server.make_project())

@@ -1,0 +1,159 @@
+"""A real `marey serve` in a process of its own, that tests can kill, stop and start again on the same data."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Self
+
+import httpx
+
+from marey_client import Marey
+from marey_client.retries import ONCE, Retries
+from marey_server.app import connect_database
+from marey_server.process.settings import Settings
+from marey_server.store.fsck import check_store
+
+READY_S = 120.0
+"""A machine that does much else at once takes its time."""
+
+PATIENT = Retries(tries=400, first_s=0.1, longest_s=1.0, total_s=1.5 * READY_S)
+"""Outlasts a server that takes all its time to start again."""
+QUICK_LEASES = {"MAREY_LEASE_TTL_S": "3", "MAREY_HEARTBEAT_S": "0.5", "MAREY_CANCEL_GRACE_S": "2"}
+
+
+class MareyProcess:
+    """A process with its own environment; `log` is what it printed."""
+
+    def __init__(self, log: Path) -> None:
+        self.log = log
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def spawn(self, arguments: list[str], environment: dict[str, str], stdin: bytes | None = None) -> None:
+        """Start the program; `stdin` is written to it and kept open."""
+        surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", *arguments],
+                env=surroundings | environment,
+                stdin=subprocess.PIPE if stdin is not None else subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+        if stdin is not None:
+            assert self.process.stdin is not None
+            self.process.stdin.write(stdin)
+            self.process.stdin.flush()
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal."""
+        assert self.process is not None
+        self.process.send_signal(number)
+
+    def kill(self) -> None:
+        """End it as a power cut would."""
+        assert self.process is not None
+        with contextlib.suppress(ProcessLookupError):
+            self.process.kill()
+        self.process.wait(30)
+
+    def wait_until_dead(self, seconds: float = 60) -> int:
+        """Wait until it has ended by itself."""
+        assert self.process is not None
+        return self.process.wait(seconds)
+
+    def stop(self) -> int | None:
+        """End it politely, if it runs."""
+        if self.process is None:
+            return None
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGCONT)
+            self.process.terminate()
+        try:
+            return self.process.wait(40)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            raise
+
+
+class ServerProcess(MareyProcess):
+    """`marey serve` on a port of its own; `environment` is what whoever started it told it."""
+
+    def __init__(self, folder: Path, database_url: str | None = None, **environment: str) -> None:
+        super().__init__(folder / "server.log")
+        self.data = folder / "data"
+        self.port = free_port()
+        self.url = f"http://127.0.0.1:{self.port}"
+        self._settings = Settings(data=self.data, database_url=database_url, blobs="database")
+        self.environment = {"MAREY_DATA": str(self.data), "MAREY_PORT": str(self.port), **environment}
+        if database_url is not None:
+            self.environment["MAREY_DATABASE_URL"] = database_url
+
+    def start(self, *, workers: int = 0, fault: str | None = None) -> Self:
+        """Start, and wait until it can serve."""
+        environment = self.environment | ({"MAREY_FAULT": fault} if fault else {})
+        self.spawn(["marey_client.cli", "serve", "--workers", str(workers)], environment)
+        assert self.process is not None
+        deadline = time.monotonic() + READY_S
+        with httpx.Client(verify=False) as asking:  # reading certificates each time takes the server's time
+            while time.monotonic() < deadline:
+                assert self.process.poll() is None, f"the server ended:\n{self.log.read_text()[-3000:]}"
+                with contextlib.suppress(httpx.TransportError):
+                    if asking.get(f"{self.url}/readyz", timeout=5).status_code == 200:
+                        return self
+                time.sleep(0.05)
+        raise AssertionError(f"the server is not ready:\n{self.log.read_text()[-3000:]}")
+
+    @property
+    def token(self) -> str:
+        """The first administrator's."""
+        return (self.data / "admin.token").read_text().strip()
+
+    def client(self, *, patient: bool = True, port: int | None = None) -> Marey:
+        """An administrator's client; a patient one outlasts a restart."""
+        url = f"http://127.0.0.1:{port}" if port else self.url
+        return Marey(url, self.token, retries=PATIENT if patient else ONCE)
+
+    def check_database(self) -> None:
+        """Fail when what `marey db fsck` does finds anything."""
+        with closing(connect_database(self._settings)) as database:
+            findings = list(check_store(database))
+        assert not findings, "\n".join(map(str, findings))
+
+
+class WorkerProcess(MareyProcess):
+    """`python -m marey_worker`, started apart from the server, so that it outlives it."""
+
+    def start(self, url: str, token: str, folder: Path, *, name: str, fault: str | None = None) -> Self:
+        """Start; it finds the server by itself."""
+        environment = {"MAREY_FAULT": fault} if fault else {}
+        arguments = ["marey_worker", "--attached", "--server", url, "--name", name, "--cache", str(folder / "cache")]
+        self.spawn(arguments, environment, stdin=f"{token}\n".encode())
+        return self
+
+
+@contextlib.contextmanager
+def serving(folder: Path, database_url: str | None = None) -> Iterator[ServerProcess]:
+    """A server with one worker, until the block ends; it must end well."""
+    process = ServerProcess(folder, database_url).start(workers=1)
+    try:
+        yield process
+    finally:
+        status = process.stop()
+    assert status == 0, process.log.read_text()[-3000:]
+
+
+def free_port() -> int:
+    """A loopback port nobody listens on just now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port

@@ -1,0 +1,104 @@
+"""A project with people in every role, and small documents to put into it."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from marey_schemas.access import MemberChange, ProjectChange, ProjectCreate, Role, UserCreate, Visibility
+from marey_schemas.items import Item, ItemCreate
+from marey_schemas.kinds import Kind
+from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
+from marey_server.store import items, members, projects, users
+from marey_server.store.database.connections import Database
+from marey_server.store.transaction import Transaction
+
+ALL_SCOPES = ("read", "write", "jobs", "work", "admin")
+
+
+def skeleton_tree(joints: int = 3, *, bone_m: float = 0.5) -> dict[str, Any]:
+    """A chain of joints `j0`, `j1`, ..."""
+    chain = [{"name": f"j{i}", "parent": i - 1, "offset": [0, bone_m if i else 0, 0]} for i in range(joints)]
+    return {"schema": "marey/skeleton@1", "joints": chain}
+
+
+def motion_tree(skeleton: Any, *, frames: int = 5, joints: int = 3, seed: int = 0) -> dict[str, Any]:
+    """A random motion of the chain; `skeleton` is an item, or a reference."""
+    ref = {"item": skeleton.id, "revision": skeleton.revision} if isinstance(skeleton, Item) else skeleton
+    poses = np.random.default_rng(seed).normal(size=(frames, 3 + 4 * joints)).astype("<f4")
+    return {
+        "schema": "marey/motion@1",
+        "skeleton": ref,
+        "frame_rate_hz": 120.0,
+        "joints": [f"j{i}" for i in range(joints)],
+        "poses": poses,
+    }
+
+
+def _new_user(tx: Transaction, name: str, *, administrator: bool = False) -> Principal:
+    made = users.create_user(tx, UserCreate(name=name, administrator=administrator))
+    return Principal("user", made.id, made.name, administrator, ALL_SCOPES)
+
+
+class Lab:
+    """The project `lab` in a database, and who is who in it."""
+
+    def __init__(self, database: Database, name: str = "lab") -> None:
+        self.database = database
+        self.name = name
+        database.write(SYSTEM, self._furnish)
+
+    def _furnish(self, tx: Transaction) -> None:
+        self.owner, self.maintainer, self.contributor, self.reader, self.stranger = (
+            _new_user(tx, f"{who}-{self.name}") for who in ("owner", "maintainer", "contributor", "reader", "stranger")
+        )
+        self.anonymous = ANONYMOUS
+        tx.principal = self.owner
+        projects.create_project(tx, ProjectCreate(name=self.name))
+        for who in (self.maintainer, self.contributor, self.reader):
+            role = Role(str(who.user_name).partition("-")[0])
+            members.put_member(tx, self.name, str(who.user_name), MemberChange(role=role))
+
+    def sign_up(self, name: str, *, administrator: bool = False) -> Principal:
+        """A new user, as a principal with every scope."""
+        return self.database.write(SYSTEM, _new_user, name, administrator=administrator)
+
+    def read(self, function: Any, *args: Any, who: Principal | None = None, **kwargs: Any) -> Any:
+        """Run a read, as the owner unless told otherwise."""
+        return self.database.read(who or self.owner, function, *args, **kwargs)
+
+    def write(self, function: Any, *args: Any, who: Principal | None = None, **kwargs: Any) -> Any:
+        """Run a write, as the owner unless told otherwise."""
+        return self.database.write(who or self.owner, function, *args, **kwargs)
+
+    def make_public(self) -> None:
+        """Let everybody read the project."""
+        change = ProjectChange(visibility=Visibility.PUBLIC)
+        self.write(projects.change_project, self.name, change, expected_rev=None)
+
+    def add_skeleton(self, name: str = "rig", **kwargs: Any) -> Item:
+        """A new skeleton."""
+        request = ItemCreate(name=name, parts={"hierarchy": skeleton_tree(**kwargs)})
+        return self.write(items.create_item, self.name, Kind.SKELETON, request)
+
+    def add_clip(
+        self,
+        skeleton: Item,
+        name: str = "walk",
+        *,
+        collection: str = "",
+        tags: tuple[str, ...] = (),
+        who: Principal | None = None,
+        info: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> Item:
+        """A new clip of random poses."""
+        parts = {"motion": motion_tree(skeleton, **kwargs)} | ({"info": info} if info else {})
+        request = ItemCreate(name=name, collection=collection, tags=tags, parts=parts)
+        return self.write(items.create_item, self.name, Kind.CLIP, request, who=who)
+
+
+@pytest.fixture
+def lab(database: Database) -> Lab:
+    """A project with people in every role, on SQLite and on Postgres."""
+    return Lab(database)

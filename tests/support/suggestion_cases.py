@@ -1,0 +1,70 @@
+"""Small suites over databases made by hand, for tests of what evaluations suggest."""
+
+from dataclasses import replace
+
+import numpy as np
+from tests.support.made_databases import arc_track, made_database, mirrored_track, random_tracks
+
+from marey_motion.evaluation.result import EvaluationOptions, Grid
+from marey_motion.evaluation.scenario import suite_trials
+from marey_motion.evaluation.suite import assemble, run_suite
+
+OPTIONS = EvaluationOptions(
+    grid=Grid((1.0, 2.0), (-50.0, 0.0, 50.0)), approach_s=2.0, duration_s=6.0, families=("circle",)
+)
+UNWANTED = ("fast_000", "fast_001")
+
+
+def named(tracks, prefix="clip"):
+    return [track._replace(uid=f"{prefix}_{number:03d}") for number, track in enumerate(tracks)]
+
+
+def wandering_tracks(count=8, seed=3):
+    """Clips of some use, and two that are too fast for anything that is asked."""
+    fast = [arc_track(9.0 + number, 0.0, 4.0, uid=uid) for number, uid in enumerate(UNWANTED)]
+    return [*named(random_tracks(count, seed)), *fast]
+
+
+def with_mirrored(tracks):
+    """A database of the tracks and their mirrored twins."""
+    both = sorted(
+        (one for track in tracks for one in (track, mirrored_track(track)._replace(uid=f"{track.uid}~mirrored"))),
+        key=lambda track: track.uid,
+    )
+    database = made_database(both)
+    clips = tuple(
+        replace(clip, mirrored_from=clip.uid.removesuffix("~mirrored")) if clip.uid.endswith("~mirrored") else clip
+        for clip in database.clips
+    )
+    return replace(database, clips=clips)
+
+
+def simulated(database, options=OPTIONS):
+    """Records of the whole suite."""
+    return run_suite(database, options, trials=suite_trials(options))
+
+
+def evaluated(database, options=OPTIONS):
+    """The database's evaluation, without a baseline."""
+    return assemble(database, options, suite_trials(options), simulated(database, options))
+
+
+def same_to_the_bit(database, records, other, other_records):
+    """Whether two sets of trials agree in every bit, their rows named by clip and frame."""
+    return all(
+        np.array_equal(getattr(one, name), getattr(two, name), equal_nan=name.endswith("_cost"))
+        for one, two in zip(records, other_records, strict=True)
+        for name in ("positions", "headings", "status", "match_cost", "continuing_cost", "pose_cost")
+    ) and all(
+        places(database, one.rows) == places(other, two.rows) for one, two in zip(records, other_records, strict=True)
+    )
+
+
+def places(database, rows):
+    """Clip and frame of each row; parts of clips are named and counted as in the whole clip."""
+    found = []
+    for index, row in zip(database.clip_of_row[rows].tolist(), rows.tolist(), strict=True):
+        clip = database.clips[index]
+        uid, _, part = clip.uid.partition("#")
+        found.append((uid, row - clip.start + (int(part.split("-")[0]) if part else 0)))
+    return found

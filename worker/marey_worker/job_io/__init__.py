@@ -1,0 +1,1 @@
+"""Inputs and results of jobs: caches, places of results, refusals, and stored reports."""

@@ -1,0 +1,86 @@
+"""Clips that may be added to an evaluated set: databases by the folder the clips lie in, and by their skeleton."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.improvement.selection import source_of
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.preparing import SAME_OFFSET_M
+from marey_motion.skeleton import same_hierarchy
+from marey_schemas.documents import Motion, RevisionRef
+from marey_schemas.jobs import PinnedInput
+from marey_schemas.kinds import Kind
+from marey_schemas.wording import counted
+from marey_worker.context import Context
+from marey_worker.job_io.evaluated_set import EvaluatedSet
+from marey_worker.job_io.matching_clips import ClipSet, build_clips, read_motions, uid_of
+from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+
+
+class Unusable(NamedTuple):
+    """Clips of a folder that cannot be matched, and why."""
+
+    folder: str
+    clips: int
+    code: str
+    detail: str
+
+
+@dataclass
+class Candidates:
+    """Databases by folder, all with the set's options and normaliser; and folders that make none."""
+
+    databases: dict[str, MatchingDatabase] = field(default_factory=dict)
+    unusable: list[Unusable] = field(default_factory=list)
+
+
+class _Group(NamedTuple):
+    pins: list[PinnedInput]
+    motions: list[tuple[str, Motion]]
+
+
+def read_candidates(context: Context, evaluated: EvaluatedSet) -> Candidates:
+    """The job's input `candidates`, without clips that the set has."""
+    database = evaluated.clips.database
+    known = {source_of(clip) for clip in database.clips}
+    pins = [pin for pin in context.inputs.get("candidates", ()) if uid_of(pin) not in known]
+    groups: dict[tuple[str, str], _Group] = defaultdict(lambda: _Group([], []))
+    for pin, motion in zip(pins, read_motions(context, pins), strict=True):
+        group = groups[pin.collection, _skeleton_of(motion).item]
+        group.pins.append(pin)
+        group.motions.append(motion)
+    found = Candidates()
+    for name, group in _named(context, groups):
+        try:
+            found.databases[name] = _build(context, group, database)
+        except MotionError as error:
+            found.unusable.append(Unusable(name, len(group.pins), error.code, str(error)))
+            context.log(f"{name}: {counted(len(group.pins), 'clip')} cannot be matched: {error}")
+    return found
+
+
+def _named(context: Context, groups: dict[tuple[str, str], _Group]) -> Iterator[tuple[str, _Group]]:
+    """Each group by its folder, and by its skeleton where a folder has clips of several."""
+    for (folder, skeleton), group in groups.items():
+        alone = sum(other == folder for other, _ in groups) == 1
+        yield folder if alone else f"{folder} ({context.item(Kind.SKELETON, skeleton).name})", group
+
+
+def _build(context: Context, group: _Group, database: MatchingDatabase) -> MatchingDatabase:
+    """The group's database, with the very body of the set where it is of the set's skeleton."""
+    newest = max(map(_skeleton_of, group.motions), key=lambda ref: ref.revision)
+    rigged = read_rigged(context, Rig.as_stored(newest))
+    body = database.body
+    if not same_hierarchy(rigged.skeleton, body.skeleton, tolerance_m=SAME_OFFSET_M):
+        body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
+    return build_clips(context, ClipSet(tuple(group.pins)), group.motions, body, database.options, database.normaliser)
+
+
+def _skeleton_of(motion: tuple[str, Motion]) -> RevisionRef:
+    return RevisionRef.model_validate(motion[1].skeleton.model_dump())

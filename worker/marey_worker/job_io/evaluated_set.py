@@ -1,0 +1,64 @@
+"""Evaluations that jobs start from, the sets of clips behind them, and the files that jobs answer with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from marey_motion.evaluation.improvement.objective import Objective
+from marey_motion.evaluation.result import EvaluationResult
+from marey_motion.evaluation.result_documents import records_from_tree, result_from_tree
+from marey_motion.evaluation.scenario import Trial
+from marey_schemas.encoding.codecs import JSON, encode_tree
+from marey_schemas.improvement import ObjectiveParams
+from marey_schemas.jobs import PinnedInput
+from marey_schemas.kinds import Kind
+from marey_schemas.reports import StoredFile
+from marey_worker.context import Context
+from marey_worker.job_io.matching_clips import MatchingClips, read_evaluated_clips, refusing_motion_errors
+
+
+@dataclass(frozen=True)
+class EvaluatedSet:
+    """An evaluation with its records, and its clips under its normaliser."""
+
+    result: EvaluationResult
+    clips: MatchingClips
+
+    @property
+    def trials(self) -> tuple[Trial, ...]:
+        """The trials that were made."""
+        return tuple(one.trial for one in self.result.trials)
+
+
+def read_result(context: Context, pin: PinnedInput) -> tuple[EvaluationResult, Mapping[str, Any]]:
+    """An evaluation with the records of its trials, and its document."""
+    document = context.document(Kind.EVALUATION, pin.item, pin.revision, "evaluation")
+    records = records_from_tree(context.document(Kind.EVALUATION, pin.item, pin.revision, "records"))
+    with refusing_motion_errors():
+        return result_from_tree(document, tuple(records.values())), document
+
+
+def read_evaluated_set(context: Context) -> EvaluatedSet:
+    """The job's input `evaluation`, and its clips. Raises `JobRefused`."""
+    (pin,) = context.inputs["evaluation"]
+    result, document = read_result(context, pin)
+    return EvaluatedSet(result, read_evaluated_clips(context, pin, document, result.options.database))
+
+
+def objective_of(params: ObjectiveParams) -> Objective:
+    """The objective that was asked for."""
+    return Objective(**params.model_dump())
+
+
+def store_document(context: Context, tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Send a document as a file of JSON; what the job's result says of it."""
+    return store_file(context, encode_tree(tree, JSON))
+
+
+def store_file(context: Context, data: bytes) -> dict[str, Any]:
+    """Send a file; what the job's result says of it, by which it is kept."""
+    file = context.scratch / "document"
+    file.write_bytes(data)
+    return StoredFile(blob=context.put_file(file), size_bytes=len(data)).model_dump(mode="json")

@@ -1,0 +1,214 @@
+"""Clips of a project as a matching database, kept from task to task: tasks of one evaluation share it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from marey_motion import documents
+from marey_motion.errors import MotionError
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.building import build_database
+from marey_motion.matching.database import MatchingDatabase, SourceClip
+from marey_motion.matching.normaliser import Normaliser
+from marey_motion.matching.options import DatabaseOptions
+from marey_motion.matching.search import SearchIndex, build_index
+from marey_schemas.documents import Motion, RevisionRef
+from marey_schemas.encoding.canonical import canonical_json, document_digest
+from marey_schemas.evaluation import EvaluateParams
+from marey_schemas.jobs import PinnedInput
+from marey_schemas.kinds import Kind
+from marey_schemas.wording import counted
+from marey_worker.context import Context, JobRefused
+from marey_worker.job_io.skeleton_cache import Rig, read_rigged
+from marey_worker.kept import Kept
+
+LOOP_TAG = "loop"
+NAMES_SHOWN = 5
+MOST_KEPT = 1
+"""Databases; one of an hour of motion takes a few hundred megabytes."""
+
+
+@dataclass(frozen=True)
+class MatchingClips:
+    """Clips as motion matching searches them."""
+
+    database: MatchingDatabase
+
+    @cached_property
+    def index(self) -> SearchIndex:
+        """Of the database's normalised features; made when it is first needed."""
+        database = self.database
+        return build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
+
+
+_kept: Kept[bytes, MatchingClips] = Kept(MOST_KEPT)
+
+
+@dataclass(frozen=True)
+class ClipSet:
+    """Which clips, and what of them: all that decides a database beside its options and normaliser."""
+
+    clips: tuple[PinnedInput, ...]
+    rig: PinnedInput | None = None
+    loops: tuple[str, ...] = ()
+    trims: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+
+    def as_tree(self) -> dict[str, Any]:
+        """To be kept with an evaluation."""
+        return {
+            "clips": [pin.model_dump(mode="json") for pin in self.clips],
+            "rig": None if self.rig is None else self.rig.model_dump(mode="json"),
+            "loops": list(self.loops),
+            "trims": {item: list(frames) for item, frames in self.trims.items()},
+        }
+
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any]) -> ClipSet:
+        """What `as_tree` wrote."""
+        return cls(
+            clips=tuple(map(PinnedInput.model_validate, tree["clips"])),
+            rig=None if tree["rig"] is None else PinnedInput.model_validate(tree["rig"]),
+            loops=tuple(tree["loops"]),
+            trims={item: (start, stop) for item, (start, stop) in tree["trims"].items()},
+        )
+
+
+def wanted_clips(context: Context, params: EvaluateParams) -> ClipSet:
+    """The clips that the job shall evaluate."""
+    (rig,) = context.inputs.get("rig", ()) or (None,)
+    return ClipSet(context.inputs["clips"], rig, params.loops, params.trims)
+
+
+def read_clips(context: Context, params: EvaluateParams, options: DatabaseOptions) -> MatchingClips:
+    """The job's clips, ready to be matched.
+
+    Raises `JobRefused` for clips of several skeletons, for trims that do not fit, for a skeleton that lacks joints, and
+    where too little is left to match.
+    """
+    pins = {name: [(pin.item, pin.revision) for pin in many] for name, many in context.inputs.items()}
+    chosen = params.model_dump(mode="json", include={"database", "loops", "trims"})
+    wanted = wanted_clips(context, params)
+    with refusing_motion_errors():
+        return _kept.get(
+            canonical_json({"inputs": pins, "params": chosen}),
+            lambda: MatchingClips(build_set(context, wanted, options, _pinned_normaliser(context))),
+        )
+
+
+def read_evaluated_clips(
+    context: Context, evaluation: PinnedInput, document: Mapping[str, Any], options: DatabaseOptions
+) -> MatchingClips:
+    """The clips of an evaluation as they were, under its normaliser. Raises `JobRefused` for one that names none."""
+    if "clip_set" not in document:
+        raise JobRefused("clips-unknown", f"{evaluation.path} does not tell which clips it is of; evaluate them again")
+    wanted = ClipSet.from_tree(document["clip_set"])
+    normaliser = Normaliser.from_tree(document["normaliser"])
+    with refusing_motion_errors():
+        return _kept.get(
+            canonical_json({"evaluation": [evaluation.item, evaluation.revision]}),
+            lambda: MatchingClips(build_set(context, wanted, options, normaliser)),
+        )
+
+
+@contextmanager
+def refusing_motion_errors() -> Iterator[None]:
+    """What the mathematics refuses, no second try will change."""
+    try:
+        yield
+    except MotionError as error:
+        raise JobRefused(error.code, str(error)) from error
+
+
+def build_set(
+    context: Context, wanted: ClipSet, options: DatabaseOptions, normaliser: Normaliser | None
+) -> MatchingDatabase:
+    """The database of clips of one skeleton. Raises `JobRefused`, `MotionError`."""
+    motions = list(read_motions(context, wanted.clips))
+    rigged = read_rigged(context, _common_rig(context, wanted, motions))
+    body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
+    return build_clips(context, wanted, motions, body, options, normaliser)
+
+
+def build_clips(
+    context: Context,
+    wanted: ClipSet,
+    motions: Sequence[tuple[str, Motion]],
+    body: MatchingBody,
+    options: DatabaseOptions,
+    normaliser: Normaliser | None,
+) -> MatchingDatabase:
+    """The database of clips whose motions, one for each with its digest, are at hand."""
+    infos = context.documents(wanted.clips, "info", required=False)
+    clips = [
+        SourceClip(
+            uid=uid_of(pin),
+            name=pin.path,
+            clip=documents.clip_from_document(motion, body.skeleton),
+            content=content,
+            loop=pin.item in wanted.loops or LOOP_TAG in (info or {}).get("tags", ()),
+            frames=_trim(pin, motion, wanted.trims),
+            tags=tuple((info or {}).get("tags", ())),
+        )
+        for (pin, info), (content, motion) in zip(infos, motions, strict=True)
+    ]
+    context.progress(0, None, f"building a database of {counted(len(clips), 'clip')}")
+    return build_database(clips, body, options, normaliser=normaliser)
+
+
+def uid_of(pin: PinnedInput) -> str:
+    """What a database calls a clip."""
+    return f"{pin.item}@{pin.revision}"
+
+
+def read_motions(context: Context, pins: Sequence[PinnedInput]) -> Iterator[tuple[str, Motion]]:
+    """Each clip's motion and its digest."""
+    for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
+        context.progress(0, None, f"reading clip {done + 1} of {len(pins)}, {pin.name}")
+        yield document_digest(tree), Motion.model_validate(tree)
+
+
+def _common_rig(context: Context, wanted: ClipSet, motions: Sequence[tuple[str, Motion]]) -> Rig:
+    """The skeleton of all clips, at the newest revision in use. Raises `JobRefused` where there are several."""
+    used = [RevisionRef.model_validate(motion.skeleton.model_dump()) for _, motion in motions]
+    (most, count), *others = Counter(ref.item for ref in used).most_common()
+    if others:
+        odd = [pin.path for pin, ref in zip(wanted.clips, used, strict=True) if ref.item != most]
+        commonest = context.item(Kind.SKELETON, most)
+        place = commonest.path
+        raise JobRefused(
+            "several-skeletons",
+            f"the clips move {len(others) + 1} skeletons: {count} of {len(used)} move {place}, but not {_listed(odd)}; "
+            "move all to one of them first, with marey retarget",
+        )
+    skeleton = max(used, key=lambda ref: ref.revision)
+    edited = wanted.rig
+    if edited is not None and edited.item != most:
+        raise JobRefused("wrong-rig", f"the input rig is {edited.item}; the clips move {most}")
+    mapping = skeleton if edited is None else RevisionRef(item=edited.item, revision=edited.revision)
+    return Rig(skeleton, mapping)
+
+
+def _trim(pin: PinnedInput, motion: Motion, trims: Mapping[str, tuple[int, int]]) -> tuple[int, int] | None:
+    trim = trims.get(pin.item)
+    if trim is not None and trim[1] > len(motion.poses):
+        frames = len(motion.poses)
+        raise JobRefused("bad-trim", f"{pin.path}: the frames {trim[0]}:{trim[1]} are not there; it has {frames}")
+    return trim
+
+
+def _pinned_normaliser(context: Context) -> Normaliser | None:
+    """The normaliser of the evaluation that the job names, if it names one."""
+    for pin in context.inputs.get("normaliser", ()):
+        evaluation = context.document(Kind.EVALUATION, pin.item, pin.revision, "evaluation")
+        return Normaliser.from_tree(evaluation["normaliser"])
+    return None
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:NAMES_SHOWN])
+    return f"{shown} and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else shown
