@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.material import real_folder
 from marey_motion.clip import Clip
-from marey_motion.evaluation.result import EvaluationOptions
+from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.suite import assemble, run_suite
 from marey_motion.formats import read_motion
 from marey_motion.gait import generate_dataset

@@ -6,8 +6,9 @@ import numpy as np
 
 from marey_motion.evaluation.coverage import Windows, coverage_of
 from marey_motion.evaluation.metrics import measure_trial, pooled_metrics
+from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.relevance import count_switches, measure_usage
-from marey_motion.evaluation.result import EvaluationOptions, EvaluationResult, Grid, Provenance
+from marey_motion.evaluation.result import EvaluationResult, Provenance
 from marey_motion.evaluation.scenario import reference, suite_trials
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import Status, TrialRecord

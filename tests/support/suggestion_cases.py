@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from tests.support.made_databases import arc_track, made_database, mirrored_track, random_tracks
 
-from marey_motion.evaluation.result import EvaluationOptions, Grid
+from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.evaluation.suite import assemble, run_suite
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from math import radians
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.result import EvaluationOptions
+from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database

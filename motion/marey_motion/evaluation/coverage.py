@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.result import Coverage, EvaluationOptions, Grid
+from marey_motion.evaluation.options import EvaluationOptions, Grid
+from marey_motion.evaluation.result import Coverage
 from marey_motion.matching.database import MatchingDatabase
 
 Floats = NDArray[np.float64]

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.result import EvaluationOptions, Grid, Metrics, TrialResult
+from marey_motion.evaluation.options import EvaluationOptions, Grid
+from marey_motion.evaluation.result import Metrics, TrialResult
 from marey_motion.evaluation.scenario import TIME_TOLERANCE_S, Reference, Trial
 from marey_motion.matching.record import Status, TrialRecord
 

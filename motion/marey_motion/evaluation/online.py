@@ -25,7 +25,7 @@ from marey_motion.evaluation.coverage import (
     cell_edges,
 )
 from marey_motion.evaluation.live_windows import LiveWindows
-from marey_motion.evaluation.result import Grid
+from marey_motion.evaluation.options import Grid
 from marey_motion.evaluation.scenario import Reference, Trial, reference
 from marey_motion.kinematics import SHORTEST_LATERAL_M, forward_vectors
 from marey_motion.matching.body import MatchingBody

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.result import EvaluationOptions, Provenance
+from marey_motion.evaluation.options import EvaluationOptions
+from marey_motion.evaluation.result import Provenance
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 from marey_motion.version import code_version

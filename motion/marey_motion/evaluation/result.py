@@ -4,43 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.evaluation.scenario import Family, Trial
+from marey_motion.evaluation.options import EvaluationOptions
+from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import DatabaseClip
-from marey_motion.matching.options import ControllerOptions, DatabaseOptions
 from marey_motion.matching.record import TrialRecord
 
 Metrics = Mapping[str, float | None]
 """Value by name, in the unit the name ends with; None where it is not defined, as a response time that never came."""
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Speeds and turn rates of a suite; the defaults are those of the paper's section 4.2."""
-
-    speeds_m_s: tuple[float, ...] = tuple(np.arange(1.0, 3.01, 0.25).tolist())
-    turn_rates_deg_s: tuple[float, ...] = tuple(np.arange(-100.0, 100.1, 25.0).tolist())
-
-
-@dataclass(frozen=True)
-class EvaluationOptions:
-    """Everything that decides the result beside the clips."""
-
-    grid: Grid = field(default_factory=Grid)
-    families: tuple[Family, ...] = ("circle", "switching")
-    approach_s: float = 3.0
-    duration_s: float = 30.0
-    switch_speed_m_s: float = 4.0
-    switch_every_s: float = 5.0
-    window: Literal["circle", "all"] = "circle"
-    coverage_least_s: float = 1.0
-    literal_formulas: bool = False
-    database: DatabaseOptions = field(default_factory=DatabaseOptions)
-    controller: ControllerOptions = field(default_factory=ControllerOptions)
 
 
 @dataclass(frozen=True)

@@ -10,15 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.result import (
-    ClipUsage,
-    Coverage,
-    EvaluationOptions,
-    EvaluationResult,
-    Grid,
-    Provenance,
-    TrialResult,
-)
+from marey_motion.evaluation.options import EvaluationOptions, Grid
+from marey_motion.evaluation.result import ClipUsage, Coverage, EvaluationResult, Provenance, TrialResult
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.options import ControllerOptions, DatabaseOptions, FeatureWeights

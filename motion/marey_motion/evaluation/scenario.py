@@ -8,18 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.options import EvaluationOptions, Family
 from marey_motion.matching.options import TICK_RATE_HZ
 
-if TYPE_CHECKING:  # the result holds trials
-    from marey_motion.evaluation.result import EvaluationOptions
-
-Family = Literal["circle", "switching"]
 Floats = NDArray[np.float64]
 
 LOOK_AHEAD_S = 1.0

@@ -15,9 +15,10 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.baseline import baseline_database
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.metrics import measure_trial, offset_asymmetry, pooled_metrics
+from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.provenance import provenance_of
 from marey_motion.evaluation.relevance import count_switches, measure_usage, treading_share, unused_clips
-from marey_motion.evaluation.result import EvaluationOptions, EvaluationResult, TrialResult
+from marey_motion.evaluation.result import EvaluationResult, TrialResult
 from marey_motion.evaluation.scenario import (
     LOOK_AHEAD_S,
     Reference,

@@ -5,18 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import unquote_to_bytes
 
 from tornado.httputil import HTTPMessageDelegate, HTTPServerRequest
 from tornado.routing import Router
+from tornado.web import Application
 
 from marey_server.errors import NotFound
 from marey_server.http.declarations import Operation
 from marey_server.http.resource import Resource
-
-if TYPE_CHECKING:
-    from marey_server.app import Application
 
 _VARIABLE = re.compile(r"\{(\w+)(?::int)?\}")
 _NUMBER = re.compile(rb"\d{1,9}")

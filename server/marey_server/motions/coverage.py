@@ -78,7 +78,7 @@ def _mapping(tx: Transaction, project: str, skeleton: str, revision: int) -> Tre
 def begin(request: CoverageStreamCreate, given: Given) -> tuple[NewStream, Tree]:
     """A new stream, and the members of `CoverageStreamState` that are computed."""
     from marey_motion.evaluation.online import OnlineCoverage
-    from marey_motion.evaluation.result import Grid
+    from marey_motion.evaluation.options import Grid
 
     grid = Grid()
     grid = Grid(request.speeds_m_s or grid.speeds_m_s, request.turn_rates_deg_s or grid.turn_rates_deg_s)

@@ -12,7 +12,7 @@ from marey_motion.evaluation.coverage import (
     measure_coverage,
     sliding_windows,
 )
-from marey_motion.evaluation.result import EvaluationOptions, Grid
+from marey_motion.evaluation.options import EvaluationOptions, Grid
 
 OPTIONS = EvaluationOptions()
 

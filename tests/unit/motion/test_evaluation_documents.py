@@ -5,7 +5,7 @@ import pytest
 from tests.support.evaluation_cases import arc, clips_of, record_of, root_database
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.result import EvaluationOptions, Grid
+from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.result_documents import (
     records_from_tree,
     records_to_tree,

@@ -16,7 +16,7 @@ from tests.support.evaluation_results import SMALL, evaluated, made_up, some_cov
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import Windows, coverage_of
-from marey_motion.evaluation.result import EvaluationOptions, Grid
+from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.scenario import demand, suite_trials
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import Status

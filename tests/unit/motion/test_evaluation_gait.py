@@ -9,7 +9,7 @@ import pytest
 
 from marey_motion.evaluation import suite as suites
 from marey_motion.evaluation.coverage import coverage_holes, measure_coverage
-from marey_motion.evaluation.result import EvaluationOptions, Grid
+from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.scenario import reference, suite_trials
 from marey_motion.evaluation.suite import assemble, evaluate, evaluate_baseline, run_suite
 from marey_motion.gait import GaitStyle, generate_gait

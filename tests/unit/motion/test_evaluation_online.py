@@ -10,7 +10,7 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import Windows, cell_counts, cell_edges, sliding_windows
 from marey_motion.evaluation.live_windows import LiveWindows, smoother
 from marey_motion.evaluation.online import FARTHEST_M, OnlineCoverage
-from marey_motion.evaluation.result import Grid
+from marey_motion.evaluation.options import Grid
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.simulation_root import simulation_root

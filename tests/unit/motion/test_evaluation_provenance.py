@@ -5,8 +5,8 @@ import pytest
 from tests.support.evaluation_cases import arc, root_database
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.provenance import provenance_of, require_comparable
-from marey_motion.evaluation.result import EvaluationOptions, Grid
 from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.matching.options import ControllerOptions, DatabaseOptions, FeatureWeights
 

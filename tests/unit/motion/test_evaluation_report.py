@@ -11,7 +11,8 @@ from tests.support.report_pages import HOSTILE, is_sound
 
 from marey_motion.evaluation.compare import compare_results
 from marey_motion.evaluation.judgement import is_followed, judge, mean_speed_m_s
-from marey_motion.evaluation.result import EvaluationOptions, Grid, TrialResult
+from marey_motion.evaluation.options import EvaluationOptions, Grid
+from marey_motion.evaluation.result import TrialResult
 from marey_motion.evaluation.scenario import Trial, demand
 from marey_motion.evaluation.suite import evaluate
 from marey_motion.gait import generate_gait

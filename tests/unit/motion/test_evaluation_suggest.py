@@ -24,7 +24,7 @@ from marey_motion.evaluation.improvement.redundancy import Removal
 from marey_motion.evaluation.improvement.selection import joined, without_rows, without_sources
 from marey_motion.evaluation.improvement.suggest import SuggestionOptions, suggest
 from marey_motion.evaluation.improvement.suggestion_documents import comparison_to_tree, suggestions_to_tree
-from marey_motion.evaluation.result import EvaluationOptions
+from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.similarity import accepted_distance
 from marey_motion.evaluation.suite import EvaluationCancelled
 from marey_motion.formats import read_motion

@@ -7,7 +7,7 @@ import pytest
 from tests.support.evaluation_cases import arc, trajectory_database
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.result import EvaluationOptions, Grid
+from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.result_documents import records_to_tree
 from marey_motion.evaluation.scenario import reference, suite_trials
 from marey_motion.evaluation.suite import EvaluationCancelled, assemble, run_suite

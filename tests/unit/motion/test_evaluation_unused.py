@@ -18,7 +18,7 @@ from tests.support.suggestion_cases import (
 from marey_motion.evaluation.improvement.resimulation import needed_rows
 from marey_motion.evaluation.improvement.selection import without_rows, without_sources
 from marey_motion.evaluation.improvement.unused import find_unused
-from marey_motion.evaluation.result import Grid
+from marey_motion.evaluation.options import Grid
 from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.evaluation.suite import run_suite
 from marey_motion.matching.options import DatabaseOptions

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.result import EvaluationOptions, Grid
+from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials
 
 RATE_HZ = 60.0

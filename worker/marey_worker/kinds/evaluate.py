@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from marey_motion.evaluation.result import EvaluationOptions
+from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.result_documents import records_from_tree, records_to_tree, result_to_tree
 from marey_motion.evaluation.scenario import Trial, suite_trials
 from marey_motion.evaluation.suite import assemble, evaluate_baseline, run_suite

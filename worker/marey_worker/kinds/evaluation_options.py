@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from marey_motion.evaluation.result import EvaluationOptions, Grid
+from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.matching.options import ControllerOptions, DatabaseOptions, FeatureWeights
 from marey_schemas.evaluation import EvaluateParams
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.improvement.selection import clips_by_source, same_skeleton
-from marey_motion.evaluation.result import Coverage, EvaluationOptions
+from marey_motion.evaluation.options import EvaluationOptions
+from marey_motion.evaluation.result import Coverage
 from marey_motion.evaluation.similarity import every_kth, nearest_poses, window_cells, window_rows
 from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase

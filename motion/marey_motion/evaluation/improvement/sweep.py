@@ -10,7 +10,8 @@ import numpy as np
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.objective import Objective, headline_means
 from marey_motion.evaluation.metrics import measure_trial, pooled_metrics
-from marey_motion.evaluation.result import EvaluationOptions, Metrics
+from marey_motion.evaluation.options import EvaluationOptions
+from marey_motion.evaluation.result import Metrics
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials
 from marey_motion.evaluation.suite import CancelCallback, run_suite
 from marey_motion.matching.database import MatchingDatabase

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from marey_motion.evaluation.improvement.resimulation import needed_rows
 from marey_motion.evaluation.improvement.selection import clips_by_source
-from marey_motion.evaluation.result import EvaluationOptions
+from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import TrialRecord

@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.options import Family
 from marey_motion.evaluation.result import EvaluationResult
-from marey_motion.evaluation.scenario import Family
 from marey_reports.drawing.drawn import DrawnFigure, Sketch, finish
 from marey_reports.evaluation.figures.clip_graph import draw_clip_graph
 from marey_reports.evaluation.figures.clip_usage import draw_usage

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.evaluation.scenario import Family, Reference, Trial, reference
+from marey_motion.evaluation.options import Family
+from marey_motion.evaluation.scenario import Reference, Trial, reference
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import COLOURS, INK, PAPER, REFERENCE, SMALL, Place, add_keys, add_panel, new_figure
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject, choose_trial, find_record
