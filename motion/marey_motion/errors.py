@@ -18,7 +18,7 @@ class MotionError(ValueError):
     where : the place in the input (joint, field, frame), or None when it concerns the whole
     """
 
-    default_code: ClassVar[str] = "motion_invalid"
+    default_code: ClassVar[str] = "motion-invalid"
 
     def __init__(self, message: str, *, code: str | None = None, where: str | None = None) -> None:
         super().__init__(message)

@@ -134,13 +134,17 @@ def plan_retarget(
     )
 
 
-def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
+def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None) -> Clip:
     """The clip's motion on the plan's target skeleton.
 
     Mapped joints take the source's orientation, all others rest (or keep theirs between copies of one rig). Bones keep
     the target's lengths, but point where `translations` of the source point its own; on its own skeleton a clip keeps
     them. The pelvis travels as in the source, times the plan's scale; a root of its own, above the pelvis, moves along
     without turning.
+
+    Parameters
+    ----------
+    bones : result of `moved_bones`, from a caller who has computed it already
 
     Raises
     ------
@@ -158,7 +162,7 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
         ways[joint], sources[joint] = kernels.CARRIED, joint
     poses = np.empty((clip.frame_count, 3 + 4 * target.joint_count), dtype=np.float32)
     kernels.rotations(
-        moved_bones(clip, plan).rotations,
+        (bones or moved_bones(clip, plan)).rotations,
         plan.source.parents,
         ways,
         sources,
@@ -178,7 +182,7 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
 
 
 def moved_bones(clip: Clip, plan: RetargetPlan) -> FollowedBones:
-    """The source's rotations as its bones point, with what to tell of bones that translations turned."""
+    """Compute the source's rotations as its bones point, and which bones its translations turned."""
     if plan.changes_no_pose:
         return FollowedBones(clip.poses[:, 3:], {})
     return follow_moved_bones(clip, {pair.standard: clip.skeleton.index_of(pair.source) for pair in plan.pairs})

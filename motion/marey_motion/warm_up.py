@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from importlib.metadata import version
@@ -19,6 +20,8 @@ from numpy.typing import NDArray
 from marey_motion.clip import Clip
 
 PACKAGE = Path(__file__).parent
+# Either numba itself or the options that all kernels share.
+_IMPORTS_COMPILER = re.compile(r"^(?:import numba|from (?:numba|marey_motion\.kernels) import)\b", re.MULTILINE)
 STAMP = Path(os.environ.get("NUMBA_CACHE_DIR") or PACKAGE / "__pycache__") / "kernels-compiled"
 
 _ASF = b""":version 1.10
@@ -48,6 +51,11 @@ _ASF = b""":version 1.10
 _AMC = b":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 16 0 0 0 0\nfemur 10\n2\nroot 0 16 0 0 0 0\nfemur 11.5\n"
 
 
+def kernel_sources() -> list[Path]:
+    """List the modules of the package that contain compiled functions: those that import the compiler."""
+    return [source for source in PACKAGE.rglob("*.py") if _IMPORTS_COMPILER.search(source.read_text("utf-8"))]
+
+
 def discard_outdated_kernels() -> None:
     """Remove compiled code that is older than any source of kernels.
 
@@ -60,8 +68,8 @@ def discard_outdated_kernels() -> None:
 
 
 def _changed() -> float:
-    """When a source of kernels was changed last."""
-    return max(source.stat().st_mtime for form in ("*_kernels.py", "*_lanes.py") for source in PACKAGE.rglob(form))
+    """Time of the last change to a source of kernels, in seconds since the epoch."""
+    return max(source.stat().st_mtime for source in kernel_sources())
 
 
 def _is_done() -> bool:

@@ -255,8 +255,8 @@ def short(frames):
         ),
         (short(8), TO_FIRST, "alignment-impossible", "short: .*60 frames cannot be aligned with 8"),
         (short(20), AlignOptions(reference="nobody"), "unknown-reference", "nobody: the reference is none"),
-        (short(20), AlignOptions(rate_hz=float("nan")), "motion_invalid", "rate_hz: the rate is nan"),
-        (SourceExample("clip_a@1", "twin", walk()), None, "motion_invalid", "clip_a@1: two examples have this uid"),
+        (short(20), AlignOptions(rate_hz=float("nan")), "motion-invalid", "rate_hz: the rate is nan"),
+        (SourceExample("clip_a@1", "twin", walk()), None, "motion-invalid", "clip_a@1: two examples have this uid"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_by_name(odd, options, code, said):

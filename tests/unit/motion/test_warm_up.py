@@ -15,6 +15,41 @@ read_motion(write_motion(generate_gait(1.0, 0.0, 0.5), "bvh"), "walk.bvh")
 """
 
 
+NAME_MODULES_OF_KERNELS = """
+import importlib, pkgutil
+import marey_motion
+from numba.core.dispatcher import Dispatcher
+
+for found in pkgutil.walk_packages(marey_motion.__path__, "marey_motion."):
+    for kernel in vars(importlib.import_module(found.name)).values():
+        if isinstance(kernel, Dispatcher):
+            print(kernel.py_func.__code__.co_filename)
+"""
+
+
+def test_every_module_with_a_compiled_function_is_a_source_of_kernels() -> None:
+    found = subprocess.run([sys.executable, "-c", NAME_MODULES_OF_KERNELS], capture_output=True, text=True, check=True)
+    sources = {Path(name) for name in found.stdout.split()}
+    assert {"euler.py", "numeric_text.py", "bvh_writer.py", "amc_frames.py"} <= {source.name for source in sources}
+    assert sources <= set(warm_up.kernel_sources())
+
+
+def test_compiled_code_is_discarded_after_any_source_of_kernels_has_changed(tmp_path: Path, monkeypatch) -> None:
+    source = tmp_path / "euler.py"
+    source.write_text("from numba import njit\n")
+    compiled = tmp_path / "__pycache__" / "euler.nbi"
+    compiled.parent.mkdir()
+    compiled.write_bytes(b"")
+    monkeypatch.setattr(warm_up, "PACKAGE", tmp_path)
+    os.utime(source, (1_000, 1_000))
+    warm_up.discard_outdated_kernels()
+    assert compiled.exists()
+    os.utime(source)
+    os.utime(compiled, (1_000, 1_000))
+    warm_up.discard_outdated_kernels()
+    assert not compiled.exists()
+
+
 def test_a_first_file_finds_the_kernels_compiled(tmp_path: Path) -> None:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     subprocess.run([sys.executable, "-m", "marey_motion.warm_up", "files"], env=environment, check=True)

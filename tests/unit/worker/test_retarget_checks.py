@@ -5,13 +5,27 @@ from dataclasses import replace
 import numpy as np
 from tests.support.project_in_memory import ProjectInMemory, add_clip
 
+from marey_motion import retargeting
 from marey_motion.documents import skeleton_to_document
 from marey_motion.gait import game_skeleton, generate_gait
+from marey_motion.moved_bones import follow_moved_bones
 from marey_schemas.jobs import PinnedInput, RetargetParams
 from marey_schemas.kinds import Kind
 from marey_worker.job_io import skeleton_cache
 from marey_worker.job_io.skeleton_cache import Kept
 from marey_worker.kinds import retarget
+
+
+def counted_follows(monkeypatch):
+    """Count the calls of the function that computes where bones point."""
+    calls = []
+
+    def follow(clip, joints):
+        calls.append(clip)
+        return follow_moved_bones(clip, joints)
+
+    monkeypatch.setattr(retargeting, "follow_moved_bones", follow)
+    return calls
 
 
 def test_the_checks_of_a_result_name_the_bones_that_translations_moved(tmp_path, monkeypatch):
@@ -28,6 +42,7 @@ def test_the_checks_of_a_result_name_the_bones_that_translations_moved(tmp_path,
     skeleton = {"item": "skeleton_b", "revision": 1, "kind": Kind.SKELETON, "name": "b", "collection": "rigs"}
     project.inputs["skeleton"] = (PinnedInput(**skeleton),)
 
+    follows = counted_follows(monkeypatch)
     project.into = "out"
     result = retarget.run(project, RetargetParams())
     assert (result["clips"], result["refused"]) == (2, [])
@@ -36,4 +51,5 @@ def test_the_checks_of_a_result_name_the_bones_that_translations_moved(tmp_path,
     (check,) = checks["moved"]
     assert check["code"] == "bones-moved-by-translations"
     assert check["joints"] == ["LeftUpLeg"]
+    assert len(follows) == 2, "the bones of a clip are followed once, for its check and its poses"
     assert 10.0 < check["values"]["largest_turn_deg"] < 20.0

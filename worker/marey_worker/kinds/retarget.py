@@ -71,9 +71,9 @@ class _Retargeting:
         source = Rig(used, edited.ref if edited else used)
         plan = plan_between(self._context, source, self._target, self._params.scale)
         taken = documents.clip_from_document(motion, plan.source)
-        warning = moved_bones(taken, plan).warning
-        checks = () if warning is None else (Check.model_validate(warning.as_dict()),)
-        clip = retarget(taken, plan)
+        bones = moved_bones(taken, plan)
+        checks = () if bones.warning is None else (Check.model_validate(bones.warning.as_dict()),)
+        clip = retarget(taken, plan, bones)
         self._frames += clip.frame_count
         return StagedOutput(
             name=f"{pin.collection}/{pin.name}",
