@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from marey_motion.clip import Clip
 
 PACKAGE = Path(__file__).parent
-# Either numba itself or the options that all kernels share.
-_IMPORTS_COMPILER = re.compile(r"^(?:import numba|from (?:numba|marey_motion\.kernels) import)\b", re.MULTILINE)
+# Either numba itself or the options of a decorator that kernels share, at the outer level of the module.
+_IMPORTS_COMPILER = re.compile(r"^(?:import numba|from (?:numba|[\w.]*kernels) import)\b", re.MULTILINE)
 STAMP = Path(os.environ.get("NUMBA_CACHE_DIR") or PACKAGE / "__pycache__") / "kernels-compiled"
 
 _ASF = b""":version 1.10
