@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections import OrderedDict
 from collections.abc import Callable
 
+from marey_schemas.lru import LruCache
 from marey_server.errors import TooManyRequests
 
 REMEMBERED = 10_000
@@ -21,17 +21,15 @@ class TryLimit:
     def __init__(self, per_minute: int, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._per_minute = per_minute
         self._clock = clock
-        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._buckets: LruCache[str, tuple[float, float]] = LruCache(max_entries=REMEMBERED)
 
     def take(self, key: str) -> None:
         """Count one try. Raises `TooManyRequests`, saying when the next is allowed."""
         now = self._clock()
-        left, since = self._buckets.pop(key, (float(self._per_minute), now))
+        left, since = self._buckets.get(key) or (float(self._per_minute), now)
         left = min(float(self._per_minute), left + (now - since) * self._per_minute / 60)
         if left < 1:
-            self._buckets[key] = (left, now)
+            self._buckets.put(key, (left, now))
             wait_s = math.ceil((1 - left) * 60 / self._per_minute)
             raise TooManyRequests(f"Too many tries; wait {wait_s} s.", headers={"Retry-After": str(wait_s)})
-        self._buckets[key] = (left - 1, now)
-        if len(self._buckets) > REMEMBERED:
-            self._buckets.popitem(last=False)
+        self._buckets.put(key, (left - 1, now))

@@ -44,7 +44,8 @@ class ModelUser(Resource):
         known = self.services.models.get(found.part.digest)
         if known is None:
             loaded = await self.look_up(models.load_model, project, found)
-            known = await self.compute(self.services.models.parse, found.part.digest, loaded)
+            known = await self.compute(models.parse_model, loaded)
+            self.services.models.put(found.part.digest, known)
         return found, known
 
 

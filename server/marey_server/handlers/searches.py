@@ -15,7 +15,7 @@ from marey_server.http.resource import Resource
 from marey_server.http.streaming import attachment
 from marey_server.motions import search_answers, searching
 from marey_server.motions.models import SampleFormat
-from marey_server.motions.searching import FoundSearchable, Key, Searchable
+from marey_server.motions.searching import FoundSearchable, Searchable, SearchableKey
 
 
 class FoundFileQuery(Request):
@@ -33,7 +33,7 @@ class Searcher(Resource):
     ) -> tuple[list[FoundSearchable], list[Searchable]]:
         """The model of each step with its tree, parsed; those used last are kept."""
         found = await self.look_up(searching.find_searchables, project, kind_of(kind), item, request)
-        parsed: dict[Key, Searchable] = {}
+        parsed: dict[SearchableKey, Searchable] = {}
         for one in found:
             key = one.key(request.seed)
             if key not in parsed:
@@ -46,7 +46,8 @@ class Searcher(Resource):
         known = self.services.searchables.get(key)
         if known is None:
             loaded = await self.look_up(searching.load_searchable, project, found)
-            known = await self.compute_long(self.services.searchables.parse, key, loaded, seed)
+            known = await self.compute_long(searching.parse_searchable, loaded, seed)
+            self.services.searchables.put(key, known)
         return known
 
 

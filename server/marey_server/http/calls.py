@@ -13,9 +13,8 @@ from marey_schemas.access import Role
 from marey_server.access import scopes
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.errors import Forbidden, Unauthenticated
-from marey_server.http.answer_cache import AnswerCache
 from marey_server.http.declarations import Access, Operation
-from marey_server.http.reply import Form, Rendered, Reply, render
+from marey_server.http.reply import AnswerCache, Form, Rendered, Reply, render
 from marey_server.store import idempotency, projects, tokens
 from marey_server.store.transaction import Transaction
 

@@ -11,11 +11,18 @@ from pydantic import BaseModel
 
 from marey_schemas.encoding.codecs import JSON as JSON_NAME
 from marey_schemas.encoding.codecs import encode_tree
-from marey_server.http.answer_cache import AnswerCache
+from marey_schemas.lru import LruCache
 from marey_server.http.etags import entity_tag, matches
 from marey_server.http.negotiation import MediaType
 
 API = "/api/v1"
+
+AnswerCache = LruCache[tuple[str, str], bytes]
+"""Bodies of documents that never change, by digest and media type.
+
+Reading the same document again only copies bytes to the socket. Permission is not cached: every request asks the store
+before it takes a body from here.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +82,7 @@ def render(reply: Reply, form: Form, answers: AnswerCache) -> Rendered:
     if reply.content is None:
         return Rendered(reply.status or form.status, headers, b"")
     if isinstance(reply.content, Lasting):
-        body = answers.get((reply.content.digest, form.media.form), partial(_load, reply.content, form.media))
+        body = answers.get_or_make((reply.content.digest, form.media.form), partial(_load, reply.content, form.media))
     else:
         body = encode(reply.content, form.media)
     headers["Content-Type"] = reply.media_type or str(form.media)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import threading
 import zipfile
-from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -22,7 +20,6 @@ if TYPE_CHECKING:
 
 
 MIB = 1 << 20
-MOST_KEPT_BYTES = 64 * MIB
 LARGEST_ANSWER_BYTES = 32 * MIB
 """Of the poses of all samples of one request."""
 
@@ -89,35 +86,9 @@ def parse_model(loaded: LoadedModel) -> UsableModel:
     return UsableModel(primitive, RevisionRef.model_validate(loaded.model["skeleton"]))
 
 
-class ModelCache:
-    """The models used last, as many as fit into `max_bytes`. Any thread may use it."""
-
-    def __init__(self, max_bytes: int = MOST_KEPT_BYTES) -> None:
-        self._max_bytes = max_bytes
-        self._models: OrderedDict[str, tuple[UsableModel, int]] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, digest: str) -> UsableModel | None:
-        """The model of a document, if it is kept."""
-        with self._lock:
-            if digest not in self._models:
-                return None
-            self._models.move_to_end(digest)
-            return self._models[digest][0]
-
-    def parse(self, digest: str, loaded: LoadedModel) -> UsableModel:
-        """The model of a document, kept from now on. Raises `Invalid`."""
-        model = parse_model(loaded)
-        size = size_bytes(model.primitive)
-        with self._lock:
-            self._models[digest] = (model, size)
-            while len(self._models) > 1 and sum(held for _, held in self._models.values()) > self._max_bytes:
-                self._models.popitem(last=False)
-        return model
-
-
-def size_bytes(primitive: MotionPrimitive) -> int:
-    """Of its arrays, and of what follows from its mixture."""
+def size_bytes(model: UsableModel) -> int:
+    """Bytes of a model's arrays, and of those that are computed from its mixture."""
+    primitive = model.primitive
     parts = (primitive.spatial, primitive.temporal)
     arrays = [array for part in parts for array in (part.mean, part.directions, part.projections)]
     return 3 * primitive.mixture.covariances.nbytes + sum(array.nbytes for array in arrays)

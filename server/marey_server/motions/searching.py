@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -22,12 +20,10 @@ if TYPE_CHECKING:
     from marey_motion.modelling.search.tree import SampleTree
     from marey_motion.rigs import JointMapping
 
-MOST_KEPT_BYTES = 64 << 20
-
 MOST_DRAWING_WORK = 2e9
 """For trees of a request that are drawn because models have none: about nanoseconds of one thread."""
 
-Key = tuple[str, str, str]
+SearchableKey = tuple[str, str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +37,7 @@ class FoundSearchable:
     tree: FoundPart | None
     mapping: FoundPart | None
 
-    def key(self, seed: int) -> Key:
+    def key(self, seed: int) -> SearchableKey:
         """What names it, with a tree drawn with `seed` where it has none of its own."""
         tree = f"seed {seed}" if self.tree is None else self.tree.digest
         return self.model.part.digest, tree, "" if self.mapping is None else self.mapping.digest
@@ -139,32 +135,6 @@ def require_drawable(work: float) -> None:
         )
 
 
-class SearchableCache:
-    """The searchable models used last, as many as fit into `max_bytes`. Any thread may use it."""
-
-    def __init__(self, max_bytes: int = MOST_KEPT_BYTES) -> None:
-        self._max_bytes = max_bytes
-        self._kept: OrderedDict[Key, tuple[Searchable, int]] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, key: Key) -> Searchable | None:
-        """One that is kept."""
-        with self._lock:
-            if key not in self._kept:
-                return None
-            self._kept.move_to_end(key)
-            return self._kept[key][0]
-
-    def parse(self, key: Key, loaded: LoadedSearchable, seed: int) -> Searchable:
-        """One that is kept from now on. Raises `Invalid`."""
-        made = parse_searchable(loaded, seed)
-        with self._lock:
-            self._kept[key] = (made, _size_bytes(made))
-            while len(self._kept) > 1 and sum(size for _, size in self._kept.values()) > self._max_bytes:
-                self._kept.popitem(last=False)
-        return made
-
-
 def _find(tx: Transaction, project: str, item_id: str) -> FoundSearchable:
     model = models.find_model(tx, project, Kind.MODEL, item_id, None)
     ref = items.load_part(tx, model.part, arrays="none")["skeleton"]
@@ -179,5 +149,6 @@ def _find(tx: Transaction, project: str, item_id: str) -> FoundSearchable:
     return FoundSearchable(model, tree, mapping)
 
 
-def _size_bytes(made: Searchable) -> int:
-    return models.size_bytes(made.usable.primitive) + made.tree.samples.nbytes + made.tree.means.nbytes
+def size_bytes(made: Searchable) -> int:
+    """Bytes of a model's arrays and of its tree's."""
+    return models.size_bytes(made.usable) + made.tree.samples.nbytes + made.tree.means.nbytes

@@ -8,11 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from marey_schemas.lru import LruCache
 from marey_server.access.limits import TryLimit
 from marey_server.access.principal import SYSTEM, Principal
-from marey_server.http.answer_cache import AnswerCache
-from marey_server.motions.models import ModelCache
-from marey_server.motions.searching import SearchableCache
+from marey_server.motions.models import UsableModel
+from marey_server.motions.models import size_bytes as model_bytes
+from marey_server.motions.searching import Searchable, SearchableKey
+from marey_server.motions.searching import size_bytes as searchable_bytes
 from marey_server.process.computing import ComputeThreads
 from marey_server.process.observe import Metrics
 from marey_server.process.settings import Settings
@@ -23,6 +25,15 @@ from marey_server.store.jobs.reaper import StartGrace
 
 SIGN_INS_AT_ONCE = 2
 """A password takes 32 MiB and 0.1 s to check."""
+
+LARGEST_ANSWER_SHARE = 8
+"""A body larger than this part of the cache of answers is not kept: it would displace all others."""
+ANSWER_ENTRY_BYTES = 512
+"""Memory of an entry of the cache of answers besides its body."""
+
+MODEL_CACHE_BYTES = 64 << 20
+"""Of parsed models; models with their search trees may take as much again."""
+TOKENS_REMEMBERED = 10_000
 
 
 @dataclass(frozen=True)
@@ -42,9 +53,15 @@ class Services:
         self.database = database
         self.description = description
         self.metrics = Metrics()
-        self.answers = AnswerCache(settings.answer_cache_bytes)
-        self.models = ModelCache()
-        self.searchables = SearchableCache()
+        self.answers: LruCache[tuple[str, str], bytes] = LruCache(
+            max_bytes=settings.answer_cache_bytes,
+            largest_bytes=settings.answer_cache_bytes // LARGEST_ANSWER_SHARE,
+            size_of=lambda body: len(body) + ANSWER_ENTRY_BYTES,
+        )
+        self.models: LruCache[str, UsableModel] = LruCache(max_bytes=MODEL_CACHE_BYTES, size_of=model_bytes)
+        self.searchables: LruCache[SearchableKey, Searchable] = LruCache(
+            max_bytes=MODEL_CACHE_BYTES, size_of=searchable_bytes
+        )
         self.draining = asyncio.Event()
         self.in_flight: set[Any] = set()
         self.metrics.in_flight.set_function(lambda: len(self.in_flight))
@@ -52,7 +69,7 @@ class Services:
         self.compute_threads = ComputeThreads()
         self._tries_by_name = TryLimit(settings.login_tries_per_minute)
         self._tries_by_address = TryLimit(10 * settings.login_tries_per_minute)
-        self._tokens_noted: dict[str, float] = {}
+        self._tokens_noted: LruCache[str, float] = LruCache(max_entries=TOKENS_REMEMBERED)
         self.queue_policy = QueuePolicy(settings.lease_ttl_s, settings.heartbeat_s, settings.cancel_grace_s)
         self.start_grace = StartGrace(self.queue_policy)
 
@@ -64,12 +81,12 @@ class Services:
     def note_use(self, principal: Principal) -> None:
         """Remember that a token was used, at most once in `NOTE_USE_EVERY_S` for each."""
         token_id, now = principal.token_id, time.monotonic()
-        if (
-            token_id is None
-            or now - self._tokens_noted.get(token_id, -tokens.NOTE_USE_EVERY_S) < tokens.NOTE_USE_EVERY_S
-        ):
+        if token_id is None:
             return
-        self._tokens_noted[token_id] = now
+        noted = self._tokens_noted.get(token_id)
+        if noted is not None and now - noted < tokens.NOTE_USE_EVERY_S:
+            return
+        self._tokens_noted.put(token_id, now)
         self.database.submit_write(SYSTEM, tokens.note_use, token_id)
 
     def close(self) -> None:

@@ -14,8 +14,9 @@ from marey_motion.documents import skeleton_to_document
 from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.primitive_documents import primitive_to_tree
 from marey_motion.modelling.training import train_primitive
+from marey_schemas.lru import LruCache
 from marey_server.errors import Invalid
-from marey_server.motions.models import FoundModel, LoadedModel, ModelCache, parse_model, sample_document, sample_file
+from marey_server.motions.models import FoundModel, LoadedModel, parse_model, sample_document, sample_file, size_bytes
 from marey_server.store.items.reading import FoundPart
 
 FOUND = FoundModel("model_1", "sway", FoundPart("sha256:" + "0" * 64, 3, 7))
@@ -30,11 +31,12 @@ def loaded():
 
 
 def test_the_models_used_last_are_kept_within_bounds(loaded):
-    size = 3 * ModelCache().parse("probe", loaded).primitive.spatial.mean.nbytes
-    roomy, tight = ModelCache(), ModelCache(max_bytes=size)
+    model = parse_model(loaded)
+    assert size_bytes(model) > model.primitive.spatial.mean.nbytes
+    roomy, tight = (LruCache(max_bytes=places * size_bytes(model), size_of=size_bytes) for places in (3, 1))
     for cache in (roomy, tight):
         for name in "abc":
-            cache.parse(name, loaded)
+            cache.put(name, parse_model(loaded))
     assert all(roomy.get(name) is not None for name in "abc")
     assert [tight.get(name) is not None for name in "abc"] == [False, False, True]
     assert roomy.get("a") is roomy.get("a")

@@ -11,9 +11,9 @@ from marey_schemas.annotations import AnnotateParams, CutParams
 from marey_schemas.documents import Annotation
 from marey_schemas.jobs import PinnedInput
 from marey_schemas.kinds import Kind
+from marey_schemas.lru import LruCache
 from marey_worker.context import JobRefused
 from marey_worker.job_io import skeleton_cache
-from marey_worker.job_io.skeleton_cache import Kept
 from marey_worker.kinds import annotate, cut
 
 STEPS = AnnotateParams.model_validate({"proposal": {"method": "steps"}})
@@ -22,7 +22,7 @@ STEPS = AnnotateParams.model_validate({"proposal": {"method": "steps"}})
 @pytest.fixture
 def project(tmp_path, monkeypatch):
     """A walk ahead and one backward; nothing is kept of earlier tests."""
-    monkeypatch.setattr(skeleton_cache, "_skeletons", Kept(4))
+    monkeypatch.setattr(skeleton_cache, "_skeletons", LruCache(max_entries=4))
     made = ProjectInMemory(tmp_path)
     made.log = lambda text: None
     add_clip(made, "walk", generate_gait(1.4, 0.0, 5.0))

@@ -16,7 +16,7 @@ from marey_worker.kinds import evaluate
 @pytest.fixture
 def project(tmp_path, monkeypatch):
     """Three walks; nothing is kept of earlier tests."""
-    monkeypatch.setattr(matching_clips, "_kept", matching_clips.Kept(1))
+    monkeypatch.setattr(matching_clips, "_cache", matching_clips.LruCache(max_entries=1))
     made = ProjectInMemory(tmp_path)
     for turn_rate in (-50, 0, 50):
         add_clip(made, f"walk {turn_rate}", generate_gait(1.25, radians(turn_rate), 5.0))

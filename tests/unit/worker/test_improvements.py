@@ -27,7 +27,7 @@ class LoggedProject(ProjectInMemory):
 @pytest.fixture
 def project(tmp_path, monkeypatch):
     """Three walks and one that no trial asks for; nothing is kept of earlier tests."""
-    monkeypatch.setattr(matching_clips, "_kept", matching_clips.Kept(1))
+    monkeypatch.setattr(matching_clips, "_cache", matching_clips.LruCache(max_entries=1))
     made = LoggedProject(tmp_path)
     for speed, turn_rate in ((1.25, -50), (1.25, 0), (1.25, 50), (4.0, 0)):
         add_clip(made, f"walk {speed} {turn_rate}", generate_gait(speed, radians(turn_rate), 5.0))

@@ -12,9 +12,9 @@ from marey_schemas.documents import Annotation
 from marey_schemas.editing.edits import EditParams
 from marey_schemas.jobs import ExportParams, PinnedInput, RetargetParams, StagedOutput
 from marey_schemas.kinds import Kind
+from marey_schemas.lru import LruCache
 from marey_worker.context import JobRefused
 from marey_worker.job_io import skeleton_cache
-from marey_worker.job_io.skeleton_cache import Kept
 from marey_worker.job_io.staged_results import StagedResults
 from marey_worker.kinds import align, annotate, cut, edit, export, retarget
 
@@ -25,8 +25,8 @@ STEPS = AnnotateParams.model_validate({"proposal": {"method": "steps"}})
 @pytest.fixture
 def project(tmp_path, monkeypatch):
     """Two walks of one skeleton; nothing is kept of earlier tests."""
-    monkeypatch.setattr(skeleton_cache, "_skeletons", Kept(4))
-    monkeypatch.setattr(skeleton_cache, "_plans", Kept(4))
+    monkeypatch.setattr(skeleton_cache, "_skeletons", LruCache(max_entries=4))
+    monkeypatch.setattr(skeleton_cache, "_plans", LruCache(max_entries=4))
     made = ProjectInMemory(tmp_path)
     made.log = lambda text: None
     for name, turn in (("left", 20), ("right", -20)):

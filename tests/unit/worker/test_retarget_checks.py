@@ -11,8 +11,8 @@ from marey_motion.gait import game_skeleton, generate_gait
 from marey_motion.moved_bones import follow_moved_bones
 from marey_schemas.jobs import PinnedInput, RetargetParams
 from marey_schemas.kinds import Kind
+from marey_schemas.lru import LruCache
 from marey_worker.job_io import skeleton_cache
-from marey_worker.job_io.skeleton_cache import Kept
 from marey_worker.kinds import retarget
 
 
@@ -29,8 +29,8 @@ def counted_follows(monkeypatch):
 
 
 def test_the_checks_of_a_result_name_the_bones_that_translations_moved(tmp_path, monkeypatch):
-    monkeypatch.setattr(skeleton_cache, "_skeletons", Kept(4))
-    monkeypatch.setattr(skeleton_cache, "_plans", Kept(4))
+    monkeypatch.setattr(skeleton_cache, "_skeletons", LruCache(max_entries=4))
+    monkeypatch.setattr(skeleton_cache, "_plans", LruCache(max_entries=4))
     project = ProjectInMemory(tmp_path)
     project.log = lambda text: None
     plain = generate_gait(1.4, 0.0, 2.0)

@@ -22,10 +22,10 @@ from marey_schemas.encoding.canonical import canonical_json, document_digest
 from marey_schemas.evaluation import EvaluateParams
 from marey_schemas.jobs import PinnedInput
 from marey_schemas.kinds import Kind
+from marey_schemas.lru import LruCache
 from marey_schemas.wording import counted
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.skeleton_cache import Rig, read_rigged
-from marey_worker.kept import Kept
 
 LOOP_TAG = "loop"
 NAMES_SHOWN = 5
@@ -46,7 +46,7 @@ class MatchingClips:
         return build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
 
 
-_kept: Kept[bytes, MatchingClips] = Kept(MOST_KEPT)
+_cache: LruCache[bytes, MatchingClips] = LruCache(max_entries=MOST_KEPT)
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def read_clips(context: Context, params: EvaluateParams, options: DatabaseOption
     chosen = params.model_dump(mode="json", include={"database", "loops", "trims"})
     wanted = wanted_clips(context, params)
     with refusing_motion_errors():
-        return _kept.get(
+        return _cache.get_or_make(
             canonical_json({"inputs": pins, "params": chosen}),
             lambda: MatchingClips(build_set(context, wanted, options, _pinned_normaliser(context))),
         )
@@ -109,7 +109,7 @@ def read_evaluated_clips(
     wanted = ClipSet.from_tree(document["clip_set"])
     normaliser = Normaliser.from_tree(document["normaliser"])
     with refusing_motion_errors():
-        return _kept.get(
+        return _cache.get_or_make(
             canonical_json({"evaluation": [evaluation.item, evaluation.revision]}),
             lambda: MatchingClips(build_set(context, wanted, options, normaliser)),
         )

@@ -11,8 +11,8 @@ from marey_motion.rigs import JointAxes, JointMapping, guess_axes, map_joints, r
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents import RevisionRef, SkeletonHierarchy, SkeletonMapping
 from marey_schemas.kinds import Kind
+from marey_schemas.lru import LruCache
 from marey_worker.context import Context, NoSuchThing
-from marey_worker.kept import Kept
 
 MOST_KEPT = 512
 
@@ -37,8 +37,8 @@ class Rig(NamedTuple):
         return cls(ref, ref)
 
 
-_skeletons: Kept[Rig, Rigged] = Kept(MOST_KEPT)
-_plans: Kept[tuple[Rig, Rig, float | None], RetargetPlan] = Kept(MOST_KEPT)
+_skeletons: LruCache[Rig, Rigged] = LruCache(max_entries=MOST_KEPT)
+_plans: LruCache[tuple[Rig, Rig, float | None], RetargetPlan] = LruCache(max_entries=MOST_KEPT)
 
 
 def read_rigged(context: Context, rig: Rig) -> Rigged:
@@ -46,7 +46,7 @@ def read_rigged(context: Context, rig: Rig) -> Rigged:
 
     Raises `MotionError` where the mapping contradicts the skeleton.
     """
-    return _skeletons.get(rig, lambda: _read(context, rig))
+    return _skeletons.get_or_make(rig, lambda: _read(context, rig))
 
 
 def plan_between(context: Context, source: Rig, target: Rig, scale: float | None) -> RetargetPlan:
@@ -55,7 +55,7 @@ def plan_between(context: Context, source: Rig, target: Rig, scale: float | None
     def plan() -> RetargetPlan:
         return plan_retarget(*read_rigged(context, source), *read_rigged(context, target), scale=scale)
 
-    return _plans.get((source, target, scale), plan)
+    return _plans.get_or_make((source, target, scale), plan)
 
 
 def _read(context: Context, rig: Rig) -> Rigged:

@@ -1,0 +1,90 @@
+"""A bounded cache that drops the least recently used values first."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from typing import Generic, TypeVar
+
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
+
+
+class LruCache(Generic[Key, Value]):
+    """The most recently used values, bounded by number, by bytes, or by both. Any thread may use it.
+
+    Parameters
+    ----------
+    max_entries : largest number of values; None for any number
+    max_bytes : largest sum of `size_of` over all values; None for any sum. The newest value is kept even if it alone
+        is larger, unless it exceeds `largest_bytes`.
+    largest_bytes : values larger than this are not kept, so that one of them does not displace all others
+    size_of : bytes of a value; needed only with a bound in bytes
+    """
+
+    def __init__(
+        self,
+        *,
+        max_entries: int | None = None,
+        max_bytes: int | None = None,
+        largest_bytes: int | None = None,
+        size_of: Callable[[Value], int] = lambda _: 0,
+    ) -> None:
+        self._max_entries = max_entries
+        self._max_bytes = max_bytes
+        self._largest_bytes = largest_bytes
+        self._size_of = size_of
+        self._entries: OrderedDict[Key, tuple[Value, int]] = OrderedDict()
+        self._held_bytes = 0
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def get(self, key: Key) -> Value | None:
+        """Return the value of `key`, or None."""
+        with self._lock:
+            entry = self._entries.get(key)
+            if entry is None:
+                return None
+            self._entries.move_to_end(key)
+            return entry[0]
+
+    def put(self, key: Key, value: Value) -> None:
+        """Keep a value under `key`, in place of the one that it had."""
+        size = self._size_of(value)
+        if self._largest_bytes is not None and size > self._largest_bytes:
+            return
+        with self._lock:
+            if key in self._entries:
+                self._held_bytes -= self._entries.pop(key)[1]
+            self._entries[key] = (value, size)
+            self._held_bytes += size
+            while self._is_over():
+                self._drop_oldest()
+
+    def get_or_make(self, key: Key, make: Callable[[], Value]) -> Value:
+        """Return the value of `key`; call `make` and keep what it returns if there is none.
+
+        `make` runs without the lock: two threads that miss at the same time both make the value. Room for one entry is
+        freed before `make` runs, since values may be large.
+        """
+        found = self.get(key)
+        if found is not None:
+            return found
+        with self._lock:
+            while self._max_entries is not None and len(self._entries) >= self._max_entries:
+                self._drop_oldest()
+        value = make()
+        self.put(key, value)
+        return value
+
+    def _is_over(self) -> bool:
+        if self._max_entries is not None and len(self._entries) > self._max_entries:
+            return True
+        return self._max_bytes is not None and self._held_bytes > self._max_bytes and len(self._entries) > 1
+
+    def _drop_oldest(self) -> None:
+        _, (_, size) = self._entries.popitem(last=False)
+        self._held_bytes -= size
