@@ -15,7 +15,7 @@ from marey_motion.editing.annotations import layers
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents import RevisionRef
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
-from marey_server.store.items import annotating
+from marey_server.motions import annotating
 
 ANNOTATIONS = "/projects/lab/annotations"
 FRAMES = 100

@@ -10,6 +10,7 @@ from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
 from marey_server.http.declarations import Access, Body, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
+from marey_server.motions.annotating import apply_commands, prepare_annotation
 from marey_server.store import items
 
 MOST_TRIES = 5
@@ -41,7 +42,7 @@ class AnnotationCommands(Resource):
         expected_rev = self.precondition.expected_rev
         for _ in range(MOST_TRIES):
             found = await self.look_up(items.find_annotation, project, item)
-            changed = await self.compute(items.apply_commands, found, body, expected_rev=expected_rev)
+            changed = await self.compute(apply_commands, found, body, expected_rev=expected_rev)
             try:
                 return await self.answer(items.put_changed, project, item, changed, body.message)
             except PreconditionFailed:
@@ -69,7 +70,7 @@ class ClipAnnotations(Resource):
         if kind_of(kind) is not Kind.CLIP:
             raise NotFound(f"Clips are annotated, not {kind}.", code="no-annotations")
         clip = await self.look_up(items.find_annotated_clip, project, item)
-        prepared = await self.compute(items.prepare_annotation, clip, body)
+        prepared = await self.compute(prepare_annotation, clip, body)
         return await self.answer_with(
             lambda made: Reply(made, rev=made.rev, location=f"/projects/{project}/annotations/{made.id}"),
             items.create_item,

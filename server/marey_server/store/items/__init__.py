@@ -1,10 +1,8 @@
 """Items: named things with revisions. This package is the only one that writes them."""
 
 from marey_server.store.items.annotating import (
-    apply_commands,
     find_annotated_clip,
     find_annotation,
-    prepare_annotation,
     put_changed,
 )
 from marey_server.store.items.changing import (
@@ -29,7 +27,6 @@ __all__ = [
     "Part",
     "Published",
     "StoredDocument",
-    "apply_commands",
     "change_item",
     "create_item",
     "delete_item",
@@ -39,7 +36,6 @@ __all__ = [
     "list_items",
     "list_revisions",
     "load_part",
-    "prepare_annotation",
     "prepare_part",
     "prepare_parts",
     "publish",
