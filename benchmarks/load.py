@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.local_server import PROJECT, clip_parts
 from benchmarks.material import noisy_clip
 from benchmarks.wire import Connection
-from marey_schemas.documents import RevisionRef
+from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 
 T = TypeVar("T")

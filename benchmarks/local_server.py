@@ -25,7 +25,8 @@ from marey_client import Marey
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, skeleton_to_document
 from marey_schemas.access import ProjectCreate
-from marey_schemas.documents import ClipInfo, RevisionRef
+from marey_schemas.documents.clips import ClipInfo
+from marey_schemas.documents.references import RevisionRef
 
 PROJECT = "bench"
 START_S = 60

@@ -30,7 +30,7 @@ from marey_motion.clip import Clip
 from marey_motion.documents import skeleton_to_document
 from marey_motion.gait import generate_gait
 from marey_schemas.access import ProjectCreate
-from marey_schemas.documents import RevisionRef
+from marey_schemas.documents.references import RevisionRef
 
 CLIPS, FRAMES, FRAME_RATE_HZ = 10_000, 300, 60.0
 UPLOADERS = 4

@@ -10,7 +10,7 @@ from benchmarks.local_server import PROJECT, clip_parts
 from benchmarks.material import noisy_clip
 from marey_motion.documents import skeleton_to_document
 from marey_schemas.access import ProjectCreate
-from marey_schemas.documents import RevisionRef
+from marey_schemas.documents.references import RevisionRef
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM

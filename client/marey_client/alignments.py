@@ -14,8 +14,9 @@ from marey_client.evaluations import Places, as_input, as_places, items_at
 from marey_client.items import ItemHandle
 from marey_client.motions import ClipHandle, MotionArrays, frames_text
 from marey_client.one_or_several import several
-from marey_schemas.alignment import AlignmentInfo, AlignParams
+from marey_schemas.documents.alignments import AlignmentInfo
 from marey_schemas.items import Item
+from marey_schemas.job_params import AlignParams
 from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
 from marey_schemas.kinds import Kind
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from marey_client.annotations import AnnotationHandle
 from marey_client.evaluations import Places, as_input, as_places, items_at
-from marey_schemas.annotations import AnnotateParams, CutParams
 from marey_schemas.items import Item
+from marey_schemas.job_params import AnnotateParams, CutParams
 from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import Any
 from marey_client.items import ItemHandle
 from marey_client.one_or_several import several
 from marey_client.transport import as_json, read_model
-from marey_schemas.annotations import AnnotationChange
-from marey_schemas.documents import Annotation
+from marey_schemas.documents.annotations import Annotation
+from marey_schemas.editing.annotation_commands import AnnotationChange
 from marey_schemas.items import Item
 
 

@@ -25,9 +25,10 @@ from marey_client.marey import Marey
 from marey_client.motions import ClipHandle, SkeletonHandle
 from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate
-from marey_schemas.documents import SkeletonHierarchy
-from marey_schemas.imports import ImportEntry, ImportOptions
+from marey_schemas.documents.skeletons import SkeletonHierarchy
+from marey_schemas.imports import ImportEntry
 from marey_schemas.jobs import CollectionInput, Job
+from marey_schemas.options.imports import ImportOptions
 
 PROJECT = "demo"
 TAKES, RESULTS, SKELETON = "takes", "retargeted", "game"

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from marey_client.edits import Commands, EditHandle, as_edit
 from marey_client.evaluations import Places, as_input, as_places, items_at
-from marey_schemas.editing.edits import EditParams
+from marey_schemas.job_params import EditParams
 from marey_schemas.jobs import ItemInput, JobCreate
 
 if TYPE_CHECKING:

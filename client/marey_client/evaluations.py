@@ -13,9 +13,8 @@ from marey_client.findings import Findings, OnProgress, find_out
 from marey_client.motions import ClipHandle
 from marey_client.reports import ReportedHandle
 from marey_schemas.base import Request
-from marey_schemas.evaluation import EvaluateParams
-from marey_schemas.improvement import CompareParams, OptimiseParams, SuggestParams, SweepParams
 from marey_schemas.items import Item
+from marey_schemas.job_params import CompareParams, EvaluateParams, OptimiseParams, SuggestParams, SweepParams
 from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
 
 if TYPE_CHECKING:

@@ -21,12 +21,12 @@ from marey_schemas.imports import (
     ImportAnswer,
     ImportEntry,
     ImportFile,
-    ImportOptions,
     ImportRequest,
     Refusal,
     skeleton_output,
 )
 from marey_schemas.jobs import Job, JobOutput
+from marey_schemas.options.imports import ImportOptions
 
 MOTION_SUFFIXES = (".amc", ".asf", ".bson", ".bson.bz2", ".bvh", ".c3d", ".json", ".npz")
 COMPANION_SUFFIX = ".asf"

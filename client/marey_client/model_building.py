@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from marey_client.errors import NoAnnotations
 from marey_client.evaluations import Places, as_input, as_places, items_at
 from marey_client.imports import LocalFile, Notice
-from marey_schemas.imports import ImportOptions
 from marey_schemas.model_pipelines import ModelPlan
+from marey_schemas.options.imports import ImportOptions
 
 if TYPE_CHECKING:
     from marey_client.project import ProjectHandle

@@ -17,11 +17,11 @@ from marey_client.downloads import download, safe_file_name, saved_atomically
 from marey_client.items import Items
 from marey_client.motions import ClipHandle, MotionArrays
 from marey_client.searches import SearchableHandle
-from marey_schemas.documents import ClipInfo, Source
+from marey_schemas.documents.clips import ClipInfo, Source
 from marey_schemas.encoding.codecs import JSON, encode_tree
+from marey_schemas.job_params import ModelParams
 from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
 from marey_schemas.kinds import Kind
-from marey_schemas.modelling import ModelParams
 
 AlignedPlace = str | CollectionInput | ItemInput | ProcessedHandle
 """A folder of aligned clips by its path, an aligned clip, or either as an input of jobs."""

@@ -13,8 +13,10 @@ from marey_client.annotations import AnnotationHandle
 from marey_client.edits import Commands, preview_edit
 from marey_client.items import ItemHandle, Items
 from marey_client.one_or_several import several
-from marey_schemas.annotations import AnnotationImport
-from marey_schemas.documents import Annotation, ClipInfo, Motion, SkeletonHierarchy, SkeletonMapping
+from marey_schemas.documents.annotations import Annotation
+from marey_schemas.documents.clips import ClipInfo, Motion
+from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
+from marey_schemas.editing.annotation_commands import AnnotationImport
 from marey_schemas.editing.previews import EditPreview
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind

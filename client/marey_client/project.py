@@ -26,14 +26,11 @@ from marey_client.paging import pages
 from marey_client.pipelines import PipelineRun, submit_pipeline
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.access import Project, ProjectChange
-from marey_schemas.alignment import AlignParams
-from marey_schemas.annotations import AnnotateParams, CutParams
-from marey_schemas.evaluation import EvaluateParams
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
-from marey_schemas.jobs import ItemInput, Job, JobCreate, RetargetParams
+from marey_schemas.job_params import AlignParams, AnnotateParams, CutParams, EvaluateParams, ModelParams, RetargetParams
+from marey_schemas.jobs import ItemInput, Job, JobCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.model_pipelines import model_pipeline
-from marey_schemas.modelling import ModelParams
 from marey_schemas.pipelines import PipelineCreate
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from marey_client.downloads import safe_file_name, saved_atomically
 from marey_client.items import ItemHandle
-from marey_schemas.reports import StoredFigure
+from marey_schemas.documents.reports import StoredFigure
 
 
 class ReportedHandle(ItemHandle):

@@ -14,14 +14,16 @@ from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import ClipError, MappingError
 from marey_motion.rigs import STANDARD_JOINTS, JointAxes, JointMapping
 from marey_motion.skeleton import EndSite, Skeleton
-from marey_schemas import documents as schemas
+from marey_schemas.documents import annotations as annotation_documents
+from marey_schemas.documents import clips, skeletons
+from marey_schemas.documents.references import OutputRef, RevisionRef
 from marey_schemas.editing.edits import EditDocument
 
 
-def skeleton_to_document(skeleton: Skeleton) -> schemas.SkeletonHierarchy:
+def skeleton_to_document(skeleton: Skeleton) -> skeletons.SkeletonHierarchy:
     """Part `hierarchy` of a skeleton."""
     joints = tuple(
-        schemas.Joint(
+        skeletons.Joint(
             name=name,
             parent=int(parent),
             offset=tuple(offset.tolist()),
@@ -37,11 +39,13 @@ def skeleton_to_document(skeleton: Skeleton) -> schemas.SkeletonHierarchy:
             strict=True,
         )
     )
-    sites = tuple(schemas.EndSite(joint=site.joint, offset=tuple(site.offset.tolist())) for site in skeleton.end_sites)
-    return schemas.SkeletonHierarchy(joints=joints, end_sites=sites)
+    sites = tuple(
+        skeletons.EndSite(joint=site.joint, offset=tuple(site.offset.tolist())) for site in skeleton.end_sites
+    )
+    return skeletons.SkeletonHierarchy(joints=joints, end_sites=sites)
 
 
-def skeleton_from_document(document: schemas.SkeletonHierarchy) -> Skeleton:
+def skeleton_from_document(document: skeletons.SkeletonHierarchy) -> Skeleton:
     """The skeleton of a `hierarchy` part; `SkeletonError` where its numbers describe none."""
     return Skeleton(
         joint_names=tuple(joint.name for joint in document.joints),
@@ -53,10 +57,10 @@ def skeleton_from_document(document: schemas.SkeletonHierarchy) -> Skeleton:
     )
 
 
-def clip_to_document(clip: Clip, skeleton: schemas.RevisionRef | schemas.OutputRef) -> schemas.Motion:
+def clip_to_document(clip: Clip, skeleton: RevisionRef | OutputRef) -> clips.Motion:
     """Part `motion` of a clip whose skeleton is stored as `skeleton`."""
     names = clip.skeleton.joint_names
-    return schemas.Motion(
+    return clips.Motion(
         skeleton=skeleton,
         frame_rate_hz=clip.frame_rate_hz,
         joints=names,
@@ -66,7 +70,7 @@ def clip_to_document(clip: Clip, skeleton: schemas.RevisionRef | schemas.OutputR
     )
 
 
-def clip_from_document(document: schemas.Motion, skeleton: Skeleton) -> Clip:
+def clip_from_document(document: clips.Motion, skeleton: Skeleton) -> Clip:
     """The clip of a `motion` part, with its rotations in the skeleton's order.
 
     `ClipError` where the document is not of this skeleton or its numbers are no motion.
@@ -92,21 +96,21 @@ def clip_from_document(document: schemas.Motion, skeleton: Skeleton) -> Clip:
 
 def layer_to_document(
     layer: Layer,
-    clip: schemas.RevisionRef | schemas.OutputRef,
+    clip: RevisionRef | OutputRef,
     name: str,
     made_by: Literal["person", "algorithm"] = "person",
-) -> schemas.Annotation:
+) -> annotation_documents.Annotation:
     """Part `annotation` of a layer of this name over a clip that is stored as `clip`."""
-    return schemas.Annotation(
+    return annotation_documents.Annotation(
         clip=clip,
         layer=name,
         made_by=made_by,
-        segments=tuple(schemas.Segment(**segment._asdict()) for segment in layer.segments),
-        keyframes=tuple(schemas.Keyframe(**keyframe._asdict()) for keyframe in layer.keyframes),
+        segments=tuple(annotation_documents.Segment(**segment._asdict()) for segment in layer.segments),
+        keyframes=tuple(annotation_documents.Keyframe(**keyframe._asdict()) for keyframe in layer.keyframes),
     )
 
 
-def layer_from_document(document: schemas.Annotation, frame_count: int) -> Layer:
+def layer_from_document(document: annotation_documents.Annotation, frame_count: int) -> Layer:
     """The layer of an `annotation` part over a clip of so many frames; `AnnotationError` where it goes beyond them."""
     return Layer(
         frame_count,
@@ -115,20 +119,20 @@ def layer_from_document(document: schemas.Annotation, frame_count: int) -> Layer
     )
 
 
-def mapping_to_document(mapping: JointMapping, axes: Mapping[str, JointAxes]) -> schemas.SkeletonMapping:
+def mapping_to_document(mapping: JointMapping, axes: Mapping[str, JointAxes]) -> skeletons.SkeletonMapping:
     """Part `mapping` of a skeleton."""
-    return schemas.SkeletonMapping(
+    return skeletons.SkeletonMapping(
         rig=mapping.rig,
         method=mapping.method,
         confidence=mapping.confidence,
         joints=dict(mapping.joints),
-        axes={joint: schemas.JointAxes(twist=one.twist, swing=one.swing) for joint, one in axes.items()},
+        axes={joint: skeletons.JointAxes(twist=one.twist, swing=one.swing) for joint, one in axes.items()},
         notes=mapping.notes,
     )
 
 
 def mapping_from_document(
-    document: schemas.SkeletonMapping, skeleton: Skeleton
+    document: skeletons.SkeletonMapping, skeleton: Skeleton
 ) -> tuple[JointMapping, dict[str, JointAxes]]:
     """Mapping and axes of a `mapping` part that people may have edited.
 
@@ -171,7 +175,7 @@ def _angle_in_radians(name: str, value: Any) -> tuple[str, Any]:
     return f"{name.removesuffix('_deg')}_rad", math.radians(angles) if isinstance(angles, float | int) else angles
 
 
-def _orthonormal(joint: str, axes: schemas.JointAxes) -> JointAxes:
+def _orthonormal(joint: str, axes: skeletons.JointAxes) -> JointAxes:
     twist, swing = np.array(axes.twist), np.array(axes.swing)
     length = float(np.linalg.norm(twist))
     if not 0.0 < length < np.inf:

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from marey_schemas.base import Answer, Request
-from marey_schemas.documents import MAX_JOINTS, RevisionRef
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.documents.skeletons import MAX_JOINTS
 from marey_schemas.encoding.arrays import ArrayOf
-from marey_schemas.evaluation import ItemId, Speed, TurnRate
-from marey_schemas.names import JointName
+from marey_schemas.names import ItemId, JointName
+from marey_schemas.options.evaluation import Speed, TurnRate
 
 LEAST_FRAME_RATE_HZ, MOST_FRAME_RATE_HZ = 10.0, 240.0
 MOST_CELLS = 2000

@@ -12,16 +12,27 @@ from importlib.metadata import entry_points
 from types import MappingProxyType
 from typing import Any, Literal
 
-from marey_schemas.alignment import AlignParams
-from marey_schemas.annotations import AnnotateParams, CutParams
 from marey_schemas.base import Request
-from marey_schemas.editing.edits import EditParams
-from marey_schemas.evaluation import EvaluateParams, count_evaluation_tasks
-from marey_schemas.improvement import CompareParams, OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
-from marey_schemas.jobs import ExportParams, ImportParams, InputSpec, JobKind, RetargetParams
+from marey_schemas.job_params import (
+    AlignParams,
+    AnnotateParams,
+    CompareParams,
+    CutParams,
+    EditParams,
+    EvaluateParams,
+    ExportParams,
+    ImportParams,
+    ModelParams,
+    OptimiseParams,
+    RetargetParams,
+    SuggestParams,
+    SweepParams,
+    TreeParams,
+    count_evaluation_tasks,
+    count_sweep_tasks,
+)
+from marey_schemas.jobs import InputSpec, JobKind
 from marey_schemas.kinds import PARTS, Kind
-from marey_schemas.modelling import ModelParams
-from marey_schemas.sample_trees import TreeParams
 
 ENTRY_POINT_GROUP = "marey.job_kinds"
 MOST_TASKS = 1000

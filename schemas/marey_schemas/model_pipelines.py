@@ -4,14 +4,11 @@ from typing import Any, Self
 
 from pydantic import Field, model_validator
 
-from marey_schemas.alignment import AlignParams
-from marey_schemas.annotations import AnnotateParams, CutParams
 from marey_schemas.base import Request
-from marey_schemas.jobs import CollectionInput, ImportParams, ItemInput
-from marey_schemas.modelling import ModelParams
+from marey_schemas.job_params import AlignParams, AnnotateParams, CutParams, ImportParams, ModelParams, TreeParams
+from marey_schemas.jobs import CollectionInput, ItemInput
 from marey_schemas.names import CollectionPath, ItemName
 from marey_schemas.pipelines import PipelineCreate, PipelineStep
-from marey_schemas.sample_trees import TreeParams
 
 Inputs = tuple[ItemInput | CollectionInput, ...]
 

@@ -30,3 +30,11 @@ Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
 Message = Annotated[str, StringConstraints(max_length=2000)]
 
 JointName = Annotated[str, StringConstraints(min_length=1, max_length=1024)]
+
+Label = Annotated[str, StringConstraints(min_length=1, max_length=255)]
+
+LayerName = Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=r"^[^/\x00-\x1f\x7f]+$")]
+
+ItemId = Annotated[str, StringConstraints(min_length=1, max_length=64)]
+
+TrialName = Annotated[str, StringConstraints(min_length=1, max_length=100)]

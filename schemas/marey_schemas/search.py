@@ -7,8 +7,8 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, StringConstraints, model_validator
 
 from marey_schemas.base import Answer, Request
-from marey_schemas.documents import Motion
-from marey_schemas.references import RevisionRef
+from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.references import RevisionRef
 
 MOST_CONSTRAINTS = 64
 MOST_STEPS = 16

@@ -18,7 +18,7 @@ from marey_client.motions import ClipHandle
 from marey_client.project import ProjectHandle
 from marey_motion.documents import clip_from_document, skeleton_from_document
 from marey_motion.kinematics import global_positions
-from marey_schemas.documents import Motion
+from marey_schemas.documents.clips import Motion
 from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree
 
 pytestmark = pytest.mark.timeout(600)

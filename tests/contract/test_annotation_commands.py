@@ -4,7 +4,7 @@ import inspect
 from typing import get_args
 
 from marey_motion.editing.annotations.layers import COMMANDS
-from marey_schemas.annotations import AnnotationCommand
+from marey_schemas.editing.annotation_commands import AnnotationCommand
 
 
 def test_each_command_that_travels_says_what_the_function_of_its_name_takes():

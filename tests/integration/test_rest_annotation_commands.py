@@ -13,7 +13,7 @@ from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, skeleton_to_document
 from marey_motion.editing.annotations import layers
 from marey_motion.skeleton import Skeleton
-from marey_schemas.documents import RevisionRef
+from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 from marey_server.motions import annotating
 

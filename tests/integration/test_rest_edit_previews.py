@@ -15,7 +15,7 @@ from marey_motion.editing.registry import apply_edit
 from marey_motion.kinematics import global_positions
 from marey_motion.rigs import guess_axes, map_joints
 from marey_schemas.access import ProjectChange, Role, Visibility
-from marey_schemas.documents import RevisionRef
+from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.codecs import BSON, JSON, MSGPACK, decode_tree, encode_tree
 from marey_server.motions import previewing
 

@@ -4,11 +4,11 @@ import hashlib
 from dataclasses import dataclass, field
 
 from marey_motion.documents import clip_to_document, skeleton_to_document
-from marey_schemas.documents import RevisionRef
-from marey_schemas.evaluation import EvaluateParams
+from marey_schemas.documents.references import RevisionRef
 from marey_schemas.items import Item
-from marey_schemas.jobs import PinnedInput
+from marey_schemas.job_params import EvaluateParams
 from marey_schemas.kinds import Kind
+from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import NoSuchThing, Task
 
 NOW = "2026-01-01T00:00:00Z"

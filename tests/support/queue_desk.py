@@ -13,7 +13,9 @@ from marey_schemas import job_kinds
 from marey_schemas.access import ProjectCreate, UserCreate
 from marey_schemas.base import Request
 from marey_schemas.job_kinds import KindDeclaration
-from marey_schemas.jobs import (
+from marey_schemas.jobs import InputSpec, Job, JobCreate, Progress
+from marey_schemas.kinds import Kind
+from marey_schemas.worker_protocol import (
     ClaimRequest,
     CompleteAnswer,
     CompleteRequest,
@@ -21,14 +23,9 @@ from marey_schemas.jobs import (
     FailRequest,
     Heartbeat,
     HeartbeatAnswer,
-    InputSpec,
-    Job,
-    JobCreate,
     Lease,
-    Progress,
     StagedOutput,
 )
-from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.store import projects, tokens, users
 from marey_server.store.database.connections import Database

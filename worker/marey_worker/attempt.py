@@ -17,7 +17,7 @@ from typing import Any
 
 from marey_client.errors import LeaseLost, MareyError, NotFound
 from marey_schemas.job_kinds import find_kind
-from marey_schemas.jobs import CompleteRequest, FailRequest, Lease
+from marey_schemas.worker_protocol import CompleteRequest, FailRequest, Lease
 from marey_worker import faults, signatures
 from marey_worker.attempt_api import AttemptApi
 from marey_worker.child_process import ChildProcess

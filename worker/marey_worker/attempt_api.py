@@ -15,7 +15,9 @@ from marey_client.paging import pages
 from marey_client.retries import Retries
 from marey_client.transport import BLOCKS, Transport, as_json, read_model
 from marey_schemas.items import Item
-from marey_schemas.jobs import (
+from marey_schemas.jobs import Progress, TaskResult
+from marey_schemas.kinds import Kind
+from marey_schemas.worker_protocol import (
     ClaimRequest,
     CompleteRequest,
     FailRequest,
@@ -24,10 +26,7 @@ from marey_schemas.jobs import (
     Lease,
     LeaseList,
     LogAnswer,
-    Progress,
-    TaskResult,
 )
-from marey_schemas.kinds import Kind
 
 PATIENT = Retries(tries=100, longest_s=10.0, total_s=600.0)
 """For the last word of an attempt: computed results are worth waiting for."""

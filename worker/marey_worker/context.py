@@ -11,8 +11,9 @@ from typing import Any, NamedTuple, TypeVar
 
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.items import Item
-from marey_schemas.jobs import PinnedInput, Progress, StagedOutput, StageRequest
+from marey_schemas.jobs import Progress
 from marey_schemas.kinds import Kind
+from marey_schemas.worker_protocol import PinnedInput, StagedOutput, StageRequest
 from marey_worker.messages import Made, PutFile, ReadBlob, ReadItem, ReadPart, ReadResults, Reply, Request, Run, Stage
 
 T = TypeVar("T")

@@ -8,7 +8,8 @@ import threading
 import time
 
 from marey_client.errors import LeaseLost, MareyError
-from marey_schemas.jobs import HeartbeatAnswer, Lease, Progress
+from marey_schemas.jobs import Progress
+from marey_schemas.worker_protocol import HeartbeatAnswer, Lease
 from marey_worker.attempt_api import AttemptApi
 
 log = logging.getLogger(__name__)

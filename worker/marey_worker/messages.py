@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from marey_schemas.jobs import PinnedInput, Progress
+from marey_schemas.jobs import Progress
 from marey_schemas.kinds import Kind
+from marey_schemas.worker_protocol import PinnedInput
 
 # From the supervisor
 

@@ -17,7 +17,7 @@ from marey_client.errors import Forbidden, Invalid, MareyError, Unauthenticated
 from marey_client.retries import ONCE
 from marey_client.transport import Transport
 from marey_schemas.job_kinds import job_kinds
-from marey_schemas.jobs import ClaimRequest, Lease
+from marey_schemas.worker_protocol import ClaimRequest, Lease
 from marey_worker import faults
 from marey_worker.attempt import Attempt, Stop
 from marey_worker.attempt_api import AttemptApi, claim

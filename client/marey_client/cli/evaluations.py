@@ -18,7 +18,7 @@ from marey_client.cli.output import print_json, print_table, tell
 if TYPE_CHECKING:
     from marey_client.evaluations import EvaluationHandle
     from marey_client.marey import Marey
-    from marey_schemas.evaluation import EvaluateParams
+    from marey_schemas.job_params import EvaluateParams
 
 WORST_SHOWN = 5
 MOST_VALUES = 200
@@ -139,7 +139,7 @@ def evaluation_at(marey: Marey, place: str) -> EvaluationHandle:
 
 def _params(**given: Any) -> EvaluateParams:
     """The options that were given; defaults stay those of the declaration."""
-    from marey_schemas.evaluation import EvaluateParams
+    from marey_schemas.job_params import EvaluateParams
 
     for group in ("database", "controller"):
         given[group] = {name: value for name, value in given[group].items() if value is not None} or None

@@ -59,7 +59,7 @@ def upload(
 ) -> None:
     """Import motion files. Each goes in or is refused with a reason; the same file again makes nothing new."""
     from marey_client.imports import find_files, left_out_text
-    from marey_schemas.imports import ImportOptions
+    from marey_schemas.options.imports import ImportOptions
 
     given = {
         "collection": collection, "unit": unit, "unit_scale_m": unit_scale_m, "up_axis": up_axis,

@@ -190,7 +190,7 @@ def _places(
 
 def _weights(given: Sequence[str] | None) -> dict[str, float]:
     """`name=value` of the objective's weights."""
-    from marey_schemas.improvement import ObjectiveParams
+    from marey_schemas.options.improvement import ObjectiveParams
 
     weights = {}
     for text in given or ():

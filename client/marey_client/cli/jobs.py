@@ -42,7 +42,7 @@ def retarget(
     as_json: AsJson = False,
 ) -> None:
     """Move clips to another skeleton, as a job."""
-    from marey_schemas.jobs import RetargetParams
+    from marey_schemas.job_params import RetargetParams
     from marey_schemas.kinds import Kind
 
     addresses = [Address.parse(source) for source in sources]

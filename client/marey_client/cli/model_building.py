@@ -130,7 +130,7 @@ def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[st
             raise WrongUsage("import.… is for files of this machine; name the project they go to with --project")
         return addresses[0].project, {"takes": [clips_at(marey, address) for address in addresses]}
     from marey_client.imports import find_files, left_out_text
-    from marey_schemas.imports import ImportOptions
+    from marey_schemas.options.imports import ImportOptions
 
     found = find_files(map(Path, takes))
     if found.left_out:

@@ -61,7 +61,7 @@ def joint_axes(
     as_json: AsJson = False,
 ) -> None:
     """Show the twist and swing axes of joints, or change those of one."""
-    from marey_schemas.documents import JointAxes
+    from marey_schemas.documents.skeletons import JointAxes
     from marey_schemas.kinds import Kind
 
     with connect(context) as marey:

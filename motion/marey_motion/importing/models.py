@@ -29,8 +29,8 @@ from marey_motion.modelling.primitive_documents import primitive_to_tree
 from marey_motion.modelling.search.tree import TreeOptions
 from marey_motion.modelling.search.tree_documents import sample_tree_to_tree
 from marey_motion.skeleton import same_hierarchy
-from marey_schemas.originals import original_of
-from marey_schemas.references import PartDigestRef
+from marey_schemas.documents.originals import original_of
+from marey_schemas.documents.references import PartDigestRef
 
 
 def import_modelled(

@@ -12,8 +12,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from marey_schemas.base import Request
-from marey_schemas.evaluation import ItemId
-from marey_schemas.names import JointName
+from marey_schemas.names import ItemId, JointName
 
 MOST_FRAME = 100_000_000
 MOST_LISTED = 4096

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self, get_args
+from typing import Annotated, Literal, get_args
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from marey_schemas.base import Request
 from marey_schemas.editing.commands import (
@@ -30,10 +30,8 @@ from marey_schemas.editing.commands import (
     Trim,
 )
 from marey_schemas.editing.constraints import Constrain, PlantFeet
-from marey_schemas.names import NameSuffix, Tag
 
 MOST_COMMANDS = 256
-
 AnyCommand = (
     Trim
     | Split
@@ -59,7 +57,6 @@ AnyCommand = (
     | PlantFeet
 )
 EditCommand = Annotated[AnyCommand, Field(discriminator="command")]
-
 COMMAND_MODELS: dict[str, type[Request]] = {
     get_args(model.model_fields["command"].annotation)[0]: model for model in get_args(AnyCommand)
 }
@@ -77,30 +74,3 @@ class EditDocument(Request):
     def sources(self) -> tuple[str, ...]:
         """Ids of the clips that the commands name."""
         return tuple(dict.fromkeys(str(one.source) for one in self.commands if isinstance(one, Concatenate | Paste)))
-
-
-class EditParams(Request):
-    """Parameters of `edit`."""
-
-    commands: tuple[EditCommand, ...] = Field(
-        (), max_length=MOST_COMMANDS, description="What to do, in order, where the input `edit` does not say it."
-    )
-    in_place: bool = Field(
-        False, description="Make each result the next revision of its clip; otherwise it is a clip of its own."
-    )
-    suffix: NameSuffix = Field("", description="Appended to the names.")
-    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the results.")
-
-    @model_validator(mode="after")
-    def _check_place(self) -> Self:
-        if self.in_place and self.suffix:
-            raise ValueError("suffix: results that take the place of their clips keep their names")
-        return self
-
-    def unclear_place(self, into: str) -> str | None:
-        """Why results that go into this collection would change the clips themselves unasked, or not though asked."""
-        if self.in_place and into:
-            return f"the results cannot both take the place of the clips and go to {into}"
-        if not (self.in_place or into or self.suffix):
-            return "the results would take the place of the clips; give a folder or a suffix, or in_place"
-        return None

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from marey_schemas.base import Answer, Request
-from marey_schemas.documents import Motion
+from marey_schemas.documents.clips import Motion
 from marey_schemas.editing.commands import Frames
 from marey_schemas.editing.edits import MOST_COMMANDS, EditCommand
 from marey_schemas.encoding.arrays import ArrayOf

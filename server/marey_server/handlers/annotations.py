@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from marey_schemas.annotations import AnnotationChange, AnnotationImport
+from marey_schemas.editing.annotation_commands import AnnotationChange, AnnotationImport
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_server.errors import Conflict, NotFound, PreconditionFailed

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
-from marey_schemas.imports import ImportAnswer, ImportEntry, ImportOptions, ImportRequest, Refusal
+from marey_schemas.imports import ImportAnswer, ImportEntry, ImportRequest, Refusal
 from marey_schemas.jobs import Job, JobCreate
+from marey_schemas.options.imports import ImportOptions
 from marey_server.errors import BadRequest, Invalid, MareyError, TooLarge
 from marey_server.field_errors import field_errors
 from marey_server.http.declarations import MIB, Access, Body, Files, writes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from functools import partial
 
-from marey_schemas.jobs import (
+from marey_schemas.worker_protocol import (
     BatchCompleteAnswer,
     BatchCompleteRequest,
     ClaimRequest,

@@ -7,9 +7,9 @@ from typing import Any, Literal
 from pydantic import Field
 
 from marey_schemas.base import Request
+from marey_schemas.documents.reports import REPORTS, StoredFigure, StoredFile
+from marey_schemas.documents.reports import Report as ReportDocument
 from marey_schemas.kinds import Kind
-from marey_schemas.reports import REPORTS, StoredFigure, StoredFile
-from marey_schemas.reports import Report as ReportDocument
 from marey_server.errors import NotFound
 from marey_server.handlers.items import kind_of
 from marey_server.http.declarations import Access, Bytes, reads

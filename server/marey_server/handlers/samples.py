@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_schemas.modelling import MOST_SAMPLES, MOST_SEED
+from marey_schemas.documents.models import MOST_SAMPLES, MOST_SEED
 from marey_server.handlers.items import kind_of
 from marey_server.http.declarations import Access, Bytes, Document, reads
 from marey_server.http.queries import MAX_INTEGER

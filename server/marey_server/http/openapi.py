@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
-from marey_schemas.documents import SCHEMAS
+from marey_schemas.documents.registry import SCHEMAS
 from marey_schemas.encoding.codecs import MEDIA_TYPES
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import MEDIA_TYPE as PROBLEM_TYPE

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from marey_schemas.annotations import AnnotationChange, AnnotationImport, command_arguments
-from marey_schemas.documents import Annotation, RevisionRef
+from marey_schemas.documents.annotations import Annotation
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.editing.annotation_commands import AnnotationChange, AnnotationImport, command_arguments
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH

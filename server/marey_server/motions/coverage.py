@@ -25,7 +25,8 @@ from marey_schemas.coverage_streams import (
     MeasuredCoverage,
     Performer,
 )
-from marey_schemas.documents import Motion, SkeletonHierarchy, SkeletonMapping
+from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from marey_schemas.alignment import AlignmentInfo
-from marey_schemas.documents import Motion, SkeletonHierarchy
+from marey_schemas.documents.alignments import AlignmentInfo
+from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.encoding import codecs
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind

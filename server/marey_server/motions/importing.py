@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from marey_schemas.access import Role
-from marey_schemas.documents import Check, SkeletonHierarchy
-from marey_schemas.imports import ImportEntry, ImportOptions, Refusal
+from marey_schemas.documents.clips import Check
+from marey_schemas.documents.skeletons import SkeletonHierarchy
+from marey_schemas.imports import ImportEntry, Refusal
 from marey_schemas.kinds import Kind
+from marey_schemas.options.imports import ImportOptions
 from marey_server.errors import MareyError
 from marey_server.motions.importing_graphs import ImportedGraph, graph_draft, graph_to_import
 from marey_server.store import blobs, items, projects

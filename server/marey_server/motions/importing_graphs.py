@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from marey_schemas.documents.originals import original_of
 from marey_schemas.kinds import Kind
-from marey_schemas.originals import original_of
 from marey_server.errors import Invalid
 from marey_server.store import items
 from marey_server.store.documents import prepare_document

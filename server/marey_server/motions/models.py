@@ -7,7 +7,8 @@ import zipfile
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from marey_schemas.documents import RevisionRef, SkeletonHierarchy
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.kinds import Kind
 from marey_server.errors import Invalid, NotFound
 from marey_server.store import items

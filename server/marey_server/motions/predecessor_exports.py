@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
 
-from marey_schemas.alignment import AlignmentInfo
-from marey_schemas.documents import Annotation, SkeletonHierarchy
-from marey_schemas.graphs import ModelGraph
+from marey_schemas.documents.alignments import AlignmentInfo
+from marey_schemas.documents.annotations import Annotation
+from marey_schemas.documents.graphs import ModelGraph
+from marey_schemas.documents.models import checked_model, predecessor_origin
+from marey_schemas.documents.originals import StoredOriginal, content_digest
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.documents.sample_trees import SampleTreeDocument
+from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.kinds import Kind
-from marey_schemas.modelling import checked_model, predecessor_origin
-from marey_schemas.originals import StoredOriginal, content_digest
-from marey_schemas.references import RevisionRef
-from marey_schemas.sample_trees import SampleTreeDocument
 from marey_server.errors import Invalid, NotFound
 
 Parts = Mapping[str, dict[str, Any]]

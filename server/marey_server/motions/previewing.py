@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import ValidationError
 
-from marey_schemas.documents import Motion, SkeletonHierarchy, SkeletonMapping
+from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.editing.edits import EditDocument
 from marey_schemas.editing.previews import EditPreview, EditPreviewRequest
 from marey_schemas.kinds import Kind

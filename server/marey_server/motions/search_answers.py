@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from math import degrees
 from typing import TYPE_CHECKING, Any
 
-from marey_schemas.documents import RevisionRef
+from marey_schemas.documents.references import RevisionRef
 from marey_schemas.problems import FieldError
 from marey_schemas.search import ConstraintError, FoundStep, SearchAnswer, SearchRequest, StartPlacement
 from marey_server.errors import Invalid, TooLarge

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from marey_schemas.documents import SkeletonMapping
+from marey_schemas.documents.models import log_likelihoods
+from marey_schemas.documents.skeletons import SkeletonMapping
 from marey_schemas.kinds import Kind
-from marey_schemas.modelling import log_likelihoods
 from marey_schemas.search import SearchRequest
 from marey_server.errors import Invalid, NotFound, TooLarge
 from marey_server.motions import models

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from sqlalchemy import bindparam, insert, select
 
-from marey_schemas.documents import SCHEMAS
+from marey_schemas.documents.registry import SCHEMAS
 from marey_schemas.encoding import blocks
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import canonical_json, detach_arrays

@@ -18,7 +18,7 @@ from marey_client import Marey
 from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate
-from marey_schemas.imports import ImportOptions
+from marey_schemas.options.imports import ImportOptions
 
 
 @pytest.fixture(scope="module", params=BACKENDS)

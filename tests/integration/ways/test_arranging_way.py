@@ -15,8 +15,8 @@ from marey_client.imports import find_files
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
 from marey_schemas.access import ProjectCreate
-from marey_schemas.imports import ImportOptions
 from marey_schemas.items import ItemChange
+from marey_schemas.options.imports import ImportOptions
 
 NAMES = (f"lab{number}" for number in itertools.count(1))
 

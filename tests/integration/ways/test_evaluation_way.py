@@ -16,8 +16,8 @@ from marey_client.project import ProjectHandle
 from marey_motion.clip import Clip
 from marey_motion.formats import write_bvh
 from marey_motion.gait import game_skeleton
-from marey_schemas.imports import ImportOptions
 from marey_schemas.items import ItemChange
+from marey_schemas.options.imports import ImportOptions
 
 pytestmark = pytest.mark.timeout(300)
 

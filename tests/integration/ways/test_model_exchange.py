@@ -20,10 +20,12 @@ from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
 from marey_motion.formats.predecessor.encoding import encode_document
 from marey_motion.formats.predecessor.model import read_predecessor_model
-from marey_schemas.imports import ImportEntry, ImportOptions
+from marey_schemas.imports import ImportEntry
 from marey_schemas.items import ItemChange
-from marey_schemas.jobs import ImportParams, JobCreate
+from marey_schemas.job_params import ImportParams
+from marey_schemas.jobs import JobCreate
 from marey_schemas.kinds import Kind
+from marey_schemas.options.imports import ImportOptions
 
 pytestmark = pytest.mark.timeout(300)
 

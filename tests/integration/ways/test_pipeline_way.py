@@ -20,8 +20,8 @@ from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
 from marey_motion.formats import write_motion
 from marey_motion.gait import generate_gait
-from marey_schemas.imports import ImportOptions
 from marey_schemas.kinds import Kind
+from marey_schemas.options.imports import ImportOptions
 
 pytestmark = pytest.mark.timeout(600)
 

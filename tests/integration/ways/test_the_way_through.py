@@ -17,10 +17,12 @@ from marey_client.imports import FILES_PER_IMPORT, find_files
 from marey_motion.formats import read_motion, write_bvh
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_schemas.access import Login, ProjectCreate, UserCreate
-from marey_schemas.documents import SkeletonMapping
-from marey_schemas.imports import ImportFile, ImportOptions
+from marey_schemas.documents.skeletons import SkeletonMapping
+from marey_schemas.imports import ImportFile
 from marey_schemas.items import ItemChange
-from marey_schemas.jobs import CollectionInput, ImportParams, ItemInput, JobCreate
+from marey_schemas.job_params import ImportParams
+from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
+from marey_schemas.options.imports import ImportOptions
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 
 from marey_client import errors
 from marey_client.imports import FILES_PER_IMPORT, LocalFile, batches, find_files, refusal_text
-from marey_schemas.imports import ImportOptions
+from marey_schemas.options.imports import ImportOptions
 
 
 def named(names, size=100):

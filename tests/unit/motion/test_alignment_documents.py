@@ -10,7 +10,7 @@ from marey_motion.alignment.aligned_documents import StoredExample, example_to_t
 from marey_motion.alignment.aligning import AlignOptions, align_clips, restore, with_mirrored
 from marey_motion.alignment.segments import Cut
 from marey_motion.errors import MotionError
-from marey_schemas.alignment import AlignmentInfo
+from marey_schemas.documents.alignments import AlignmentInfo
 from marey_schemas.encoding.codecs import JSON, MEDIA_TYPES, decode_tree, encode_tree
 
 BODY = body_of(walk())

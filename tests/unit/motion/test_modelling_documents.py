@@ -15,9 +15,10 @@ from marey_motion.modelling.primitive_documents import (
 )
 from marey_motion.modelling.training import train_primitive
 from marey_motion.skeleton import Skeleton
+from marey_schemas.documents.models import MotionPrimitiveDocument
 from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree, encode_tree
-from marey_schemas.modelling import ModelParams, MotionPrimitiveDocument
+from marey_schemas.job_params import ModelParams
 
 SKELETON = {"item": "skel_1", "revision": 2}
 

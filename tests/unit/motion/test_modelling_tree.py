@@ -16,8 +16,8 @@ from marey_motion.modelling.search.objective import build_objective
 from marey_motion.modelling.search.samples import search_tree
 from marey_motion.modelling.search.tree import END_EFFECTORS, SampleTree, TreeOptions, build_tree
 from marey_motion.modelling.search.tree_documents import sample_tree_from_tree, sample_tree_to_tree
+from marey_schemas.documents.sample_trees import SampleTreeDocument
 from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree, encode_tree
-from marey_schemas.sample_trees import SampleTreeDocument
 
 LATENT = TreeOptions(samples=600, features="latent")
 

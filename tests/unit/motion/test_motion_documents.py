@@ -9,17 +9,18 @@ from marey_motion import documents
 from marey_motion.errors import ClipError, MappingError, SkeletonError
 from marey_motion.rigs import guess_axes, map_joints
 from marey_motion.skeleton import same_hierarchy
-from marey_schemas import documents as schemas
+from marey_schemas.documents import clips, skeletons
+from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding import codecs
 
-STORED = schemas.RevisionRef(item="skeleton-1", revision=3)
+STORED = RevisionRef(item="skeleton-1", revision=3)
 
 
 @pytest.mark.parametrize("media_type", ["application/json", "application/msgpack", "application/bson"])
 def test_a_clip_comes_back_to_the_bit_in_every_media_type(body, tumbling, media_type):
     clip = tumbling(body, translated=(3, 9))
     sent = codecs.encode_tree(documents.clip_to_document(clip, STORED).model_dump(by_alias=True), media_type)
-    document = schemas.Motion.model_validate(codecs.decode_tree(sent, media_type))
+    document = clips.Motion.model_validate(codecs.decode_tree(sent, media_type))
     back = documents.clip_from_document(document, body)
 
     assert document.skeleton == STORED
@@ -36,7 +37,7 @@ def test_a_slice_of_a_clip_is_a_document_too(body, tumbling):
 def test_a_skeleton_comes_back_exactly(body):
     skeleton = replace(body, display_names=("Hips", *["again"] * 21))
     tree = documents.skeleton_to_document(skeleton).model_dump(by_alias=True, mode="json")
-    back = documents.skeleton_from_document(schemas.SkeletonHierarchy.model_validate(tree))
+    back = documents.skeleton_from_document(skeletons.SkeletonHierarchy.model_validate(tree))
 
     assert same_hierarchy(back, skeleton)
     assert back.display_names == skeleton.display_names
@@ -90,7 +91,7 @@ def test_a_mapping_comes_back_with_its_axes(body):
     mapping = map_joints(body)
     axes = guess_axes(body, mapping)
     tree = documents.mapping_to_document(mapping, axes).model_dump(by_alias=True, mode="json")
-    back, back_axes = documents.mapping_from_document(schemas.SkeletonMapping.model_validate(tree), body)
+    back, back_axes = documents.mapping_from_document(skeletons.SkeletonMapping.model_validate(tree), body)
 
     assert back == mapping
     assert set(back_axes) == set(axes)
@@ -100,7 +101,7 @@ def test_a_mapping_comes_back_with_its_axes(body):
 
 
 def edited(body, joints=None, axes=None):
-    return schemas.SkeletonMapping.model_validate({"joints": joints or {}, "axes": axes or {}})
+    return skeletons.SkeletonMapping.model_validate({"joints": joints or {}, "axes": axes or {}})
 
 
 def test_axes_that_a_person_wrote_are_squared_up(body):

@@ -3,12 +3,7 @@
 import pytest
 from pydantic import ValidationError
 
-from marey_schemas.evaluation import (
-    MOST_EVALUATION_TASKS,
-    MOST_TRIALS,
-    EvaluateParams,
-    count_evaluation_tasks,
-)
+from marey_schemas.job_params import MOST_EVALUATION_TASKS, MOST_TRIALS, EvaluateParams, count_evaluation_tasks
 
 
 def test_the_defaults_are_the_published_suite() -> None:

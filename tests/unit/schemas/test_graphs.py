@@ -5,8 +5,8 @@ import copy
 import pytest
 from pydantic import ValidationError
 
-from marey_schemas.documents import SCHEMAS
-from marey_schemas.graphs import ModelGraph
+from marey_schemas.documents.graphs import ModelGraph
+from marey_schemas.documents.registry import SCHEMAS
 
 
 def node(number, kind, *following):

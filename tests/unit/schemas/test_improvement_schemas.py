@@ -3,8 +3,9 @@
 import pytest
 from pydantic import ValidationError
 
-from marey_schemas.improvement import ObjectiveParams, OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
 from marey_schemas.job_kinds import MOST_TASKS, find_kind
+from marey_schemas.job_params import OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
+from marey_schemas.options.improvement import ObjectiveParams
 
 
 def test_a_sweep_has_a_task_for_every_setting_and_never_too_many():

@@ -8,7 +8,8 @@ import pytest
 
 from marey_schemas import job_kinds
 from marey_schemas.job_kinds import BUILT_IN, IMPORT, KindDeclaration, UnknownKindError, find_kind
-from marey_schemas.jobs import InputSpec, RetargetParams
+from marey_schemas.job_params import RetargetParams
+from marey_schemas.jobs import InputSpec
 from marey_schemas.kinds import Kind
 
 

@@ -5,7 +5,7 @@ from pydantic import ValidationError
 from tests.support import predecessor_models as models
 from tests.support.predecessor_models import FILE
 
-from marey_schemas.modelling import MotionPrimitiveDocument, log_likelihoods, predecessor_origin
+from marey_schemas.documents.models import MotionPrimitiveDocument, log_likelihoods, predecessor_origin
 
 
 @pytest.fixture(scope="module")

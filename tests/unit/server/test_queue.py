@@ -6,7 +6,8 @@ import pytest
 from tests.support.queue_desk import Desk
 
 from marey_schemas.access import ProjectCreate
-from marey_schemas.jobs import BatchCompletion, ClaimRequest, CompleteRequest, JobCreate, Progress
+from marey_schemas.jobs import JobCreate, Progress
+from marey_schemas.worker_protocol import BatchCompletion, ClaimRequest, CompleteRequest
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import Forbidden, Invalid, LeaseLost, NotFound
 from marey_server.store import projects

@@ -13,7 +13,7 @@ from sqlalchemy import Connection, delete, func, select
 from tests.support.queue_desk import Desk
 from tests.support.queue_model import TERMINAL, ModelJob, ModelQueue
 
-from marey_schemas.jobs import Lease
+from marey_schemas.worker_protocol import Lease
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import Conflict, LeaseLost
 from marey_server.store import tables

@@ -7,12 +7,13 @@ from tests.support.project_in_memory import ProjectInMemory, add_clip
 from marey_motion import documents
 from marey_motion.alignment.aligned_documents import StoredExample, set_from_examples
 from marey_motion.gait import generate_gait
-from marey_schemas.alignment import AlignmentInfo, AlignParams
-from marey_schemas.documents import Annotation
-from marey_schemas.documents import Motion as MotionDocument
+from marey_schemas.documents.alignments import AlignmentInfo
+from marey_schemas.documents.annotations import Annotation
+from marey_schemas.documents.clips import Motion as MotionDocument
 from marey_schemas.encoding.canonical import document_digest
-from marey_schemas.jobs import PinnedInput
+from marey_schemas.job_params import AlignParams
 from marey_schemas.kinds import Kind
+from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import JobRefused
 from marey_worker.kinds import align
 

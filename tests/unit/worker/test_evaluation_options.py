@@ -4,7 +4,7 @@ from dataclasses import asdict
 
 from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.scenario import suite_trials
-from marey_schemas.evaluation import EvaluateParams
+from marey_schemas.job_params import EvaluateParams
 from marey_worker.kinds.evaluation_options import options_of
 
 

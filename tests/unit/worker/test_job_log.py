@@ -3,7 +3,7 @@
 import pytest
 
 from marey_client.errors import Unreachable
-from marey_schemas.jobs import LogAnswer
+from marey_schemas.worker_protocol import LogAnswer
 from marey_worker import job_log
 from marey_worker.job_log import JobLog
 

@@ -9,8 +9,9 @@ import pytest
 from marey_client.errors import LeaseLost, Unavailable, Unreachable
 from marey_client.retries import Retries
 from marey_client.transport import Transport
-from marey_schemas.jobs import HeartbeatAnswer, Lease, Progress, Resources
+from marey_schemas.jobs import Progress, Resources
 from marey_schemas.problems import Problem
+from marey_schemas.worker_protocol import HeartbeatAnswer, Lease
 from marey_worker import attempt_api, heartbeats
 from marey_worker.heartbeats import LeaseKeeper
 

@@ -9,9 +9,10 @@ from marey_motion import retargeting
 from marey_motion.documents import skeleton_to_document
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_motion.moved_bones import follow_moved_bones
-from marey_schemas.jobs import PinnedInput, RetargetParams
+from marey_schemas.job_params import RetargetParams
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
+from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.job_io import skeleton_cache
 from marey_worker.kinds import retarget
 

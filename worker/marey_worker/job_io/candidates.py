@@ -13,10 +13,11 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.preparing import SAME_OFFSET_M
 from marey_motion.skeleton import same_hierarchy
-from marey_schemas.documents import Motion, RevisionRef
-from marey_schemas.jobs import PinnedInput
+from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.references import RevisionRef
 from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted
+from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import Context
 from marey_worker.job_io.evaluated_set import EvaluatedSet
 from marey_worker.job_io.matching_clips import ClipSet, build_clips, read_motions, uid_of

@@ -10,11 +10,11 @@ from marey_motion.evaluation.improvement.objective import Objective
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import records_from_tree, result_from_tree
 from marey_motion.evaluation.scenario import Trial
+from marey_schemas.documents.reports import StoredFile
 from marey_schemas.encoding.codecs import JSON, encode_tree
-from marey_schemas.improvement import ObjectiveParams
-from marey_schemas.jobs import PinnedInput
 from marey_schemas.kinds import Kind
-from marey_schemas.reports import StoredFile
+from marey_schemas.options.improvement import ObjectiveParams
+from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import Context
 from marey_worker.job_io.matching_clips import MatchingClips, read_evaluated_clips, refusing_motion_errors
 

@@ -17,13 +17,14 @@ from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.normaliser import Normaliser
 from marey_motion.matching.options import DatabaseOptions
 from marey_motion.matching.search import SearchIndex, build_index
-from marey_schemas.documents import Motion, RevisionRef
+from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.canonical import canonical_json, document_digest
-from marey_schemas.evaluation import EvaluateParams
-from marey_schemas.jobs import PinnedInput
+from marey_schemas.job_params import EvaluateParams
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
 from marey_schemas.wording import counted
+from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.skeleton_cache import Rig, read_rigged
 

@@ -9,7 +9,8 @@ from marey_motion import documents
 from marey_motion.retargeting import RetargetPlan, plan_retarget
 from marey_motion.rigs import JointAxes, JointMapping, guess_axes, map_joints, require_trust
 from marey_motion.skeleton import Skeleton
-from marey_schemas.documents import RevisionRef, SkeletonHierarchy, SkeletonMapping
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
 from marey_worker.context import Context, NoSuchThing

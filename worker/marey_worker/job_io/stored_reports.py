@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from marey_reports.drawing.drawn import DrawnFigure
-from marey_schemas.reports import Report, StoredFigure, StoredFile
+from marey_schemas.documents.reports import Report, StoredFigure, StoredFile
 from marey_worker.context import Context
 
 

@@ -25,12 +25,14 @@ from marey_motion.alignment.cost import CostOptions
 from marey_motion.alignment.segments import Cut, cuts_of
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
-from marey_schemas.alignment import MOST_EXAMPLES, AlignParams
-from marey_schemas.documents import Annotation, Motion, RevisionRef
+from marey_schemas.documents.annotations import Annotation
+from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.canonical import document_digest
-from marey_schemas.jobs import PinnedInput, StagedOutput
+from marey_schemas.job_params import MOST_EXAMPLES, AlignParams
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
+from marey_schemas.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present

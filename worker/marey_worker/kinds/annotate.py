@@ -14,11 +14,14 @@ from marey_motion.editing.annotations.speed_proposals import PauseOptions, Reach
 from marey_motion.editing.annotations.step_proposals import StepOptions, propose_steps
 from marey_motion.errors import AnnotationError, MotionError, UnknownJoint
 from marey_motion.matching.body import MatchingBody
-from marey_schemas.annotations import AnnotateParams, StepsProposal, VelocityMinimaProposal, WristContactProposal
-from marey_schemas.documents import Motion, RevisionRef
-from marey_schemas.jobs import ItemInput, PinnedInput, StagedOutput
+from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.job_params import AnnotateParams
+from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
+from marey_schemas.options.annotations import StepsProposal, VelocityMinimaProposal, WristContactProposal
+from marey_schemas.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import require_different

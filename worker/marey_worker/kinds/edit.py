@@ -14,10 +14,13 @@ from marey_motion.editing.registry import EditedClip, NamedCommand, edit_clip
 from marey_motion.editing.take import EditedBody
 from marey_motion.errors import EditError, MotionError
 from marey_motion.skeleton import Skeleton
-from marey_schemas.documents import ClipInfo, Motion, RevisionRef, SkeletonHierarchy, Source
-from marey_schemas.editing.edits import EditDocument, EditParams
-from marey_schemas.jobs import PinnedInput, StagedOutput
+from marey_schemas.documents.clips import ClipInfo, Motion, Source
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.documents.skeletons import SkeletonHierarchy
+from marey_schemas.editing.edits import EditDocument
+from marey_schemas.job_params import EditParams
 from marey_schemas.kinds import Kind
+from marey_schemas.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused, NoSuchThing
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import ResultPlaces

@@ -13,9 +13,9 @@ from marey_motion.evaluation.suite import assemble, evaluate_baseline, run_suite
 from marey_motion.matching.record import TrialRecord
 from marey_reports.evaluation.page import verdict
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
-from marey_schemas.evaluation import EvaluateParams
-from marey_schemas.jobs import StagedOutput
+from marey_schemas.job_params import EvaluateParams
 from marey_schemas.kinds import Kind
+from marey_schemas.worker_protocol import StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import read_clips, refusing_motion_errors, wanted_clips
 from marey_worker.kinds.evaluation_headline import headline_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.matching.options import ControllerOptions, DatabaseOptions, FeatureWeights
-from marey_schemas.evaluation import EvaluateParams
+from marey_schemas.job_params import EvaluateParams
 
 OF_THE_SUITE = (
     "families",

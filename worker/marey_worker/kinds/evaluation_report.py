@@ -8,8 +8,8 @@ from typing import Any
 from marey_motion.evaluation.result import EvaluationResult
 from marey_reports.evaluation.figures import FIGURES, DrawnFigure, draw_figure, draw_figures
 from marey_reports.evaluation.page import render_report
-from marey_schemas.evaluation import EvaluateParams
-from marey_schemas.reports import EvaluationReport
+from marey_schemas.documents.reports import EvaluationReport
+from marey_schemas.job_params import EvaluateParams
 from marey_worker.context import Context
 from marey_worker.job_io.stored_reports import store_report
 

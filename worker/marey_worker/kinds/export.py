@@ -11,12 +11,15 @@ from marey_motion import documents
 from marey_motion.errors import MotionError
 from marey_motion.exporting import write_clip_file
 from marey_motion.skeleton import Skeleton
-from marey_schemas.documents import Motion, RevisionRef, SkeletonHierarchy
+from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.documents.reports import StoredFile
+from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.encoding import codecs
-from marey_schemas.jobs import ExportParams, PinnedInput
+from marey_schemas.job_params import ExportParams
 from marey_schemas.kinds import Kind
-from marey_schemas.reports import StoredFile
 from marey_schemas.wording import counted
+from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import Context, JobRefused, NoSuchThing
 
 EPOCH = (1980, 1, 1, 0, 0, 0)

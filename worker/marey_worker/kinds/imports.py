@@ -8,10 +8,13 @@ from marey_motion.documents import skeleton_from_document
 from marey_motion.errors import MotionError
 from marey_motion.importing import files
 from marey_motion.importing.files import FileDigests, ImportedDocuments, ImportRequest, ModelledDocuments, PlannedFile
-from marey_schemas.documents import Check, OutputRef, SkeletonHierarchy
+from marey_schemas.documents.clips import Check
+from marey_schemas.documents.references import OutputRef
+from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, Refusal, skeleton_output
-from marey_schemas.jobs import ImportParams, StagedOutput
+from marey_schemas.job_params import ImportParams
 from marey_schemas.kinds import Kind
+from marey_schemas.worker_protocol import StagedOutput
 from marey_worker.context import Context, JobRefused, NoSuchThing
 from marey_worker.job_io.staged_results import StagedResults
 

@@ -14,11 +14,13 @@ from marey_motion.alignment.aligned_documents import StoredExample, set_from_exa
 from marey_motion.modelling.options import DEFAULT_OPTIONS, ModelOptions
 from marey_motion.modelling.primitive_documents import trained_to_tree
 from marey_motion.modelling.training import train_primitive
-from marey_schemas.alignment import AlignmentInfo
-from marey_schemas.documents import Motion, RevisionRef, SkeletonHierarchy
-from marey_schemas.jobs import PinnedInput, StagedOutput
+from marey_schemas.documents.alignments import AlignmentInfo
+from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.documents.skeletons import SkeletonHierarchy
+from marey_schemas.job_params import ModelParams
 from marey_schemas.kinds import Kind
-from marey_schemas.modelling import ModelParams
+from marey_schemas.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 from marey_worker.kinds.model_report import write_model_report

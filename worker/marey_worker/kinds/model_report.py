@@ -11,8 +11,8 @@ from marey_motion.modelling.training import TrainedPrimitive
 from marey_motion.rigs import map_joints
 from marey_reports.models.figures import ModelSubject, draw_alignment_figures, draw_model_figures
 from marey_reports.models.page import render_model_report
-from marey_schemas.modelling import ModelParams
-from marey_schemas.reports import ModelReport
+from marey_schemas.documents.reports import ModelReport
+from marey_schemas.job_params import ModelParams
 from marey_worker.context import Context
 from marey_worker.job_io.stored_reports import store_report
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from marey_motion.evaluation.improvement.sweep import SweepRow, group_influences, sweep_weights, vary_each_group
 from marey_motion.matching.options import FeatureWeights
-from marey_schemas.improvement import SweepParams
+from marey_schemas.job_params import SweepParams
 from marey_worker.context import Context
 from marey_worker.job_io.evaluated_set import objective_of, read_evaluated_set, store_document
 from marey_worker.job_io.matching_clips import refusing_motion_errors

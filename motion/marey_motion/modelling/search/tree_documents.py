@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from marey_motion.modelling.search.tree import SampleTree, TreeOptions
-from marey_schemas.references import PartDigestRef
+from marey_schemas.documents.references import PartDigestRef
 
 TREE_SCHEMA = "marey/sample-tree@1"
 

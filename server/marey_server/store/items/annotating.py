@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from marey_schemas.access import Role
-from marey_schemas.documents import RevisionRef
+from marey_schemas.documents.references import RevisionRef
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_server.errors import Invalid, MareyError, NotFound

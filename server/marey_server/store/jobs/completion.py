@@ -7,15 +7,14 @@ from typing import Any
 
 from sqlalchemy import bindparam, exists, select, tuple_, update
 
-from marey_schemas.jobs import (
+from marey_schemas.jobs import JobOutput, JobState
+from marey_schemas.worker_protocol import (
     BatchCompletion,
     BatchCompletionResult,
     CompleteAnswer,
     CompleteRequest,
     FailAnswer,
     FailRequest,
-    JobOutput,
-    JobState,
 )
 from marey_server import faults
 from marey_server.errors import MareyError, NotFound

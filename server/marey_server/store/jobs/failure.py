@@ -7,7 +7,8 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Row, update
 
-from marey_schemas.jobs import FailRequest, FailureReason
+from marey_schemas.jobs import FailureReason
+from marey_schemas.worker_protocol import FailRequest
 from marey_server.store.jobs import staging
 from marey_server.store.jobs.endings import AttemptEnd, end_attempts, end_jobs, failure_document
 from marey_server.store.jobs.events import emit_job_events, wake_workers

@@ -25,16 +25,16 @@ from sqlalchemy import (
 from sqlalchemy.sql.dml import ReturningUpdate
 
 from marey_schemas.access import Role
-from marey_schemas.jobs import (
+from marey_schemas.jobs import Resources
+from marey_schemas.problems import FieldError
+from marey_schemas.worker_protocol import (
     PROTOCOL_VERSION,
     ClaimRequest,
     Heartbeat,
     HeartbeatAnswer,
     Lease,
     PinnedInput,
-    Resources,
 )
-from marey_schemas.problems import FieldError
 from marey_server import faults
 from marey_server.access.secret_tokens import IssuedToken, issue_attempt_token
 from marey_server.errors import Forbidden, Invalid

@@ -9,9 +9,10 @@ from typing import Any
 
 from sqlalchemy import bindparam, delete, func, insert, select, tuple_, update
 
-from marey_schemas.jobs import ItemInput, StagedOutput
+from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import FieldError
+from marey_schemas.worker_protocol import StagedOutput
 from marey_server import faults
 from marey_server.errors import Conflict, Invalid
 from marey_server.store import blobs, documents

@@ -11,7 +11,7 @@ from marey_client.project import ProjectHandle
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
 from marey_schemas.access import ProjectCreate
-from marey_schemas.imports import ImportOptions
+from marey_schemas.options.imports import ImportOptions
 
 EXAMPLES = 12
 

@@ -8,8 +8,8 @@ import time
 
 from marey_schemas.base import Request
 from marey_schemas.job_kinds import KindDeclaration
-from marey_schemas.jobs import PinnedInput
 from marey_schemas.kinds import Kind
+from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import JobRefused
 
 

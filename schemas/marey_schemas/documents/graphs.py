@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, StringConstraints, model_validator
 
 from marey_schemas.base import Request
-from marey_schemas.originals import StoredOriginal
-from marey_schemas.references import OutputRef, RevisionRef
+from marey_schemas.documents.originals import StoredOriginal
+from marey_schemas.documents.references import OutputRef, RevisionRef
 
 MOST_PRIMITIVES = 10_000
 TYPES_TO_END_IN = ("end", "idle", "single")

@@ -1,7 +1,4 @@
-"""Trees over samples of a model: how one is made, and part `tree` of an item of the kind `model`.
-
-The options are those of `marey_motion.modelling.search.tree`.
-"""
+"""Trees over samples of a model: part `tree` of an item of the kind `model`."""
 
 from __future__ import annotations
 
@@ -12,27 +9,10 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from marey_schemas.base import Request
+from marey_schemas.documents.references import PartDigestRef
 from marey_schemas.encoding.arrays import ArrayOf
+from marey_schemas.job_params import MOST_TREE_SAMPLES, TreeParams
 from marey_schemas.names import Digest
-from marey_schemas.references import PartDigestRef
-
-MOST_TREE_SAMPLES = 100_000
-
-
-class TreeParams(Request):
-    """Parameters of `tree`."""
-
-    samples: int = Field(10_000, ge=1, le=MOST_TREE_SAMPLES, description="Drawn from the model.")
-    branching: int = Field(4, ge=2, le=64, description="Children of a node, at most.")
-    leaf_size: int = Field(1, ge=1, le=MOST_TREE_SAMPLES, description="Nodes of so few samples are not split.")
-    depth: int = Field(64, ge=1, le=64, description="Levels below the root, at most.")
-    features: Literal["end_effectors", "latent"] = Field(
-        "end_effectors", description="What is grouped: where hands, feet and head are, or the spatial scores."
-    )
-
-    def unclear_place(self, into: str) -> str | None:
-        """Why the tree cannot go into this collection."""
-        return f"a tree becomes a part of its model and cannot go to {into}; leave `into` empty" if into else None
 
 
 class SampleTreeDocument(Request):

@@ -1,7 +1,4 @@
-"""Generative models of motion: what training can be asked for, and part `model` of an item of the kind `model`.
-
-The options are those of `marey_motion.modelling.options`.
-"""
+"""Generative models of motion: part `model` of an item of the kind `model`."""
 
 from __future__ import annotations
 
@@ -13,10 +10,10 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from marey_schemas.base import Request
+from marey_schemas.documents.originals import StoredOriginal
+from marey_schemas.documents.references import OutputRef, RevisionRef
 from marey_schemas.encoding.arrays import ArrayOf
-from marey_schemas.names import ItemName, JointName, Tag
-from marey_schemas.originals import StoredOriginal
-from marey_schemas.references import OutputRef, RevisionRef
+from marey_schemas.names import ItemName, JointName
 
 MOST_JOINTS = 4096
 MOST_KEYFRAMES = 1000
@@ -25,51 +22,9 @@ MOST_BASIS_NUMBERS = 20_000_000
 """Canonical frames times spline coefficients, whose products are kept while a model is in use."""
 MOST_SAMPLES = 1000
 MOST_SEED = 2**63 - 1
-
 Vector = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=1)]
 Matrix = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=2)]
 Stack = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=3)]
-Share = Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)]
-
-
-class ModelParams(Request):
-    """Parameters of `model`."""
-
-    name: ItemName = Field("model", description="Name of the result, and of the action.")
-    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the result.")
-    scaling: Literal["jacobian", "root_max", "sfpca", "none"] = Field(
-        "jacobian",
-        description="How channels are weighed. jacobian: by how far they move the body; sfpca: optimised for the "
-        "positions of joints; root_max: root axes to a maximum of 1; none: as they are.",
-    )
-    inner_product: Literal["coefficients", "l2"] = Field(
-        "coefficients", description="l2: integrals of products of functions, which do not depend on the knots."
-    )
-    spatial_share: Share = Field(0.95, description="Share of the variance that the spatial components hold.")
-    spatial_components: int | None = Field(None, ge=0, le=1000, description="Exactly so many, in place of the share.")
-    spatial_coefficients: int | None = Field(
-        None, ge=4, le=10_000, description="Of each channel's spline; default: a fifth of the frames, at least 7."
-    )
-    temporal_share: Share = Field(0.99, description="Share of the variance that the time components hold.")
-    most_temporal_components: int = Field(3, ge=0, le=1000, description="The time components are at most so many.")
-    temporal_coefficients: int = Field(8, ge=4, le=1000, description="Of the spline of the time function.")
-    temporal_weight: float | None = Field(
-        None, ge=1e-3, le=1e3, allow_inf_nan=False, description="Of time in latent vectors; default: as much as space."
-    )
-    criterion: Literal["bic", "aic"] = Field("bic", description="What chooses the number of mixture components.")
-    most_mixture_components: int = Field(10, ge=1, le=100, description="Tried at most.")
-    mixture_components: int | None = Field(None, ge=1, le=100, description="Exactly so many, in place of a choice.")
-    regularisation: float = Field(
-        1e-4, ge=1e-12, le=1, allow_inf_nan=False, description="Added to variances, as a share of the mean variance."
-    )
-    starts: int = Field(5, ge=1, le=100, description="Of expectation maximisation; the best counts.")
-    leave_one_out: bool = Field(True, description="Measure how well each example is reconstructed by the others.")
-    folds: int = Field(5, ge=0, le=100, description="Parts held out in turn for likelihoods; 0: none.")
-    report_samples: int = Field(200, ge=0, le=10_000, description="Drawn to measure feet and durations.")
-    report: bool = Field(True, description="Write the report and its figures.")
-    search_check: bool = Field(
-        True, description="For the report: search for places that examples reached, by a model without them."
-    )
 
 
 class FunctionalComponentsDocument(Request):

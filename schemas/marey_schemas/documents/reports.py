@@ -7,8 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Request
-from marey_schemas.evaluation import TrialName
-from marey_schemas.names import Digest
+from marey_schemas.names import Digest, TrialName
 
 ScriptDigest = Annotated[str, StringConstraints(pattern=r"^sha256-[A-Za-z0-9+/]{43}=$")]
 """A script by its content, as a Content-Security-Policy names it."""

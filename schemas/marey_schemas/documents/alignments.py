@@ -1,4 +1,4 @@
-"""Aligned examples of an action: what can be asked for, and part `info` of an item of the kind `processed`."""
+"""Aligned examples of an action: part `info` of an item of the kind `processed`."""
 
 from __future__ import annotations
 
@@ -6,66 +6,14 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, StringConstraints, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from marey_schemas.annotations import Label, LayerName
 from marey_schemas.base import Request
 from marey_schemas.encoding.arrays import ArrayOf
-from marey_schemas.names import Digest, JointName, NameSuffix, Tag
+from marey_schemas.job_params import AlignParams
+from marey_schemas.names import Digest, JointName, Label
 
-MOST_EXAMPLES = 2000
-"""That are all compared with each other, mirrored ones counted."""
-
-Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
-ReferenceChoice = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 Metres = Annotated[float, Field(allow_inf_nan=False)]
-
-
-class AlignParams(Request):
-    """Parameters of `align`."""
-
-    suffix: NameSuffix = Field("", description="Appended to the names of the results.")
-    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the results.")
-    reference: ReferenceChoice = Field(
-        "medoid",
-        description="Whose time is the canonical time: medoid (the clip nearest to all others), nearest_mean_length, "
-        "or the id of a clip.",
-    )
-    rate_hz: float | None = Field(
-        None,
-        gt=0,
-        le=1000,
-        allow_inf_nan=False,
-        description="Of canonical frames; default: that of the reference where it is named, else the commonest one.",
-    )
-    layer: LayerName | None = Field(
-        None, description="Layer of the annotations to go by; default: the only one that a clip has among the input."
-    )
-    labels: tuple[Label, ...] = Field(
-        (), max_length=1000, description="Labels whose segments and keyframes cut the clips; none: all of them."
-    )
-    slope_limit: int | None = Field(
-        3, ge=0, le=60, description="So many frames in a row of one clip may belong to one of the other; null: any."
-    )
-    cost: Literal["turned", "plain"] = Field(
-        "turned",
-        description="turned: poses are compared after the best turn and shift on the ground; plain: as they are.",
-    )
-    window: int = Field(1, ge=1, le=61, description="Odd number of frames that are compared at once.")
-    weights: dict[JointName, Weight] = Field(
-        default_factory=dict,
-        max_length=4096,
-        description="Weight in the cost by joint, under its own or its standard name; others count 1.",
-    )
-    mirroring: Literal["none", "add"] = Field("none", description="add: a mirrored twin of every clip beside it.")
-    keep_height: bool = Field(True, description="Leave heights above the floor as they are.")
-
-    @field_validator("window")
-    @classmethod
-    def _check_window(cls, window: int) -> int:
-        if window % 2 == 0:
-            raise ValueError("must be odd: as many frames before as after")
-        return window
 
 
 class ExampleRef(Request):

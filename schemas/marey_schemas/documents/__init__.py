@@ -1,0 +1,1 @@
+"""Documents that the revisions of items are made of."""

@@ -1,0 +1,93 @@
+"""Clips: their motions and what is known about where they come from.
+
+Lengths are metres, times seconds, quaternions w,x,y,z; axes are right-handed with Y up
+(docs/explanation/conventions.md).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, StringConstraints, model_validator
+
+from marey_schemas.base import Request
+from marey_schemas.documents.references import OutputRef as OutputRef
+from marey_schemas.documents.references import RevisionRef as RevisionRef
+from marey_schemas.documents.skeletons import MAX_JOINTS
+from marey_schemas.encoding.arrays import ArrayOf
+from marey_schemas.names import Digest, JointName, Tag
+
+MAX_FRAME_RATE_HZ = 100_000.0
+
+
+class Motion(Request):
+    """Part `motion` of a clip: the poses."""
+
+    schema_: Literal["marey/motion@1"] = Field("marey/motion@1", alias="schema")
+    skeleton: RevisionRef | OutputRef
+    frame_rate_hz: float = Field(gt=0, le=MAX_FRAME_RATE_HZ, allow_inf_nan=False)
+    joints: tuple[JointName, ...] = Field(min_length=1, max_length=MAX_JOINTS, description="Order of the rotations.")
+    poses: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=2)] = Field(
+        description="[frames, 3 + 4*joints]: root translation (m), then local quaternions."
+    )
+    translations: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=3, columns=3)] | None = Field(
+        None, description="[frames, k, 3] local translations (m) that replace offsets."
+    )
+    translated_joints: tuple[JointName, ...] = ()
+
+    @model_validator(mode="after")
+    def _check_shapes(self) -> Self:
+        frames, width = self.poses.shape
+        if frames < 1:
+            raise ValueError("poses: a motion needs at least one frame")
+        if width != 3 + 4 * len(self.joints):
+            raise ValueError(f"poses: {width} columns, but {len(self.joints)} joints need {3 + 4 * len(self.joints)}")
+        if (self.translations is None) != (not self.translated_joints):
+            raise ValueError("translations and translated_joints go together")
+        if self.translations is not None and self.translations.shape != (frames, len(self.translated_joints), 3):
+            raise ValueError(
+                f"translations: shape {self.translations.shape}, expected {(frames, len(self.translated_joints), 3)}"
+            )
+        if unknown := set(self.translated_joints) - set(self.joints):
+            raise ValueError(f"translated_joints: {sorted(unknown)} are none of the joints")
+        return self
+
+
+class Check(Request):
+    """One finding about a motion: a stable code, where it was seen, and a sentence for people."""
+
+    code: Annotated[str, StringConstraints(pattern=r"^[a-z0-9-]{1,64}$")]
+    message: str
+    joints: tuple[str, ...] = ()
+    frames: tuple[int, int] | None = Field(None, description="Half-open frame range.")
+    values: dict[str, Any] = Field(default_factory=dict)
+
+
+class Source(Request):
+    """Where a clip came from and what the importer did to it."""
+
+    file: Digest | None = Field(None, description="The file exactly as it came.")
+    file_name: str | None = None
+    companion: Digest | None = Field(None, description="A second file the format needs, as an ASF beside an AMC.")
+    companion_name: str | None = None
+    format: str | None = None
+    details: dict[str, Any] = Field(
+        default_factory=dict,
+        description="Unit scale, axes, channel orders, trimmed frames, floor shift, with the evidence.",
+    )
+
+
+class ClipInfo(Request):
+    """Part `info` of a clip: what people and importers say about it."""
+
+    schema_: Literal["marey/clip-info@1"] = Field("marey/clip-info@1", alias="schema")
+    subject: str | None = None
+    action: str | None = None
+    tags: tuple[Tag, ...] = ()
+    capture_system: str | None = None
+    licence: str | None = None
+    comment: str | None = None
+    source: Source | None = None
+    checks: tuple[Check, ...] = ()

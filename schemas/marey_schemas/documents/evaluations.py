@@ -1,0 +1,31 @@
+"""Evaluations of locomotion clips: the parts of an item of the kind `evaluation`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import ConfigDict, Field
+
+from marey_schemas.base import Request
+
+
+class EvaluationDocument(Request):
+    """Part `evaluation`: options, provenance, metrics of every trial, usage, coverage, baseline.
+
+    Its members are those of `marey_motion.evaluation.result.EvaluationResult`, with arrays as leaves; what is fixed
+    here is what lists and summaries show.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    schema_: Literal["marey/evaluation@1"] = Field("marey/evaluation@1", alias="schema")
+    verdict: str = Field(max_length=2000, description="How good the clips are, in a sentence or two.")
+    headline: dict[str, float | int | None] = Field(max_length=64, description="The numbers that lists show, by name.")
+
+
+class EvaluationRecords(Request):
+    """Part `records`: every tick of every trial, joined over the trials."""
+
+    model_config = ConfigDict(extra="allow")
+
+    schema_: Literal["marey/evaluation-records@1"] = Field("marey/evaluation-records@1", alias="schema")

@@ -1,0 +1,51 @@
+"""The document models by the name of their schema."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import ConfigDict, Field, StringConstraints
+
+from marey_schemas.base import Request
+from marey_schemas.documents.alignments import AlignmentInfo
+from marey_schemas.documents.annotations import Annotation
+from marey_schemas.documents.clips import ClipInfo, Motion
+from marey_schemas.documents.evaluations import EvaluationDocument, EvaluationRecords
+from marey_schemas.documents.graphs import ModelGraph
+from marey_schemas.documents.models import MotionPrimitiveDocument
+from marey_schemas.documents.references import OutputRef as OutputRef
+from marey_schemas.documents.references import RevisionRef as RevisionRef
+from marey_schemas.documents.reports import EvaluationReport, ModelReport
+from marey_schemas.documents.sample_trees import SampleTreeDocument
+from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
+from marey_schemas.editing.edits import EditDocument
+
+
+class OpenDocument(Request):
+    """A document of a kind whose own schema is not fixed yet: anything under `body`."""
+
+    model_config = ConfigDict(extra="allow")
+
+    schema_: Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]*/[a-z0-9][a-z0-9_-]*@[1-9][0-9]*$")] = (
+        Field("marey/document@1", alias="schema")
+    )
+
+
+SCHEMAS: dict[str, type[Request]] = {
+    "marey/skeleton@1": SkeletonHierarchy,
+    "marey/skeleton-mapping@1": SkeletonMapping,
+    "marey/motion@1": Motion,
+    "marey/clip-info@1": ClipInfo,
+    "marey/annotation@1": Annotation,
+    "marey/evaluation@1": EvaluationDocument,
+    "marey/evaluation-records@1": EvaluationRecords,
+    "marey/evaluation-report@1": EvaluationReport,
+    "marey/edit@1": EditDocument,
+    "marey/alignment@1": AlignmentInfo,
+    "marey/motion-primitive@1": MotionPrimitiveDocument,
+    "marey/sample-tree@1": SampleTreeDocument,
+    "marey/model-report@1": ModelReport,
+    "marey/model-graph@1": ModelGraph,
+    "marey/document@1": OpenDocument,
+}
+"""Model by schema name."""

@@ -1,0 +1,78 @@
+"""Skeletons: the hierarchy of joints, and which joint plays which standard joint.
+
+Lengths are metres, quaternions w,x,y,z; axes are right-handed with Y up (docs/explanation/conventions.md).
+"""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from marey_schemas.base import Request
+from marey_schemas.documents.references import OutputRef as OutputRef
+from marey_schemas.documents.references import RevisionRef as RevisionRef
+from marey_schemas.names import JointName
+
+MAX_JOINTS = 4096
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class Joint(Request):
+    """One joint of a hierarchy."""
+
+    name: JointName
+    parent: int = Field(ge=-1, description="Index of the parent, smaller than the joint's own; -1 for the root.")
+    offset: Vector3 = Field(description="Position in the parent's rest frame, metres.")
+    rest_rotation: Quaternion = Field((1.0, 0.0, 0.0, 0.0), description="Local rest rotation, w,x,y,z.")
+    display_name: str | None = Field(None, description="Name in the source, where it differs from `name`.")
+
+
+class EndSite(Request):
+    """A point at the end of a chain that has no rotation of its own."""
+
+    joint: int = Field(ge=0)
+    offset: Vector3
+
+
+class SkeletonHierarchy(Request):
+    """Part `hierarchy` of a skeleton: joints with parents before children."""
+
+    schema_: Literal["marey/skeleton@1"] = Field("marey/skeleton@1", alias="schema")
+    joints: tuple[Joint, ...] = Field(min_length=1, max_length=MAX_JOINTS)
+    end_sites: tuple[EndSite, ...] = Field((), max_length=4 * MAX_JOINTS)
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        seen: set[str] = set()
+        for index, joint in enumerate(self.joints):
+            if joint.name in seen:
+                raise ValueError(f"joints[{index}]: the name {joint.name!r} stands twice")
+            seen.add(joint.name)
+            if (joint.parent == -1) != (index == 0) or joint.parent >= index:
+                place = f"joints[{index}] ({joint.name})"
+                raise ValueError(f"{place}: parent {joint.parent} must come before it; only joint 0 is the root")
+        for index, site in enumerate(self.end_sites):
+            if site.joint >= len(self.joints):
+                raise ValueError(f"end_sites[{index}]: joint {site.joint} does not exist")
+        return self
+
+
+class JointAxes(Request):
+    """Anatomical axes of a joint in its own local frame: `twist` along the bone, `swing` orthogonal to it."""
+
+    twist: Vector3
+    swing: Vector3
+
+
+class SkeletonMapping(Request):
+    """Part `mapping` of a skeleton: which joint plays which standard joint, and its axes. Editable."""
+
+    schema_: Literal["marey/skeleton-mapping@1"] = Field("marey/skeleton-mapping@1", alias="schema")
+    rig: str | None = Field(None, description="The known rig whose names were recognised.")
+    method: Literal["names", "geometry", "manual"] = "manual"
+    confidence: float = Field(1.0, ge=0.0, le=1.0)
+    joints: dict[str, JointName] = Field(default_factory=dict, description="Standard joint name to joint name.")
+    axes: dict[JointName, JointAxes] = Field(default_factory=dict)
+    notes: tuple[str, ...] = ()

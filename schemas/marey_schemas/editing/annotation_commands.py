@@ -1,0 +1,139 @@
+"""Commands that change an annotation, and imports of annotations in the forms of the predecessor."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from marey_schemas.base import Request
+from marey_schemas.names import ItemName, Label, LayerName, Message
+
+MAX_FRAME = 2**31 - 1
+MAX_COMMANDS = 1000
+Frame = Annotated[int, Field(ge=0, le=MAX_FRAME)]
+
+
+class CreateSegment(Request):
+    """Put the frames [start, end) under a label."""
+
+    command: Literal["create_segment"]
+    label: Label
+    start: Frame
+    end: Frame
+    overwrite: bool = Field(False, description="Segments that are there give way; else they forbid it.")
+
+
+class RemoveSegment(Request):
+    """Leave the frames of a segment without a label."""
+
+    command: Literal["remove_segment"]
+    at: Frame = Field(description="Any frame of the segment.")
+
+
+class SplitSegment(Request):
+    """Cut a segment in two."""
+
+    command: Literal["split_segment"]
+    at: Frame = Field(description="First frame of the second part.")
+    label: Label | None = Field(None, description="Of the second part; absent: that of the first.")
+
+
+class MergeSegment(Request):
+    """Make one of a segment and its neighbour, with the gap between them."""
+
+    command: Literal["merge_segment"]
+    at: Frame = Field(description="Any frame of the segment, whose label stays.")
+    neighbour: Literal["next", "previous", "nearest"] = "next"
+
+
+class MoveBoundary(Request):
+    """Let a segment start or end at another frame; a neighbour at that edge follows or gives way."""
+
+    command: Literal["move_boundary"]
+    at: Frame = Field(description="Any frame of the segment.")
+    edge: Literal["start", "end"]
+    to: Frame
+
+
+class RelabelSegment(Request):
+    """Give a segment another label."""
+
+    command: Literal["relabel_segment"]
+    at: Frame = Field(description="Any frame of the segment.")
+    label: Label
+
+
+class AddKeyframe(Request):
+    """Mark a frame."""
+
+    command: Literal["add_keyframe"]
+    label: Label
+    frame: Frame
+
+
+class MoveKeyframe(Request):
+    """Mark another frame instead."""
+
+    command: Literal["move_keyframe"]
+    label: Label
+    frame: Frame
+    to: Frame
+
+
+class RemoveKeyframe(Request):
+    """Take a mark away."""
+
+    command: Literal["remove_keyframe"]
+    label: Label
+    frame: Frame
+
+
+class Clear(Request):
+    """Take every segment and keyframe away."""
+
+    command: Literal["clear"]
+
+
+AnnotationCommand = Annotated[
+    CreateSegment
+    | RemoveSegment
+    | SplitSegment
+    | MergeSegment
+    | MoveBoundary
+    | RelabelSegment
+    | AddKeyframe
+    | MoveKeyframe
+    | RemoveKeyframe
+    | Clear,
+    Field(discriminator="command"),
+]
+
+
+class AnnotationChange(Request):
+    """Commands that are applied to an annotation one after another: all of them, or none."""
+
+    commands: tuple[AnnotationCommand, ...] = Field(min_length=1, max_length=MAX_COMMANDS)
+    message: Message = Field("", description="Shown in the history.")
+
+
+class AnnotationImport(Request):
+    """An annotation of a clip in one of the predecessor's forms: `sections`, or `semantic_annotation`."""
+
+    document: dict[str, Any] = Field(description="The document, as the predecessor keeps or exports it.")
+    layer: LayerName = "imported"
+    name: ItemName | None = Field(None, description="Of the annotation; default: that of the clip and the layer's.")
+    end_index: Literal["inclusive", "exclusive"] = Field(
+        "inclusive",
+        description="Whether a section holds its frame `end_idx`, as the predecessor's editor means it, or ends before "
+        "it, as its time warping means it.",
+    )
+    labels: tuple[Label, ...] | None = Field(
+        None, max_length=1000, description="Only these: labels that overlap make layers of their own."
+    )
+    message: Message = ""
+
+
+def command_arguments(command: Request) -> dict[str, Any]:
+    """What a command says besides its name."""
+    return command.model_dump(exclude={"command"})

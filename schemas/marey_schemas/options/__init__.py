@@ -1,0 +1,1 @@
+"""Options: the one declaration of name, type, range, default and meaning of everything that can be chosen."""

@@ -1,0 +1,63 @@
+"""Options of proposals: which segments and keyframes an algorithm finds in a clip."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from marey_schemas.base import Request
+from marey_schemas.names import JointName
+
+Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
+Degrees = Annotated[float, Field(ge=0, le=360, allow_inf_nan=False)]
+
+
+class StepsProposal(Request):
+    """Steps of a walk or run, from the contact of one foot to that of the other, named after the foot that swings."""
+
+    method: Literal["steps"] = "steps"
+    contact_speed_m_s: float = Field(
+        0.5, gt=0, le=10, allow_inf_nan=False, description="A foot slower than this begins to stand."
+    )
+    shortest_s: Seconds = Field(0.2, description="Shorter steps get no label.")
+    longest_s: Seconds = Field(1.5, description="Longer steps get no label.")
+    shortest_m: float = Field(0.2, ge=0, le=10, allow_inf_nan=False, description="Way of the hips in a step.")
+    most_turn_deg: Degrees = Field(45.0, description="Steps that turn the body more get no label.")
+    most_aside_deg: Degrees = Field(45.0, description="Steps that lead further off where the body faces get no label.")
+    standing_s: Seconds = Field(0.6, description="Both feet on the ground for so long: labelled `standing`.")
+
+    @model_validator(mode="after")
+    def _check_durations(self) -> Self:
+        if self.longest_s <= self.shortest_s:
+            raise ValueError("longest_s must be more than shortest_s")
+        return self
+
+
+class VelocityMinimaProposal(Request):
+    """Movements from one minimum of the speed of joints to the next, with a keyframe `pause` at each minimum."""
+
+    method: Literal["velocity_minima"] = "velocity_minima"
+    joints: tuple[JointName, ...] = Field(
+        (), max_length=256, description="Joints, by their own or their standard names, whose mean speed counts."
+    )
+    smoothing_s: float = Field(0.05, gt=0, le=10, allow_inf_nan=False, description="Deviation of the smoothing.")
+    least_depth: float = Field(
+        0.1, gt=0, le=1, allow_inf_nan=False, description="Depth of a minimum, as a share of the highest speed."
+    )
+    least_apart_s: float = Field(0.2, gt=0, le=3600, allow_inf_nan=False, description="Time between minima.")
+
+
+class WristContactProposal(Request):
+    """Reaches of a hand out of its rest and back, with a keyframe `contact` where it arrives at its far place."""
+
+    method: Literal["wrist_contact"] = "wrist_contact"
+    hand: Literal["left", "right", "either"] = Field("either", description="Either: the one that reaches farther.")
+    least_reach_m: float = Field(0.2, gt=0, le=10, allow_inf_nan=False, description="Less is no reach.")
+    arrived: float = Field(
+        0.95, gt=0.25, le=1, allow_inf_nan=False, description="Share of the way at which a hand has arrived."
+    )
+    release: bool = Field(False, description="A keyframe `release` at the last frame at the far place, too.")
+
+
+Proposal = Annotated[StepsProposal | VelocityMinimaProposal | WristContactProposal, Field(discriminator="method")]

@@ -1,0 +1,32 @@
+"""Options of imports: what the caller knows and the files do not say."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from marey_schemas.base import Request
+from marey_schemas.names import CollectionPath, Tag
+
+
+class ImportOptions(Request):
+    """What the caller knows and the files do not say. Absent: inferred from evidence, or asked for when ambiguous."""
+
+    collection: CollectionPath = Field("", description="Folder of the project that the clips go to.")
+    skeleton: str | None = Field(
+        None, description="Item id of the skeleton the clips must use; absent: found or created."
+    )
+    unit: Literal["m", "cm", "mm", "dm", "inch", "ft", "cmu"] | None = Field(
+        None, description="Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."
+    )
+    unit_scale_m: float | None = Field(None, gt=1e-6, lt=1e3, description="Metres per unit, where no named unit fits.")
+    up_axis: Literal["x", "y", "z"] | None = Field(
+        None, description="Axis that points up in the files. Absent: inferred."
+    )
+    frame_rate_hz: float | None = Field(None, gt=0, le=100_000, description="Instead of what the files say.")
+    trim_rest_pose: bool = Field(False, description="Drop rest poses at both ends.")
+    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of every clip.")
+    subject: str | None = Field(None, max_length=255, description="Who moves.")
+    licence: str | None = Field(None, max_length=255, description="What the data may be used for.")
+    capture_system: str | None = Field(None, max_length=255, description="What recorded it.")

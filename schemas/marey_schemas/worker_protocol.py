@@ -1,0 +1,201 @@
+"""Messages between workers and the server: claims, leases, heartbeats, staged results, and the ends of attempts."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from marey_schemas.base import Answer, Request
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.jobs import ItemInput, JobOutput, JobState, Progress, Resources
+from marey_schemas.kinds import Kind
+from marey_schemas.names import CollectionPath, ItemName, Tag
+
+PROTOCOL_VERSION = 1
+"""Version of the worker protocol; sent with every claim."""
+
+
+class ClaimRequest(Request):
+    """A worker asks for work."""
+
+    worker: str = Field(min_length=1, max_length=255, description="Name of the worker, for people.")
+    kinds: tuple[str, ...] = Field(min_length=1, max_length=256)
+    labels: dict[str, str] = Field(default_factory=dict)
+    max: int = Field(1, ge=1, le=256)
+    wait_s: float = Field(0, ge=0, le=30)
+    protocol: int = PROTOCOL_VERSION
+    job: str | None = Field(None, description="Only this job.")
+
+
+class PinnedInput(Answer):
+    """An input as the worker reads it."""
+
+    item: str
+    revision: int
+    kind: Kind
+    name: str
+    collection: str
+    below: str | None = Field(None, description="Of what another job made: its collection below that job's `into`.")
+
+    @property
+    def folder(self) -> str:
+        """Where below the job's `into` results go that keep the place of this input."""
+        return self.collection if self.below is None else self.below
+
+    @property
+    def path(self) -> str:
+        """Collection and name."""
+        return f"{self.collection}/{self.name}".lstrip("/")
+
+    @property
+    def ref(self) -> RevisionRef:
+        """As documents refer to it."""
+        return RevisionRef(item=self.item, revision=self.revision)
+
+    def as_input(self) -> ItemInput:
+        """As results name what they were made of."""
+        return ItemInput(item=self.item, revision=self.revision)
+
+
+class Lease(Answer):
+    """The right to work on a job until the lease ends."""
+
+    job: str
+    project: str
+    kind: str
+    params: dict[str, Any]
+    inputs: dict[str, tuple[PinnedInput, ...]]
+    into: str
+    seed: int
+    position: int | None = Field(None, description="Of a task: which of its fan-out it is, from 0.")
+    size: int | None = Field(None, description="Tasks of the fan-out, for its tasks and for the job that gathers them.")
+    resources: Resources
+    fence: int
+    attempt: int
+    attempt_token: str
+    lease_ttl_s: float
+    heartbeat_s: float
+
+
+class LeaseList(Answer):
+    """The leases a claim got; empty if there was no work."""
+
+    leases: tuple[Lease, ...] = ()
+
+
+class Heartbeat(Request):
+    """The worker is alive."""
+
+    progress: Progress | None = None
+
+
+class HeartbeatAnswer(Answer):
+    """How long the lease lasts now, and whether to stop."""
+
+    lease_ttl_s: float
+    cancel_requested: bool
+    deadline_s: float | None = Field(None, description="Seconds left of the job's time limit.")
+
+
+class StagedOutput(Request):
+    """One result, staged: invisible until the attempt completes."""
+
+    name: str = Field(
+        min_length=1, max_length=1500, description="Unique within the attempt; other outputs refer to it."
+    )
+    kind: Kind
+    item_name: ItemName
+    collection: CollectionPath = Field("", description="Below the job's `into`.")
+    tags: tuple[Tag, ...] = Field((), max_length=64)
+    parts: dict[str, Any] = Field(min_length=1)
+    sources: dict[str, tuple[ItemInput, ...]] = Field(
+        default_factory=dict, description="Inputs this result was made from, by input name."
+    )
+    reuse: Literal["by_name", "by_content"] = Field(
+        "by_name", description="by_content: an item of the project with equal parts serves instead of a new one."
+    )
+
+
+class StageRequest(Request):
+    """Stage results."""
+
+    outputs: tuple[StagedOutput, ...] = Field(min_length=1, max_length=256)
+
+
+class CompleteRequest(Request):
+    """Publish what is staged and end the job. The same `write_id` again gives the same answer."""
+
+    write_id: str = Field(min_length=8, max_length=64)
+    result: dict[str, Any] = Field(default_factory=dict)
+    code_version: str | None = Field(None, max_length=255)
+    environment: dict[str, str] = Field(default_factory=dict)
+
+
+class FailRequest(Request):
+    """The attempt did not succeed."""
+
+    write_id: str = Field(min_length=8, max_length=64)
+    code: str = Field(min_length=1, max_length=128)
+    detail: str = Field("", max_length=20_000)
+    signature: str | None = Field(None, max_length=255, description="Two attempts with the same signature are poison.")
+    retryable: bool = True
+    interrupted: bool = Field(False, description="The worker was stopped; counts as no attempt.")
+
+
+class BatchCompletion(CompleteRequest):
+    """One completion of a batch."""
+
+    job: str
+    fence: int
+
+
+class BatchCompleteRequest(Request):
+    """Complete many jobs that stage no outputs beyond those staged already."""
+
+    completions: tuple[BatchCompletion, ...] = Field(min_length=1, max_length=256)
+
+
+class CompleteAnswer(Answer):
+    """The job has succeeded, and this is what it published."""
+
+    job: str
+    state: JobState
+    outputs: tuple[JobOutput, ...] = ()
+
+
+class FailAnswer(Answer):
+    """What becomes of the job after the failed attempt."""
+
+    job: str
+    state: JobState
+    retry_in_s: float | None = Field(None, description="Set when the job is queued again.")
+
+
+class BatchCompletionResult(Answer):
+    """What became of one completion of a batch: an answer, or the reason why there is none."""
+
+    job: str
+    fence: int
+    answer: CompleteAnswer | None = None
+    code: str | None = None
+    detail: str | None = None
+
+
+class BatchCompleteAnswer(Answer):
+    """One result per completion, in the order sent."""
+
+    results: tuple[BatchCompletionResult, ...]
+
+
+class StageAnswer(Answer):
+    """How many results the attempt has staged."""
+
+    staged: int
+
+
+class LogAnswer(Answer):
+    """How long the attempt's log is now."""
+
+    offset: int = Field(description="Where the next piece goes.")
+    capped: bool = Field(default=False, description="The log is full; nothing more is kept.")
