@@ -23,10 +23,10 @@ import numpy as np
 
 from benchmarks.local_server import LocalServer, clean_environment, running
 from marey_client import Marey
+from marey_client.handles.pipelines import PipelineRun
 from marey_client.imports import find_files
-from marey_client.model_building import plan_model
-from marey_client.pipelines import PipelineRun
 from marey_client.project import ProjectHandle
+from marey_client.requests import plan_model
 from marey_motion.clip import Clip
 from marey_motion.formats import write_motion
 from marey_motion.gait import game_skeleton, generate_gait

@@ -1,4 +1,4 @@
-"""Bytes by digest: which does the server lack, send them, fetch them."""
+"""Bytes by digest: ask which the server lacks, send them, fetch them."""
 
 from __future__ import annotations
 
@@ -6,19 +6,21 @@ import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import httpx
 
 from marey_client.downloads import saved_atomically
-from marey_client.errors import DigestMismatch, FileChanged
+from marey_client.errors import Conflict, DigestMismatch, FileChanged, Unreachable
 from marey_client.one_or_several import several
-from marey_client.transport import OCTETS, Transport
-from marey_client.uploads import send_in_pieces
-from marey_schemas.items import BlobsMissing, BlobsQuery
+from marey_client.transport import OCTETS, Transport, as_json, read_model
+from marey_schemas.items import BlobsMissing, BlobsQuery, Upload, UploadCreate
 
 CHUNK_BYTES = 1 << 20
 DIGESTS_PER_QUESTION = 10_000
 RESUMABLE_FROM_BYTES = 64 << 20
+PIECE_BYTES = 16 << 20
+TRIES_PER_PIECE = 5
 
 
 def digest_of(data: bytes) -> str:
@@ -111,3 +113,42 @@ def _chunks(path: Path, size_bytes: int) -> Iterator[bytes]:
             yield chunk
     if left > 0:
         raise FileChanged(f"{path} has become shorter while it was being sent")
+
+
+def send_in_pieces(transport: Transport, path: Path, digest: str) -> str:
+    """Send a file as a resumable upload; the digest of the blob it became.
+
+    Raises `Unreachable` where the server stays away, `FileChanged` where the file becomes shorter, `Invalid` where the
+    bytes that arrived are not what `digest` says.
+    """
+    announced = UploadCreate(length=path.stat().st_size, digest=digest)
+    upload = read_model(Upload, transport.send("POST", "/uploads", content=as_json(announced)))
+    tries = 0
+    with path.open("rb") as file:
+        while upload.digest is None:
+            try:
+                upload, tries = _send_piece(transport, upload, file), 0
+            except (Unreachable, Conflict):
+                tries += 1
+                now = transport.get(Upload, f"/uploads/{upload.id}")
+                if now == upload and tries == TRIES_PER_PIECE:
+                    raise
+                upload = now
+    return digest
+
+
+def _send_piece(transport: Transport, upload: Upload, file: BinaryIO) -> Upload:
+    """How far the upload is after one more piece; the last one, perhaps empty, makes a blob of it."""
+    file.seek(upload.offset)
+    piece = file.read(min(PIECE_BYTES, upload.length - upload.offset))
+    if not piece and upload.offset < upload.length:
+        raise FileChanged(f"{file.name} has become shorter while it was being sent")
+    response = transport.send(
+        "PATCH",
+        f"/uploads/{upload.id}",
+        content=piece,
+        media_type=OCTETS,
+        headers={"Upload-Offset": str(upload.offset)},
+        repeatable=False,
+    )
+    return read_model(Upload, response)

@@ -2,44 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from typing import Any, Literal
 
 from marey_client.access import Members
-from marey_client.alignments import ProcessedHandle, align_request
-from marey_client.annotation_jobs import AnnotationPlaces, annotate_request, cut_request
-from marey_client.annotations import AnnotationHandle
-from marey_client.blobs import Blobs
-from marey_client.coverage_streams import CoverageStreams
-from marey_client.edit_jobs import edit_request
-from marey_client.edits import Commands, EditHandle, Edits
-from marey_client.evaluations import EvaluationHandle, Places, as_input, as_places, evaluate_request, items_at
-from marey_client.imports import Imports
-from marey_client.items import ItemHandle, Items
+from marey_client.handles.coverage_streams import CoverageStreams
+from marey_client.handles.edits import Commands
+from marey_client.handles.evaluations import EvaluationHandle
+from marey_client.handles.models import ModelHandle
+from marey_client.handles.pipelines import PipelineRun, submit_pipeline
 from marey_client.jobs import Jobs
-from marey_client.model_building import Takes, plan_model
-from marey_client.models import AlignedPlaces, ModelHandle, model_request
-from marey_client.motions import ClipHandle, SkeletonHandle
-from marey_client.paging import pages
-from marey_client.pipelines import PipelineRun, submit_pipeline
-from marey_client.transport import Params, Transport, as_json, read_model
+from marey_client.project_items import ProjectItems
+from marey_client.requests import (
+    AlignedClips,
+    Annotations,
+    Clips,
+    Takes,
+    align_request,
+    annotate_request,
+    cut_request,
+    edit_request,
+    evaluate_request,
+    model_request,
+    plan_model,
+    retarget_request,
+)
+from marey_client.transport import Params, as_json, read_model
 from marey_schemas.access import Project, ProjectChange
-from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
 from marey_schemas.job_params import AlignParams, AnnotateParams, CutParams, EvaluateParams, ModelParams, RetargetParams
-from marey_schemas.jobs import ItemInput, Job, JobCreate
-from marey_schemas.kinds import Kind
+from marey_schemas.jobs import Job, JobCreate
 from marey_schemas.model_pipelines import model_pipeline
 from marey_schemas.pipelines import PipelineCreate
 
 
-class ProjectHandle:
+class ProjectHandle(ProjectItems):
     """A project by its name; nothing is asked until a method is called."""
-
-    def __init__(self, transport: Transport, name: str) -> None:
-        self.transport = transport
-        self.name = name
 
     def __repr__(self) -> str:
         return f"<project {self.name!r} at {self.transport.url}>"
@@ -70,59 +68,6 @@ class ProjectHandle:
     # -- what it holds -------------------------------------------------------------------------------------------------
 
     @cached_property
-    def clips(self) -> Items[ClipHandle]:
-        """Its clips."""
-        return Items(self.transport, self.name, Kind.CLIP, ClipHandle)
-
-    @cached_property
-    def skeletons(self) -> Items[SkeletonHandle]:
-        """Its skeletons."""
-        return Items(self.transport, self.name, Kind.SKELETON, SkeletonHandle)
-
-    @cached_property
-    def annotations(self) -> Items[AnnotationHandle]:
-        """Its annotations."""
-        return Items(self.transport, self.name, Kind.ANNOTATION, AnnotationHandle)
-
-    @cached_property
-    def processed(self) -> Items[ProcessedHandle]:
-        """Its aligned clips."""
-        return Items(self.transport, self.name, Kind.PROCESSED, ProcessedHandle)
-
-    @cached_property
-    def edits(self) -> Edits:
-        """Its edits."""
-        return Edits(self.transport, self.name, Kind.EDIT, EditHandle)
-
-    @cached_property
-    def models(self) -> Items[ModelHandle]:
-        """Its models."""
-        return Items(self.transport, self.name, Kind.MODEL, ModelHandle)
-
-    @cached_property
-    def evaluations(self) -> Items[EvaluationHandle]:
-        """Its evaluations."""
-        return Items(self.transport, self.name, Kind.EVALUATION, EvaluationHandle)
-
-    def items(self, kind: Kind) -> Items[Any]:
-        """Its items of any kind."""
-        known: dict[Kind, type[ItemHandle]] = {
-            Kind.CLIP: ClipHandle,
-            Kind.SKELETON: SkeletonHandle,
-            Kind.ANNOTATION: AnnotationHandle,
-            Kind.PROCESSED: ProcessedHandle,
-            Kind.EDIT: EditHandle,
-            Kind.EVALUATION: EvaluationHandle,
-            Kind.MODEL: ModelHandle,
-        }
-        return Items(self.transport, self.name, kind, known.get(kind, ItemHandle))
-
-    @cached_property
-    def collections(self) -> Collections:
-        """Its tree of folders."""
-        return Collections(self.transport, self.name)
-
-    @cached_property
     def coverage_streams(self) -> CoverageStreams:
         """Performances that are being measured while they are recorded."""
         return CoverageStreams(self.transport, self.name)
@@ -131,11 +76,6 @@ class ProjectHandle:
     def members(self) -> Members:
         """Who may do what."""
         return Members(self.transport, self.name)
-
-    @cached_property
-    def imports(self) -> Imports:
-        """Files in."""
-        return Imports(self.transport, self.name, Blobs(self.transport), Jobs(self.transport))
 
     # -- jobs ----------------------------------------------------------------------------------------------------------
 
@@ -168,27 +108,23 @@ class ProjectHandle:
 
     def retarget(
         self,
-        clips: Places,
+        clips: Clips,
         skeleton: str,
         *,
         into: str,
         params: RetargetParams | None = None,
         priority: int = 0,
     ) -> Job:
-        """Hand in the retargeting of clips, a folder by its path, or folders and clips, to the skeleton with this id.
+        """Submit the retargeting of clips, a folder by its path, or folders and clips, to the skeleton with this id.
 
-        Mappings of the clips' skeletons that were edited since the clips were imported are gone by.
+        Uses the newest joint mapping of each skeleton.
         """
-        places = as_places(clips)
-        inputs: dict[str, Any] = {"clips": tuple(map(as_input, places)), "skeleton": ItemInput(item=skeleton)}
-        if edited := self.edited_rigs(item for place in places for item in items_at(self, place)):
-            inputs["rigs"] = edited
-        given = (params or RetargetParams()).model_dump(exclude_unset=True)
-        return self.submit(JobCreate(kind="retarget", inputs=inputs, params=given, into=into, priority=priority))
+        request = retarget_request(self, clips, skeleton, params or RetargetParams())
+        return self.submit(request.model_copy(update={"into": into, "priority": priority}))
 
     def annotate(
         self,
-        clips: Places,
+        clips: Clips,
         *,
         proposal: str | Mapping[str, Any] = "steps",
         into: str = "",
@@ -204,7 +140,7 @@ class ProjectHandle:
         request = annotate_request(self, clips, AnnotateParams.model_validate({"proposal": method, **options}))
         return self.submit(request.model_copy(update={"into": into, "priority": priority}))
 
-    def cut(self, annotations: AnnotationPlaces, *, into: str, priority: int = 0, **options: Any) -> Job:
+    def cut(self, annotations: Annotations, *, into: str, priority: int = 0, **options: Any) -> Job:
         """Hand in the cutting of clips along the segments of annotations, into folders below `into`.
 
         `options` are those of `CutParams`, for example `labels=("step_left", "step_right")` or `by_label=True`.
@@ -214,10 +150,10 @@ class ProjectHandle:
 
     def align(
         self,
-        clips: Places,
+        clips: Clips,
         *,
         into: str,
-        annotations: AnnotationPlaces | None = None,
+        annotations: Annotations | None = None,
         priority: int = 0,
         cache: Literal["use", "refresh", "off"] = "use",
         **options: Any,
@@ -230,18 +166,18 @@ class ProjectHandle:
         request = align_request(self, clips, annotations, AlignParams.model_validate(options))
         return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
 
-    def edit(self, clips: Places, commands: Commands, *, into: str = "", priority: int = 0, **options: Any) -> Job:
+    def edit(self, clips: Clips, commands: Commands, *, into: str = "", priority: int = 0, **options: Any) -> Job:
         """Hand in the editing of clips, a folder by its path, or folders and clips, by commands or a stored edit.
 
         The results go to the folder `into`, or get a `suffix`, or with `in_place=True` are the next revisions of the
         clips themselves. `options` are those of `EditParams`.
         """
-        request = edit_request(self, clips, commands, **options)
+        request = edit_request(self, clips, commands, options)
         return self.submit(request.model_copy(update={"into": into, "priority": priority}))
 
     def evaluate(
         self,
-        clips: Places,
+        clips: Clips,
         *,
         into: str = "",
         normaliser: EvaluationHandle | str | None = None,
@@ -266,7 +202,7 @@ class ProjectHandle:
 
     def train_model(
         self,
-        aligned: AlignedPlaces,
+        aligned: AlignedClips,
         *,
         into: str = "",
         seed: int = 0,
@@ -289,58 +225,6 @@ class ProjectHandle:
         (made,) = jobs.outputs(job.id)
         return self.models.get(made.item)
 
-    def edited_rigs(self, clips: Iterable[Item]) -> tuple[ItemInput, ...]:
-        """The skeletons of clips that have more than their first revision: their mapping may have been edited."""
-        used = {str(clip.summary["skeleton"]) for clip in clips}
-        skeletons = map(self.skeletons.get, sorted(used))
-        return tuple(ItemInput(item=one.id) for one in skeletons if one.item.revision > 1)
-
     def jobs(self, *, filters: Params | None = None) -> Iterator[Job]:
         """Its jobs, newest first."""
         return Jobs(self.transport).list(self.name, filters=filters)
-
-
-@dataclass(frozen=True)
-class Collections:
-    """The tree of folders of a project."""
-
-    transport: Transport
-    project: str
-
-    @property
-    def url(self) -> str:
-        """The path below the API's root."""
-        return f"/projects/{self.project}/collections"
-
-    def list(
-        self, *, path: str | None = None, deleted: bool = False, filters: Params | None = None
-    ) -> Iterator[Collection]:
-        """Every folder, by path; with `path` that one and those below it, with `deleted` those that can be restored."""
-        params = {"path": path or None, "deleted": "true" if deleted else None, **(filters or {})}
-        return pages(self.transport, Collection, self.url, params)
-
-    def at(self, path: str, *, deleted: bool = False) -> Collection | None:
-        """The folder with this path, or None; of several that were deleted, the one that was last."""
-        found = [one for one in self.list(path=path, deleted=deleted) if one.path == path]
-        return max(found, key=lambda one: one.deleted_at or one.created_at, default=None)
-
-    def create(self, path: str) -> Collection:
-        """Make a folder and those above it."""
-        return self.transport.post(Collection, self.url, CollectionCreate(path=path))
-
-    def move(self, collection: Collection, path: str) -> Collection:
-        """Move or rename a folder with all it holds."""
-        state = {"If-Match": f'"{collection.rev}.json"'}
-        body = as_json(CollectionChange(path=path))
-        return read_model(
-            Collection, self.transport.send("PATCH", f"{self.url}/{collection.id}", content=body, headers=state)
-        )
-
-    def delete(self, collection: Collection) -> None:
-        """Hide a folder with all it holds."""
-        state = {"If-Match": f'"{collection.rev}.json"'}
-        self.transport.send("DELETE", f"{self.url}/{collection.id}", headers=state)
-
-    def restore(self, collection: Collection) -> Collection:
-        """Bring a deleted folder back with all it held."""
-        return self.transport.post(Collection, f"{self.url}/{collection.id}/restore")

@@ -13,8 +13,8 @@ from tests.support.another_loader import positions_by_another_loader
 from tests.support.server_process import ServerProcess
 
 from marey_client import Marey
+from marey_client.handles.clips import ClipHandle
 from marey_client.imports import find_files
-from marey_client.motions import ClipHandle
 from marey_client.project import ProjectHandle
 from marey_motion.documents import clip_from_document, skeleton_from_document
 from marey_motion.kinematics import global_positions

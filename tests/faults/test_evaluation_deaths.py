@@ -12,7 +12,7 @@ from tests.support.evaluation_takes import write_walks
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 
 from marey_client import Marey
-from marey_client.evaluations import EvaluationHandle
+from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
 
+from marey_client.handles.pipelines import PipelineRun
 from marey_client.imports import LocalFile, find_files
-from marey_client.pipelines import PipelineRun
 from marey_client.project import ProjectHandle
 from marey_motion.clip import Clip
 from marey_motion.formats import write_motion

@@ -19,7 +19,7 @@ from marey_client.cli.output import print_json, print_pairs, print_table, tell, 
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
-    from marey_client.annotations import AnnotationHandle
+    from marey_client.handles.annotations import AnnotationHandle
     from marey_client.marey import Marey
     from marey_schemas.jobs import Job
 

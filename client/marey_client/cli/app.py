@@ -16,13 +16,11 @@ from marey_client.cli import (
     files,
     improvements,
     jobs,
-    model_building,
     models,
     organise,
     pipelines,
     processes,
     projects,
-    reports,
     searches,
     skeletons,
 )
@@ -73,12 +71,10 @@ for register in (
     annotating,
     edits,
     evaluations,
-    reports,
     improvements,
     models,
     searches,
     jobs,
-    model_building,
     pipelines,
 ):
     register.add_to(app)

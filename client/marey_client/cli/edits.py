@@ -17,7 +17,7 @@ from marey_client.cli.output import print_json, print_pairs, print_table
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
-    from marey_client.edits import EditHandle
+    from marey_client.handles.edits import EditHandle
     from marey_client.marey import Marey
     from marey_schemas.editing.edits import EditDocument
     from marey_schemas.editing.previews import EditPreview
@@ -186,7 +186,7 @@ def _commands(
 
 
 def _given(marey: Marey, project: str, do: list[str] | None, file: str | None) -> EditDocument:
-    from marey_client.edits import as_edit
+    from marey_client.handles.edits import as_edit
 
     if (file is None) == (not do):
         raise WrongUsage("give commands by --do, or by --file, and not both")

@@ -1,4 +1,4 @@
-"""`evaluate`."""
+"""`evaluate` and `report`."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import clips_at, follow
 from marey_client.cli.output import print_json, print_table, tell
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
-    from marey_client.evaluations import EvaluationHandle
+    from marey_client.handles.evaluations import EvaluationHandle
     from marey_client.marey import Marey
     from marey_schemas.job_params import EvaluateParams
 
@@ -27,6 +28,7 @@ MOST_VALUES = 200
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
     app.command()(evaluate)
+    app.command()(report)
 
 
 def evaluate(
@@ -105,6 +107,31 @@ def evaluate(
     if out is not None:
         tell(f"report: {out}")
     return None
+
+
+def report(
+    context: typer.Context,
+    place: Annotated[str, typer.Argument(help="An evaluation or a model: project/folder/name, or project/id.")],
+    out: Annotated[Path, typer.Option("--out", "--output", "-o", help="The file to write.")] = Path("report.html"),
+    figures: Annotated[
+        Path | None, typer.Option(help="Write every figure to this folder: PNG, SVG, JSON, CSV.")
+    ] = None,
+    open_it: Annotated[bool, typer.Option("--open", help="Show it in a browser.")] = False,
+) -> None:
+    """Write the report of an evaluation or a model to a file."""
+    from marey_schemas.kinds import Kind
+
+    with connect(context) as marey:
+        found = require_item(marey, Address.parse(place), [Kind.EVALUATION, Kind.MODEL])
+        found.save_report(out)
+        drawn = found.save_figures(figures) if figures is not None else []
+    typer.echo(out)
+    if figures is not None:
+        tell(f"{counted(len(drawn), 'file')} of figures in {figures}")
+    if open_it:
+        import webbrowser
+
+        webbrowser.open(out.absolute().as_uri())
 
 
 def _clips_in(marey: Marey, address: Address) -> list[Any]:

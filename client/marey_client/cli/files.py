@@ -232,7 +232,7 @@ def show(
 
 def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
     """What people want to know about an item; a clip with its skeleton, its source and what was noticed about it."""
-    from marey_client.motions import ClipHandle
+    from marey_client.handles.clips import ClipHandle
 
     yield from item.item.model_dump(mode="json", exclude={"parts", "summary", "rev", "tags"}).items()
     yield "tags", " ".join(item.item.tags)

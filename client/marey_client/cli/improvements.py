@@ -18,8 +18,8 @@ from marey_schemas.wording import counted
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from marey_client.evaluations import EvaluationHandle
-    from marey_client.findings import Findings
+    from marey_client.handles.evaluations import EvaluationHandle
+    from marey_client.handles.findings import Findings
     from marey_client.marey import Marey
     from marey_schemas.jobs import CollectionInput, ItemInput, Job
 

@@ -14,8 +14,8 @@ from marey_client.cli.jobs import follow
 from marey_client.cli.output import print_json, print_table, tell
 
 if TYPE_CHECKING:
+    from marey_client.handles.models import ModelHandle
     from marey_client.marey import Marey
-    from marey_client.models import ModelHandle
     from marey_schemas.jobs import CollectionInput, ItemInput
 
 FORMATS = ("bvh", "npz", "predecessor", "json")

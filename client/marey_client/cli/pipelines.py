@@ -1,22 +1,26 @@
-"""`pipeline`: jobs that work on what others of them make, handed in and followed together."""
+"""`pipeline` and `build-model`: jobs that work on the results of others, submitted and followed together."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.failures import Refused
+from marey_client.cli.addresses import Address, require_item
+from marey_client.cli.failures import Refused, WrongUsage
 from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.jobs import clips_at, json_or_text
 from marey_client.cli.json_files import read_json
-from marey_client.cli.output import print_json, print_table, tell, tell_refused
+from marey_client.cli.output import print_json, print_table, progress, tell, tell_refused
 
 if TYPE_CHECKING:
-    from marey_client.pipelines import PipelineRun
+    from marey_client.handles.pipelines import PipelineRun
+    from marey_client.marey import Marey
     from marey_schemas.jobs import Job
 
 INTERRUPTED = 130
@@ -24,12 +28,32 @@ COLUMNS = ("step", "kind", "state", "done", "job", "")
 COUNTED = ("clips", "annotations", "frames", "samples", "nodes")
 REFUSED_SHOWN = 3
 
+STEPS = ("import", "annotate", "cut", "align", "model", "tree")
+
+
+class Method(StrEnum):
+    """How annotations are proposed."""
+
+    STEPS = "steps"
+    VELOCITY_MINIMA = "velocity_minima"
+    WRIST_CONTACT = "wrist_contact"
+
+
+class Cache(StrEnum):
+    """What becomes of results that were computed before."""
+
+    USE = "use"
+    REFRESH = "refresh"
+    OFF = "off"
+
+
 Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until every job has ended.")]
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
     app.command()(pipeline)
+    app.command()(build_model)
 
 
 def pipeline(
@@ -46,6 +70,111 @@ def pipeline(
     with connect(context) as marey:
         run = marey.project(project).pipeline(wanted)
         follow_run(run, project, wait=wait, as_json=as_json)
+
+
+def build_model(
+    context: typer.Context,
+    takes: Annotated[
+        list[str],
+        typer.Argument(help="Clips or folders of clips, project/folder[/name]; with --project, files of this machine."),
+    ],
+    name: Annotated[str, typer.Option(help="Of the model, and of the action.")],
+    project: Annotated[str | None, typer.Option(help="The project that files of this machine go to.")] = None,
+    to: Annotated[str | None, typer.Option(help="Skeleton to carry the takes over to: project/folder/name.")] = None,
+    into: Annotated[str | None, typer.Option(help="Folder of the results; default: the model's name.")] = None,
+    propose: Annotated[Method | None, typer.Option(help="Propose annotations in this way, and go by them.")] = None,
+    layer: Annotated[str | None, typer.Option(help="Annotations of this layer; with --propose, its name.")] = None,
+    label: Annotated[list[str] | None, typer.Option(help="Only segments of this label; may be repeated.")] = None,
+    whole: Annotated[bool, typer.Option("--whole", help="Cut nothing: annotations align whole takes.")] = False,
+    rate: Annotated[float | None, typer.Option(help="Frames per second of the aligned clips.")] = None,
+    mirror: Annotated[bool, typer.Option("--mirror", help="Learn from mirrored examples, too.")] = False,
+    tree: Annotated[bool, typer.Option("--tree/--no-tree", help="Make a tree for searches.")] = True,
+    choices: Annotated[
+        list[str] | None, typer.Option("--set", help="step.parameter=value, such as align.window=5; may be repeated.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 0,
+    priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
+    cache: Annotated[Cache, typer.Option(help="What becomes of results that are there.")] = Cache.USE,
+    wait: Wait = True,
+    as_json: AsJson = False,
+) -> None:
+    """From takes to a model: import, retarget, annotate, cut, align, learn, make a tree.
+
+    What was computed before is not computed again: after a take has changed, only what depends on it is.
+    """
+    plan: dict[str, Any] = _chosen(choices or ())
+    if propose is not None:
+        _choose(plan, ("annotate", "proposal", "method"), propose.value, f"--propose {propose.value}")
+        plan["annotate"] |= {"layer": layer} if layer else {}
+    elif layer is not None:
+        plan["layer"] = layer
+    if label or ((propose or layer) and not whole):
+        plan.setdefault("align" if whole else "cut", {}).update({"labels": label} if label else {})
+    plan["align"] = {
+        **plan.get("align", {}),
+        **({} if rate is None else {"rate_hz": rate}),
+        **({"mirroring": "add"} if mirror else {}),
+    }
+    plan |= {} if tree else {"tree": None}
+    plan |= {"into": into.strip("/")} if into else {}
+    with connect(context) as marey:
+        place, found = _takes(marey, takes, project, plan.pop("import", {}))
+        if to is not None:
+            plan["skeleton"] = {"item": _skeleton(marey, to, place)}
+        with progress() as advance:
+            found |= {"name": name, "seed": seed, "priority": priority, "cache": cache.value, "notice": advance}
+            run = marey.project(place).build_model(**found, **plan)
+        follow_run(run, place, wait=wait, as_json=as_json)
+
+
+def _chosen(choices: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Parameters by step, and by the members of their objects."""
+    chosen: dict[str, dict[str, Any]] = {}
+    for text in choices:
+        path, equals, value = text.partition("=")
+        step, *names = path.split(".")
+        if not equals or step not in STEPS or not all(names) or not names:
+            raise WrongUsage(f"{text!r}: write step.parameter=value, the step one of {', '.join(STEPS)}")
+        _choose(chosen, (step, *names), json_or_text(value), f"--set {text}")
+    return chosen
+
+
+def _choose(chosen: dict[str, Any], path: Sequence[str], value: Any, told: str) -> None:
+    """Put a value at its place. Raises `WrongUsage` where something else was chosen on the way to it."""
+    place: Any = chosen
+    for depth, name in enumerate(path[:-1], start=1):
+        place = place.setdefault(name, {})
+        if not isinstance(place, dict):
+            raise WrongUsage(f"{told} does not go with --set {'.'.join(path[:depth])}={place}; give one of them")
+    place[path[-1]] = value
+
+
+def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """The project, and the takes as `build_model` wants them. Files are sent."""
+    if project is None:
+        addresses = [Address.parse(take) for take in takes]
+        if len({address.project for address in addresses}) > 1:
+            raise WrongUsage("the takes must be in one project")
+        if options:
+            raise WrongUsage("import.… is for files of this machine; name the project they go to with --project")
+        return addresses[0].project, {"takes": [clips_at(marey, address) for address in addresses]}
+    from marey_client.imports import find_files, left_out_text
+    from marey_schemas.options.imports import ImportOptions
+
+    found = find_files(map(Path, takes))
+    if found.left_out:
+        tell(left_out_text(found.left_out))
+    return project, {"takes": found.files, "options": ImportOptions.model_validate(options)}
+
+
+def _skeleton(marey: Marey, to: str, project: str) -> str:
+    from marey_schemas.kinds import Kind
+
+    address = Address.parse(to)
+    if address.project != project:
+        raise WrongUsage("the takes and the skeleton must be in one project")
+    skeleton_id: str = require_item(marey, address, [Kind.SKELETON]).id
+    return skeleton_id
 
 
 def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> None:

@@ -82,7 +82,7 @@ def demo(
     as_json: AsJson = False,
 ) -> None:
     """From takes to an evaluated dataset on this machine: import, retarget, evaluate; a table, a picture, a report."""
-    from marey_client.demo import demonstrate
+    from marey_client.cli.demo.story import demonstrate
 
     demonstrate(motion, data=data, keep_serving=serve_on, as_json=as_json)
 

@@ -14,7 +14,7 @@ from tests.support.command_line import CommandLine
 
 from marey_client import Marey
 from marey_client.errors import Invalid, RequestFailed
-from marey_client.motions import ClipHandle
+from marey_client.handles.clips import ClipHandle
 from marey_client.project import ProjectHandle
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_from_document, commands_of_edit, skeleton_from_document

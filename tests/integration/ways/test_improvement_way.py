@@ -12,7 +12,7 @@ from tests.support.server_process import ServerProcess
 
 from marey_client import Marey
 from marey_client.errors import JobUnsuccessful
-from marey_client.evaluations import EvaluationHandle
+from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.project import ProjectHandle
 from marey_schemas.access import Login, Role, UserCreate
 from marey_schemas.jobs import CollectionInput, JobCreate

@@ -20,8 +20,8 @@ from marey_client.cli.jobs import watching
 from marey_client.cli.output import print_table
 from marey_client.cli.pipelines import _tell_shortfalls
 from marey_client.errors import Forbidden, Invalid, NotFound, Unauthenticated
+from marey_client.handles.pipelines import PipelineRun
 from marey_client.marey import Marey
-from marey_client.pipelines import PipelineRun
 from marey_schemas.jobs import Job, JobState
 from marey_schemas.kinds import Kind
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from marey_client.demo_evaluation import DemoEvaluation, travels
+from marey_client.cli.demo.evaluation import DemoEvaluation, travels
 
 RATE_HZ = 30.0
 

@@ -11,7 +11,7 @@ import pytest
 from marey_client.cli.evaluations import _params, _values
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.jobs import show_progress
-from marey_client.evaluations import clip_rows, record_arrays, trial_rows
+from marey_client.handles.evaluations import clip_rows, record_arrays, trial_rows
 from marey_schemas.jobs import CollectionInput, Job, Progress
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC).isoformat()

@@ -8,7 +8,7 @@ import pytest
 from marey_client.blobs import digest_of
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.improvements import _print_comparison, _weights
-from marey_client.evaluations import EvaluationHandle
+from marey_client.handles.evaluations import EvaluationHandle
 from marey_schemas.items import Item
 
 NOW = "2026-01-01T00:00:00Z"

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from marey_client.downloads import saved_atomically
-from marey_client.edits import as_edit
+from marey_client.handles.clips import MotionArrays
+from marey_client.handles.edits import as_edit
+from marey_client.handles.searches import search_request
 from marey_client.imports import find_files
-from marey_client.motions import MotionArrays
-from marey_client.searches import search_request
 from marey_client.transport import BLOCKS
 from marey_schemas.encoding.codecs import decode_tree, encode_tree
 

@@ -6,7 +6,7 @@ import json
 import httpx
 import pytest
 
-from marey_client import blobs, errors, uploads
+from marey_client import blobs, errors
 
 DATA = bytes(range(251)) * 100
 
@@ -42,7 +42,7 @@ class UploadServer:
 
 @pytest.fixture
 def upload_server(make_problem, monkeypatch):
-    monkeypatch.setattr(uploads, "PIECE_BYTES", 4096)
+    monkeypatch.setattr(blobs, "PIECE_BYTES", 4096)
     monkeypatch.setattr(blobs, "RESUMABLE_FROM_BYTES", 1000)
     return UploadServer(make_problem)
 
@@ -79,7 +79,7 @@ def test_a_connection_that_never_lets_a_piece_through_is_given_up(send, upload_s
     upload_server.faults = [0] * 100
     with pytest.raises(errors.Unreachable):
         send()
-    assert upload_server.sent == uploads.TRIES_PER_PIECE * 4096
+    assert upload_server.sent == blobs.TRIES_PER_PIECE * 4096
 
 
 def test_a_file_that_shrinks_is_noticed(script, upload_server, tmp_path):

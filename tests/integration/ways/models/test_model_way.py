@@ -13,7 +13,7 @@ import pytest
 from tests.support.command_line import CommandLine
 
 from marey_client.errors import JobUnsuccessful, RequestFailed
-from marey_client.models import ModelHandle
+from marey_client.handles.models import ModelHandle
 from marey_client.project import ProjectHandle
 from marey_motion.formats import read_motion
 

@@ -14,15 +14,16 @@ from pathlib import Path
 from typing import Any
 
 from marey_client import embedded
+from marey_client.cli.demo.evaluation import evaluate_locomotion
+from marey_client.cli.demo.report import Report, print_report
 from marey_client.cli.output import Advance, print_json, progress, tell
 from marey_client.credentials import ADMIN_TOKEN, read_secret
-from marey_client.demo_evaluation import evaluate_locomotion
-from marey_client.demo_report import Report, print_report
 from marey_client.errors import NotFound
+from marey_client.handles.clips import ClipHandle
+from marey_client.handles.skeletons import SkeletonHandle
 from marey_client.imports import FoundFiles, LocalFile, find_files
 from marey_client.jobs import Jobs
 from marey_client.marey import Marey
-from marey_client.motions import ClipHandle, SkeletonHandle
 from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate
 from marey_schemas.documents.skeletons import SkeletonHierarchy

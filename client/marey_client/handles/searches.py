@@ -9,10 +9,10 @@ from typing import Any
 from pydantic import BaseModel
 
 from marey_client.downloads import safe_file_name, saved_atomically
-from marey_client.findings import OnProgress
+from marey_client.handles.findings import OnProgress
+from marey_client.handles.reports import ReportedHandle
 from marey_client.jobs import Jobs
 from marey_client.one_or_several import several
-from marey_client.reports import ReportedHandle
 from marey_client.transport import BLOCKS, as_json, read_tree
 from marey_schemas.job_params import TreeParams
 from marey_schemas.jobs import Job, JobCreate

@@ -1,4 +1,4 @@
-"""Clips and skeletons: the items whose parts have names of their own."""
+"""Clips: their poses, their description and their annotations."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from marey_client.annotations import AnnotationHandle
-from marey_client.edits import Commands, preview_edit
+from marey_client.handles.annotations import AnnotationHandle
+from marey_client.handles.edits import Commands, preview_edit
 from marey_client.items import ItemHandle, Items
 from marey_client.one_or_several import several
 from marey_schemas.documents.annotations import Annotation
 from marey_schemas.documents.clips import ClipInfo, Motion
-from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.editing.annotation_commands import AnnotationImport
 from marey_schemas.editing.previews import EditPreview
 from marey_schemas.items import Item
@@ -103,22 +102,6 @@ class ClipHandle(ItemHandle):
         wanted = AnnotationImport.model_validate({"document": document, **options})
         made = self.transport.post(Item, f"{self.url}/annotations", wanted)
         return AnnotationHandle(self.transport, self.project, made)
-
-
-class SkeletonHandle(ItemHandle):
-    """One skeleton."""
-
-    def hierarchy(self) -> SkeletonHierarchy:
-        """Joints, offsets and rest pose."""
-        return SkeletonHierarchy.model_validate(self.part("hierarchy"))
-
-    def mapping(self) -> SkeletonMapping:
-        """Which joint plays which standard joint, and its axes."""
-        return SkeletonMapping.model_validate(self.part("mapping"))
-
-    def put_mapping(self, mapping: SkeletonMapping) -> Item:
-        """Make a revision with another mapping."""
-        return self.put_part("mapping", mapping.model_dump(mode="json", by_alias=True))
 
 
 def frames_text(frames: slice | None) -> str | None:

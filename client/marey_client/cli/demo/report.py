@@ -13,9 +13,9 @@ from typing import Any
 
 import typer
 
+from marey_client.cli.demo.evaluation import DemoEvaluation
 from marey_client.cli.output import print_rows, tell
 from marey_client.credentials import ADMIN_TOKEN
-from marey_client.demo_evaluation import DemoEvaluation
 from marey_client.imports import refusal_text
 from marey_schemas.imports import ImportEntry
 from marey_schemas.items import Item

@@ -3,30 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_client.findings import Findings, OnProgress, find_out
-from marey_client.motions import ClipHandle
-from marey_client.reports import ReportedHandle
+from marey_client.handles.clips import ClipHandle
+from marey_client.handles.findings import Findings, OnProgress, find_out
+from marey_client.handles.reports import ReportedHandle
+from marey_client.places import Places, as_inputs
 from marey_schemas.base import Request
-from marey_schemas.items import Item
-from marey_schemas.job_params import CompareParams, EvaluateParams, OptimiseParams, SuggestParams, SweepParams
-from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
+from marey_schemas.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
 
-if TYPE_CHECKING:
-    from marey_client.project import ProjectHandle
-
-LOOP_TAG = "loop"
 COSTS = ("match_cost", "continuing_cost", "pose_cost")
-
-Place = str | CollectionInput | ItemInput | ClipHandle
-"""A folder by its path, a clip, or either as an input of jobs."""
-
-Places = Place | Sequence[Place]
 
 
 class EvaluationHandle(ReportedHandle):
@@ -67,7 +57,9 @@ class EvaluationHandle(ReportedHandle):
         inputs = {"before": self.as_input(), "after": after.as_input()}
         return self._find_out("compare", inputs, CompareParams.model_validate(options), on_progress)
 
-    def suggest(self, candidates: Places = (), *, on_progress: OnProgress | None = None, **options: Any) -> Findings:
+    def suggest(
+        self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
+    ) -> Findings:
         """Which clips can go, and which of the candidates, folders and clips, would fill holes.
 
         `options` are those of `SuggestParams`.
@@ -75,7 +67,9 @@ class EvaluationHandle(ReportedHandle):
         params = SuggestParams.model_validate(options)
         return self._find_out("suggest", self._with_candidates(candidates), params, on_progress)
 
-    def optimise(self, candidates: Places = (), *, on_progress: OnProgress | None = None, **options: Any) -> Findings:
+    def optimise(
+        self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
+    ) -> Findings:
         """Clips taken away and candidates added, one step after another, while that lowers the objective.
 
         `options` are those of `OptimiseParams`.
@@ -88,55 +82,16 @@ class EvaluationHandle(ReportedHandle):
         params = SweepParams.model_validate(options)
         return self._find_out("sweep", {"evaluation": self.as_input()}, params, on_progress)
 
-    def _with_candidates(self, candidates: Places) -> dict[str, Any]:
+    def _with_candidates(self, candidates: Places[ClipHandle]) -> dict[str, Any]:
         inputs: dict[str, Any] = {"evaluation": self.as_input()}
-        if places := as_places(candidates):
-            inputs["candidates"] = tuple(map(as_input, places))
+        if places := as_inputs(candidates):
+            inputs["candidates"] = places
         return inputs
 
     def _find_out(
         self, kind: str, inputs: Mapping[str, Any], params: Request, on_progress: OnProgress | None
     ) -> Findings:
         return find_out(self.transport, self.project, kind, inputs, params, on_progress)
-
-
-def evaluate_request(
-    project: ProjectHandle, clips: Places, params: EvaluateParams, normaliser: EvaluationHandle | str | None
-) -> JobCreate:
-    """The job that evaluates `clips`, with loops that are tagged so and the mapping of a skeleton that was edited."""
-    places = as_places(clips)
-    found = [item for place in places for item in items_at(project, place)]
-    inputs: dict[str, Any] = {"clips": tuple(map(as_input, places))}
-    if normaliser is not None:
-        inputs["normaliser"] = ItemInput(item=normaliser) if isinstance(normaliser, str) else normaliser.as_input()
-    if len(edited := project.edited_rigs(found)) == 1:
-        (inputs["rig"],) = edited
-    loops = dict.fromkeys((*params.loops, *(item.id for item in found if LOOP_TAG in item.tags)))
-    given = params.model_copy(update={"loops": tuple(loops)}).model_dump(mode="json", exclude_defaults=True)
-    return JobCreate(kind="evaluate", inputs=inputs, params=given)
-
-
-def as_places(places: Places) -> list[Place]:
-    """One place or several, as a list."""
-    return [places] if isinstance(places, str | CollectionInput | ItemInput | ClipHandle) else list(places)
-
-
-def as_input(place: Place) -> CollectionInput | ItemInput:
-    """A place as an input of jobs; a clip at the revision that was read."""
-    if isinstance(place, str):
-        return CollectionInput(collection=place.strip("/"))
-    return place.as_input() if isinstance(place, ClipHandle) else place
-
-
-def items_at(project: ProjectHandle, place: Place) -> Iterator[Item]:
-    """The clips that a place stands for, as they are now."""
-    if isinstance(place, ClipHandle):
-        yield place.item
-    elif isinstance(place, ItemInput):
-        yield project.clips.get(place.item).item
-    else:
-        folder = place.strip("/") if isinstance(place, str) else place.collection
-        yield from (clip.item for clip in project.clips.list(collection=folder))
 
 
 # -- documents as tables -----------------------------------------------------------------------------------------------

@@ -12,21 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_client.alignments import ProcessedHandle
 from marey_client.downloads import download, safe_file_name, saved_atomically
+from marey_client.handles.clips import ClipHandle, MotionArrays
+from marey_client.handles.searches import SearchableHandle
 from marey_client.items import Items
-from marey_client.motions import ClipHandle, MotionArrays
-from marey_client.searches import SearchableHandle
 from marey_schemas.documents.clips import ClipInfo, Source
 from marey_schemas.encoding.codecs import JSON, encode_tree
-from marey_schemas.job_params import ModelParams
-from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
 from marey_schemas.kinds import Kind
-
-AlignedPlace = str | CollectionInput | ItemInput | ProcessedHandle
-"""A folder of aligned clips by its path, an aligned clip, or either as an input of jobs."""
-
-AlignedPlaces = AlignedPlace | Sequence[AlignedPlace]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,20 +107,6 @@ class ModelHandle(SearchableHandle):
     def _samples(self, n: int, seed: int, revision: int | None) -> dict[str, Any]:
         tree, _ = self.transport.get_tree(f"{self.url}/samples", {"n": str(n), "seed": str(seed), "revision": revision})
         return dict(tree)
-
-
-def model_request(aligned: AlignedPlaces, params: ModelParams) -> JobCreate:
-    """The job that trains a model on aligned clips."""
-    single = isinstance(aligned, str | CollectionInput | ItemInput | ProcessedHandle)
-    places = [aligned] if single else list(aligned)  # type: ignore[arg-type]
-    inputs = {"aligned": tuple(map(_as_input, places))}
-    return JobCreate(kind="model", inputs=inputs, params=params.model_dump(mode="json", exclude_defaults=True))
-
-
-def _as_input(place: Any) -> CollectionInput | ItemInput:
-    if isinstance(place, str):
-        return CollectionInput(collection=place.strip("/"))
-    return place.as_input() if isinstance(place, ProcessedHandle) else place
 
 
 def _saved(path: str | Path, data: bytes) -> Path:

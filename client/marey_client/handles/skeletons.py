@@ -1,0 +1,23 @@
+"""Skeletons: joints, rest pose, and the mapping to standard joints."""
+
+from __future__ import annotations
+
+from marey_client.items import ItemHandle
+from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
+from marey_schemas.items import Item
+
+
+class SkeletonHandle(ItemHandle):
+    """One skeleton."""
+
+    def hierarchy(self) -> SkeletonHierarchy:
+        """Joints, offsets and rest pose."""
+        return SkeletonHierarchy.model_validate(self.part("hierarchy"))
+
+    def mapping(self) -> SkeletonMapping:
+        """Which joint plays which standard joint, and its axes."""
+        return SkeletonMapping.model_validate(self.part("mapping"))
+
+    def put_mapping(self, mapping: SkeletonMapping) -> Item:
+        """Make a revision with another mapping."""
+        return self.put_part("mapping", mapping.model_dump(mode="json", by_alias=True))

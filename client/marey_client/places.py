@@ -1,0 +1,45 @@
+"""The inputs of jobs as callers write them: folders by their paths, items as handles, or several of these."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TypeAlias, TypeVar
+
+from marey_client.items import ItemHandle, Items
+from marey_schemas.items import Item
+from marey_schemas.jobs import CollectionInput, ItemInput
+
+Handle = TypeVar("Handle", bound=ItemHandle)
+
+Place: TypeAlias = str | CollectionInput | ItemInput | Handle
+"""A folder by its path, an item, or either as an input of jobs."""
+
+Places: TypeAlias = Place[Handle] | Sequence[Place[Handle]]
+
+
+def as_inputs(places: Places[Handle]) -> tuple[CollectionInput | ItemInput, ...]:
+    """Return one place or several as inputs of jobs; handles at the revision that was read."""
+    return tuple(map(_as_input, _as_list(places)))
+
+
+def items_at(items: Items[Handle], places: Places[Handle], *, sort: str | None = None) -> Iterator[Item]:
+    """Yield the items at one place or several, as they are now or at the revision that a place names."""
+    for place in _as_list(places):
+        if isinstance(place, ItemHandle):
+            yield place.item
+        elif isinstance(place, ItemInput):
+            item = items.get(place.item).item
+            yield item if place.revision is None else item.model_copy(update={"revision": place.revision})
+        else:
+            folder = place.strip("/") if isinstance(place, str) else place.collection
+            yield from (one.item for one in items.list(collection=folder, sort=sort))
+
+
+def _as_list(places: Places[Handle]) -> list[Place[Handle]]:
+    return [places] if isinstance(places, str | CollectionInput | ItemInput | ItemHandle) else list(places)
+
+
+def _as_input(place: Place[Handle]) -> CollectionInput | ItemInput:
+    if isinstance(place, str):
+        return CollectionInput(collection=place.strip("/"))
+    return place.as_input() if isinstance(place, ItemHandle) else place

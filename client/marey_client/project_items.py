@@ -1,0 +1,137 @@
+"""The items of one project, by kind, and the folders that they are in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from marey_client.blobs import Blobs
+from marey_client.handles.annotations import AnnotationHandle
+from marey_client.handles.clips import ClipHandle
+from marey_client.handles.edits import EditHandle, Edits
+from marey_client.handles.evaluations import EvaluationHandle
+from marey_client.handles.models import ModelHandle
+from marey_client.handles.processed import ProcessedHandle
+from marey_client.handles.skeletons import SkeletonHandle
+from marey_client.imports import Imports
+from marey_client.items import ItemHandle, Items
+from marey_client.jobs import Jobs
+from marey_client.paging import pages
+from marey_client.transport import Params, Transport, as_json, read_model
+from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
+from marey_schemas.jobs import ItemInput
+from marey_schemas.kinds import Kind
+
+
+class ProjectItems:
+    """The items of a project, by its name; nothing is asked until a method is called."""
+
+    def __init__(self, transport: Transport, name: str) -> None:
+        self.transport = transport
+        self.name = name
+
+    @cached_property
+    def imports(self) -> Imports:
+        """Imports of files."""
+        return Imports(self.transport, self.name, Blobs(self.transport), Jobs(self.transport))
+
+    @cached_property
+    def clips(self) -> Items[ClipHandle]:
+        """Its clips."""
+        return Items(self.transport, self.name, Kind.CLIP, ClipHandle)
+
+    @cached_property
+    def skeletons(self) -> Items[SkeletonHandle]:
+        """Its skeletons."""
+        return Items(self.transport, self.name, Kind.SKELETON, SkeletonHandle)
+
+    @cached_property
+    def annotations(self) -> Items[AnnotationHandle]:
+        """Its annotations."""
+        return Items(self.transport, self.name, Kind.ANNOTATION, AnnotationHandle)
+
+    @cached_property
+    def processed(self) -> Items[ProcessedHandle]:
+        """Its processed data: clips aligned to a reference, with their time functions."""
+        return Items(self.transport, self.name, Kind.PROCESSED, ProcessedHandle)
+
+    @cached_property
+    def edits(self) -> Edits:
+        """Its edits."""
+        return Edits(self.transport, self.name, Kind.EDIT, EditHandle)
+
+    @cached_property
+    def models(self) -> Items[ModelHandle]:
+        """Its models."""
+        return Items(self.transport, self.name, Kind.MODEL, ModelHandle)
+
+    @cached_property
+    def evaluations(self) -> Items[EvaluationHandle]:
+        """Its evaluations."""
+        return Items(self.transport, self.name, Kind.EVALUATION, EvaluationHandle)
+
+    def items(self, kind: Kind) -> Items[Any]:
+        """Its items of any kind."""
+        known: tuple[Items[Any], ...] = (
+            self.clips, self.skeletons, self.annotations, self.processed, self.edits, self.models, self.evaluations,
+        )  # fmt: skip
+        return next((one for one in known if one.kind is kind), Items(self.transport, self.name, kind, ItemHandle))
+
+    @cached_property
+    def collections(self) -> Collections:
+        """Its tree of folders."""
+        return Collections(self.transport, self.name)
+
+    def edited_rigs(self, clips: Iterable[Item]) -> tuple[ItemInput, ...]:
+        """Return the skeletons of clips whose joint mapping may have been edited: those with several revisions."""
+        used = {str(clip.summary["skeleton"]) for clip in clips}
+        skeletons = map(self.skeletons.get, sorted(used))
+        return tuple(ItemInput(item=one.id) for one in skeletons if one.item.revision > 1)
+
+
+@dataclass(frozen=True)
+class Collections:
+    """The tree of folders of a project."""
+
+    transport: Transport
+    project: str
+
+    @property
+    def url(self) -> str:
+        """The path below the API's root."""
+        return f"/projects/{self.project}/collections"
+
+    def list(
+        self, *, path: str | None = None, deleted: bool = False, filters: Params | None = None
+    ) -> Iterator[Collection]:
+        """Every folder, by path; with `path` that one and those below it, with `deleted` those that can be restored."""
+        params = {"path": path or None, "deleted": "true" if deleted else None, **(filters or {})}
+        return pages(self.transport, Collection, self.url, params)
+
+    def at(self, path: str, *, deleted: bool = False) -> Collection | None:
+        """The folder with this path, or None; of several that were deleted, the one that was last."""
+        found = [one for one in self.list(path=path, deleted=deleted) if one.path == path]
+        return max(found, key=lambda one: one.deleted_at or one.created_at, default=None)
+
+    def create(self, path: str) -> Collection:
+        """Make a folder and those above it."""
+        return self.transport.post(Collection, self.url, CollectionCreate(path=path))
+
+    def move(self, collection: Collection, path: str) -> Collection:
+        """Move or rename a folder with all it holds."""
+        state = {"If-Match": f'"{collection.rev}.json"'}
+        body = as_json(CollectionChange(path=path))
+        return read_model(
+            Collection, self.transport.send("PATCH", f"{self.url}/{collection.id}", content=body, headers=state)
+        )
+
+    def delete(self, collection: Collection) -> None:
+        """Hide a folder with all it holds."""
+        state = {"If-Match": f'"{collection.rev}.json"'}
+        self.transport.send("DELETE", f"{self.url}/{collection.id}", headers=state)
+
+    def restore(self, collection: Collection) -> Collection:
+        """Bring a deleted folder back with all it held."""
+        return self.transport.post(Collection, f"{self.url}/{collection.id}/restore")

@@ -1,0 +1,185 @@
+"""Requests for the jobs of each kind: parameters, and inputs together with what the server knows of them.
+
+Every request uses the newest joint mapping of each skeleton.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, TypeAlias
+
+from marey_client.errors import NoAnnotations
+from marey_client.handles.annotations import AnnotationHandle
+from marey_client.handles.clips import ClipHandle
+from marey_client.handles.edits import Commands, EditHandle, as_edit
+from marey_client.handles.evaluations import EvaluationHandle
+from marey_client.handles.processed import ProcessedHandle
+from marey_client.imports import LocalFile, Notice
+from marey_client.places import Places, as_inputs, items_at
+from marey_client.project_items import ProjectItems
+from marey_schemas.base import Request
+from marey_schemas.items import Item
+from marey_schemas.job_params import (
+    AlignParams,
+    AnnotateParams,
+    CutParams,
+    EditParams,
+    EvaluateParams,
+    ModelParams,
+    RetargetParams,
+)
+from marey_schemas.jobs import ItemInput, JobCreate
+from marey_schemas.model_pipelines import ModelPlan
+from marey_schemas.options.imports import ImportOptions
+
+LOOP_TAG = "loop"
+
+Clips: TypeAlias = Places[ClipHandle]
+"""Clips, folders of clips by their paths, or several of these."""
+
+Annotations: TypeAlias = Places[AnnotationHandle]
+AlignedClips: TypeAlias = Places[ProcessedHandle]
+
+Takes: TypeAlias = Clips | Sequence[LocalFile]
+"""Clips and folders of clips that are there, or files on this machine, as `find_files` finds them."""
+
+
+def retarget_request(project: ProjectItems, clips: Clips, skeleton: str, params: RetargetParams) -> JobCreate:
+    """Ask for clips on the skeleton with this id."""
+    inputs: dict[str, Any] = {"clips": as_inputs(clips), "skeleton": ItemInput(item=skeleton)}
+    if edited := project.edited_rigs(items_at(project.clips, clips)):
+        inputs["rigs"] = edited
+    return JobCreate(kind="retarget", inputs=inputs, params=_given(params))
+
+
+def annotate_request(project: ProjectItems, clips: Clips, params: AnnotateParams) -> JobCreate:
+    """Ask for annotations of clips."""
+    inputs: dict[str, Any] = {"clips": as_inputs(clips)}
+    if edited := project.edited_rigs(items_at(project.clips, clips)):
+        inputs["rigs"] = edited
+    return JobCreate(kind="annotate", inputs=inputs, params=_given(params))
+
+
+def cut_request(project: ProjectItems, annotations: Annotations, params: CutParams) -> JobCreate:
+    """Ask for the pieces of clips that annotations mark; the clips are those that the annotations name."""
+    found = {
+        one.id: one
+        for one in items_at(project.annotations, annotations, sort="id")
+        if params.layer in (None, one.summary["layer"])
+    }
+    clips = {(one.summary["clip"], one.summary["clip_revision"]) for one in found.values()}
+    inputs = {
+        "annotations": tuple(ItemInput(item=one.id, revision=one.revision) for one in found.values()),
+        "clips": tuple(ItemInput(item=clip, revision=revision) for clip, revision in sorted(clips)),
+    }
+    return JobCreate(kind="cut", inputs=inputs, params=_given(params))
+
+
+def align_request(
+    project: ProjectItems, clips: Clips, annotations: Annotations | None, params: AlignParams
+) -> JobCreate:
+    """Ask for clips aligned with each other.
+
+    Without annotations, but with a layer or labels: by the annotations of that layer over these clips.
+    """
+    found = {item.id: item for item in items_at(project.clips, clips)}
+    inputs: dict[str, Any] = {"clips": as_inputs(clips)}
+    if len(edited := project.edited_rigs(found.values())) == 1:
+        (inputs["rig"],) = edited
+    if annotations is not None:
+        inputs["annotations"] = as_inputs(annotations)
+    elif params.layer is not None or params.labels:
+        inputs["annotations"] = _annotations_of(project, found, params.layer)
+    return JobCreate(kind="align", inputs=inputs, params=_changed(params))
+
+
+def edit_request(project: ProjectItems, clips: Clips, commands: Commands, options: Mapping[str, Any]) -> JobCreate:
+    """Ask for edited clips; the clips that the commands name become inputs. `options` are those of `EditParams`."""
+    inputs: dict[str, Any] = {"clips": as_inputs(clips)}
+    if isinstance(commands, EditHandle):
+        edit = commands.document(revision=commands.item.revision)
+        inputs["edit"] = commands.as_input()
+        params = EditParams.model_validate(options)
+    else:
+        edit = as_edit(commands)
+        params = EditParams.model_validate({**options, "commands": edit.commands})
+    if edit.sources:
+        inputs["sources"] = tuple(ItemInput(item=item) for item in edit.sources)
+    if edited := project.edited_rigs(items_at(project.clips, clips)):
+        inputs["rigs"] = edited
+    return JobCreate(kind="edit", inputs=inputs, params=_given(params))
+
+
+def evaluate_request(
+    project: ProjectItems, clips: Clips, params: EvaluateParams, normaliser: EvaluationHandle | str | None
+) -> JobCreate:
+    """Ask for an evaluation of clips; those with the tag `loop` are loops."""
+    found = list(items_at(project.clips, clips))
+    inputs: dict[str, Any] = {"clips": as_inputs(clips)}
+    if normaliser is not None:
+        inputs["normaliser"] = ItemInput(item=normaliser) if isinstance(normaliser, str) else normaliser.as_input()
+    if len(edited := project.edited_rigs(found)) == 1:
+        (inputs["rig"],) = edited
+    loops = dict.fromkeys((*params.loops, *(item.id for item in found if LOOP_TAG in item.tags)))
+    return JobCreate(kind="evaluate", inputs=inputs, params=_changed(params.model_copy(update={"loops": tuple(loops)})))
+
+
+def model_request(aligned: AlignedClips, params: ModelParams) -> JobCreate:
+    """Ask for a model that is trained on aligned clips."""
+    return JobCreate(kind="model", inputs={"aligned": as_inputs(aligned)}, params=_changed(params))
+
+
+def plan_model(
+    project: ProjectItems,
+    takes: Takes,
+    *,
+    options: ImportOptions | None = None,
+    layer: str | None = None,
+    notice: Notice | None = None,
+    **choices: Any,
+) -> ModelPlan:
+    """Plan the jobs that make a model of these takes. Files are sent now, to be imported with these `options`.
+
+    With a `layer`, clips are cut along their annotations of that layer, or aligned by them. The `choices` are fields of
+    `ModelPlan`; results go to a folder of the model's name unless one is named.
+    Raises `NoAnnotations` where no annotation of the layer is over the clips.
+    """
+    files = [one for one in takes if isinstance(one, LocalFile)] if isinstance(takes, Sequence) else []
+    known = _of_files(project, files, options, notice) if files else _of_clips(project, takes, layer)  # type: ignore[arg-type]
+    return ModelPlan.model_validate({"into": choices.get("name"), **known, **choices})
+
+
+def _of_files(
+    project: ProjectItems, files: Sequence[LocalFile], options: ImportOptions | None, notice: Notice | None
+) -> dict[str, Any]:
+    given = options.model_dump(exclude_unset=True) if options else {}
+    return {"files": {"files": project.imports.send(files, notice=notice), **given}}
+
+
+def _of_clips(project: ProjectItems, clips: Clips, layer: str | None) -> dict[str, Any]:
+    found = {one.id: one for one in items_at(project.clips, clips)}
+    known = {"clips": as_inputs(clips), "rigs": project.edited_rigs(found.values())}
+    if layer is None:
+        return known
+    annotations = _annotations_of(project, found, layer)
+    if not annotations:
+        raise NoAnnotations(f"none of these clips has an annotation in the layer {layer!r}")
+    return {**known, "annotations": annotations}
+
+
+def _annotations_of(project: ProjectItems, clips: Mapping[str, Item], layer: str | None) -> tuple[ItemInput, ...]:
+    """Return the annotations over these clips, by id; those of one layer unless it is None."""
+    listed: Iterable[AnnotationHandle] = project.annotations.list(sort="id")
+    return tuple(
+        one.as_input()
+        for one in listed
+        if one.item.summary["clip"] in clips and layer in (None, one.item.summary["layer"])
+    )
+
+
+def _given(params: Request) -> dict[str, Any]:
+    return params.model_dump(mode="json", exclude_unset=True)
+
+
+def _changed(params: Request) -> dict[str, Any]:
+    return params.model_dump(mode="json", exclude_defaults=True)
