@@ -16,6 +16,7 @@ from marey_client.errors import BadFileName, NothingToUpload, SameName
 from marey_client.jobs import Jobs
 from marey_client.one_or_several import several
 from marey_client.transport import Transport, as_json, read_model
+from marey_schemas.formats import FORMATS, IMPORTED_ENDINGS, format_named
 from marey_schemas.imports import (
     FileName,
     ImportAnswer,
@@ -28,9 +29,6 @@ from marey_schemas.imports import (
 from marey_schemas.jobs import Job, JobOutput
 from marey_schemas.options.imports import ImportOptions
 
-MOTION_SUFFIXES = (".amc", ".asf", ".bson", ".bson.bz2", ".bvh", ".c3d", ".json", ".npz")
-COMPANION_SUFFIX = ".asf"
-NEEDS_COMPANION_SUFFIX = ".amc"
 FILES_PER_IMPORT = 50
 BYTES_PER_IMPORT = 64 << 20
 UPLOADS_AT_ONCE = 8
@@ -75,12 +73,12 @@ def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
             raise NothingToUpload(f"{place} does not exist")
         for path in _files_below(place):
             below = path.relative_to(place)
-            if path.name.lower().endswith(MOTION_SUFFIXES):
+            if path.name.lower().endswith(IMPORTED_ENDINGS):
                 _add(files, below.as_posix(), path)
             else:
                 left_out.append(path)
     if not files:
-        raise NothingToUpload(f"no motion files ({', '.join(MOTION_SUFFIXES)}) in {_listed(searched)}")
+        raise NothingToUpload(f"no motion files ({', '.join(IMPORTED_ENDINGS)}) in {_listed(searched)}")
     return FoundFiles(tuple(files.values()), tuple(left_out))
 
 
@@ -107,26 +105,24 @@ def _add(files: dict[str, LocalFile], name: str, path: Path) -> None:
 
 
 def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
-    """Files in portions that one request can import.
+    """Split files into portions that one request can import.
 
-    Each AMC comes with the ASF files of its folder, and files that differ in their suffix alone stay together, because
-    the server names clips with an eye on the other files of a request.
+    A file that needs a companion comes with all companions of its folder, an AMC with every ASF; and files that differ
+    in their ending alone stay together, because the names of clips depend on the other files of a request.
     """
     groups: defaultdict[tuple[str, str], list[LocalFile]] = defaultdict(list)
-    companions: defaultdict[str, list[LocalFile]] = defaultdict(list)
     for file in files:
         path = PurePosixPath(file.name)
         groups[path.parent.as_posix(), path.stem].append(file)
-        if path.suffix.lower() == COMPANION_SUFFIX:
-            companions[path.parent.as_posix()].append(file)
+    companions = _companions(files)
     portion: dict[str, LocalFile] = {}
     size = 0
-    accompanied = {folder for (folder, _), group in groups.items() if any(map(_needs_companion, group))}
     for (folder, _), group in groups.items():
+        beside = companions.get(folder, [])
         needs_companion = any(map(_needs_companion, group))
-        if folder in accompanied and not needs_companion and all(file in companions[folder] for file in group):
+        if not needs_companion and all(file in beside for file in group):
             continue  # goes with the files that need it, never on its own as a skeleton
-        together = {file.name: file for file in [*(companions[folder] if needs_companion else []), *group]}
+        together = {file.name: file for file in [*(beside if needs_companion else []), *group]}
         together_bytes = sum(file.size_bytes for file in together.values())
         if portion and (len(portion) + len(together) > FILES_PER_IMPORT or size + together_bytes > BYTES_PER_IMPORT):
             yield list(portion.values())
@@ -137,8 +133,23 @@ def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
         yield list(portion.values())
 
 
+def _companions(files: Sequence[LocalFile]) -> dict[str, list[LocalFile]]:
+    """Find, for each folder with files that need a companion, the files that can be one."""
+    wanted: defaultdict[str, set[str]] = defaultdict(set)
+    for file in files:
+        for row in FORMATS:
+            if row.needs_companion and row.names(file.name):
+                wanted[PurePosixPath(file.name).parent.as_posix()].add(str(row.companion))
+    found: defaultdict[str, list[LocalFile]] = defaultdict(list)
+    for file in files:
+        folder = PurePosixPath(file.name).parent.as_posix()
+        if any(format_named(name).names(file.name) for name in wanted.get(folder, ())):
+            found[folder].append(file)
+    return found
+
+
 def _needs_companion(file: LocalFile) -> bool:
-    return file.name.lower().endswith(NEEDS_COMPANION_SUFFIX)
+    return any(row.needs_companion and row.names(file.name) for row in FORMATS)
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from marey_motion.clip import Clip
-from marey_motion.formats import write_bvh, write_npz, write_predecessor_clip
+from marey_motion.formats import write_motion
 from marey_motion.importing.source import SourceInfo
+from marey_schemas.formats import format_named
 
 
 @dataclass(frozen=True)
@@ -23,28 +24,28 @@ class ExportedFile:
 def write_clip_file(
     clip: Clip, file_format: str, *, unit: str | float = "cm", info: Mapping[str, Any] | None = None
 ) -> ExportedFile:
-    """Write a clip as `bvh`, `npz` or `predecessor`.
+    """Write a clip in one of `marey_schemas.formats.MOTION_FORMATS`.
 
     Parameters
     ----------
-    unit : unit of length of a BVH, by name or in metres
-    info : the clip's `info` document; a BVH keeps the rotation orders of the file it came from
+    unit : unit of length by name or in metres, where the format leaves it open
+    info : the clip's `info` document; Euler angles keep the rotation orders of the file it came from
 
     Raises
     ------
     FormatError    where the format cannot hold the clip
     """
-    if file_format == "bvh":
-        return ExportedFile(write_bvh(clip, unit=unit, source=_source(clip, info or {})), ".bvh", "text/plain")
-    if file_format == "npz":
-        return ExportedFile(write_npz(clip), ".npz", "application/x-npz")
-    if file_format == "predecessor":
-        return ExportedFile(write_predecessor_clip(clip), ".bson.bz2", "application/x-bzip2")
-    raise ValueError(f"no writer for {file_format!r}")
+    row = format_named(file_format)
+    options: dict[str, Any] = {}
+    if len(row.units) > 1:
+        options["unit"] = unit
+    if row.euler:
+        options["source"] = _source(clip, info or {})
+    return ExportedFile(write_motion(clip, file_format, **options), row.endings[0], row.media_type)
 
 
 def _source(clip: Clip, info: Mapping[str, Any]) -> SourceInfo | None:
-    """The rotation orders of the file a clip came from, where it is still on that file's skeleton."""
+    """Read the rotation orders of the file a clip came from, where it is still on that file's skeleton."""
     details = info.get("source", {}).get("details", {})
     channels = tuple(tuple(names) for names in details.get("channels", ()))
     if len(channels) != clip.skeleton.joint_count:

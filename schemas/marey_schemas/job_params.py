@@ -9,6 +9,7 @@ from pydantic import Field, StringConstraints, field_validator, model_validator
 
 from marey_schemas.base import Request
 from marey_schemas.editing.edits import MOST_COMMANDS, EditCommand
+from marey_schemas.formats import ExportFormat, WrittenUnit
 from marey_schemas.imports import ImportFile
 from marey_schemas.names import (
     MAX_NAME_LENGTH,
@@ -392,5 +393,5 @@ class RetargetParams(Request):
 class ExportParams(Request):
     """Parameters of `export`: one archive of files."""
 
-    format: Literal["bvh", "npz", "predecessor", "json", "original"] = Field("bvh", description="Format of the files.")
-    unit: Literal["m", "cm"] = Field("cm", description="Unit of length where the format leaves it open.")
+    format: ExportFormat = Field("bvh", description="Format of the files.")
+    unit: WrittenUnit = Field("cm", description="Unit of length where the format leaves it open.")

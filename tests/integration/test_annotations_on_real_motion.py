@@ -9,7 +9,8 @@ import pytest
 from marey_motion.editing.annotations.layers import Layer
 from marey_motion.editing.annotations.speed_proposals import ReachOptions, propose_reaches
 from marey_motion.editing.annotations.step_proposals import propose_steps
-from marey_motion.formats import pair_companions, read_motion
+from marey_motion.formats import read_motion
+from marey_motion.importing.plan import pair_companions
 from marey_motion.matching.body import MatchingBody
 from marey_motion.rigs import map_joints
 
@@ -19,7 +20,7 @@ SUBJECTS = ("02", "05", "07", "09", "16")
 def annotate(folder: Path, pattern: str, propose) -> dict[str, tuple[float, Layer]]:
     """Frame rate and layer of every take."""
     names = sorted(str(path.relative_to(folder)) for path in folder.glob(pattern))
-    companions = {pairing.motion: pairing.skeleton for pairing in pair_companions(names)}
+    companions = {pairing.file: pairing.companion for pairing in pair_companions(names)}
     layers = {}
     for name in names:
         companion = companions.get(name)

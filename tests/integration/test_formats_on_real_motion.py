@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from tests.support.another_loader import positions_by_another_loader
 
 from marey_motion.errors import AmbiguousUnits, FormatError, MotionError
-from marey_motion.formats import ImportedMotion, pair_companions, read_motion, write_bvh
+from marey_motion.formats import ImportedMotion, read_motion, write_bvh
 from marey_motion.importing.checks import CODES
 from marey_motion.importing.landmarks import find_landmarks
+from marey_motion.importing.plan import pair_companions
 from marey_motion.importing.units import hip_heights
 from marey_motion.kinematics import global_positions, global_rotations
 from marey_motion.quaternions import angle_between
@@ -60,7 +61,7 @@ class Collection:
 def collection(mocap: Path) -> Collection:
     with (mocap / "MANIFEST.csv").open(newline="") as table:
         manifest = {row["path"]: row for row in csv.DictReader(table)}
-    companions = {pairing.motion: pairing.skeleton for pairing in pair_companions(manifest)}
+    companions = {pairing.file: pairing.companion for pairing in pair_companions(manifest)}
     outcomes: dict[str, Outcome] = {}
     for name in manifest:
         companion = companions.get(name)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from marey_motion.clip import Clip
-from marey_motion.formats import pair_companions, read_motion
+from marey_motion.formats import read_motion
+from marey_motion.importing.plan import pair_companions
 from marey_motion.kinematics import global_positions
 from marey_motion.looping import rotated
 from marey_motion.matching.body import MatchingBody
@@ -23,7 +24,7 @@ SETS = ("bandai-namco-1", "bandai-namco-2")
 
 def read_takes(folder: Path, pattern: str) -> list[SourceClip]:
     names = sorted(str(path.relative_to(folder)) for path in folder.glob(pattern))
-    companions = {pairing.motion: pairing.skeleton for pairing in pair_companions(names)}
+    companions = {pairing.file: pairing.companion for pairing in pair_companions(names)}
     takes = []
     for name in names:
         companion = companions.get(name)

@@ -14,7 +14,8 @@ from marey_client.cli.failures import Refused, WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.lookup import kind_named
 from marey_client.cli.output import print_json, print_pairs, print_table, progress, tell
-from marey_schemas.wording import counted
+from marey_schemas.formats import EXPORT_FORMATS
+from marey_schemas.wording import counted, one_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from marey_schemas.kinds import Kind
 
 DOWNLOADS_AT_ONCE = 4
-FORMATS = ("original", "bvh", "npz", "predecessor", "json")
 
 WARNINGS_SHOWN = 2  # of each code: a folder of thousands shows what it has, not everything it has
 
@@ -274,7 +274,7 @@ def _show_history(item: ItemHandle, as_json: bool) -> None:
 def download(
     context: typer.Context,
     place: Annotated[str, typer.Argument(help="A clip, or a folder of them: project/folder[/name].")],
-    format: Annotated[str, typer.Option(help="original, bvh, npz, predecessor or json.")] = "original",  # noqa: A002
+    format: Annotated[str, typer.Option(help=f"{one_of(EXPORT_FORMATS)}.")] = "original",  # noqa: A002
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
     unit: Annotated[str | None, typer.Option(help="Unit of a BVH file: cm or m.")] = None,
     restored: Annotated[bool, typer.Option(help="Aligned clips in their own time, where they stood.")] = False,
@@ -284,8 +284,8 @@ def download(
 
     A file that is there already is replaced; of clips that would have one file name, the later ones get a number.
     """
-    if format not in FORMATS:
-        raise WrongUsage(f"{format!r} is no format; there are {', '.join(FORMATS)}")
+    if format not in EXPORT_FORMATS:
+        raise WrongUsage(f"{format!r} is no format; there are {', '.join(EXPORT_FORMATS)}")
     address = Address.parse(place)
     with connect(context) as marey:
         clips, base = _clips_at(marey, address)

@@ -12,13 +12,13 @@ from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import follow
 from marey_client.cli.output import print_json, print_table, tell
+from marey_schemas.formats import SAMPLE_FORMATS
+from marey_schemas.wording import one_of
 
 if TYPE_CHECKING:
     from marey_client.handles.models import ModelHandle
     from marey_client.marey import Marey
     from marey_schemas.jobs import CollectionInput, ItemInput
-
-FORMATS = ("bvh", "npz", "predecessor", "json")
 
 
 def add_to(app: typer.Typer) -> None:
@@ -86,7 +86,7 @@ def sample(
     place: Annotated[str, typer.Argument(help="A model: project/folder/name, or project/id.")],
     n: Annotated[int, typer.Option("-n", min=1, max=1000, help="How many motions.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same motions.")] = 0,
-    format: Annotated[str, typer.Option(help="bvh, npz, predecessor or json.")] = "bvh",  # noqa: A002
+    format: Annotated[str, typer.Option(help=f"{one_of(SAMPLE_FORMATS)}.")] = "bvh",  # noqa: A002
     out: Annotated[
         Path | None, typer.Option("--out", "--output", "-o", help="Folder to write files to; default: this one.")
     ] = None,
@@ -95,8 +95,8 @@ def sample(
     as_json: AsJson = False,
 ) -> None:
     """Draw motions from a model, and write them to files or make clips of them."""
-    if format not in FORMATS:
-        raise WrongUsage(f"{format!r} is no format; there are {', '.join(FORMATS)}")
+    if format not in SAMPLE_FORMATS:
+        raise WrongUsage(f"{format!r} is no format; there are {', '.join(SAMPLE_FORMATS)}")
     if into is not None and out is not None:
         raise WrongUsage("--out writes files, --into makes clips; ask for one of them")
     with connect(context) as marey:

@@ -14,12 +14,12 @@ from marey_client.cli.jobs import watching
 from marey_client.cli.json_files import read_json
 from marey_client.cli.models import model_at
 from marey_client.cli.output import print_json, print_table, tell
-from marey_schemas.wording import counted
+from marey_schemas.formats import MOTION_FORMATS
+from marey_schemas.wording import counted, one_of
 
 if TYPE_CHECKING:
     from marey_schemas.search import SearchAnswer
 
-FORMATS = ("bvh", "npz", "predecessor")
 
 Many = list[str] | None
 
@@ -79,14 +79,14 @@ def search(
     out: Annotated[
         Path | None, typer.Option("--out", "--output", "-o", help="File or folder to write the motion to.")
     ] = None,
-    format: Annotated[str, typer.Option(help="bvh, npz or predecessor.")] = "bvh",  # noqa: A002
+    format: Annotated[str, typer.Option(help=f"{one_of(MOTION_FORMATS)}.")] = "bvh",  # noqa: A002
     as_json: AsJson = False,
 ) -> None:
     """Find the motion of a model that meets constraints. WHEN is a keyframe, start, end, or a canonical frame."""
     from marey_schemas.search import SearchRequest
 
-    if format not in FORMATS:
-        raise WrongUsage(f"{format!r} is no format; there are {', '.join(FORMATS)}")
+    if format not in MOTION_FORMATS:
+        raise WrongUsage(f"{format!r} is no format; there are {', '.join(MOTION_FORMATS)}")
     asked: dict[str, Any] = _read_request(request)
     constraints = [
         *_joint_constraints("joint_position", at, "target_m", 3, {"tolerance_cm": tolerance_cm}),

@@ -1,48 +1,38 @@
-"""Motion files in and out: a reader and a writer per format, and one place where units and axes are converted."""
+"""Files of motion: readers and writers, one module per row of `marey_schemas.formats`, and one conversion of units.
+
+A module has `read_<name>` where its row reads something, and `write_<name>` where it writes motion.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
+from importlib import import_module
 from typing import Any
 
 from marey_motion.clip import Clip
 from marey_motion.errors import FormatError, UnknownFormat
-from marey_motion.formats import detection
-from marey_motion.formats.asf import read_asf
-from marey_motion.formats.asf_amc import Pairing, pair_companions, read_asf_amc, skeleton_source
-from marey_motion.formats.bvh import read_bvh
-from marey_motion.formats.bvh_writer import write_bvh
+from marey_motion.formats.bvh import write_bvh
 from marey_motion.formats.conversion import convert
 from marey_motion.formats.detection import detect_format
-from marey_motion.formats.npz import read_npz, write_npz
-from marey_motion.formats.predecessor.clips import (
-    read_predecessor,
-    write_predecessor_clip,
-    write_predecessor_skeleton,
-)
-from marey_motion.importing.source import ImportedMotion, ImportOptions, SourceInfo, SourceMotion
+from marey_motion.formats.npz import write_npz
+from marey_motion.formats.predecessor import write_predecessor, write_predecessor_skeleton
+from marey_motion.importing.source import ImportedMotion, ImportOptions, SourceDocument, SourceInfo, SourceMotion
+from marey_schemas.formats import MOTION_FORMATS, FileFormat
 
 __all__ = [
-    "WRITERS",
     "ImportOptions",
     "ImportedMotion",
-    "Pairing",
     "SourceInfo",
     "detect_format",
-    "pair_companions",
     "read_motion",
+    "read_source",
     "write_bvh",
     "write_motion",
     "write_npz",
-    "write_predecessor_clip",
+    "write_predecessor",
     "write_predecessor_skeleton",
 ]
-
-WRITERS: dict[str, Callable[..., bytes]] = {
-    detection.BVH: write_bvh,
-    detection.NPZ: write_npz,
-    detection.PREDECESSOR: write_predecessor_clip,
-}
 
 
 def read_motion(
@@ -59,48 +49,69 @@ def read_motion(
     ----------
     data : the file
     name : its name: its ending helps to tell the format, and messages carry it
-    companion : the ASF of an AMC (`pair_companions` finds it in a batch), the skeleton of a predecessor's clip
+    companion : the ASF of an AMC, the skeleton document of a predecessor's clip
     companion_name : its name, for messages
-    options : what the user knows better than the file
+    options : facts that the user knows better than the file
 
     Raises
     ------
     FormatError    with file, line and joint; `AmbiguousUnits` where the user has to choose; `UnknownFormat`
     """
     options = options or ImportOptions()
-    second = None if companion is None else bytes(companion)
-    return convert(_read_source(bytes(data), name, second, companion_name, options), name, options)
+    source = read_source(data, name, companion=companion, companion_name=companion_name, options=options)
+    if isinstance(source, SourceDocument):
+        message = f"the document is about a {source.subject}, not about a motion; import it into a project"
+        raise FormatError(message, code="not-a-motion", file=name)
+    return convert(source, name, options)
 
 
-def _read_source(
-    data: bytes, name: str, companion: bytes | None, companion_name: str, options: ImportOptions
-) -> SourceMotion:
-    found, rate_hz = detect_format(data, name), options.frame_rate_hz
-    if found == detection.BVH:
-        return read_bvh(data, name, frame_rate_hz=rate_hz)
-    if found == detection.ASF:
-        return skeleton_source(read_asf(data, name))
-    if found == detection.AMC:
-        if companion is None:
-            message = "an AMC holds angles alone; import it together with its ASF"
-            raise FormatError(message, code="asf-missing", file=name)
-        return read_asf_amc(data, companion, name, asf_file=companion_name, frame_rate_hz=rate_hz)
-    if found == detection.NPZ:
-        return read_npz(data, name, frame_rate_hz=rate_hz)
-    if found == detection.PREDECESSOR:
-        return read_predecessor(data, name, skeleton=companion, skeleton_file=companion_name, frame_rate_hz=rate_hz)
-    message = f"there is no reader for {found.upper()} files; they hold markers, not a skeleton's motion"
-    raise FormatError(message, code="reader-absent", file=name)
+def read_source(
+    data: bytes | memoryview,
+    name: str,
+    *,
+    companion: bytes | memoryview | None,
+    companion_name: str,
+    options: ImportOptions,
+) -> SourceMotion | SourceDocument:
+    """Detect the format of a file and read it in its own unit and axes, or decode a document about something else.
+
+    Raises
+    ------
+    FormatError    with file, line and joint; `UnknownFormat`
+    """
+    content = bytes(data)
+    row = detect_format(content, name)
+    if row.unread:
+        message = f"there is no reader for {row.name.upper()} files; {row.unread}"
+        raise FormatError(message, code="reader-absent", file=name)
+    given: dict[str, Any] = {}
+    if "motion" in row.reads:
+        given["frame_rate_hz"] = options.frame_rate_hz
+    if row.companion is not None and companion is not None:
+        given |= {"companion": bytes(companion), "companion_name": companion_name}
+    source: SourceMotion | SourceDocument = reader_of(row)(content, name, **given)
+    return source
 
 
 def write_motion(clip: Clip, file_format: str, **options: Any) -> bytes:
-    """Write a clip in one of `WRITERS`' formats; the options are those of its writer.
+    """Write a clip in a format that holds motion; the options are those of its writer.
 
     Raises
     ------
     UnknownFormat    for any other format; `FormatError` where the format cannot hold the clip
     """
-    writer = WRITERS.get(file_format)
-    if writer is None:
-        raise UnknownFormat(f"there is no writer for {file_format!r}; choose one of {', '.join(WRITERS)}")
-    return writer(clip, **options)
+    if file_format not in MOTION_FORMATS:
+        raise UnknownFormat(f"there is no writer for {file_format!r}; choose one of {', '.join(MOTION_FORMATS)}")
+    written: bytes = _function("write", file_format)(clip, **options)
+    return written
+
+
+def reader_of(row: FileFormat) -> Callable[..., SourceMotion | SourceDocument]:
+    """Find the reader of a format that has one."""
+    return _function("read", row.name)
+
+
+@cache
+def _function(verb: str, name: str) -> Callable[..., Any]:
+    function: Callable[..., Any] = getattr(import_module(f"{__name__}.{name}"), f"{verb}_{name}")
+    return function

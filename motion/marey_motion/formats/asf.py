@@ -18,7 +18,10 @@ from marey_motion.errors import FormatLimit
 from marey_motion.formats.joint_names import MAX_JOINTS, MAX_NAME_LENGTH
 from marey_motion.formats.numeric_text import excerpt
 from marey_motion.formats.text_lines import TextLines, decode_name
+from marey_motion.importing.source import SourceMotion
+from marey_schemas.formats import UNITS_M
 
+FORMAT = "asf-amc"
 ROOT = "root"
 _AXES = "xyz"
 _IN_DEGREES = {b"deg": True, b"degree": True, b"degrees": True, b"rad": False, b"radian": False, b"radians": False}
@@ -74,7 +77,34 @@ class AsfSkeleton:
         return tuple((j, bone.vector) for j, bone in enumerate(self.bones) if j not in inner)
 
 
-def read_asf(data: bytes, file: str) -> AsfSkeleton:
+def read_asf(data: bytes, file: str) -> SourceMotion:
+    """Read a skeleton in its own unit and axes. Raises `FormatError` with the line, and the bone where there is one."""
+    return skeleton_source(parse_asf(data, file))
+
+
+def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
+    """Make a source without motion of a parsed skeleton."""
+    names = tuple(bone.name for bone in skeleton.bones)
+    scale: float | None = None
+    declared: tuple[str, ...] = ()
+    if skeleton.length_unit is not None:
+        scale = UNITS_M["inch"] / skeleton.length_unit
+        declared = (f"the ASF gives length {skeleton.length_unit:g}: one unit is 1/{skeleton.length_unit:g} inch",)
+    return SourceMotion(
+        format=FORMAT,
+        joint_names=names,
+        display_names=names,
+        parents=skeleton.parents,
+        offsets=skeleton.offsets(),
+        rest_rotations=np.tile([1.0, 0.0, 0.0, 0.0], (len(names), 1)),
+        end_sites=skeleton.end_sites(),
+        unit_scale_m=scale,
+        declared=declared,
+        channels=tuple(bone.channels for bone in skeleton.bones),
+    )
+
+
+def parse_asf(data: bytes, file: str) -> AsfSkeleton:
     """Read an ASF file; `FormatError` with the line, and the bone where there is one."""
     return _AsfReader(TextLines(data, file)).read()
 

@@ -1,7 +1,7 @@
-"""BVH (Biovision hierarchy): reading.
+"""BVH (Biovision hierarchy): reading; writing is in `bvh_writer`.
 
 Rotations are intrinsic in the order of a joint's CHANNELS, in degrees, whatever their number and wherever its
-position channels stand. Position channels replace the joint's OFFSET, axis by axis.
+position channels are. Position channels replace the joint's OFFSET, axis by axis.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.formats.bvh_hierarchy import BvhHeader, read_header
+from marey_motion.formats.bvh_writer import write_bvh
 from marey_motion.formats.euler import NO_COLUMN, rotations_from_euler
 from marey_motion.formats.frame_times import frame_rate_of
 from marey_motion.formats.joint_names import unique_names
@@ -20,6 +21,8 @@ from marey_motion.formats.text_lines import TextLines, number_problem
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.importing.source import SourceMotion
 from marey_schemas.wording import counted
+
+__all__ = ["read_bvh", "write_bvh"]
 
 FORMAT = "bvh"
 # Offsets and positions of the same joint agree to this part of the largest offset where exporters rounded both.

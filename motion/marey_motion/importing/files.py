@@ -1,26 +1,21 @@
-"""From uploaded files to the documents of skeletons and clips. No files, network or database: bytes in, documents out.
-
-A caller plans a batch by its names (which file needs which companion, what becomes of each), then imports file by file,
-so that one bad file harms no other and memory holds one at a time.
-"""
+"""Import of one file: bytes in, documents of skeletons, clips and models out. No files, network or database."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from pathlib import PurePosixPath
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, mapping_to_document, skeleton_to_document
 from marey_motion.errors import FormatError, MappingError
-from marey_motion.formats import pair_companions, read_motion
-from marey_motion.formats.predecessor.documents import pair_trees, read_document
+from marey_motion.formats import read_source
+from marey_motion.formats.conversion import convert
 from marey_motion.formats.predecessor.graph import PredecessorGraph
-from marey_motion.importing.source import ImportedMotion, ImportOptions
+from marey_motion.importing.plan import PlannedFile
+from marey_motion.importing.source import ImportedMotion, ImportOptions, SourceDocument
 from marey_motion.importing.units import unit_in_metres
 from marey_motion.rigs import JointAxes, JointMapping, guess_axes, map_joints
 from marey_motion.skeleton import Skeleton
@@ -28,32 +23,8 @@ from marey_motion.skeleton import Skeleton
 SKELETON_OUTPUT = "skeleton"
 """What a clip calls the skeleton of its own file until both are stored."""
 SAME_OFFSET_M = 1e-3
-_LONGEST_SEGMENT, _LONGEST_PATH = 255, 1024
-_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 Tree = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class PlannedFile:
-    """What becomes of one file of a batch.
-
-    Parameters
-    ----------
-    name : as given
-    role : a `motion` or `skeleton` to import, the `companion` of others, or `refused`
-    companion : the file that it needs
-    folder, item_name : where the clip goes, below the target, and what it is called
-    reason : why it is refused
-    """
-
-    name: str
-    role: Literal["motion", "skeleton", "companion", "refused"]
-    folder: str = ""
-    item_name: str = ""
-    companion: str | None = None
-    code: str = ""
-    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -122,46 +93,6 @@ def import_options(given: Mapping[str, Any]) -> ImportOptions:
     return ImportOptions(**chosen)
 
 
-def plan_imports(names: Sequence[str]) -> list[PlannedFile]:
-    """What becomes of each file of a batch, in the order given. Folders in names become folders below the target."""
-    companions = {pairing.motion: pairing for pairing in pair_companions(names)}
-    trees = pair_trees(names)
-    needed = {*trees.values(), *(one.skeleton for one in companions.values() if one.skeleton is not None)}
-    taken: set[tuple[str, str]] = set()
-    seen: set[str] = set()
-    planned = []
-    for name in names:
-        one = _place(name, taken)
-        pairing = companions.get(name)
-        if name in seen:
-            one = replace(one, role="refused", code="name-repeated", reason="another file of the upload has this name")
-        elif one.role == "motion" and name in needed:
-            one = replace(one, role="companion")
-        elif one.role == "motion" and pairing is not None and pairing.skeleton is None:
-            one = replace(one, role="refused", code="asf-missing", reason=pairing.reason or "")
-        elif one.role == "motion" and (pairing is not None or name in trees):
-            one = replace(one, companion=pairing.skeleton if pairing is not None else trees[name])
-        if one.role == "motion":
-            taken.add((one.folder, one.item_name))
-        seen.add(name)
-        planned.append(one)
-    return planned
-
-
-def _place(name: str, taken: set[tuple[str, str]]) -> PlannedFile:
-    path = PurePosixPath(name.replace("\\", "/"))
-    segments = [part for part in path.parts if part not in ("/", ".", "..")]
-    if not segments or any(len(part) > _LONGEST_SEGMENT for part in segments) or len(name) > _LONGEST_PATH:
-        reason = f"a name has 1 to {_LONGEST_SEGMENT} characters, with its folders {_LONGEST_PATH}"
-        return PlannedFile(name, "refused", code="name-invalid", reason=reason)
-    if any(_CONTROL.search(part) for part in segments):
-        return PlannedFile(
-            name, "refused", code="name-invalid", reason="a name has no line breaks or control characters"
-        )
-    folder, stem = "/".join(segments[:-1]), PurePosixPath(segments[-1]).stem
-    return PlannedFile(name, "motion", folder, segments[-1] if (folder, stem) in taken else stem)
-
-
 def import_file(
     planned: PlannedFile,
     data: bytes | memoryview,
@@ -175,18 +106,18 @@ def import_file(
     ------
     MotionError    with code, file, line and joint where they are known
     """
-    subject = read_document(bytes(data), planned.name)
-    if subject is not None:
-        from marey_motion.importing.models import import_modelled
-
-        return import_modelled(planned, *subject, request, digests, None if companion is None else bytes(companion))
-    imported = read_motion(
+    source = read_source(
         data,
         planned.name,
         companion=companion,
-        companion_name=planned.companion or "the ASF",
+        companion_name=planned.companion or "the companion",
         options=request.options,
     )
+    if isinstance(source, SourceDocument):
+        from marey_motion.importing.models import import_modelled
+
+        return import_modelled(planned, source, request, digests, None if companion is None else bytes(companion))
+    imported = convert(source, planned.name, request.options)
     checks = tuple(_check_document(warning.as_dict()) for warning in imported.warnings)
     info = _info(imported, planned, digests, request, checks) if imported.clip is not None else None
     if request.skeleton is not None and imported.clip is not None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 from marey_motion.documents import mapping_to_document, skeleton_to_document
 from marey_motion.errors import FormatError
-from marey_motion.formats.predecessor.documents import Subject, model_name
+from marey_motion.formats.predecessor.documents import model_name
 from marey_motion.formats.predecessor.graph import graph_of_document
 from marey_motion.formats.predecessor.model import model_of_document
 from marey_motion.formats.predecessor.tree import read_predecessor_tree
@@ -19,11 +17,12 @@ from marey_motion.importing.files import (
     ImportedDocuments,
     ImportRequest,
     ModelledDocuments,
-    PlannedFile,
     Tree,
     anatomy_of,
     as_tree,
 )
+from marey_motion.importing.plan import PlannedFile
+from marey_motion.importing.source import SourceDocument
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.primitive_documents import primitive_to_tree
 from marey_motion.modelling.search.tree import TreeOptions
@@ -35,21 +34,20 @@ from marey_schemas.documents.references import PartDigestRef
 
 def import_modelled(
     planned: PlannedFile,
-    subject: Subject,
-    document: Mapping[str, Any],
+    source: SourceDocument,
     request: ImportRequest,
     digests: FileDigests,
     tree: bytes | None,
 ) -> ImportedDocuments:
     """A model with its tree, or a graph, of a file of the predecessor. Raises `FormatError`."""
     file = planned.name
-    if subject == "tree":
+    if source.subject == "tree":
         message = "a tree over samples of a model; import it together with its model, named alike, as in walk_mm.json"
         raise FormatError(f"{message} and walk_cluster_tree.json", code="model-missing", file=file)
-    if subject == "graph":
-        graph = ModelledDocuments(planned.item_name, graph=graph_of_document(document, file))
+    if source.subject == "graph":
+        graph = ModelledDocuments(planned.item_name, graph=graph_of_document(source.document, file))
         return ImportedDocuments("", None, None, None, None, (), graph)
-    found = model_of_document(document, file, skeleton=request.skeleton)
+    found = model_of_document(source.document, file, skeleton=request.skeleton)
     skeleton = found.primitive.skeleton
     given = request.skeleton is not None
     if request.skeleton is not None and not same_hierarchy(skeleton, request.skeleton, tolerance_m=SAME_OFFSET_M):

@@ -1,7 +1,8 @@
-"""What goes into an import and what comes out: options, the motion as its file has it, the record of what was done."""
+"""Input and output of an import: options, the content of a file in its own units, and the record of what was done."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any, Literal
@@ -15,12 +16,13 @@ from marey_motion.skeleton import Skeleton
 
 UpAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Handedness = Literal["right", "left"]
+Subject = Literal["model", "tree", "graph"]
 UP_AXES: tuple[UpAxis, ...] = ("x", "y", "z", "-x", "-y", "-z")
 
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What the user knows better than the file; None means "infer, and say how".
+    """Facts that the user knows better than the file; None means "infer, and record how".
 
     Parameters
     ----------
@@ -96,8 +98,16 @@ class SourceMotion:
 
 
 @dataclass(frozen=True)
+class SourceDocument:
+    """A decoded file that holds no motion: a model, a tree over the samples of a model, or a graph of models."""
+
+    subject: Subject
+    document: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
 class SourceInfo:
-    """What an importer found and did, kept with the clip.
+    """Record of what an import found and did, kept with the clip.
 
     Parameters
     ----------

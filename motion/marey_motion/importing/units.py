@@ -18,17 +18,8 @@ from marey_motion.importing.checks import CheckWarning
 from marey_motion.importing.landmarks import Landmarks, path_length
 from marey_motion.importing.source import Handedness, ImportOptions, SourceMotion, UpAxis
 from marey_motion.kinematics import forward_kinematics
+from marey_schemas.formats import UNITS_M
 
-# Metres per unit: the units that motion files have been seen in. The CMU data base counts in 1/0.45 inch.
-UNITS_M = {
-    "mm": 0.001,
-    "cm": 0.01,
-    "inch": 0.0254,
-    "cmu": 0.0254 / 0.45,
-    "dm": 0.1,
-    "ft": 0.3048,
-    "m": 1.0,
-}
 CONVENTIONAL_UNITS = ("m", "cm", "mm")
 # Adults, from the joint that carries both legs down the bones to the ankle. No length fits two units in these bounds.
 LEG_LENGTH_M = (0.72, 1.2)

@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from marey_schemas.base import Request
+from marey_schemas.formats import LengthUnit
 from marey_schemas.names import CollectionPath, Tag
 
 
@@ -17,7 +18,7 @@ class ImportOptions(Request):
     skeleton: str | None = Field(
         None, description="Item id of the skeleton the clips must use; absent: found or created."
     )
-    unit: Literal["m", "cm", "mm", "dm", "inch", "ft", "cmu"] | None = Field(
+    unit: LengthUnit | None = Field(
         None, description="Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."
     )
     unit_scale_m: float | None = Field(None, gt=1e-6, lt=1e3, description="Metres per unit, where no named unit fits.")

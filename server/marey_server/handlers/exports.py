@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from marey_schemas.base import Request
+from marey_schemas.formats import EXPORT_MEDIA_TYPES, ExportFormat, WrittenUnit
 from marey_server.handlers.items import kind_of
 from marey_server.http.declarations import Access, Bytes, reads
 from marey_server.http.queries import MAX_INTEGER
@@ -14,7 +15,7 @@ from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.http.streaming import BlobSender, attachment
 from marey_server.motions import exporting
-from marey_server.motions.exporting import ExportFormat, ExportTime
+from marey_server.motions.exporting import ExportTime
 from marey_server.motions.predecessor_exports import PredecessorOptions
 
 
@@ -22,7 +23,7 @@ class ExportQuery(Request):
     """Which file."""
 
     format: ExportFormat = Field("original", description="original: the file exactly as it was imported.")
-    unit: Literal["m", "cm"] = Field("cm", description="Unit of length of a BVH.")
+    unit: WrittenUnit = Field("cm", description="Unit of length of a BVH.")
     end_index: Literal["inclusive", "exclusive"] = Field(
         "inclusive", description="Of an annotation of the predecessor: whether a section holds its frame `end_idx`."
     )
@@ -55,13 +56,7 @@ class Export(BlobSender):
         access=Access.READER,
         query=ExportQuery,
         answer=Bytes,
-        answer_types=(
-            "application/octet-stream",
-            "text/plain",
-            "application/json",
-            "application/x-npz",
-            "application/x-bzip2",
-        ),
+        answer_types=EXPORT_MEDIA_TYPES,
         also=((206, None), (416, None)),
         headers=("Range", "If-Range"),
     )

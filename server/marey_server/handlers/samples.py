@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import Field
 
 from marey_schemas.base import Request
 from marey_schemas.documents.models import MOST_SAMPLES, MOST_SEED
+from marey_schemas.formats import MOTION_MEDIA_TYPES, MotionFormat, WrittenUnit
 from marey_server.handlers.items import kind_of
 from marey_server.http.declarations import Access, Bytes, Document, reads
 from marey_server.http.queries import MAX_INTEGER
@@ -15,7 +14,7 @@ from marey_server.http.reply import Rendered, Reply, render
 from marey_server.http.resource import Resource
 from marey_server.http.streaming import IMMUTABLE, attachment
 from marey_server.motions import models
-from marey_server.motions.models import FoundModel, SampleFormat, UsableModel
+from marey_server.motions.models import FoundModel, UsableModel
 
 
 class SampleQuery(Request):
@@ -29,8 +28,8 @@ class SampleQuery(Request):
 class SampleFileQuery(SampleQuery):
     """Which samples, and as which files."""
 
-    format: SampleFormat = Field("bvh", description="Of the files; several come as one ZIP archive.")
-    unit: Literal["m", "cm"] = Field("cm", description="Unit of length of a BVH.")
+    format: MotionFormat = Field("bvh", description="Of the files; several come as one ZIP archive.")
+    unit: WrittenUnit = Field("cm", description="Unit of length of a BVH.")
 
 
 class ModelUser(Resource):
@@ -81,7 +80,7 @@ class SampleFiles(ModelUser):
         access=Access.READER,
         query=SampleFileQuery,
         answer=Bytes,
-        answer_types=("text/plain", "application/x-npz", "application/x-bzip2", "application/zip"),
+        answer_types=(*MOTION_MEDIA_TYPES, "application/zip"),
     )
     async def get(self, project: str, kind: str, item: str, query: SampleFileQuery) -> Reply:
         """Motions drawn from a model (kind `models`) as files: one as it is, several as a ZIP archive."""

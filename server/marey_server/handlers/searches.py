@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import Field
 
 from marey_schemas.base import Request
+from marey_schemas.formats import MOTION_MEDIA_TYPES, MotionFormat, WrittenUnit
 from marey_schemas.search import SearchRequest
 from marey_server.handlers.items import kind_of
 from marey_server.http.declarations import Access, Bytes, Document, reads
@@ -14,15 +13,14 @@ from marey_server.http.reply import Rendered, Reply, render
 from marey_server.http.resource import Resource
 from marey_server.http.streaming import attachment
 from marey_server.motions import search_answers, searching
-from marey_server.motions.models import SampleFormat
 from marey_server.motions.searching import FoundSearchable, Searchable, SearchableKey
 
 
 class FoundFileQuery(Request):
     """As which file."""
 
-    format: SampleFormat = Field("bvh", description="Of the file.")
-    unit: Literal["m", "cm"] = Field("cm", description="Unit of length of a BVH.")
+    format: MotionFormat = Field("bvh", description="Of the file.")
+    unit: WrittenUnit = Field("cm", description="Unit of length of a BVH.")
 
 
 class Searcher(Resource):
@@ -86,7 +84,7 @@ class SearchFile(Searcher):
         query=FoundFileQuery,
         body=SearchRequest,
         answer=Bytes,
-        answer_types=("text/plain", "application/x-npz", "application/x-bzip2"),
+        answer_types=MOTION_MEDIA_TYPES,
     )
     async def post(self, project: str, kind: str, item: str, query: FoundFileQuery, body: SearchRequest) -> Reply:
         """What a search finds, as a file of motion: all steps in one."""

@@ -9,6 +9,7 @@ from marey_schemas.documents.alignments import AlignmentInfo
 from marey_schemas.documents.clips import Motion
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.encoding import codecs
+from marey_schemas.formats import ExportFormat
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_server.errors import Invalid, NotFound
@@ -19,7 +20,6 @@ from marey_server.store.transaction import Transaction
 WITH_MOTION = (Kind.CLIP, Kind.PROCESSED)
 """The kinds whose part `motion` can be written as a file of motion."""
 
-ExportFormat = Literal["original", "bvh", "npz", "predecessor", "json"]
 ExportTime = Literal["canonical", "source"]
 
 

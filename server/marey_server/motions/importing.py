@@ -23,7 +23,8 @@ from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:  # numeric modules take a second to load: only who imports files pays for them
     from marey_motion.errors import MotionError
-    from marey_motion.importing.files import ImportedDocuments, ImportRequest, PlannedFile
+    from marey_motion.importing.files import ImportedDocuments, ImportRequest
+    from marey_motion.importing.plan import PlannedFile
 
 log = logging.getLogger(__name__)
 
@@ -79,7 +80,7 @@ def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
 
 def plan(names: Sequence[str]) -> list[PlannedFile]:
     """What becomes of each file of a batch."""
-    from marey_motion.importing.files import plan_imports
+    from marey_motion.importing.plan import plan_imports
 
     return plan_imports(names)
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import io
 import zipfile
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import SkeletonHierarchy
+from marey_schemas.formats import MotionFormat
 from marey_schemas.kinds import Kind
 from marey_server.errors import Invalid, NotFound
 from marey_server.store import items
@@ -27,8 +28,6 @@ LARGEST_ANSWER_BYTES = 32 * MIB
 SAMPLES_SCHEMA = "marey/motion-samples@1"
 EPOCH = (1980, 1, 1, 0, 0, 0)
 """The date of files in archives: the same samples are the same bytes."""
-
-SampleFormat = Literal["bvh", "npz", "predecessor"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +122,7 @@ class SampleFile:
 
 
 def sample_file(
-    found: FoundModel, model: UsableModel, count: int, seed: int, file_format: SampleFormat, unit: str
+    found: FoundModel, model: UsableModel, count: int, seed: int, file_format: MotionFormat, unit: str
 ) -> SampleFile:
     """One sample as a file, or several as a ZIP archive of files. Raises `Invalid`."""
     from marey_motion.errors import MotionError

@@ -9,10 +9,11 @@ from math import degrees
 from typing import TYPE_CHECKING, Any
 
 from marey_schemas.documents.references import RevisionRef
+from marey_schemas.formats import MotionFormat
 from marey_schemas.problems import FieldError
 from marey_schemas.search import ConstraintError, FoundStep, SearchAnswer, SearchRequest, StartPlacement
 from marey_server.errors import Invalid, TooLarge
-from marey_server.motions.models import LARGEST_ANSWER_BYTES, SampleFile, SampleFormat
+from marey_server.motions.models import LARGEST_ANSWER_BYTES, SampleFile
 from marey_server.motions.search_constraints import CM, constraint_of, placement_of
 from marey_server.motions.searching import FoundSearchable, Searchable
 
@@ -153,7 +154,7 @@ def answer_of(
     return answer.model_dump(by_alias=True, exclude_none=True)
 
 
-def file_of(result: SearchResult, found: Sequence[FoundSearchable], file_format: SampleFormat, unit: str) -> SampleFile:
+def file_of(result: SearchResult, found: Sequence[FoundSearchable], file_format: MotionFormat, unit: str) -> SampleFile:
     """All steps as one file. Raises `Invalid` where the format cannot hold it."""
     from marey_motion.errors import MotionError
     from marey_motion.exporting import write_clip_file

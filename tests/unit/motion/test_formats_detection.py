@@ -30,7 +30,7 @@ from marey_motion.gait import generate_gait
     ],
 )
 def test_bytes_count_more_than_names(data: bytes, name: str, expected: str) -> None:
-    assert detect_format(data, name) == expected
+    assert detect_format(data, name).name == expected
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,11 @@ import random
 from collections.abc import Callable
 from pathlib import Path
 
-import motion_big_files as big
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.support import motion_big_files as big
 from tests.support.motion_files import ARM, ZXY, bvh, nested
 from tests.support.motion_fuzz import read_broken, seeds
 

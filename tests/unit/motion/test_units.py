@@ -14,9 +14,10 @@ from marey_motion.errors import AmbiguousUnits, MotionError
 from marey_motion.formats import ImportedMotion, ImportOptions, read_motion, write_bvh
 from marey_motion.formats.npz import write_npz
 from marey_motion.gait import game_skeleton, generate_gait
-from marey_motion.importing.units import UNITS_M, unit_in_metres
+from marey_motion.importing.units import unit_in_metres
 from marey_motion.kinematics import global_positions, global_rotations
 from marey_motion.skeleton import EndSite, Skeleton
+from marey_schemas.formats import UNITS_M
 
 # Rows are the walker's x, y, z in the axes of a file whose upward axis is the key.
 FILE_AXES: dict[str, np.ndarray] = {

@@ -7,7 +7,8 @@ from typing import Any
 from marey_motion.documents import skeleton_from_document
 from marey_motion.errors import MotionError
 from marey_motion.importing import files
-from marey_motion.importing.files import FileDigests, ImportedDocuments, ImportRequest, ModelledDocuments, PlannedFile
+from marey_motion.importing.files import FileDigests, ImportedDocuments, ImportRequest, ModelledDocuments
+from marey_motion.importing.plan import PlannedFile, plan_imports
 from marey_schemas.documents.clips import Check
 from marey_schemas.documents.references import OutputRef
 from marey_schemas.documents.skeletons import SkeletonHierarchy
@@ -38,7 +39,7 @@ class _Importing:
 
     def run(self) -> dict[str, Any]:
         """All files; what became of them, in the order given."""
-        plan = files.plan_imports([file.name for file in self._params.files])
+        plan = plan_imports([file.name for file in self._params.files])
         entries = []
         for done, planned in enumerate(plan):
             self._context.progress(done, len(plan), f"importing {planned.name}")

@@ -32,21 +32,20 @@ from marey_motion.skeleton import Skeleton
 ClipForm = Literal["poses", "frames"]
 
 
-def read_predecessor(
-    data: bytes,
+def motion_of_document(
+    document: dict[str, Any],
     file: str,
     *,
     skeleton: bytes | None = None,
     skeleton_file: str = "the skeleton document",
     frame_rate_hz: float | None = None,
 ) -> SourceMotion:
-    """Read a clip document with its skeleton document, or a skeleton document alone.
+    """Read a clip document with the file of its skeleton document, or a skeleton document alone.
 
     Raises
     ------
     FormatError    naming the field, and the joint where there is one
     """
-    document = decode_document(data, file)
     if "poses" not in document and "frames" not in document:
         return read_skeleton_document(document, file)
     if skeleton is None:
@@ -63,7 +62,7 @@ def read_predecessor(
     return source
 
 
-def write_predecessor_clip(clip: Clip, *, form: ClipForm = "poses", encoding: Encoding = "bson.bz2") -> bytes:
+def write_predecessor(clip: Clip, *, form: ClipForm = "poses", encoding: Encoding = "bson.bz2") -> bytes:
     """Write a clip document: rows of numbers ("poses") or the engine's objects ("frames").
 
     Raises

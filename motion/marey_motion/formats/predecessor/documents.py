@@ -1,47 +1,61 @@
-"""What a document of the predecessor is about: a motion, a model, a tree over its samples, or a graph of models."""
+"""Reading of any file of the predecessor: a motion, a model, a tree over its samples, or a graph of models."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
-from typing import Any, Literal
+from typing import Any
 
-from marey_motion.formats.detection import PREDECESSOR, detect_format
+from marey_motion.formats.predecessor.clips import motion_of_document
 from marey_motion.formats.predecessor.encoding import decode_document
 from marey_motion.formats.predecessor.graph import is_graph
 from marey_motion.formats.predecessor.model import layout_of
 from marey_motion.formats.predecessor.tree import is_tree
+from marey_motion.importing.source import SourceDocument, SourceMotion, Subject
+from marey_schemas.formats import format_named
 
-Subject = Literal["model", "tree", "graph"]
-
-_MARKS = (b"sspm", b"eigen_vectors_spatial", b"spatial_coeffs", b"indices", b"start_node", b"startNode")
-"""A document of none of these words is about a motion, and need not be looked into here."""
-
-_BZ2 = b"BZh"
 _MODEL_ENDINGS = ("_quaternion_mm", "_mm")
 _TREE_ENDINGS = ("_quaternion_cluster_tree", "_cluster_tree", "_tree")
-_SUFFIXES = (".json", ".bson", ".bz2")
+_SUFFIXES = tuple({PurePosixPath(f"file{ending}").suffix for ending in format_named("predecessor").endings})
 
 
-def read_document(data: bytes, file: str) -> tuple[Subject, Mapping[str, Any]] | None:
-    """A document about anything but a motion, and what it is about; None for motions and for other formats.
+def read_predecessor(
+    data: bytes,
+    file: str,
+    *,
+    companion: bytes | None = None,
+    companion_name: str = "the skeleton document",
+    frame_rate_hz: float | None = None,
+) -> SourceMotion | SourceDocument:
+    """Read a motion in its own unit and axes, or a document about something else; the file is decoded once.
 
-    Raises `FormatError` where it is about to be one of these and cannot be decoded.
+    Parameters
+    ----------
+    companion, companion_name : the skeleton document of a clip, and its name for messages
+
+    Raises
+    ------
+    FormatError    naming the field, and the joint where there is one
     """
-    if detect_format(data, file) != PREDECESSOR:
-        return None
-    if not data.startswith(_BZ2) and not any(mark in data for mark in _MARKS):
-        return None
     document = decode_document(data, file)
+    subject = _subject_of(document)
+    if subject is not None:
+        return SourceDocument(subject, document)
+    return motion_of_document(
+        document, file, skeleton=companion, skeleton_file=companion_name, frame_rate_hz=frame_rate_hz
+    )
+
+
+def _subject_of(document: Mapping[str, Any]) -> Subject | None:
     if layout_of(document) is not None:
-        return "model", document
+        return "model"
     if is_tree(document):
-        return "tree", document
-    return ("graph", document) if is_graph(document) else None
+        return "tree"
+    return "graph" if is_graph(document) else None
 
 
 def model_name(stem: str) -> str:
-    """What a model is called whose file is called so: `walk_leftStance` of `walk_leftStance_quaternion_mm`.
+    """Name a model after its file: `walk_leftStance` of `walk_leftStance_quaternion_mm`.
 
     The stem may still have the first of two suffixes, as in `walk_mm.bson` of `walk_mm.bson.bz2`.
     """
@@ -49,7 +63,7 @@ def model_name(stem: str) -> str:
 
 
 def pair_trees(names: Sequence[str]) -> dict[str, str]:
-    """The tree of each model among files, by their names, as in `walk_mm.json` and `walk_cluster_tree.json`."""
+    """Find the tree of each model among files, by their names, as in `walk_mm.json` and `walk_cluster_tree.json`."""
     trees: dict[tuple[str, str], str] = {}
     models: dict[tuple[str, str], str] = {}
     for name in names:

@@ -1,92 +1,53 @@
-"""ASF/AMC (Acclaim): reading an AMC motion with the ASF skeleton it belongs to.
+"""AMC (Acclaim motion capture): reading a motion with the ASF skeleton it belongs to.
 
 Angles turn about fixed axes in the order the skeleton lists them: `dof rx ry rz` is Rz · Ry · Rx.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from pathlib import PurePosixPath
-
 import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.errors import FormatError
 from marey_motion.formats.amc_frames import scan_frames
-from marey_motion.formats.asf import AsfSkeleton, read_asf
+from marey_motion.formats.asf import AsfSkeleton, parse_asf, skeleton_source
 from marey_motion.formats.euler import NO_COLUMN, rotations_from_euler
 from marey_motion.formats.numeric_text import excerpt
 from marey_motion.formats.text_lines import TextLines
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.importing.source import SourceMotion
 
-FORMAT = "asf-amc"
 DEFAULT_RATE_HZ = 120.0
-INCH_M = 0.0254
 
 
-@dataclass(frozen=True)
-class Pairing:
-    """Which ASF an AMC belongs to; `reason` says why where there is none."""
-
-    motion: str
-    skeleton: str | None
-    reason: str | None = None
-
-
-def pair_companions(names: Iterable[str]) -> tuple[Pairing, ...]:
-    """Find the ASF of every AMC among the paths of one upload, by name.
-
-    In the same folder: the file of the same stem, else the one whose stem the AMC's begins with up to a separator
-    (16_01.amc with 16.asf, 07_01-walk.amc with 07.asf), the longest of several; else the folder's only ASF.
-    """
-    paths = sorted({PurePosixPath(name.replace("\\", "/")): name for name in names}.items())
-    skeletons: dict[PurePosixPath, list[tuple[PurePosixPath, str]]] = {}
-    for path, name in paths:
-        if path.suffix.lower() == ".asf":
-            skeletons.setdefault(path.parent, []).append((path, name))
-    pairings = []
-    for path, name in paths:
-        if path.suffix.lower() == ".amc":
-            pairings.append(_pairing(path, name, skeletons.get(path.parent, [])))
-    return tuple(pairings)
-
-
-def _pairing(path: PurePosixPath, name: str, skeletons: list[tuple[PurePosixPath, str]]) -> Pairing:
-    stem = path.stem.lower()
-    matching = [
-        (len(asf.stem), asf_name)
-        for asf, asf_name in skeletons
-        if stem == asf.stem.lower() or (stem.startswith(asf.stem.lower()) and not stem[len(asf.stem)].isalnum())
-    ]
-    if matching:
-        return Pairing(name, max(matching)[1])
-    if len(skeletons) == 1:
-        return Pairing(name, skeletons[0][1])
-    if skeletons:
-        return Pairing(name, None, f"none of the {len(skeletons)} ASF files beside it has its name")
-    return Pairing(name, None, "no ASF file beside it; an AMC holds angles alone and needs its skeleton")
-
-
-def read_asf_amc(
-    amc: bytes, asf: bytes, file: str, *, asf_file: str = "the ASF", frame_rate_hz: float | None = None
+def read_amc(
+    data: bytes,
+    file: str,
+    *,
+    companion: bytes | None = None,
+    companion_name: str = "the ASF",
+    frame_rate_hz: float | None = None,
 ) -> SourceMotion:
-    """Read a motion and its skeleton as they stand, in their own unit and axes.
+    """Read a motion and its skeleton in their own unit and axes.
 
     Parameters
     ----------
-    amc, asf : the two files
-    file, asf_file : their names, for messages
+    data : the AMC file
+    file : its name, for messages
+    companion, companion_name : the ASF file, and its name for messages
     frame_rate_hz : frames per second; AMC files carry none, 120 is assumed with a warning
 
     Raises
     ------
     FormatError    with the line, and the bone where there is one
     """
-    skeleton = read_asf(asf, asf_file)
+    if companion is None:
+        message = "an AMC holds angles alone; import it together with its ASF"
+        raise FormatError(message, code="asf-missing", file=file)
+    skeleton = parse_asf(companion, companion_name)
     source = skeleton_source(skeleton)
-    lines = TextLines(amc, file)
+    lines = TextLines(data, file)
     degrees, declared_rate_hz = _read_amc_header(lines, skeleton.degrees)
     values, gaps = scan_frames(lines, skeleton)
     if gaps:
@@ -104,28 +65,6 @@ def read_asf_amc(
         )
     _fill_motion(source, skeleton, values, degrees)
     return source
-
-
-def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
-    """A skeleton without motion."""
-    names = tuple(bone.name for bone in skeleton.bones)
-    scale: float | None = None
-    declared: tuple[str, ...] = ()
-    if skeleton.length_unit is not None:
-        scale = INCH_M / skeleton.length_unit
-        declared = (f"the ASF gives length {skeleton.length_unit:g}: one unit is 1/{skeleton.length_unit:g} inch",)
-    return SourceMotion(
-        format=FORMAT,
-        joint_names=names,
-        display_names=names,
-        parents=skeleton.parents,
-        offsets=skeleton.offsets(),
-        rest_rotations=np.tile([1.0, 0.0, 0.0, 0.0], (len(names), 1)),
-        end_sites=skeleton.end_sites(),
-        unit_scale_m=scale,
-        declared=declared,
-        channels=tuple(bone.channels for bone in skeleton.bones),
-    )
 
 
 def _read_amc_header(lines: TextLines, degrees: bool) -> tuple[bool, float | None]:

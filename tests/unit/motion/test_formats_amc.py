@@ -8,14 +8,15 @@ from scipy.spatial.transform import Rotation
 from tests.support.motion_files import AMC, ASF
 
 from marey_motion.errors import FormatError
-from marey_motion.formats import pair_companions, read_motion
-from marey_motion.formats.asf_amc import read_asf_amc
+from marey_motion.formats import read_motion
+from marey_motion.formats.amc import read_amc
+from marey_motion.importing.plan import pair_companions
 from marey_motion.importing.source import ImportOptions, SourceMotion
 from marey_motion.kinematics import global_positions
 
 
 def read(amc: str = AMC, asf: str = ASF, **options: float) -> SourceMotion:
-    return read_asf_amc(amc.encode(), asf.encode(), "take.amc", asf_file="body.asf", **options)
+    return read_amc(amc.encode(), "take.amc", companion=asf.encode(), companion_name="body.asf", **options)
 
 
 def refusal(amc: str = AMC, asf: str = ASF) -> FormatError:
@@ -205,15 +206,15 @@ class TestPairing:
             "b/10.asf",
             "b/10_2.amc",
         ]
-        found = {pairing.motion: pairing.skeleton for pairing in pair_companions(names)}
+        found = {pairing.file: pairing.companion for pairing in pair_companions(names)}
         assert found == {"a/16/16_01.amc": "a/16/16.asf", "a/7/07_01-walk.amc": "a/7/07.asf", "b/10_2.amc": "b/10.asf"}
 
     def test_a_folders_only_asf_serves_any_name(self) -> None:
-        assert pair_companions(["x\\body.asf", "x\\take.AMC"])[0].skeleton == "x\\body.asf"
+        assert pair_companions(["x\\body.asf", "x\\take.AMC"])[0].companion == "x\\body.asf"
 
     def test_without_an_asf_the_reason_is_given(self) -> None:
         alone, unlike = pair_companions(["a/zeros.amc", "b/take.amc", "b/one.asf", "b/two.asf"])
-        assert alone.skeleton is None
+        assert alone.companion is None
         assert "no ASF" in str(alone.reason)
-        assert unlike.skeleton is None
+        assert unlike.companion is None
         assert "2 ASF" in str(unlike.reason)

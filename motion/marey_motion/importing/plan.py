@@ -1,0 +1,129 @@
+"""Plan of a batch of files, by their names alone: the companion of each file, its folder and its name, or a refusal."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+from typing import Literal
+
+from marey_motion.formats.predecessor.documents import pair_trees
+from marey_schemas.formats import IMPORTED, FileFormat, format_named
+
+_LONGEST_SEGMENT, _LONGEST_PATH = 255, 1024
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+
+_Paths = list[tuple[PurePosixPath, str]]
+
+
+@dataclass(frozen=True)
+class PlannedFile:
+    """Plan for one file of a batch.
+
+    Parameters
+    ----------
+    name : as given
+    role : a `motion` or `skeleton` to import, the `companion` of others, or `refused`
+    companion : the file that it needs
+    folder, item_name : folder below the target and name of the clip
+    reason : why it is refused
+    """
+
+    name: str
+    role: Literal["motion", "skeleton", "companion", "refused"]
+    folder: str = ""
+    item_name: str = ""
+    companion: str | None = None
+    code: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """A file and the companion it needs; `code` and `reason` say why there is none."""
+
+    file: str
+    companion: str | None
+    code: str = ""
+    reason: str = ""
+
+
+def plan_imports(names: Sequence[str]) -> list[PlannedFile]:
+    """Plan each file of a batch by its name, in the order given. Folders in names become folders below the target."""
+    companions = {pairing.file: pairing for pairing in pair_companions(names)}
+    trees = pair_trees(names)
+    needed = {*trees.values(), *(one.companion for one in companions.values() if one.companion is not None)}
+    taken: set[tuple[str, str]] = set()
+    seen: set[str] = set()
+    planned = []
+    for name in names:
+        one = _place(name, taken)
+        pairing = companions.get(name)
+        if name in seen:
+            one = replace(one, role="refused", code="name-repeated", reason="another file of the upload has this name")
+        elif one.role == "motion" and name in needed:
+            one = replace(one, role="companion")
+        elif one.role == "motion" and pairing is not None and pairing.companion is None:
+            one = replace(one, role="refused", code=pairing.code, reason=pairing.reason)
+        elif one.role == "motion" and (pairing is not None or name in trees):
+            one = replace(one, companion=pairing.companion if pairing is not None else trees[name])
+        if one.role == "motion":
+            taken.add((one.folder, one.item_name))
+        seen.add(name)
+        planned.append(one)
+    return planned
+
+
+def _place(name: str, taken: set[tuple[str, str]]) -> PlannedFile:
+    path = PurePosixPath(name.replace("\\", "/"))
+    segments = [part for part in path.parts if part not in ("/", ".", "..")]
+    if not segments or any(len(part) > _LONGEST_SEGMENT for part in segments) or len(name) > _LONGEST_PATH:
+        reason = f"a name has 1 to {_LONGEST_SEGMENT} characters, with its folders {_LONGEST_PATH}"
+        return PlannedFile(name, "refused", code="name-invalid", reason=reason)
+    if any(_CONTROL.search(part) for part in segments):
+        return PlannedFile(
+            name, "refused", code="name-invalid", reason="a name has no line breaks or control characters"
+        )
+    folder, stem = "/".join(segments[:-1]), PurePosixPath(segments[-1]).stem
+    return PlannedFile(name, "motion", folder, segments[-1] if (folder, stem) in taken else stem)
+
+
+def pair_companions(names: Iterable[str]) -> tuple[Pairing, ...]:
+    """Find the companion of every file that needs one, such as the ASF of an AMC, among the paths of one upload.
+
+    In the same folder: the file of the same stem, else the one whose stem the file's begins with up to a separator
+    (16_01.amc with 16.asf, 07_01-walk.amc with 07.asf), the longest of several; else the folder's only companion.
+    """
+    paths = sorted({PurePosixPath(name.replace("\\", "/")): name for name in names}.items())
+    pairings: list[Pairing] = []
+    for row in IMPORTED:
+        if row.companion is None or not row.needs_companion:
+            continue
+        companions: dict[PurePosixPath, _Paths] = {}
+        for path, name in paths:
+            if format_named(row.companion).names(path.name):
+                companions.setdefault(path.parent, []).append((path, name))
+        pairings += (
+            _pairing(row, path, name, companions.get(path.parent, [])) for path, name in paths if row.names(name)
+        )
+    return tuple(pairings)
+
+
+def _pairing(row: FileFormat, path: PurePosixPath, name: str, companions: _Paths) -> Pairing:
+    stem = path.stem.lower()
+    matching = [
+        (len(other.stem), other_name)
+        for other, other_name in companions
+        if stem == other.stem.lower() or (stem.startswith(other.stem.lower()) and not stem[len(other.stem)].isalnum())
+    ]
+    if matching:
+        return Pairing(name, max(matching)[1])
+    if len(companions) == 1:
+        return Pairing(name, companions[0][1])
+    wanted = str(row.companion)
+    if companions:
+        reason = f"none of the {len(companions)} {wanted.upper()} files beside it has its name"
+    else:
+        reason = f"no {wanted.upper()} file beside it; {row.needs_companion}"
+    return Pairing(name, None, f"{wanted}-missing", reason)

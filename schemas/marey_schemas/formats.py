@@ -1,0 +1,168 @@
+"""The table of file formats. Every choice, file ending, media type and answer type of a format derives from a row here.
+
+A new format is one row and one module: `marey_motion.formats.<name>` has `read_<name>` where the row reads something,
+and `write_<name>` where it writes motion.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+ORIGINAL = "original"
+"""The choice of an export that gives back the imported file itself, whatever its format."""
+OCTETS = "application/octet-stream"
+
+Content = Literal["motion", "skeleton", "model", "tree", "graph", "annotation", "alignment", "item"]
+
+UNITS_M = {
+    "mm": 0.001,
+    "cm": 0.01,
+    "inch": 0.0254,
+    "cmu": 0.0254 / 0.45,
+    "dm": 0.1,
+    "ft": 0.3048,
+    "m": 1.0,
+}
+"""Metres per unit: the units that motion files have been seen in. The CMU database counts in 1/0.45 inch."""
+
+
+@dataclass(frozen=True, slots=True)
+class FileFormat:
+    """A file format.
+
+    Parameters
+    ----------
+    name : what choices, options and the modules of readers and writers call it
+    endings : endings of file names, lower case; folders are searched for them, and the first is the one written
+    media_type : of written files
+    reads, writes : what its reader understands and its writer can write
+    units : units of length that it is written in; more than one: the caller chooses
+    begins : pattern that only the beginning of such a file matches; None where the name alone identifies it
+    other_endings : endings that identify a named file, but that folders are not searched for
+    euler : its rotations are Euler angles, whose orders an export keeps from the import
+    archive : its files are ZIP archives, told from other archives by their ending
+    companion : format of a second file that its reader takes
+    needs_companion : why that file is needed; empty where it is optional
+    unread : why there is no reader, for files that people expect to be read
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    media_type: str
+    reads: tuple[Content, ...] = ()
+    writes: tuple[Content, ...] = ()
+    units: tuple[str, ...] = ()
+    begins: re.Pattern[bytes] | None = None
+    other_endings: tuple[str, ...] = ()
+    euler: bool = False
+    archive: bool = False
+    companion: str | None = None
+    needs_companion: str = ""
+    unread: str = ""
+
+    def names(self, file: str) -> bool:
+        """Whether a file name has one of the endings."""
+        return file.lower().endswith(self.endings + self.other_endings)
+
+
+def _text(beginning: bytes) -> re.Pattern[bytes]:
+    return re.compile(rb"\A(?:\xef\xbb\xbf)?\s*" + beginning, re.IGNORECASE)
+
+
+def _line_of(*keywords: bytes) -> re.Pattern[bytes]:
+    """Matches where a line begins with one of the keywords."""
+    return re.compile(rb"(?:\A(?:\xef\xbb\xbf)?|[\r\n])\s*:(?:" + b"|".join(keywords) + rb")(?:\s|\Z)", re.IGNORECASE)
+
+
+FORMATS = (
+    FileFormat(
+        name="bvh",
+        endings=(".bvh",),
+        media_type="text/plain",
+        reads=("motion", "skeleton"),
+        writes=("motion",),
+        units=("m", "cm"),
+        begins=_text(b"hierarchy"),
+        euler=True,
+    ),
+    FileFormat(
+        name="amc",
+        endings=(".amc",),
+        media_type="text/plain",
+        reads=("motion",),
+        begins=_line_of(b"fully-specified", b"degrees", b"radians"),
+        companion="asf",
+        needs_companion="an AMC holds angles alone and needs its skeleton",
+    ),
+    FileFormat(
+        name="asf",
+        endings=(".asf",),
+        media_type="text/plain",
+        reads=("skeleton",),
+        begins=_line_of(b"version", b"units", b"bonedata"),
+    ),
+    FileFormat(
+        name="npz",
+        endings=(".npz",),
+        media_type="application/x-npz",
+        reads=("motion", "skeleton"),
+        writes=("motion",),
+        units=("m",),
+        archive=True,
+    ),
+    FileFormat(
+        name="c3d",
+        endings=(".c3d",),
+        media_type=OCTETS,
+        begins=re.compile(rb"\A[\x02-\x7f]\x50.{510}", re.DOTALL),
+        unread="they hold markers, not a skeleton's motion",
+    ),
+    FileFormat(
+        name="predecessor",
+        endings=(".bson.bz2", ".bson", ".json"),
+        media_type="application/x-bzip2",
+        reads=("motion", "skeleton", "model", "tree", "graph"),
+        writes=("motion", "model", "tree", "graph", "annotation", "alignment"),
+        units=("cm",),
+        begins=_text(rb"(?:bzh|\{)"),
+        other_endings=(".bz2", ".skeleton"),
+        companion="predecessor",
+    ),
+    FileFormat(name="json", endings=(".json",), media_type="application/json", writes=("item",)),
+)
+"""The formats, in the order in which the beginning of a file is compared with them."""
+
+_BY_NAME = {one.name: one for one in FORMATS}
+
+
+def format_named(name: str) -> FileFormat:
+    """The format of that name. Raises `KeyError`."""
+    return _BY_NAME[name]
+
+
+IMPORTED = tuple(one for one in FORMATS if one.reads or one.unread)
+"""Formats that imports recognise."""
+IMPORTED_ENDINGS = tuple(sorted(ending for one in IMPORTED for ending in one.endings))
+"""Endings of the files that an upload of a folder takes."""
+MOTION_FORMATS = tuple(one.name for one in FORMATS if "motion" in one.writes)
+"""Formats that a clip can be written in."""
+SAMPLE_FORMATS = (*MOTION_FORMATS, "json")
+EXPORT_FORMATS = (ORIGINAL, *SAMPLE_FORMATS)
+"""Choices of an export."""
+WRITTEN_UNITS = tuple(dict.fromkeys(unit for one in FORMATS if len(one.units) > 1 for unit in one.units))
+"""Units that the caller can choose from where a format leaves its unit open."""
+MOTION_MEDIA_TYPES = tuple(dict.fromkeys(format_named(name).media_type for name in MOTION_FORMATS))
+EXPORT_MEDIA_TYPES = tuple(dict.fromkeys((OCTETS, *(one.media_type for one in FORMATS if one.writes))))
+
+if TYPE_CHECKING:  # the type checker knows no literals computed from a table; requests are checked against them
+    MotionFormat = str
+    ExportFormat = str
+    LengthUnit = str
+    WrittenUnit = str
+else:
+    MotionFormat = Literal[MOTION_FORMATS]
+    ExportFormat = Literal[EXPORT_FORMATS]
+    LengthUnit = Literal[tuple(UNITS_M)]
+    WrittenUnit = Literal[WRITTEN_UNITS]
