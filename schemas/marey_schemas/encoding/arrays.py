@@ -10,6 +10,7 @@ from itertools import chain
 from typing import Annotated, Any
 
 import numpy as np
+import orjson
 from numpy.typing import NDArray
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
@@ -18,10 +19,22 @@ from pydantic_core import CoreSchema, core_schema
 from marey_schemas.encoding import blocks
 from marey_schemas.encoding.arrayspec import DTYPES, ArrayError, ArraySpec, little_endian, require_finite
 
-__all__ = ["DTYPES", "Array", "ArrayError", "ArrayOf", "EncodedArray", "array_from_leaf", "is_leaf", "nested_lists"]
+__all__ = [
+    "DTYPES",
+    "Array",
+    "ArrayError",
+    "ArrayOf",
+    "EncodedArray",
+    "array_from_leaf",
+    "is_leaf",
+    "json_data",
+    "nested_lists",
+]
 
 LEAF_KEYS = frozenset({"dtype", "shape", "data"})
 MAX_ARRAY_BYTES = 1 << 28
+_MISREAD_BITS = 0x15AE43FD
+"""7.038531e-26, the one float32 whose shortest text gives its neighbour if it is read as a double first."""
 _ELEMENT_TYPES: dict[str, set[type]] = {"f": {int, float}, "i": {int}, "u": {int}, "b": {bool}}
 
 
@@ -34,10 +47,17 @@ class EncodedArray:
     data: bytes
 
     @classmethod
-    def of(cls, array: NDArray[Any]) -> "EncodedArray":
-        """Encode `array` in blocks."""
+    def of(cls, array: NDArray[Any], *, predict: bool = True) -> "EncodedArray":
+        """Encode `array` in blocks; without `predict`, fast rather than small."""
         spec = ArraySpec.of(array)
-        return cls(spec.dtype, spec.shape, blocks.encode(array))
+        return cls(spec.dtype, spec.shape, blocks.encode(array, predict=predict))
+
+    def cut_frames(self, start: int, stop: int) -> "EncodedArray":
+        """Frames `start` to `stop`. Raises `ArrayError` where the bytes are corrupt."""
+        try:
+            return EncodedArray(self.dtype, (stop - start, *self.shape[1:]), blocks.cut_frames(self.data, start, stop))
+        except blocks.BlockError as error:
+            raise ArrayError("bad-array", str(error)) from error
 
     def decode(self, *, max_bytes: int = MAX_ARRAY_BYTES) -> NDArray[Any]:
         """The array itself. Raises `ArrayError` where the bytes disagree with dtype and shape, or are corrupt."""
@@ -110,23 +130,19 @@ def _from_lists(data: object, spec: ArraySpec) -> NDArray[Any]:
         raise ArrayError("out-of-range", f"an element does not fit in dtype {spec.dtype}") from error
 
 
+def json_data(array: NDArray[Any]) -> Any:
+    """`data` of a JSON leaf for `orjson`, which writes arrays itself: each number as its shortest text.
+
+    A float32 gets at most nine digits (0.1, not 0.10000000149011612) and reads back to the same bits.
+    """
+    if array.dtype == np.float32 and (array.view(np.uint32) & 0x7FFFFFFF == _MISREAD_BITS).any():
+        array = array.astype(np.float64)
+    return array if array.ndim else nested_lists(array[np.newaxis])[0]
+
+
 def nested_lists(array: NDArray[Any]) -> Any:
-    """`data` of a JSON leaf: nested lists whose numbers read back to the same bits."""
-    return (_short_decimals(array) if array.dtype == np.float32 else array).tolist()
-
-
-def _short_decimals(array: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Doubles that print with at most nine digits and round to the same float32: 0.1, not 0.10000000149011612."""
-    exact = array.astype(np.float64)
-    short = exact.copy()
-    size = np.abs(exact)
-    usable = (size > 1e-12) & (size < 1e15)  # where the power of ten below is exact
-    exponent = np.floor(np.log10(size, where=usable, out=np.zeros_like(size)))
-    for digits in (9, 8, 7):
-        scale = 10.0 ** np.clip(digits - 1 - exponent, 0, 22)
-        rounded = np.rint(exact * scale) / scale
-        short = np.where(usable & (rounded.astype(np.float32) == array), rounded, short)
-    return short
+    """`data` of a JSON leaf as Python lists, or one number where the array has no axes."""
+    return orjson.loads(orjson.dumps(json_data(array), option=orjson.OPT_SERIALIZE_NUMPY))
 
 
 @dataclass(frozen=True, slots=True)

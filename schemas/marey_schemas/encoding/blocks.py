@@ -7,7 +7,8 @@ import math
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,10 @@ class _Layout:
     def groups(self) -> int:
         return -(-self.columns // self.group_columns)
 
+    def of_frames(self, frames: int) -> "_Layout":
+        """The same tiles for another number of frames."""
+        return replace(self, spec=ArraySpec(self.spec.dtype, (frames, *self.spec.shape[1:])))
+
     def block(self, index: int) -> slice:
         """Frames of a block."""
         return slice(index * self.block_frames, min((index + 1) * self.block_frames, self.frames))
@@ -73,21 +78,49 @@ class _Layout:
         return -start % 4 if self.spec.shape[-1:] == (4,) else None
 
 
-def encode(array: NDArray[Any]) -> bytes:
+def encode(array: NDArray[Any], *, predict: bool = True) -> bytes:
     """Encode an array of any shape and travelling dtype; the same array always gives the same bytes.
 
-    Raises `ArrayError` for a dtype or shape that may not travel.
+    Without `predict`, tiles are raw and take hardly more time than copying: for bytes that are read once. Raises
+    `ArrayError` for a dtype or shape that may not travel.
     """
     array = little_endian(array)
     spec = ArraySpec.of(array)
     longer = NARROW_COLUMNS // max(math.prod(spec.shape[1:]), 1)
     layout = _Layout(spec, BLOCK_FRAMES * max(longer, 1), GROUP_COLUMNS)
+    return _assembled(layout, _packed(layout, array, predict=predict))
+
+
+def cut_frames(data: bytes, start: int, stop: int) -> bytes:
+    """Encode frames `start` to `stop` of an encoded array.
+
+    Where `start` is that of a block, blocks that are wanted whole are passed on as they are stored. All others are
+    decoded and written raw. Raises `BlockError`.
+    """
+    layout, starts = _read_head(data)
+    cut = layout.of_frames(stop - start)
+    first, inside = divmod(start, layout.block_frames)
+    blocks = 0 if inside else cut.blocks if stop == layout.frames else cut.frames // cut.block_frames
+    passed_on = starts[first * layout.groups : (first + blocks) * layout.groups + 1]
+    packed = [data[here:there] for here, there in pairwise(passed_on)]
+    rest = decode(data, frames=slice(start + blocks * cut.block_frames, stop))
+    return _assembled(cut, packed + _packed(cut.of_frames(len(rest)), rest, predict=False))
+
+
+def _packed(layout: _Layout, array: NDArray[Any], *, predict: bool) -> list[bytes]:
+    """The tiles of an array, each compressed by itself."""
     table = array.reshape(layout.frames, layout.columns)
-    packed = [
-        tiles.pack(table[layout.block(block), layout.group(group)], layout.lead(group))
+    parts = (
+        (table[layout.block(block), layout.group(group)], layout.lead(group))
         for block in range(layout.blocks)
         for group in range(layout.groups)
-    ]
+    )
+    return [tiles.pack(part, lead) if predict else tiles.pack_raw(part) for part, lead in parts]
+
+
+def _assembled(layout: _Layout, packed: list[bytes]) -> bytes:
+    """Header, index and tiles."""
+    spec = layout.spec
     head = MAGIC + spec.dtype.encode("ascii")
     head += struct.pack(f"<B{len(spec.shape)}Q", len(spec.shape), *spec.shape)
     head += struct.pack(f"<2I{len(packed)}I", layout.block_frames, layout.group_columns, *map(len, packed))

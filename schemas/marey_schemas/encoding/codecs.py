@@ -14,10 +14,11 @@ import bson
 import bson.errors
 import msgpack  # type: ignore[import-untyped]
 import numpy as np
+import orjson
 from bson.raw_bson import RawBSONDocument
 from numpy.typing import NDArray
 
-from marey_schemas.encoding.arrays import LEAF_KEYS, EncodedArray, array_from_leaf, nested_lists
+from marey_schemas.encoding.arrays import LEAF_KEYS, EncodedArray, array_from_leaf, json_data
 from marey_schemas.encoding.arrayspec import DTYPES, ArrayError, little_endian, require_finite
 
 JSON, MSGPACK, BSON = MEDIA_TYPES = ("application/json", "application/msgpack", "application/bson")
@@ -56,7 +57,7 @@ def encode_tree(tree: Any, media_type: str, *, arrays: ArrayForm = "plain") -> b
 
     plain = _Walk(MAX_DEPTH, on_array=leaf).visit(tree)
     if media_type == JSON:
-        return json.dumps(plain, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
+        return orjson.dumps(plain, option=orjson.OPT_SERIALIZE_NUMPY)
     if media_type == MSGPACK:
         packed: bytes = msgpack.packb(plain)
         return packed
@@ -98,7 +99,7 @@ def _require_media_type(media_type: str) -> None:
 
 def _leaf_as_json(value: NDArray[Any] | EncodedArray) -> dict[str, Any]:
     array = _finite_array(value)
-    return {"dtype": array.dtype.str, "shape": list(array.shape), "data": nested_lists(array)}
+    return {"dtype": array.dtype.str, "shape": list(array.shape), "data": json_data(array)}
 
 
 def _leaf_as_bytes(value: NDArray[Any] | EncodedArray, arrays: ArrayForm) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
@@ -45,10 +45,13 @@ class PartChange(Request):
     message: Message = Field("", description="Shown in the history.")
 
 
-def read_part(tx: Transaction, project: str, kind: Kind, item: str, part: str, query: PartQuery) -> Reply:
-    """A part, for who may read it. What names its revision never changes."""
+def read_part(
+    tx: Transaction, project: str, kind: Kind, item: str, part: str, query: PartQuery, *, encoded: bool
+) -> Reply:
+    """Read a part, its arrays `encoded` in blocks or decoded. A part at a named revision never changes."""
     found = items.find_part(tx, project, kind, item, part, revision=query.revision)
-    load = partial(items.load_part, tx, found, frames=query.frame_slice(), joints=query.joints)
+    arrays: Literal["encoded", "decoded"] = "encoded" if encoded else "decoded"
+    load = partial(items.load_part, tx, found, frames=query.frame_slice(), joints=query.joints, arrays=arrays)
     whole = query.frames is None and query.joints is None
     content = Lasting(found.digest, load) if whole else load()
     if query.revision is None:
@@ -68,7 +71,10 @@ class PartResource(Resource):
 
         As MessagePack or BSON with `arrays=blocks` in the media type, arrays come compressed as they are stored.
         """
-        return await self.answer_with(lambda reply: reply, read_part, project, kind_of(kind), item, part, query)
+        encoded = self.media.arrays == "blocks"
+        return await self.answer_with(
+            lambda reply: reply, read_part, project, kind_of(kind), item, part, query, encoded=encoded
+        )
 
     @writes(
         access=Access.CONTRIBUTOR,

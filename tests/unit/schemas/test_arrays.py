@@ -132,5 +132,12 @@ def test_float32_written_as_json_reads_back_to_the_bit(bits: list[int]) -> None:
     assert np.array(json.loads(text), np.float32).tobytes() == array.tobytes()
 
 
+def test_a_float32_whose_shortest_text_would_be_misread_comes_back_to_the_bit() -> None:
+    awkward = np.array([0x15AE43FD, 0x95AE43FD, 0x15AE43FE], np.uint32).view(np.float32)
+    for array in (awkward, awkward[0]):
+        text = json.dumps(nested_lists(array))
+        assert np.array(json.loads(text), np.float32).tobytes() == array.tobytes()
+
+
 def test_float32_is_written_with_few_digits() -> None:
     assert json.dumps(nested_lists(np.float32([0.1, 1.5, -123.456, -0.0]))) == "[0.1, 1.5, -123.456, -0.0]"

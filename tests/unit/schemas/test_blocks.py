@@ -113,6 +113,36 @@ def test_the_spec_is_read_without_the_tiles() -> None:
     assert blocks.read_spec(broken) == ArraySpec("<f4", (700, 43))
 
 
+@pytest.mark.parametrize(
+    "array",
+    [poses(1000, 5), poses(600, 400), np.arange(5000.0), np.arange(20_000, dtype=np.int16).reshape(5000, 2, 2)],
+    ids=["narrow", "wide", "one axis", "three axes"],
+)
+@pytest.mark.parametrize(
+    ("start", "stop"), [(0, None), (0, 512), (256, None), (256, 600), (7, 300), (512, 513), (3, 3)]
+)
+def test_frames_cut_out_of_an_encoding_are_those_of_the_array(
+    array: NDArray[Any], start: int, stop: int | None
+) -> None:
+    stop = len(array) if stop is None else stop
+    assert same_bits(blocks.decode(blocks.cut_frames(blocks.encode(array), start, stop)), array[start:stop])
+
+
+def test_blocks_that_are_cut_out_whole_are_passed_on_as_they_are_stored() -> None:
+    array = poses(1000, 40)
+    data = blocks.encode(array)
+    assert blocks.cut_frames(data, 0, 1000) == data
+    assert blocks.cut_frames(data, 256, 768) == blocks.encode(array[256:768])
+    assert len(blocks.cut_frames(data, 256, 1000)) < len(blocks.cut_frames(data, 257, 1000))
+
+
+def test_an_array_may_be_encoded_for_speed_instead_of_size() -> None:
+    array = poses(1000, 40)
+    fast = blocks.encode(array, predict=False)
+    assert same_bits(blocks.decode(fast), array)
+    assert len(blocks.encode(array)) < len(fast) < 1.01 * array.nbytes
+
+
 @st.composite
 def partial_reads(draw: st.DrawFn) -> tuple[NDArray[Any], slice, NDArray[np.intp] | None]:
     frames = draw(st.integers(1, 900))

@@ -60,34 +60,43 @@ def test_the_summary_tells_what_lists_show(lab, rig):
     assert rig.summary == {"joints": 3}
 
 
-def test_slices_of_a_motion_equal_slices_of_the_array(lab, rig):
+def cut_part(tx, kind, item_id, part, **cut):
+    """Some frames and joints of a part."""
+    return items.load_part(tx, items.find_part(tx, "lab", kind, item_id, part), **cut)
+
+
+def plain(array):
+    return array.decode() if isinstance(array, EncodedArray) else array
+
+
+@pytest.mark.parametrize("arrays", ["encoded", "decoded"])
+def test_slices_of_a_motion_equal_slices_of_the_array(lab, rig, arrays):
     clip = lab.add_clip(rig, frames=40, seed=3)
     poses = motion_tree(rig, frames=40, seed=3)["poses"]
     for frames in (None, slice(0, 1), slice(5, 17), slice(30, 400), slice(-3, None)):
         for joints in (None, ["j0"], ["j2", "j0"], ["j0", "j1", "j2"]):
-            part = lab.read(items.read_part, "lab", Kind.CLIP, clip.id, "motion", frames=frames, joints=joints)
-            tree = (
-                part.tree if frames or joints else {"poses": part.tree["poses"].decode(), "joints": ["j0", "j1", "j2"]}
-            )
+            tree = lab.read(cut_part, Kind.CLIP, clip.id, "motion", frames=frames, joints=joints, arrays=arrays)
+            assert isinstance(tree["poses"], EncodedArray) == (arrays == "encoded")
             columns = [0, 1, 2]
             for name in joints or ["j0", "j1", "j2"]:
                 columns += range(3 + 4 * int(name[1]), 7 + 4 * int(name[1]))
-            np.testing.assert_array_equal(tree["poses"], poses[frames or slice(None)][:, columns])
+            np.testing.assert_array_equal(plain(tree["poses"]), poses[frames or slice(None)][:, columns])
             assert tree["joints"] == (joints or ["j0", "j1", "j2"])
 
 
-def test_slices_cut_translations_along(lab, rig):
+@pytest.mark.parametrize("arrays", ["encoded", "decoded"])
+def test_slices_cut_translations_along(lab, rig, arrays):
     motion = motion_tree(rig, frames=6)
     motion["translations"] = np.arange(6 * 2 * 3, dtype="<f4").reshape(6, 2, 3)
     motion["translated_joints"] = ["j1", "j2"]
     clip = lab.write(items.create_item, "lab", Kind.CLIP, ItemCreate(name="w", parts={"motion": motion}))
 
     def cut(**kwargs):
-        return lab.read(items.read_part, "lab", Kind.CLIP, clip.id, "motion", **kwargs).tree
+        return lab.read(cut_part, Kind.CLIP, clip.id, "motion", arrays=arrays, **kwargs)
 
-    np.testing.assert_array_equal(cut(frames=slice(2, 4))["translations"], motion["translations"][2:4])
+    np.testing.assert_array_equal(plain(cut(frames=slice(2, 4))["translations"]), motion["translations"][2:4])
     only = cut(joints=["j2", "j0"])
-    np.testing.assert_array_equal(only["translations"], motion["translations"][:, 1:])
+    np.testing.assert_array_equal(plain(only["translations"]), motion["translations"][:, 1:])
     assert only["translated_joints"] == ["j2"]
     none = cut(joints=["j0"])
     assert (none["translations"], none["translated_joints"]) == (None, [])
@@ -100,12 +109,12 @@ def test_slices_cut_translations_along(lab, rig):
 def test_a_cut_that_makes_no_sense_is_refused(lab, rig, cut):
     clip = lab.add_clip(rig, frames=5)
     with pytest.raises(Invalid):
-        lab.read(items.read_part, "lab", Kind.CLIP, clip.id, "motion", **cut)
+        lab.read(cut_part, Kind.CLIP, clip.id, "motion", **cut)
 
 
 def test_only_motions_are_cut(lab, rig):
     with pytest.raises(Invalid):
-        lab.read(items.read_part, "lab", Kind.SKELETON, rig.id, "hierarchy", frames=slice(0, 1))
+        lab.read(cut_part, Kind.SKELETON, rig.id, "hierarchy", frames=slice(0, 1))
 
 
 # -- revisions --------------------------------------------------------------------------------------------------------

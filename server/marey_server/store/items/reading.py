@@ -147,15 +147,17 @@ def load_part(
 ) -> dict[str, Any]:
     """The document of a part, its arrays as `arrays` says.
 
-    `frames` (half-open, clipped to what is there) and `joints` (names, in the order wanted) cut a motion; what was cut
-    is decoded. Raises `Invalid` where a cut makes no sense.
+    `frames` (half-open, clipped to what is there) and `joints` (names, in the order wanted) cut a motion. Raises
+    `Invalid` where they do not fit it.
     """
     if frames is None and joints is None:
         return documents.load_document(tx, found.digest, arrays=arrays)
     tree = documents.load_document(tx, found.digest)
     if tree["schema"] != "marey/motion@1":
         raise Invalid("Only motions are cut by frames and joints.", code="not-a-motion")
-    return slice_motion(tree, frames, joints)
+    if arrays == "none":
+        raise ValueError("references name whole arrays, which a cut has not")
+    return slice_motion(tree, frames, joints, encoded=arrays == "encoded")
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,11 +175,9 @@ def read_part(
     part: str,
     *,
     revision: int | None = None,
-    frames: slice | None = None,
-    joints: Sequence[str] | None = None,
     arrays: Literal["encoded", "decoded", "none"] = "encoded",
 ) -> Part:
-    """`find_part` and `load_part`."""
+    """Find a part and load all of it."""
     found = find_part(tx, project, kind, item_id, part, revision=revision)
-    tree = load_part(tx, found, frames=frames, joints=joints, arrays=arrays)
+    tree = load_part(tx, found, arrays=arrays)
     return Part(found.digest, found.revision, found.rev, tree)

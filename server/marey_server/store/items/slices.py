@@ -17,18 +17,20 @@ from marey_server.errors import Invalid
 Tree = dict[str, Any]
 
 
-def slice_motion(motion: Tree, frames: slice | None, joints: Sequence[str] | None) -> Tree:
-    """The motion with only these frames and joints; the root's translation stays.
+def slice_motion(motion: Tree, frames: slice | None, joints: Sequence[str] | None, *, encoded: bool = False) -> Tree:
+    """Cut a motion to these frames and joints; the root's translation stays.
 
     Parameters
     ----------
     motion : document of schema marey/motion@1 with `EncodedArray` leaves
     frames : half-open range, clipped to the motion
     joints : names in the order wanted
+    encoded : whether the arrays of the result are `EncodedArray`, too
     """
     cut = dict(motion)
     poses: EncodedArray = motion["poses"]
-    if frames is not None and len(range(*frames.indices(poses.shape[0]))) == 0:
+    chosen = range(*(frames or slice(None)).indices(poses.shape[0]))
+    if not chosen:
         detail = f"The motion has {counted(poses.shape[0], 'frame')}; the range holds none of them."
         raise _invalid("frames", "no-frames", detail)
     names = list(motion["joints"])
@@ -38,12 +40,14 @@ def slice_motion(motion: Tree, frames: slice | None, joints: Sequence[str] | Non
     if len(set(wanted)) != len(wanted) or not wanted:
         raise _invalid("joints", "bad-joints", "Name each joint once, and at least one.")
     cut["joints"] = wanted
-    cut["poses"] = _decode(poses, frames, None if joints is None else _pose_columns(names, wanted))
-    translated = list(motion.get("translated_joints") or ())
-    if motion.get("translations") is not None:
+    cut["poses"] = _cut(poses, chosen, None if joints is None else _pose_columns(names, wanted), encoded=encoded)
+    stored: EncodedArray | None = motion.get("translations")
+    if stored is not None:
+        translated = list(motion["translated_joints"])
         kept = [name for name in translated if name in wanted]
         cut["translated_joints"] = kept
-        cut["translations"] = _cut_translations(motion["translations"], frames, translated, kept) if kept else None
+        columns = None if joints is None else _translation_columns(translated, kept)
+        cut["translations"] = _cut(stored, chosen, columns, encoded=encoded) if kept else None
     return cut
 
 
@@ -53,16 +57,20 @@ def _pose_columns(names: Sequence[str], wanted: Sequence[str]) -> NDArray[np.int
     return np.concatenate([np.arange(3, dtype=np.intp), (starts[:, None] + np.arange(4)).ravel()])
 
 
-def _cut_translations(
-    stored: EncodedArray, frames: slice | None, translated: Sequence[str], kept: Sequence[str]
-) -> NDArray[Any]:
-    starts = 3 * np.array([translated.index(name) for name in kept], np.intp)
-    array = _decode(stored, frames, (starts[:, None] + np.arange(3)).ravel())
-    return array.reshape(len(array), len(kept), 3)
+def _translation_columns(names: Sequence[str], wanted: Sequence[str]) -> NDArray[np.intp]:
+    starts = 3 * np.array([names.index(name) for name in wanted], np.intp)
+    return (starts[:, None] + np.arange(3)).ravel()
 
 
-def _decode(stored: EncodedArray, frames: slice | None, columns: NDArray[np.intp] | None) -> NDArray[Any]:
-    return np.ascontiguousarray(blocks.decode(stored.data, frames=frames, columns=columns))
+def _cut(
+    stored: EncodedArray, frames: range, columns: NDArray[np.intp] | None, *, encoded: bool
+) -> NDArray[Any] | EncodedArray:
+    """Some frames and columns of an array of poses, or of triples; `columns` count through all axes but the first."""
+    if encoded and columns is None:
+        return stored.cut_frames(frames.start, frames.stop)
+    array = blocks.decode(stored.data, frames=slice(frames.start, frames.stop), columns=columns)
+    array = np.ascontiguousarray(array).reshape(len(frames), -1, *stored.shape[2:])
+    return EncodedArray.of(array, predict=False) if encoded else array
 
 
 def _invalid(pointer: str, code: str, detail: str) -> Invalid:
