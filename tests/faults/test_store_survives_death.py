@@ -30,7 +30,7 @@ who = Principal("user", user_id, user_name, scopes=("read", "write"))
 FILES = [f"file {number}".encode() * 1000 for number in range(3)]
 
 def publish(tx):
-    row = projects.require(tx, "lab", scope="write")
+    row = projects.require(tx, "lab")
     trees = [{"n": n, "blob": blobs.digest_of(data)} for n, data in enumerate(FILES)]
     drafts = [items.Draft(f"d{n}", Kind.STUDY, f"study {n}", {"study": tree}, "a/b") for n, tree in enumerate(trees)]
     return items.publish(tx, row, drafts, author_id=user_id)

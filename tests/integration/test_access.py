@@ -5,11 +5,14 @@ from dataclasses import dataclass
 
 import httpx
 import pytest
+from sqlalchemy import select
 from tests.support.rest_server import ALL_SCOPES, Server
 
 from marey_schemas.access import Role
 from marey_server.handlers.catalogue import RESOURCES
-from marey_server.http.declarations import Access
+from marey_server.http.declarations import Access, writes
+from marey_server.store import projects
+from marey_server.store.tables import project
 
 CANARY = "canary-5e0f2b"
 ROLES = ("none", "stranger", "reader", "contributor", "maintainer", "owner", "admin", "attempt")
@@ -184,10 +187,10 @@ def expected(access: Access, scope: str | None, role: str, public: bool) -> set[
 ROUTES = [(resource, operation) for resource in RESOURCES for operation in resource.operations.values()]
 
 
-def test_every_route_lets_in_whom_it_declares_and_nobody_else(house: House):
-    """One test for the whole table: a house full of canaries is built once per database."""
+def find_wrong_answers(house: House, routes) -> list[str]:
+    """Send every route as every role; list the answers that differ from the declaration."""
     wrong = []
-    for route in ROUTES:
+    for route in routes:
         resource, operation = route
         for role in ROLES:
             # An attempt ends when its own token completes or fails it; the routes that do are tried last.
@@ -207,7 +210,55 @@ def test_every_route_lets_in_whom_it_declares_and_nobody_else(house: House):
                 wrong.append(f"{where}: should be refused with {sorted(refusal)}: {answer.text[:300]}")
             if (refusal is not None or role in ("none", "stranger")) and CANARY in answer.text:
                 wrong.append(f"{where}: a private byte leaked")
+    return wrong
+
+
+def test_every_route_lets_in_whom_it_declares_and_nobody_else(house: House):
+    """One test for the whole table: a house full of canaries is built once per database."""
+    wrong = find_wrong_answers(house, ROUTES)
     assert not wrong, "\n".join(wrong)
+
+
+def test_a_store_that_checks_no_role_is_found(house: House, monkeypatch: pytest.MonkeyPatch):
+    """The negative control: members are changed without asking for the caller's role, and the walk reports it."""
+    routes = [route for route in ROUTES if route[0].path == "/projects/{project}/members/{user}"]
+    assert not find_wrong_answers(house, routes)
+
+    def see_without_asking(tx, name, **_kwargs):
+        return projects.find_by_id(tx, tx.execute(select(project.c.id).where(project.c.name == name)).scalar_one())
+
+    monkeypatch.setattr(projects, "require", see_without_asking)
+    wrong = find_wrong_answers(house, routes)
+    assert any("PUT" in line and "as reader" in line and "should be refused" in line for line in wrong), wrong
+    assert any("GET" in line and "as stranger" in line and "should be refused" in line for line in wrong), wrong
+
+
+def test_only_these_routes_ask_for_more_than_a_contributor():
+    """A second home on purpose: whoever lowers the role of one of them changes this list, too."""
+    high = {
+        f"{operation.method} {resource.path}": operation.access.value
+        for resource, operation in ROUTES
+        if operation.access in (Access.MAINTAINER, Access.OWNER, Access.ADMINISTRATOR)
+    }
+    assert high == {
+        "GET /users": "administrator",
+        "POST /users": "administrator",
+        "DELETE /users/{user}": "administrator",
+        "PATCH /projects/{project}": "owner",
+        "DELETE /projects/{project}": "owner",
+        "POST /projects/{project}/restore": "owner",
+        "PUT /projects/{project}/members/{user}": "owner",
+        "DELETE /projects/{project}/members/{user}": "owner",
+        "DELETE /projects/{project}/collections/{collection}": "maintainer",
+        "POST /projects/{project}/collections/{collection}/restore": "maintainer",
+        "DELETE /projects/{project}/{kind}/{item}": "maintainer",
+        "POST /projects/{project}/{kind}/{item}/restore": "maintainer",
+    }
+
+
+def test_a_change_cannot_be_declared_for_readers():
+    with pytest.raises(TypeError, match="contributor"):
+        writes(access=Access.READER)
 
 
 def is_about_nobody(resource, role: str, code: str) -> bool:

@@ -9,6 +9,8 @@ from marey_schemas.access import MemberChange, ProjectChange, ProjectCreate, Rol
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
+from marey_server.access.roles import RequiredRole
+from marey_server.handlers.catalogue import RESOURCES
 from marey_server.store import items, members, projects, users
 from marey_server.store.database.connections import Database
 from marey_server.store.transaction import Transaction
@@ -40,6 +42,26 @@ def _new_user(tx: Transaction, name: str, *, administrator: bool = False) -> Pri
     return Principal("user", made.id, made.name, administrator, ALL_SCOPES)
 
 
+READ = RequiredRole(Role.READER, "read")
+WRITE = RequiredRole(Role.CONTRIBUTOR, "write")
+
+
+def requiring(required: RequiredRole, function: Any) -> Any:
+    """Run `function` as a request whose operation declares `required`."""
+
+    def run(tx: Transaction, *args: Any, **kwargs: Any) -> Any:
+        tx.required_role = required
+        return function(tx, *args, **kwargs)
+
+    return run
+
+
+def declared(method: str, path: str) -> RequiredRole:
+    """Return what the operation of an address declares."""
+    (found,) = (resource for resource in RESOURCES if resource.path == path)
+    return found.operations[method].required_role
+
+
 class Lab:
     """The project `lab` in a database, and who is who in it."""
 
@@ -63,13 +85,27 @@ class Lab:
         """A new user, as a principal with every scope."""
         return self.database.write(SYSTEM, _new_user, name, administrator=administrator)
 
-    def read(self, function: Any, *args: Any, who: Principal | None = None, **kwargs: Any) -> Any:
-        """Run a read, as the owner unless told otherwise."""
-        return self.database.read(who or self.owner, function, *args, **kwargs)
+    def read(
+        self,
+        function: Any,
+        *args: Any,
+        who: Principal | None = None,
+        required: RequiredRole = READ,
+        **kwargs: Any,
+    ) -> Any:
+        """Run a read as the owner or as `who`, by an operation that declares `required`."""
+        return self.database.read(who or self.owner, requiring(required, function), *args, **kwargs)
 
-    def write(self, function: Any, *args: Any, who: Principal | None = None, **kwargs: Any) -> Any:
-        """Run a write, as the owner unless told otherwise."""
-        return self.database.write(who or self.owner, function, *args, **kwargs)
+    def write(
+        self,
+        function: Any,
+        *args: Any,
+        who: Principal | None = None,
+        required: RequiredRole = WRITE,
+        **kwargs: Any,
+    ) -> Any:
+        """Run a write as the owner or as `who`, by an operation that declares `required`."""
+        return self.database.write(who or self.owner, requiring(required, function), *args, **kwargs)
 
     def make_public(self) -> None:
         """Let everybody read the project."""

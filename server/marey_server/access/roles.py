@@ -1,12 +1,31 @@
-"""What a role in a project allows: each role includes the ones before it."""
+"""Roles in a project, and the role that an operation requires."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 from marey_schemas.access import Role
 
 _RANK = {role: rank for rank, role in enumerate(Role)}
 
 
-def includes(role: Role, need: Role) -> bool:
-    """Whether somebody with `role` may do what needs `need`."""
-    return _RANK[role] >= _RANK[need]
+def includes(role: Role, required: Role) -> bool:
+    """Return whether `role` allows everything that `required` allows."""
+    return _RANK[role] >= _RANK[required]
+
+
+@dataclass(frozen=True, slots=True)
+class RequiredRole:
+    """The role and the scope that an operation requires in a project.
+
+    Handlers declare it; a request's transaction carries it; `store.projects.require` enforces it. `guests`: callers
+    without a role may do it in a public project if the role is reader.
+    """
+
+    role: Role
+    scope: str
+    guests: bool = True
+
+
+STRICTEST = RequiredRole(Role.OWNER, "write", guests=False)
+"""Required where nothing is declared."""

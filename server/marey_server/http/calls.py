@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from marey_schemas.access import Role
 from marey_server.access import scopes
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.errors import Forbidden, Unauthenticated
@@ -29,14 +28,15 @@ class Caller:
     operation: Operation
     principal: Principal | None = None
 
-    def identify(self, tx: Transaction) -> Principal:
-        """Look the credential up and check what the operation asks of any caller.
+    def identify(self, tx: Transaction) -> None:
+        """Resolve the credential and let the transaction act for its owner, within what the operation allows.
 
-        Roles in a project are checked by the store. Raises `Unauthenticated` or `Forbidden`.
+        The store enforces the role that the operation declares. Raises `Unauthenticated` or `Forbidden`.
         """
         self.principal = ANONYMOUS if self.token is None else tokens.resolve_token(tx, self.token)
         require_access(self.operation, self.principal)
-        return self.principal
+        tx.principal = self.principal
+        tx.required_role = self.operation.required_role
 
 
 def require_access(operation: Operation, principal: Principal) -> None:
@@ -80,11 +80,12 @@ class Call:
 
 def run_call(tx: Transaction, call: Call) -> Rendered:
     """Do it, once per idempotency key, and render the answer."""
-    tx.principal = call.caller.identify(tx)
+    call.caller.identify(tx)
     if call.idempotency_key is not None:
         stored = idempotency.begin(tx, call.idempotency_key, call.fingerprint)
         if stored is not None:
-            _require_role(tx, call)
+            if call.project is not None and call.caller.operation.access.role is not None:
+                projects.require(tx, call.project)  # the caller's role may have ended since the first request
             headers = {**stored.headers, "Idempotent-Replayed": "true"}
             return Rendered(stored.status, headers, stored.body)
     rendered = render(call.to_reply(call.function(tx, *call.args, **call.kwargs)), call.form, call.answers)
@@ -93,18 +94,11 @@ def run_call(tx: Transaction, call: Call) -> Rendered:
     return rendered
 
 
-def _require_role(tx: Transaction, call: Call) -> None:
-    """What the first request was allowed: whose role has ended since does not hear its answer again."""
-    operation = call.caller.operation
-    if call.project is not None and operation.access.is_role:
-        projects.require(tx, call.project, Role(operation.access), operation.scope or "read")
-
-
 def only_identify(tx: Transaction) -> None:
     """Do nothing more than `run_plain` does by itself: look the credential up."""
 
 
 def run_plain(tx: Transaction, caller: Caller, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     """Do something on behalf of the caller and hand its result back."""
-    tx.principal = caller.identify(tx)
+    caller.identify(tx)
     return function(tx, *args, **kwargs)

@@ -15,7 +15,9 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
+from marey_schemas.access import Role
 from marey_schemas.base import Answer, Request
+from marey_server.access.roles import STRICTEST, RequiredRole
 
 KIB = 1024
 MIB = 1024 * KIB
@@ -40,9 +42,9 @@ class Access(StrEnum):
     ATTEMPT = "attempt"
 
     @property
-    def is_role(self) -> bool:
-        """Whether it is a role in a project."""
-        return self in (Access.READER, Access.CONTRIBUTOR, Access.MAINTAINER, Access.OWNER)
+    def role(self) -> Role | None:
+        """The role in a project, or None where it is none."""
+        return next((role for role in Role if role.value == self.value), None)
 
 
 class Document:
@@ -98,6 +100,12 @@ class Operation:
     stream: bool
 
     @property
+    def required_role(self) -> RequiredRole:
+        """The role that the store enforces in every project which this operation touches."""
+        role = self.access.role
+        return STRICTEST if role is None else RequiredRole(role, self.scope or "read", guests=self.public)
+
+    @property
     def may_create(self) -> bool:
         """Whether `If-None-Match: *` is a precondition of it."""
         return self.precondition in ("create", "optional")
@@ -150,7 +158,10 @@ def writes(
 
     `precondition`: `required` demands If-Match; `create` demands If-Match or `If-None-Match: *`; `optional` takes
     either or none. `idempotency="key"`: honours Idempotency-Key; `nature`: doing it twice does it once anyway.
+    Readers and guests of a project change nothing in it, so `access` cannot be that of readers.
     """
+    if access is Access.READER:
+        raise TypeError("A method that changes a project requires at least the role contributor.")
     return _declare(
         access=access, scope=scope, query=query, body=body, answer=answer,
         status=status or (200 if answer else 204), precondition=precondition, idempotency=idempotency,

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from marey_schemas.access import Role
 from marey_schemas.documents.clips import Check
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, Refusal
@@ -69,7 +68,7 @@ class GivenSkeleton:
 
 def require_importer(tx: Transaction, project: str) -> None:
     """Refuse callers who may not import into the project, before their files are taken in."""
-    projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    projects.require(tx, project)
 
 
 def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
@@ -167,7 +166,7 @@ def _draft(
 
 def publish(tx: Transaction, project: str, prepared: PreparedImport, sources: Sequence[SourceFile]) -> list[Published]:
     """Store the original files and what was read from them, in one transaction."""
-    row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    row = projects.require(tx, project)
     for source in sources:
         if source.content is not None:
             blobs.put_blob(tx, source.content, expected=source.digest)

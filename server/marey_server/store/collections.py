@@ -81,7 +81,7 @@ def list_collections(
     limit: int = listing.DEFAULT_LIMIT,
 ) -> Page:
     """Collections at and below `path`, by path, without the root; or those that were deleted."""
-    project_row = projects.require(tx, project, Role.CONTRIBUTOR if deleted else Role.READER)
+    project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if deleted else Role.READER)
     order = listing.parse_order("path", {"path": collection.c.path, "id": collection.c.id})
     statement = select(collection).where(
         collection.c.project_id == project_row.id,
@@ -123,7 +123,7 @@ def _shown(row: Row[Any]) -> Collection:
 
 def create_collection(tx: Transaction, project: str, request: CollectionCreate) -> Collection:
     """A new folder, with those above it. Raises `Conflict` where there is one at this path."""
-    project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    project_row = projects.require(tx, project)
     if _lock(tx, project_row.id, request.path) is not None:
         raise _path_taken(request.path)
     return _shown(_find(tx, project_row, ensure(tx, project_row, request.path), _ALIVE))
@@ -137,7 +137,7 @@ def move_collection(
     tx: Transaction, project: str, collection_id: str, request: CollectionChange, *, expected_rev: ExpectedRev
 ) -> Collection:
     """Rename or move a folder with all it holds. Raises `Conflict` where there is a folder at the new path."""
-    project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    project_row = projects.require(tx, project)
     old, new = _find(tx, project_row, collection_id, _ALIVE, lock=True).path, request.path
     _require_no_root(old)
     if new.startswith(f"{old}/"):
@@ -183,7 +183,7 @@ def _lock_inside(tx: Transaction, project_row: ProjectRow, path: str) -> Sequenc
 
 def delete_collection(tx: Transaction, project: str, collection_id: str, *, expected_rev: ExpectedRev) -> None:
     """Hide a folder with all it holds; it can be restored."""
-    project_row = projects.require(tx, project, Role.MAINTAINER, "write")
+    project_row = projects.require(tx, project)
     path = _find(tx, project_row, collection_id, _ALIVE, lock=True).path
     _require_no_root(path)
     change_row(
@@ -207,7 +207,7 @@ def restore_collection(
     tx: Transaction, project: str, collection_id: str, *, expected_rev: ExpectedRev = None
 ) -> Collection:
     """Bring back a folder with what was deleted along with it. Raises `Conflict` where its path is taken again."""
-    project_row = projects.require(tx, project, Role.MAINTAINER, "write")
+    project_row = projects.require(tx, project)
     gone = _find(tx, project_row, collection_id, collection.c.deleted_us.is_not(None), lock=True)
     ensure(tx, project_row, gone.path.rpartition("/")[0])
     with taken(_path_taken(gone.path)):

@@ -30,7 +30,7 @@ def list_events(
     if project_name is None:
         users.require_administrator(tx.principal)
     else:
-        statement = statement.where(event.c.project_id == projects.require(tx, project_name, public=False).id)
+        statement = statement.where(event.c.project_id == projects.require(tx, project_name).id)
     if subject is not None:
         statement = statement.where(event.c.subject == subject)
     statement = statement.where(_behind(tx, after))

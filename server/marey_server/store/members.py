@@ -21,7 +21,7 @@ def list_members(
     tx: Transaction, project_name: str, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
 ) -> Page:
     """Members by name. Guests of a public project may not know them."""
-    project_row = projects.require(tx, project_name, public=False)
+    project_row = projects.require(tx, project_name)
     statement = select(user.c.name, member).join(user, user.c.id == member.c.user_id)
     statement = statement.where(member.c.project_id == project_row.id)
     order = listing.parse_order("name", {"name": user.c.name}, unique="name")
@@ -31,7 +31,7 @@ def list_members(
 
 def read_member(tx: Transaction, project_name: str, user_name: str) -> Member:
     """One member."""
-    project_row = projects.require(tx, project_name, public=False)
+    project_row = projects.require(tx, project_name)
     statement = select(user.c.name, member).join(user, user.c.id == member.c.user_id)
     row = tx.execute(statement.where(member.c.project_id == project_row.id, user.c.name == user_name)).first()
     if row is None:
@@ -93,9 +93,9 @@ def remove_member(tx: Transaction, project_name: str, user_name: str, *, expecte
 
 def _lock(tx: Transaction, project_name: str) -> ProjectRow:
     """Members of a project change one after another, so that two owners cannot remove each other."""
-    project_row = projects.require(tx, project_name, Role.OWNER, "write")
+    project_row = projects.require(tx, project_name)
     tx.execute(select(project.c.id).where(project.c.id == project_row.id).with_for_update(key_share=True))
-    return projects.require(tx, project_name, Role.OWNER, "write")  # the one before may have ended the caller's role
+    return projects.require(tx, project_name)  # the one before may have ended the caller's role
 
 
 def _require_owner(tx: Transaction, project_row: ProjectRow) -> None:

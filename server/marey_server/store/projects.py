@@ -75,29 +75,29 @@ class ProjectRow:
 def require(
     tx: Transaction,
     name: str,
-    need: Role = Role.READER,
-    scope: str = "read",
     *,
-    public: bool = True,
+    at_least: Role = Role.READER,
     deleted: bool = False,
 ) -> ProjectRow:
-    """The project `name`, if the caller has the role `need` there and a credential that reaches `scope`.
+    """Return the project `name` if the caller has the role and the scope that the transaction's operation declares.
 
-    `public=False`: guests of a public project may not. `deleted=True`: the one of this name that was deleted last.
-    Raises `NotFound` where the caller may not know the project, `Forbidden` where he may not do this in it,
-    `Unauthenticated` where signing in could help.
+    `at_least` raises the declared role and never lowers it. `deleted=True` looks for the project of this name that was
+    deleted last. Raises `NotFound` if the caller may not know the project, `Forbidden` if the caller may not do this in
+    it, `Unauthenticated` if signing in could help.
     """
+    required = tx.required_role
+    need = at_least if roles.includes(at_least, required.role) else required.role
     me = tx.principal.user_id or ""
     row = tx.first(_DELETED_BY_NAME if deleted else _ALIVE_BY_NAME, {"name": name, "me": me})
     seen = None if row is None else _as_seen(tx.principal, row)
     if seen is None or (seen.guest and deleted):
         raise NotFound(f"There is no project {name!r} that you may see.", code="no-project")
-    if not roles.includes(seen.role, need) or (seen.guest and not public):
+    if not roles.includes(seen.role, need) or (seen.guest and not required.guests):
         if tx.principal.kind == "anonymous":
             raise Unauthenticated(f"Sign in to do this in {name!r}.")
         raise Forbidden(f"This needs the role {need.value} in {name!r}.", code="insufficient-role")
-    if not seen.guest and not scopes.allows(tx.principal.scopes, scope, name):
-        raise Forbidden(f"This token does not reach {scope!r} in {name!r}.", code="insufficient-scope")
+    if not seen.guest and not scopes.allows(tx.principal.scopes, required.scope, name):
+        raise Forbidden(f"This token does not reach {required.scope!r} in {name!r}.", code="insufficient-scope")
     return seen
 
 
@@ -205,7 +205,7 @@ def _name_taken(name: str) -> Conflict:
 
 def change_project(tx: Transaction, name: str, request: ProjectChange, *, expected_rev: ExpectedRev) -> Project:
     """Change title, description or visibility."""
-    seen = require(tx, name, Role.OWNER, "write")
+    seen = require(tx, name)
     values = {field: getattr(request, field) for field in request.model_fields_set}
     if values.get("visibility") is not None:
         values["visibility"] = request.visibility.value if request.visibility else None
@@ -217,14 +217,14 @@ def change_project(tx: Transaction, name: str, request: ProjectChange, *, expect
 
 def delete_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev) -> None:
     """Hide a project and everything in it; an owner can restore it."""
-    seen = require(tx, name, Role.OWNER, "write")
+    seen = require(tx, name)
     _change(tx, seen, {"deleted_us": tx.now_us}, expected_rev, project.c.deleted_us.is_(None))
     tx.emit("project.deleted", seen.id, project_id=seen.id, name=name)
 
 
 def restore_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev = None) -> Project:
     """Bring back the project of this name that was deleted last. Raises `Conflict` where the name is taken again."""
-    seen = require(tx, name, Role.OWNER, "write", deleted=True)
+    seen = require(tx, name, deleted=True)
     with taken(_name_taken(name)):
         restored = _change(tx, seen, {"deleted_us": None}, expected_rev, project.c.deleted_us.is_not(None))
     tx.emit("project.restored", seen.id, project_id=seen.id, name=name)

@@ -10,6 +10,7 @@ from sqlalchemy import Connection, CursorResult, Executable, Table
 from sqlalchemy.dialects import postgresql, sqlite
 
 from marey_server.access.principal import Principal
+from marey_server.access.roles import STRICTEST
 from marey_server.store import tables
 from marey_server.store.blob_backings import BlobBacking
 from marey_server.store.database.clock import Clock
@@ -22,6 +23,8 @@ class Transaction:
     def __init__(self, connection: Connection, principal: Principal, clock: Clock, blobs: BlobBacking) -> None:
         self.connection = connection
         self.principal = principal
+        self.required_role = STRICTEST
+        """What the request's operation declares; `projects.require` enforces it."""
         self.blobs = blobs
         self.shared_outputs = 0
         """How many results of earlier jobs it has published anew."""

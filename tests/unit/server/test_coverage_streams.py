@@ -3,6 +3,7 @@
 import pytest
 from tests.support.interleaving import Step as Half
 from tests.support.interleaving import interleave
+from tests.support.store_fixtures import WRITE, requiring
 
 from marey_server.errors import Conflict, Forbidden, NotFound
 from marey_server.store import coverage_streams, garbage
@@ -60,7 +61,7 @@ def test_of_two_senders_at_once_one_is_taken_and_the_other_told_where_to_go_on(l
         return lambda tx: coverage_streams.advance_stream(tx, "lab", stream, step(offset, said))
 
     one, other = (
-        Half(database, lab.contributor, send(said, offset))
+        Half(database, lab.contributor, requiring(WRITE, send(said, offset)))
         for database, said, offset in ((lab.database, "a", 10), (open_database(), "b", 30))
     )
     _, second = interleave(one, other, commit=commit)
@@ -75,7 +76,11 @@ def test_of_two_senders_at_once_one_is_taken_and_the_other_told_where_to_go_on(l
 
 def test_a_request_that_arrives_twice_at_once_counts_once(lab, stream, open_database):
     half = [
-        Half(database, lab.contributor, lambda tx: coverage_streams.advance_stream(tx, "lab", stream, step(10)))
+        Half(
+            database,
+            lab.contributor,
+            requiring(WRITE, lambda tx: coverage_streams.advance_stream(tx, "lab", stream, step(10))),
+        )
         for database in (lab.database, open_database())
     ]
     first, second = interleave(*half)
@@ -137,7 +142,7 @@ def test_the_last_place_is_given_once(lab, open_database):
     for _ in range(MOST_STREAMS - 1):
         lab.write(coverage_streams.create_stream, "lab", NEW)
     halves = [
-        Half(database, lab.contributor, lambda tx: coverage_streams.create_stream(tx, "lab", NEW))
+        Half(database, lab.contributor, requiring(WRITE, lambda tx: coverage_streams.create_stream(tx, "lab", NEW)))
         for database in (lab.database, open_database())
     ]
     first, second = interleave(*halves)

@@ -3,6 +3,7 @@
 import threading
 
 import pytest
+from tests.support.store_fixtures import declared
 
 from marey_schemas.access import ProjectChange
 from marey_schemas.kinds import Kind
@@ -75,12 +76,13 @@ def test_no_event_is_missed_however_transactions_overlap(lab, open_database):
 
 
 def test_events_are_for_members_and_administrators(lab):
+    required = declared("GET", "/projects/{project}/events")
     lab.make_public()
     with pytest.raises(Unauthenticated):
-        lab.read(events.list_events, "lab", who=lab.anonymous)
+        lab.read(events.list_events, "lab", who=lab.anonymous, required=required)
     with pytest.raises(Forbidden):
-        lab.read(events.list_events, "lab", who=lab.stranger)
-    assert lab.read(events.list_events, "lab", who=lab.reader)
+        lab.read(events.list_events, "lab", who=lab.stranger, required=required)
+    assert lab.read(events.list_events, "lab", who=lab.reader, required=required)
     with pytest.raises(Forbidden):
         lab.read(events.list_events, who=lab.owner)
     chief = lab.sign_up("chief", administrator=True)

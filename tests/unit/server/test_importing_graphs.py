@@ -26,7 +26,7 @@ def add_models(lab, parts, *paths):
         drafts.append(Draft(path, Kind.MODEL, name, {"model": model}, folder))
 
     def run(tx):
-        project_row = projects.require(tx, "lab", scope="write")
+        project_row = projects.require(tx, "lab")
         return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id)
 
     return {one.name: one.item for one in lab.write(run)}

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from tests.support.store_fixtures import motion_tree, skeleton_tree
+from tests.support.store_fixtures import declared, motion_tree, skeleton_tree
 
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.items import CollectionChange, CollectionCreate, ItemChange, ItemCreate
@@ -446,19 +446,21 @@ def test_readers_read_contributors_change_maintainers_delete(lab, rig):
         (lab.maintainer, None, None, None),
     ):
         read_as, write_as = partial(lab.read, who=who), partial(lab.write, who=who)
+        delete_as = partial(lab.write, who=who, required=declared("DELETE", "/projects/{project}/{kind}/{item}"))
         for refusal, run, function, *more in (
             (can_read, read_as, items.read_item),
             (can_read, read_as, items.read_part, "motion"),
             (can_read, read_as, items.read_lineage),
             (can_change, write_as, items.change_item, request),
             (can_change, write_as, items.put_part, "info", {}),
-            (can_delete, write_as, items.delete_item),
+            (can_delete, delete_as, items.delete_item),
         ):
-            expected = {"expected_rev": None} if run is write_as else {}
+            expected = {} if run is read_as else {"expected_rev": None}
             with pytest.raises(refusal) if refusal else nullcontext():
                 run(function, "lab", Kind.CLIP, clip.id, *more, **expected)
+    restoring = declared("POST", "/projects/{project}/{kind}/{item}/restore")
     with pytest.raises(Forbidden):
-        lab.write(items.restore_item, "lab", Kind.CLIP, clip.id, who=lab.contributor)
+        lab.write(items.restore_item, "lab", Kind.CLIP, clip.id, who=lab.contributor, required=restoring)
 
 
 def test_guests_of_a_public_project_read_and_change_nothing(lab, rig):

@@ -1,18 +1,25 @@
 """Who may do what in a project."""
 
 import pytest
+from tests.support.store_fixtures import declared, requiring
 
 from marey_schemas.access import MemberChange, ProjectChange, ProjectCreate, Role, Visibility
 from marey_server.access.principal import Principal
+from marey_server.access.roles import RequiredRole
 from marey_server.errors import Conflict, Forbidden, NotFound, PreconditionFailed, Unauthenticated
 from marey_server.store import members, projects
 
 ROLES = list(Role)
 
 
-def allowed(lab, who, need, scope="read", **kwargs):
+OWNERS = declared("DELETE", "/projects/{project}")
+MEMBERS_ONLY = declared("GET", "/projects/{project}/members")
+
+
+def allowed(lab, who, need, scope="read", *, public=True):
+    required = RequiredRole(need, scope, guests=public)
     try:
-        lab.read(projects.require, "lab", need, scope, who=who, **kwargs)
+        lab.database.read(who, requiring(required, projects.require), "lab")
     except (NotFound, Forbidden, Unauthenticated) as error:
         return error.status
     return 200
@@ -116,7 +123,7 @@ def test_a_deleted_project_is_gone_until_an_owner_restores_it(lab):
     lab.write(projects.delete_project, "lab", expected_rev=before.rev)
     assert allowed(lab, lab.owner, Role.READER) == 404
     with pytest.raises(Forbidden):
-        lab.write(projects.restore_project, "lab", who=lab.reader)
+        lab.write(projects.restore_project, "lab", who=lab.reader, required=OWNERS)
     with pytest.raises(NotFound):
         lab.write(projects.restore_project, "lab", who=lab.stranger)
     assert lab.write(projects.restore_project, "lab").id == before.id
@@ -145,13 +152,20 @@ def test_members_are_known_to_members_only(lab):
     assert names == sorted(who.user_name for who in (lab.owner, lab.maintainer, lab.contributor, lab.reader))
     for who in (lab.stranger, lab.anonymous):
         with pytest.raises((Forbidden, Unauthenticated)):
-            lab.read(members.list_members, "lab", who=who)
+            lab.read(members.list_members, "lab", who=who, required=MEMBERS_ONLY)
 
 
 def test_only_owners_change_members(lab):
     for who in (lab.reader, lab.contributor, lab.maintainer):
         with pytest.raises(Forbidden):
-            lab.write(members.put_member, "lab", lab.stranger.user_name, MemberChange(role=Role.READER), who=who)
+            lab.write(
+                members.put_member,
+                "lab",
+                lab.stranger.user_name,
+                MemberChange(role=Role.READER),
+                who=who,
+                required=OWNERS,
+            )
 
 
 def test_a_project_keeps_an_owner(lab):

@@ -16,7 +16,7 @@ from marey_server.store.items import Draft, StoredDocument, references
 
 def publish(lab, *drafts, **kwargs):
     def run(tx):
-        project_row = projects.require(tx, "lab", scope="write")
+        project_row = projects.require(tx, "lab")
         return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id, **kwargs)
 
     return lab.write(run)
@@ -176,7 +176,7 @@ def test_who_still_uses_an_earlier_revision_of_such_an_item_is_stale(lab):
 
 def test_many_publishers_of_one_skeleton_make_one(lab):
     def run(tx, number):
-        project_row = projects.require(tx, "lab", scope="write")
+        project_row = projects.require(tx, "lab")
         drafts = [rig_draft(), clip_draft(f"walk {number}", seed=number)]
         return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id)
 
@@ -190,7 +190,7 @@ def test_many_publishers_of_one_name_make_its_revisions(lab):
     publish(lab, rig_draft())
 
     def run(tx, number):
-        project_row = projects.require(tx, "lab", scope="write")
+        project_row = projects.require(tx, "lab")
         return items.publish(tx, project_row, [rig_draft(), clip_draft(seed=number)], author_id=tx.principal.user_id)[1]
 
     futures = [lab.database.submit_write(lab.owner, run, number) for number in range(8)]

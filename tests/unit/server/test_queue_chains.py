@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from sqlalchemy import select, update
 from tests.support.queue_desk import SUM, Desk, document
+from tests.support.store_fixtures import declared, requiring
 
 from marey_schemas import job_kinds
 from marey_schemas.access import MemberChange, Role, UserCreate
@@ -731,17 +732,19 @@ def test_only_what_failed_or_was_cancelled_can_be_tried_again(desk: Desk) -> Non
 
 
 def test_others_jobs_are_cancelled_by_maintainers_only_and_hidden_from_strangers(desk: Desk) -> None:
+    read = requiring(declared("GET", "/jobs/{job}"), reading.read_job)
+    cancel = requiring(declared("POST", "/jobs/{job}/cancel"), reading.cancel_job)
     job = desk.submit()
     made = desk.database.write(SYSTEM, users.create_user, UserCreate(name="bob"))
     bob = Principal("user", made.id, "bob", scopes=("read", "write", "jobs"))
     with pytest.raises(NotFound):
-        desk.database.read(bob, reading.read_job, job)
+        desk.database.read(bob, read, job)
     desk.database.write(SYSTEM, members.put_member, "lab", "bob", MemberChange(role=Role.CONTRIBUTOR))
-    assert desk.database.read(bob, reading.read_job, job).id == job
+    assert desk.database.read(bob, read, job).id == job
     with pytest.raises(Forbidden):
-        desk.database.write(bob, reading.cancel_job, job)
+        desk.database.write(bob, cancel, job)
     desk.database.write(SYSTEM, members.put_member, "lab", "bob", MemberChange(role=Role.MAINTAINER))
-    assert desk.database.write(bob, reading.cancel_job, job).state == "cancelled"
+    assert desk.database.write(bob, cancel, job).state == "cancelled"
 
 
 def test_lists_show_jobs_newest_first_by_state_kind_and_author(desk: Desk) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from marey_schemas.access import Role
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
@@ -36,7 +35,7 @@ class ChangedAnnotation:
 
 def find_annotation(tx: Transaction, project: str, item_id: str) -> FoundAnnotation:
     """Read the annotation to change. Raises `NotFound`, and `Invalid` if its clip is gone."""
-    projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    projects.require(tx, project)
     found = read_part(tx, project, Kind.ANNOTATION, item_id, "annotation")
     return FoundAnnotation(found.tree, found.rev, _frame_count(tx, project, found.tree["clip"]))
 

@@ -6,7 +6,6 @@ from typing import Any
 
 from sqlalchemy import delete, insert
 
-from marey_schemas.access import Role
 from marey_schemas.items import Item, ItemChange, ItemCreate
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import FieldError
@@ -48,7 +47,7 @@ def prepare_part(kind: Kind, part: str, tree: Any) -> PreparedDocument:
 
 def create_item(tx: Transaction, project: str, kind: Kind, request: ItemCreate) -> Item:
     """A new item. Raises `Conflict` where the name is taken in its collection."""
-    project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    project_row = projects.require(tx, project)
     draft = Draft(
         name_in_batch="", kind=kind, item_name=request.name, parts=request.parts, collection=request.collection,
         tags=request.tags, reuse="new", message=request.message,
@@ -72,7 +71,7 @@ def put_part(
 
     Raises `PreconditionFailed` where the item is not at `expected_rev` any more.
     """
-    project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    project_row = projects.require(tx, project)
     found = find_item(tx, project_row, kind, item_id)
     prepared = prepare_part(kind, part, content)
     digest = documents.store_document(tx, prepared)
@@ -95,7 +94,7 @@ def change_item(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: ItemChange, *, expected_rev: ExpectedRev
 ) -> Item:
     """Rename, move or tag an item. Raises `Conflict` where the name is taken at its new place."""
-    project_row = projects.require(tx, project, Role.CONTRIBUTOR, "write")
+    project_row = projects.require(tx, project)
     values: dict[str, Any] = {"updated_us": tx.now_us}
     if request.name is not None:
         values |= {"name": request.name, "name_folded": request.name.casefold()}
@@ -115,7 +114,7 @@ def change_item(
 
 def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev) -> None:
     """Hide an item; it can be restored. What refers to its revisions stays right."""
-    project_row = projects.require(tx, project, Role.MAINTAINER, "write")
+    project_row = projects.require(tx, project)
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_(None))
     gone = _shown(tx, project_row, kind, item_id)
     absent = no_item(kind, item_id)
@@ -125,7 +124,7 @@ def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expe
 
 def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev = None) -> Item:
     """Bring back a deleted item, and its collection if that is gone. Raises `Conflict` where its name is taken."""
-    project_row = projects.require(tx, project, Role.MAINTAINER, "write")
+    project_row = projects.require(tx, project)
     gone = find_item(tx, project_row, kind, item_id, deleted=True)
     collection_id = collections.ensure(tx, project_row, gone.path)
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_not(None))

@@ -65,7 +65,7 @@ def list_items(
     count: bool = False,
 ) -> Page:
     """One page of a project's items of a kind. With `fields`, each is an object of these members only."""
-    project_row = projects.require(tx, project, Role.CONTRIBUTOR if filters.deleted else Role.READER)
+    project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if filters.deleted else Role.READER)
     order = listing.parse_order(sort, SORT_KEYS)
     identity = [project_row.id, kind.value, asdict(filters)]
     conditions = _conditions(project_row.id, kind, filters)

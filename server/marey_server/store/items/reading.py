@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 from sqlalchemy import Row, Select, bindparam, select
 
-from marey_schemas.access import Role
 from marey_schemas.items import Item, PartSummary
 from marey_schemas.kinds import Kind
 from marey_server.errors import Invalid, NotFound
@@ -126,7 +125,7 @@ def find_part(
     tx: Transaction, project: str, kind: Kind, item_id: str, part: str, *, revision: int | None = None
 ) -> FoundPart:
     """The part of the newest revision, or of `revision`. Raises `NotFound` where there is none."""
-    project_row = projects.require(tx, project, Role.READER)
+    project_row = projects.require(tx, project)
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value, "part": part}
     if revision is None:
         row = tx.first(_PART_OF_HEAD, which)

@@ -121,13 +121,13 @@ def list_results(tx: Transaction, job_id: str, cursor: str | None = None, limit:
 
 def list_job_events(tx: Transaction, job_id: str, after: int = 0, limit: int = 100) -> Page:
     """What happened to a job, for members of its project."""
-    _, project = find_job(tx, job_id, public=False)
+    _, project = find_job(tx, job_id)
     return Page(items=tuple(events.list_events(tx, project.name, after=after, limit=limit, subject=job_id)))
 
 
 def read_job_log(tx: Transaction, job_id: str, offset: int = 0, limit: int = MOST_READ_BYTES) -> LogPage:
     """A piece of what a job's attempts printed, for members of its project."""
-    row, _ = find_job(tx, job_id, public=False)
+    row, _ = find_job(tx, job_id)
     return read_log(tx, row, offset, limit)
 
 
@@ -155,7 +155,7 @@ def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLIC
     A gathering job is cancelled with its tasks. Cancelling twice is cancelling once.
     Raises `Conflict` for a job that has succeeded or failed, `Forbidden` for somebody else's job.
     """
-    row, project = find_job(tx, job_id, "jobs")
+    row, project = find_job(tx, job_id)
     require_own(tx, row, project, "cancel")
     of_job = job.c.parent_id == job_id
     tasks = _cancel(tx, of_job, policy) if row.size is not None else ()
@@ -200,12 +200,12 @@ def _cancel(tx: Transaction, which: ColumnElement[bool], policy: QueuePolicy) ->
 # -- who may -----------------------------------------------------------------------------------------------------------
 
 
-def find_job(tx: Transaction, job_id: str, scope: str = "read", *, public: bool = True) -> tuple[Row[Any], ProjectRow]:
-    """The job and its project, if the caller may read it; a job of a hidden project is as unknown as none."""
+def find_job(tx: Transaction, job_id: str) -> tuple[Row[Any], ProjectRow]:
+    """Return the job and its project; raise `NotFound` if the caller may not know the project."""
     row = tx.execute(select_jobs().where(job.c.id == job_id)).one_or_none()
     if row is not None:
         try:
-            return row, projects.require(tx, row.project_name, Role.READER, scope, public=public)
+            return row, projects.require(tx, row.project_name)
         except NotFound:
             pass
     raise NotFound(f"There is no job {job_id!r} that you may see.", code="no-job")

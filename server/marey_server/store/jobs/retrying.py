@@ -34,7 +34,7 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
     after it, as far as the caller may: the rest of a pipeline goes on. The answer is the job that takes its place.
     Raises `Conflict` for a job that has not ended or has succeeded, and for a task.
     """
-    row, project = find_job(tx, job_id, "jobs")
+    row, project = find_job(tx, job_id)
     require_own(tx, row, project, "retry")
     if row.state not in UNSUCCESSFUL:
         raise Conflict(
