@@ -7,11 +7,12 @@ import hashlib
 import json
 import logging
 import os
+import shlex
 import signal
 import socket
 import sys
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import cache, partial
@@ -34,10 +35,8 @@ from marey_server.http.resource import Resource
 from marey_server.http.routes import RouteTable
 from marey_server.launchers.local import local_workers
 from marey_server.process.administrators import TOKEN_FILE, make_first_administrator
-from marey_server.process.computing import compute_on_one_thread_each
-from marey_server.process.greeting import greeting
+from marey_server.process.computing import compute_on_one_thread_each, keep_freed_memory
 from marey_server.process.housekeeping import keeping_house
-from marey_server.process.memory import keep_freed_memory
 from marey_server.process.observe import access_log, configure_logging
 from marey_server.process.services import Description, Services
 from marey_server.process.settings import Settings, misspelt_variables
@@ -53,6 +52,7 @@ log = logging.getLogger(__name__)
 
 READ_CHUNK_BYTES = 256 * 1024
 READ_BUFFER_BYTES = 1024 * 1024
+FIRST_COMMAND = "marey project create lab"
 
 
 class CannotListen(Exception):
@@ -240,3 +240,31 @@ def _replace_worker_token(tx: Transaction, name: str) -> str:
     tokens.revoke_named(tx, name)
     wanted = TokenCreate(name=name, scopes=("read", "write", "work"), expires_in_s=None)
     return tokens.create_token(tx, wanted).secret
+
+
+def greeting(settings: Settings, address: str, database: Database) -> Iterator[str]:
+    """Its lines, without any secret."""
+    yield f"listening on {address}"
+    data = settings.data.absolute()
+    yield f"data: {data}; database: {database.shown}"
+    administrator = database.read(SYSTEM, users.administrator_principal).user_name
+    token_file = data / TOKEN_FILE
+    if token_file.is_file():
+        yield f"administrator: {administrator}; a token of an administrator is in {token_file}"
+    else:
+        yield f"administrator: {administrator}; `marey db admin-token` makes a token where there is none any more"
+    yield f"next, in another terminal{next_command(settings, address)}"
+
+
+def next_command(settings: Settings, address: str) -> str:
+    """Where to type the first command, and the command; with server and token where it would not find them itself."""
+    reachable = address.replace("//0.0.0.0:", "//127.0.0.1:").replace("//[::]:", "//[::1]:")
+    defaults = Settings.model_fields
+    usual_address = f"http://{defaults['host'].default}:{defaults['port'].default}"
+    if reachable == usual_address and settings.data.absolute() == defaults["data"].default.absolute():
+        return f" in this folder: {FIRST_COMMAND}"
+    token_file = settings.data.absolute() / TOKEN_FILE
+    if not token_file.is_file():
+        return f": marey login --server {reachable}"
+    program, words = FIRST_COMMAND.split(" ", 1)
+    return f": {program} --server {reachable} --token-file {shlex.quote(str(token_file))} {words}"

@@ -147,7 +147,7 @@ def test_a_stopping_server_says_that_it_is_not_ready(database: Database, tmp_pat
 
 
 def test_a_database_of_another_version_is_not_ready(server: Server, monkeypatch):
-    monkeypatch.setattr("marey_server.store.readiness.schema_at_head", lambda _connection: False)
+    monkeypatch.setattr("marey_server.store.fsck.schema_at_head", lambda _connection: False)
     refused = httpx.get(f"{server.address}/readyz")
     assert (refused.status_code, refused.json()["code"]) == (503, "not-ready")
     assert "db upgrade" in refused.json()["detail"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import platform
 import shutil
 import tempfile
 import threading
@@ -12,6 +13,8 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import Enum
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +24,8 @@ from marey_schemas.worker_protocol import CompleteRequest, FailRequest, Lease
 from marey_worker import faults, signatures
 from marey_worker.attempt_api import AttemptApi
 from marey_worker.child_process import ChildProcess
-from marey_worker.environment import environment
 from marey_worker.heartbeats import LeaseKeeper
 from marey_worker.job_io.input_cache import InputCache
-from marey_worker.job_log import JobLog
 from marey_worker.messages import (
     Done,
     Failed,
@@ -40,14 +41,59 @@ from marey_worker.messages import (
     Stage,
 )
 
+LOG_PIECE_BYTES = 256 << 10
+LIBRARIES = ("marey", "numpy", "scipy", "numba")
 log = logging.getLogger(__name__)
-
 MIB = 1 << 20
 WATCH_EVERY_S = 0.1
 WEIGH_EVERY_S = 0.5
 LOG_EVERY_S = 2.0
 LOG_LIMIT_BYTES = 64 * MIB
 TRANSFERS_AT_ONCE = 4
+
+
+class JobLog:
+    """The file a job prints to, and how much of it the server has.
+
+    The log of the attempt is this file from its start, so that the server's word how long it is tells where to go on,
+    whatever became of earlier answers.
+    """
+
+    def __init__(self, api: AttemptApi, path: Path) -> None:
+        self.path = path
+        self.path.touch(mode=0o600)
+        self._api = api
+        self._sent = 0
+        self._full = False
+        self._sending = threading.Lock()
+
+    @property
+    def size_bytes(self) -> int:
+        """How much was printed so far."""
+        return self.path.stat().st_size
+
+    def send(self) -> None:
+        """Send what is new, unless the server keeps no more. Raises what the server answers, and `OSError`."""
+        with self._sending, self.path.open("rb") as file:
+            while not self._full:
+                file.seek(self._sent)
+                piece = file.read(LOG_PIECE_BYTES)
+                if not piece:
+                    return
+                answer = self._api.append_log(self._sent, piece)
+                self._sent, self._full = answer.offset, answer.capped
+
+
+@cache
+def environment() -> dict[str, str]:
+    """Versions of the interpreter and of the libraries that numbers depend on."""
+    found = {"python": platform.python_version(), "machine": platform.machine()}
+    for library in LIBRARIES:
+        try:
+            found[library] = version(library)
+        except PackageNotFoundError:
+            found[library] = "absent"
+    return found
 
 
 class Stop(Enum):

@@ -1,4 +1,4 @@
-"""Where the body is and where it faces: the whole motion moved as one."""
+"""Commands that move, turn, scale or mirror the whole body, and spread a correction of its path over frames."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import kinematics, quaternions
+from marey_motion.editing.borders import smooth_step
 from marey_motion.editing.take import Take
 from marey_motion.errors import EditError
 from marey_motion.looping import LoopSeam, about_vertical
+from marey_motion.mirroring import mirror_motion
 from marey_motion.motion import Motion
 
 Floats = NDArray[np.float64]
@@ -121,3 +123,36 @@ def _direction(axis: str) -> Floats:
     if len(axis) != 2 or axis[0] not in "+-" or axis[1] not in "xyz":
         raise EditError(f"{axis!r} is no axis; write such as +z or -y", code="command-invalid")
     return np.asarray((-1.0 if axis[0] == "-" else 1.0) * np.eye(3)["xyz".index(axis[1])], dtype=np.float64)
+
+
+def mirror(take: Take) -> Take:
+    """The motion seen in a mirror, by the skeleton's own pairs of joints, whatever their names and axes."""
+    return take.moved(mirror_motion(take.skeleton, take.body.partners, take.motion))
+
+
+def fix_drift(
+    take: Take,
+    *,
+    shift_m: Sequence[float] = (0.0, 0.0, 0.0),
+    turn_rad: float = 0.0,
+    frames: tuple[int, int | None] | None = None,
+    profile: Literal["linear", "smooth"] = "linear",
+) -> Take:
+    """Spread a shift and a turn about the vertical over a range: none of it in its first frame, all in its last.
+
+    Within the range each frame turns about its own pelvis; the frames after it follow the last one rigidly. Raises
+    `EditError` where the frames are not there or there is but one.
+    """
+    start, stop = take.frames(frames)
+    if stop - start < 2:
+        raise EditError(
+            f"drift needs a range of at least 2 frames to spread over; {start}:{stop} is one",
+            code="frames-missing",
+            where="frames",
+        )
+    places = np.clip((np.arange(take.frame_count) - start) / (stop - 1 - start), 0.0, 1.0)
+    shares = places if profile == "linear" else smooth_step(places)
+    pivots = pelvis_track(take, 0, take.frame_count)
+    pivots[stop:] = pivots[stop - 1]
+    turns = about_vertical(shares * turn_rad)
+    return take.moved(carried(take.motion, turns, pivots, shares[:, None] * np.asarray(shift_m)))

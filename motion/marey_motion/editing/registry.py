@@ -19,18 +19,13 @@ import numpy as np
 from marey_motion.clip import Clip
 from marey_motion.editing.allowance import PER_COMMAND, PER_NUMBER, Allowance
 from marey_motion.editing.constraint_commands import constrain, plant_feet
-from marey_motion.editing.drift import fix_drift
+from marey_motion.editing.frames import concatenate, resample, retime, split, trim
 from marey_motion.editing.ground import find_contacts, find_ground, move_to_ground
-from marey_motion.editing.joining import concatenate
+from marey_motion.editing.joints import paste, rotate_joint
 from marey_motion.editing.loops import close_loop
-from marey_motion.editing.pasting import paste
-from marey_motion.editing.placement import face, flip_axes, move_to_origin, rotate, scale, translate
-from marey_motion.editing.ranges import split, trim
+from marey_motion.editing.placement import face, fix_drift, flip_axes, mirror, move_to_origin, rotate, scale, translate
 from marey_motion.editing.smoothing import smooth
-from marey_motion.editing.symmetry import mirror
 from marey_motion.editing.take import MOST_NUMBERS, EditedBody, Finding, Take, motion_of, require_finite, settled
-from marey_motion.editing.timing import resample, retime
-from marey_motion.editing.turning_joints import rotate_joint
 from marey_motion.errors import EditError, MotionError
 from marey_motion.motion import Motion
 

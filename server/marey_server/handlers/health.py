@@ -7,7 +7,7 @@ from marey_server.errors import Unavailable
 from marey_server.http.declarations import Access, Bytes, reads
 from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
-from marey_server.store import readiness
+from marey_server.store import fsck
 
 
 class Health(Answer):
@@ -43,7 +43,7 @@ class Readyz(Resource):
         """Can the server serve: database reachable, its schema current, blobs writable, not draining."""
         if self.services.draining.is_set():
             raise Unavailable("The server is stopping.", code="draining", headers={"Retry-After": "5"})
-        faults = await self.look_up(readiness.find_faults)
+        faults = await self.look_up(fsck.find_faults)
         if faults:
             raise Unavailable("; ".join(faults), code="not-ready", headers={"Retry-After": "5"})
         return Reply(Health(status="ready"), headers={"Cache-Control": "no-store"})

@@ -7,7 +7,7 @@ from marey_server.handlers.jobs import MAX_SUBMISSION_BYTES
 from marey_server.http.declarations import Access, Body, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
-from marey_server.store.jobs import pipelines
+from marey_server.store.jobs.submission import submit_pipeline
 
 
 class ProjectPipelines(Resource):
@@ -32,7 +32,7 @@ class ProjectPipelines(Resource):
         is.
         """
         return await self.answer_with(
-            lambda made: Reply(made, headers={"Retry-After": "1"}), pipelines.submit_pipeline, project, body
+            lambda made: Reply(made, headers={"Retry-After": "1"}), submit_pipeline, project, body
         )
 
 

@@ -1,17 +1,20 @@
-"""The HTTP side of a request, whatever it is about: its id, what answers carry, how it is refused, who has gone."""
+"""Base of all handlers: request ids, answers, errors as RFC 9457 problem documents, and closed connections."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import re
+from http.client import responses
 from typing import Any, ClassVar
 
 from tornado.iostream import StreamClosedError
 from tornado.web import HTTPError, RequestHandler
 
-from marey_server.errors import MareyError, MethodNotAllowed
-from marey_server.http import problem
+from marey_schemas.problems import MEDIA_TYPE, Problem
+from marey_server.errors import MareyError, MethodNotAllowed, Unauthenticated
 from marey_server.http.declarations import Declared, Operation
+from marey_server.http.etags import entity_tag
 from marey_server.http.reply import API, Rendered
 from marey_server.process.observe import request_id
 from marey_server.process.services import Services
@@ -26,6 +29,7 @@ _SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+log = logging.getLogger(__name__)
 
 
 class Exchange(RequestHandler):
@@ -143,11 +147,11 @@ class Exchange(RequestHandler):
             self.finish()
 
     def _write_problem(self, error: BaseException) -> None:
-        self.send(problem.render(error, self.request_id))
+        self.send(render_problem(error, self.request_id))
 
     def log_exception(self, _type: Any, value: Any, _traceback: Any) -> None:
         """Faults of ours are logged with their traceback, refusals are not faults."""
-        problem.log_fault(value, self.request_id, self.request.method or "", self.template())
+        log_fault(value, self.request_id, self.request.method or "", self.template())
 
     def on_finish(self) -> None:
         """The answer is on its way."""
@@ -159,3 +163,42 @@ class Exchange(RequestHandler):
         self._gone = True
         if not self.performing:  # a method that runs ends by itself, and a draining server waits for it
             self.services.in_flight.discard(self)
+
+
+def render_problem(error: BaseException, request_id: str) -> Rendered:
+    """The problem document of an error. Of faults that are not refusals it says nothing but the request id."""
+    if isinstance(error, MareyError):
+        problem = _of_refusal(error, request_id)
+        headers = dict(error.headers)
+    elif isinstance(error, HTTPError):
+        title = responses.get(error.status_code, "Error")
+        problem = _problem(error.status_code, title.lower().replace(" ", "-"), title, f"{title}.", request_id)
+        headers = {}
+    else:
+        detail = "Something went wrong here. It is in the server's log under this request id."
+        problem = _problem(500, MareyError.code, "The server failed.", detail, request_id)
+        headers = {}
+    if problem.status == 401:
+        headers.setdefault("WWW-Authenticate", 'Bearer realm="marey"')
+    if problem.status == 412 and isinstance(rev := problem.context.get("rev"), int):
+        headers.setdefault("ETag", entity_tag(rev, "json"))
+    headers |= {"Content-Type": MEDIA_TYPE, "Cache-Control": "no-store"}
+    return Rendered(problem.status, headers, problem.model_dump_json(by_alias=True).encode())
+
+
+def _of_refusal(error: MareyError, request_id: str) -> Problem:
+    problem = _problem(error.status, error.error_code, error.title, error.detail, request_id)
+    return problem.model_copy(update={"errors": error.errors, "context": error.context})
+
+
+def _problem(status: int, code: str, title: str, detail: str, request_id: str) -> Problem:
+    return Problem(
+        type=f"{API}/docs#problem-{code}", title=title, status=status, detail=detail, instance=request_id, code=code
+    )
+
+
+def log_fault(error: BaseException, request_id: str, method: str, path: str) -> None:
+    """Write a fault of ours to the log, with its traceback."""
+    if isinstance(error, MareyError | HTTPError | StreamClosedError | Unauthenticated):
+        return
+    log.error("%s %s failed", method, path, exc_info=error, extra={"request_id": request_id})

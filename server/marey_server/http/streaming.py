@@ -1,26 +1,63 @@
-"""Sending bytes of blobs: whole or a range, piece after piece."""
+"""Sends blobs piece by piece: the whole, or one byte range (RFC 9110, section 14).
+
+Several ranges are answered with the whole.
+"""
 
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from urllib.parse import quote
 
-from marey_server.errors import Unavailable
+from marey_server.errors import RangeNotSatisfiable, Unavailable
 from marey_server.http.declarations import MIB
 from marey_server.http.etags import entity_tag, matches
-from marey_server.http.ranges import ByteRange, parse_range
 from marey_server.http.reply import Rendered
 from marey_server.http.resource import Resource
 from marey_server.store import blobs
 from marey_server.store.transaction import Transaction
 
+_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 PIECE_BYTES = MIB
 IMMUTABLE = "private, max-age=31536000, immutable"
 WRITE_TIMEOUT_S = 60
 """A caller who takes longer for one piece has gone, or wants to hold us up."""
+
+
+@dataclass(frozen=True, slots=True)
+class ByteRange:
+    """What a caller asked for: from `first` to `last`, or with `first` None the `last` bytes at the end."""
+
+    first: int | None
+    last: int | None
+
+    def within(self, size: int) -> tuple[int, int]:
+        """Start and stop in a representation of `size` bytes. Raises `RangeNotSatisfiable`."""
+        if self.first is None:
+            start, stop = max(size - (self.last or 0), 0), size
+        else:
+            start, stop = self.first, size if self.last is None else min(self.last + 1, size)
+        if start >= stop:
+            headers = {"Content-Range": f"bytes */{size}"}
+            raise RangeNotSatisfiable(f"It has {size} bytes; none of the range is among them.", headers=headers)
+        return start, stop
+
+
+def parse_range(header: str | None, if_range: str | None, etag: str) -> ByteRange | None:
+    """The range that is asked for; None for the whole: no range, several, malformed, or of another state."""
+    if header is None or (if_range is not None and if_range.strip() != etag):
+        return None
+    match = _RANGE.fullmatch(header.strip())
+    if match is None or not (match[1] or match[2]):
+        return None
+    first = int(match[1]) if match[1] else None
+    last = int(match[2]) if match[2] else None
+    if first is not None and last is not None and last < first:
+        return None
+    return ByteRange(first, last)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,24 +5,27 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import degrees
+from math import degrees, radians
 from typing import TYPE_CHECKING, Any
 
+from marey_schemas import search as wire
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.formats import MotionFormat
 from marey_schemas.problems import FieldError
 from marey_schemas.search import ConstraintError, FoundStep, SearchAnswer, SearchRequest, StartPlacement
 from marey_server.errors import Invalid, TooLarge
 from marey_server.motions.models import LARGEST_ANSWER_BYTES, SampleFile
-from marey_server.motions.search_constraints import CM, constraint_of, placement_of
 from marey_server.motions.searching import FoundSearchable, Searchable
 
 if TYPE_CHECKING:
+    from marey_motion.alignment.aligned import Placement
     from marey_motion.clip import Clip
+    from marey_motion.modelling.search.constraints import Constraint
     from marey_motion.modelling.search.finishing import Finished
     from marey_motion.modelling.search.found_motions import FoundMotion
     from marey_motion.modelling.search.step_search import Sequel
     from marey_motion.modelling.search.steps import Step
+
 
 FAR_CM = 5.0
 """A model that misses a place by more does not reach there: inverse kinematics would hide that."""
@@ -34,6 +37,7 @@ UNITS = {
     "joint_position": "cm", "root_position": "cm", "joint_orientation": "deg", "look_direction": "deg",
     "root_heading": "deg", "keyframe_time": "s",
 }  # fmt: skip
+CM = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,3 +217,30 @@ def _found_step(result: SearchResult, number: int, one: Searchable, found: Found
         jumps_cm=dict(zip(("pelvis", *sequel.joints), map(float, jumps), strict=False)),
         evaluations=sequel.searched[number].evaluations,
     )
+
+
+def constraint_of(one: wire.SearchConstraint) -> Constraint:
+    """Metres and radians for centimetres and degrees. Raises `MotionError` for what makes no sense."""
+    from marey_motion.modelling.search import constraints as known
+
+    match one:
+        case wire.JointPositionConstraint():
+            return known.JointPosition(one.joint, one.at, one.target_m, one.tolerance_cm * CM, one.weight)
+        case wire.JointOrientationConstraint():
+            return known.JointOrientation(one.joint, one.at, one.rotation, radians(one.tolerance_deg), one.weight)
+        case wire.LookDirectionConstraint():
+            tolerance = radians(one.tolerance_deg)
+            return known.LookDirection(one.joint, one.at, one.direction, one.point_m, one.axis, tolerance, one.weight)
+        case wire.RootPositionConstraint():
+            return known.RootPosition(one.at, one.target_m, one.tolerance_cm * CM, one.weight)
+        case wire.RootHeadingConstraint():
+            return known.RootHeading(one.at, radians(one.heading_deg), radians(one.tolerance_deg), one.weight)
+        case wire.KeyframeTimeConstraint():
+            return known.KeyframeTime(one.at, one.seconds, one.tolerance_s, one.weight)
+
+
+def placement_of(start: wire.StartPlacement) -> Placement:
+    """Where the canonical frame lies."""
+    from marey_motion.alignment.aligned import Placement
+
+    return Placement(radians(start.heading_deg), start.x, start.z)

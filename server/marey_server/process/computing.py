@@ -1,11 +1,15 @@
-"""The threads that compute, and places among them for what takes seconds.
+"""Threads for computations, places among them for long ones, and settings of the C library's memory.
 
-Whatever takes long must leave a thread for what does not: exports, documents, passwords.
+Long computations must leave a thread for short ones: exports, documents, passwords.
+
+Of its own accord glibc returns blocks of some 100 kB to the system as soon as they are freed, and gets them back page
+by page. For clips that takes as long as everything else in reading one.
 """
 
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import logging
 import os
 import sys
@@ -25,6 +29,11 @@ LONGEST_WAIT_S = 20.0
 """For a place among the long computations; then the caller shall ask again."""
 ASK_AGAIN_S = 5
 BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+KEPT_BLOCK_BYTES = 8 * 2**20
+"""Larger blocks are returned to the system at once."""
+KEPT_BYTES = 32 * 2**20
+"""More than this at the end of a heap is returned; threads have heaps of their own."""
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
 
 
 class ComputeThreads:
@@ -77,3 +86,11 @@ def leave() -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0)
+
+
+def keep_freed_memory() -> None:
+    """Keep freed memory for the next request. Affects glibc only."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, KEPT_BLOCK_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, KEPT_BYTES)

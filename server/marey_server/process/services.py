@@ -1,16 +1,17 @@
-"""What one server process holds and every handler may use."""
+"""State of one server process that every handler may use: database, threads, caches, limits on sign-in."""
 
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from marey_schemas.lru import LruCache
-from marey_server.access.limits import TryLimit
 from marey_server.access.principal import SYSTEM, Principal
+from marey_server.errors import TooManyRequests
 from marey_server.motions.models import UsableModel
 from marey_server.motions.models import size_bytes as model_bytes
 from marey_server.motions.searching import Searchable, SearchableKey
@@ -23,17 +24,39 @@ from marey_server.store.database.connections import Database
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.reaper import StartGrace
 
+NAMES_REMEMBERED = 10_000
 SIGN_INS_AT_ONCE = 2
 """A password takes 32 MiB and 0.1 s to check."""
-
 LARGEST_ANSWER_SHARE = 8
 """A body larger than this part of the cache of answers is not kept: it would displace all others."""
 ANSWER_ENTRY_BYTES = 512
 """Memory of an entry of the cache of answers besides its body."""
-
 MODEL_CACHE_BYTES = 64 << 20
 """Of parsed models; models with their search trees may take as much again."""
 TOKENS_REMEMBERED = 10_000
+
+
+class TryLimit:
+    """So many tries per minute and key: a bucket that fills again steadily.
+
+    Only the latest `NAMES_REMEMBERED` keys are kept, so that guesses at many names do not fill the memory.
+    """
+
+    def __init__(self, per_minute: int, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._per_minute = per_minute
+        self._clock = clock
+        self._buckets: LruCache[str, tuple[float, float]] = LruCache(max_entries=NAMES_REMEMBERED)
+
+    def take(self, key: str) -> None:
+        """Count one try. Raises `TooManyRequests`, saying when the next is allowed."""
+        now = self._clock()
+        left, since = self._buckets.get(key) or (float(self._per_minute), now)
+        left = min(float(self._per_minute), left + (now - since) * self._per_minute / 60)
+        if left < 1:
+            self._buckets.put(key, (left, now))
+            wait_s = math.ceil((1 - left) * 60 / self._per_minute)
+            raise TooManyRequests(f"Too many tries; wait {wait_s} s.", headers={"Retry-After": str(wait_s)})
+        self._buckets.put(key, (left - 1, now))
 
 
 @dataclass(frozen=True)

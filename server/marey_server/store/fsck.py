@@ -1,4 +1,4 @@
-"""Checks that everything stored is what its name says, and that everything referred to is there.
+"""Checks of the store: whether it can serve, whether blobs match their digests, and whether references resolve.
 
 Works beside a running server, in short reads of bounded size.
 """
@@ -19,6 +19,7 @@ from marey_server.access.principal import SYSTEM
 from marey_server.store import documents
 from marey_server.store.blobs import digest_of, read_blob
 from marey_server.store.database.connections import Database
+from marey_server.store.database.schema import schema_at_head
 from marey_server.store.items.summaries import summarise
 from marey_server.store.tables import (
     blob,
@@ -200,3 +201,15 @@ def _check_upload(tx: Transaction, row: Row[Any]) -> list[Finding]:
     return (
         [] if size == row.offset else [Finding("upload-incomplete", row.id, f"{size} of {row.offset} bytes are there")]
     )
+
+
+def find_faults(tx: Transaction) -> list[str]:
+    """What keeps the server from serving, in words for its operator; empty where all is well."""
+    faults = []
+    if not schema_at_head(tx.connection):
+        faults.append("the database's tables are not those of this version: run `marey db upgrade`")
+    try:
+        tx.blobs.check_writable()
+    except OSError as error:
+        faults.append(f"blobs cannot be written: {error.strerror}")
+    return faults

@@ -22,10 +22,9 @@ from marey_motion.matching.database import SourceClip
 from marey_motion.rigs import map_joints
 from marey_reports.drawing.markup import element, text
 from marey_reports.drawing.words import amount, duration
-from marey_reports.evaluation import verdict
 from marey_reports.evaluation.definitions import METRICS
 from marey_reports.evaluation.figures import FIGURES, draw_figures
-from marey_reports.evaluation.page import compared, render_comparison, render_report
+from marey_reports.evaluation.page import compared, render_comparison, render_report, verdict
 from marey_reports.evaluation.words import find_holes
 
 

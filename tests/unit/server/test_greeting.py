@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from marey_server.access.principal import SYSTEM
-from marey_server.process.greeting import greeting, next_command
+from marey_server.app import greeting, next_command
 from marey_server.process.settings import Settings
 from marey_server.store import users
 from marey_server.store.database.connections import Database

@@ -2,8 +2,8 @@
 
 import pytest
 
-from marey_server.access.limits import REMEMBERED, TryLimit
 from marey_server.errors import TooManyRequests
+from marey_server.process.services import NAMES_REMEMBERED, TryLimit
 
 
 def test_tries_are_limited_by_key_and_come_back_with_time():
@@ -23,6 +23,6 @@ def test_tries_are_limited_by_key_and_come_back_with_time():
 
 def test_guesses_at_many_names_do_not_fill_the_memory():
     limit = TryLimit(1)
-    for number in range(REMEMBERED + 100):
+    for number in range(NAMES_REMEMBERED + 100):
         limit.take(str(number))
-    assert len(limit._buckets) == REMEMBERED
+    assert len(limit._buckets) == NAMES_REMEMBERED

@@ -10,12 +10,13 @@ from marey_schemas.kinds import Kind
 from marey_schemas.pipelines import PipelineCreate
 from marey_server.errors import Invalid
 from marey_server.store import blobs, items
-from marey_server.store.jobs import pipelines, reading
+from marey_server.store.jobs import reading
+from marey_server.store.jobs.submission import submit_pipeline
 
 
 def submit(desk: Desk, steps: dict[str, Any], **shared: Any) -> dict[str, Job]:
     wanted = PipelineCreate.model_validate({"steps": steps, **shared})
-    return desk.database.write(desk.user, pipelines.submit_pipeline, "lab", wanted).jobs
+    return desk.database.write(desk.user, submit_pipeline, "lab", wanted).jobs
 
 
 def chain(number: int = 0) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 import pytest
 
 from marey_server.errors import RangeNotSatisfiable
-from marey_server.http.ranges import parse_range
+from marey_server.http.streaming import parse_range
 
 ETAG = '"abc.bytes"'
 

@@ -3,22 +3,22 @@
 import shutil
 
 from marey_server.access.principal import SYSTEM
-from marey_server.store import readiness
+from marey_server.store import fsck
 from marey_server.store.blob_backings import DirectoryBlobs
 
 
 def test_a_store_that_can_serve_has_no_faults(database):
-    assert database.read(SYSTEM, readiness.find_faults) == []
+    assert database.read(SYSTEM, fsck.find_faults) == []
 
 
 def test_tables_of_another_version_are_told(database):
     with database.engine.begin() as connection:
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
-    assert "marey db upgrade" in database.read(SYSTEM, readiness.find_faults)[0]
+    assert "marey db upgrade" in database.read(SYSTEM, fsck.find_faults)[0]
 
 
 def test_blobs_that_cannot_be_written_are_told(database, tmp_path):
     database.blobs = DirectoryBlobs(tmp_path / "blobs")
-    assert database.read(SYSTEM, readiness.find_faults) == []
+    assert database.read(SYSTEM, fsck.find_faults) == []
     shutil.rmtree(tmp_path / "blobs")
-    assert "blobs cannot be written" in database.read(SYSTEM, readiness.find_faults)[0]
+    assert "blobs cannot be written" in database.read(SYSTEM, fsck.find_faults)[0]

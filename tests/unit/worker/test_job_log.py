@@ -4,8 +4,8 @@ import pytest
 
 from marey_client.errors import Unreachable
 from marey_schemas.worker_protocol import LogAnswer
-from marey_worker import job_log
-from marey_worker.job_log import JobLog
+from marey_worker import attempt
+from marey_worker.attempt import JobLog
 
 ARRIVES, NEVER_ARRIVES, ANSWER_IS_LOST = "arrives", "never arrives", "answer is lost"
 
@@ -33,7 +33,7 @@ class Api:
 
 @pytest.fixture
 def api(monkeypatch):
-    monkeypatch.setattr(job_log, "PIECE_BYTES", 10)
+    monkeypatch.setattr(attempt, "LOG_PIECE_BYTES", 10)
     return Api()
 
 

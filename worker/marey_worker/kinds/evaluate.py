@@ -1,28 +1,33 @@
-"""How good a set of locomotion clips is: trials spread over tasks, and one evaluation made of their records."""
+"""Evaluates a set of locomotion clips: trials spread over tasks, then one evaluation of all their records."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from marey_motion.evaluation.judgement import judge
 from marey_motion.evaluation.options import EvaluationOptions
+from marey_motion.evaluation.relevance import recorded_rows, sum_by_source
+from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import records_from_tree, records_to_tree, result_to_tree
 from marey_motion.evaluation.scenario import Trial, suite_trials
 from marey_motion.evaluation.suite import assemble, evaluate_baseline, run_suite
 from marey_motion.matching.record import TrialRecord
-from marey_reports.evaluation.page import verdict
+from marey_reports.evaluation.figures import FIGURES, DrawnFigure, draw_figure, draw_figures
+from marey_reports.evaluation.page import render_report, verdict
+from marey_schemas.documents.reports import EvaluationReport
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.job_params import EvaluateParams
 from marey_schemas.kinds import Kind
 from marey_schemas.worker_protocol import StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import read_clips, refusing_motion_errors, wanted_clips
-from marey_worker.kinds.evaluation_headline import headline_of
+from marey_worker.job_io.stored_reports import store_report
 from marey_worker.kinds.evaluation_options import options_of
-from marey_worker.kinds.evaluation_report import write_report
 
 GATHERING_STEPS = 4
+Headline = dict[str, float | int | None]
 
 
 def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
@@ -97,3 +102,44 @@ def _read_records(context: Context, results: Sequence[Mapping[str, Any]]) -> dic
     for result in results:
         known |= records_from_tree(decode_tree(context.blob(result["records"]["blob"]), MSGPACK))
     return known
+
+
+def headline_of(result: EvaluationResult) -> Headline:
+    """The numbers that lists show; units at the ends of the names, shares from 0 to 1.
+
+    Clips count once, whether their mirrored twins were added or not.
+    """
+    sources = sum_by_source(result.clips, result.usage)
+    rows = recorded_rows(result.clips, result.usage)
+    return {
+        "clips": len(sources),
+        "unused_clips": sum(source.ticks == 0 for source in sources),
+        "data_s": rows / result.options.database.rate_hz,
+        "trials": len(result.trials),
+        "followed_trials": judge(result).followed,
+        "offset_mean_m": result.suite["offset_mean"],
+        "baseline_offset_mean_m": None if result.baseline is None else result.baseline.suite["offset_mean"],
+        "abs_se_v_m_s": result.suite["abs_se_v"],
+        "abs_se_omega_deg_s": result.suite["abs_se_omega_deg"],
+        "transitions_per_s": result.suite["transitions_per_s"],
+        "pose_cost_mean_m": result.suite["pose_cost_mean"],
+        "coverage_index": result.coverage.index,
+        "symmetry": result.coverage.symmetry,
+    }
+
+
+def write_report(context: Context, result: EvaluationResult, params: EvaluateParams) -> dict[str, Any]:
+    """Draw every figure and write the page; the document that names them."""
+    figures = draw_figures(result)
+    page = render_report(result, title=params.name, figures=figures)
+    drawn = [*((None, figure) for figure in figures.values()), *_trial_figures(result, params)]
+    return store_report(context, EvaluationReport, params.name, page, drawn)
+
+
+def _trial_figures(result: EvaluationResult, params: EvaluateParams) -> Iterator[tuple[str, DrawnFigure]]:
+    """Figures of the trials that were asked for."""
+    families = {one.trial.name: one.trial.family for one in result.trials}
+    for trial in params.trial_figures:
+        for name, kind in FIGURES.items():
+            if kind.trials == "any" or (kind.trials == "one" and families[trial] in kind.families):
+                yield trial, draw_figure(name, result, trial=trial)

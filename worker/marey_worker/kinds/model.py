@@ -1,9 +1,9 @@
-"""A generative model of one action, learned from aligned clips."""
+"""Trains a generative model of one action on aligned clips, and writes its report."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import ValidationError
@@ -13,17 +13,22 @@ from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.alignment.aligned_documents import StoredExample, set_from_examples, uid_of
 from marey_motion.modelling.options import DEFAULT_OPTIONS, ModelOptions
 from marey_motion.modelling.primitive_documents import trained_to_tree
-from marey_motion.modelling.training import train_primitive
+from marey_motion.modelling.search.check import SearchCheck, check_search
+from marey_motion.modelling.training import TrainedPrimitive, train_primitive
+from marey_motion.rigs import map_joints
+from marey_reports.models.figures import ModelSubject, draw_alignment_figures, draw_model_figures
+from marey_reports.models.page import render_model_report
 from marey_schemas.documents.alignments import AlignmentInfo
 from marey_schemas.documents.clips import Motion
 from marey_schemas.documents.references import RevisionRef
+from marey_schemas.documents.reports import ModelReport
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.job_params import ModelParams
 from marey_schemas.kinds import Kind
 from marey_schemas.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
-from marey_worker.kinds.model_report import write_model_report
+from marey_worker.job_io.stored_reports import store_report
 
 OPTIONS = set(DEFAULT_OPTIONS.as_tree())
 
@@ -118,3 +123,27 @@ def _provenance(
         "reference": aligned.reference,
         "seed": context.seed,
     }
+
+
+def write_model_report(
+    context: Context, trained: TrainedPrimitive, aligned: AlignedSet, origin: Mapping[str, Any], params: ModelParams
+) -> dict[str, Any]:
+    """Draw every figure of a model and of its alignment, and write the page; the document that names them.
+
+    Parameters
+    ----------
+    origin : where the examples come from, as the part `model` says it
+    """
+    title = trained.primitive.name
+    check = _checked(context, trained, aligned) if params.search_check else None
+    subject = ModelSubject(trained.primitive, aligned, trained.report, check, context.seed)
+    figures = {**draw_alignment_figures(aligned), **draw_model_figures(subject)}
+    page = render_model_report(trained, subject, figures, title=title, origin=origin)
+    return store_report(context, ModelReport, title, page, ((None, figure) for figure in figures.values()))
+
+
+def _checked(context: Context, trained: TrainedPrimitive, aligned: AlignedSet) -> SearchCheck | None:
+    context.progress(0, None, "searching for what examples reached")
+    skeleton = aligned.skeleton
+    joints = {standard: skeleton.index_of(name) for standard, name in map_joints(skeleton).joints.items()}
+    return check_search(aligned, joints, trained.options, seed=context.seed)

@@ -1,7 +1,10 @@
-"""One motion after another."""
+"""Commands that change which frames a take has: cut, joined, resampled or retimed."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -18,6 +21,33 @@ from marey_motion.motion import Motion
 from marey_motion.resampling import count_samples, resample_motion
 from marey_motion.root_carrier import body_first, root_first, root_stands
 from marey_motion.skeleton import same_hierarchy
+
+
+def trim(take: Take, *, start: int = 0, stop: int | None = None) -> Take:
+    """Keep the frames [start, stop); without `stop`, up to the end. Raises `EditError` where they are not there."""
+    first, last = take.frames((start, stop))
+    return take.moved(take.motion.sliced(first, last))
+
+
+def split(take: Take, *, at: Sequence[int]) -> tuple[Take, ...]:
+    """Cut before each of the frames `at`, in increasing order, into one piece more than these.
+
+    Raises `EditError` where a cut lies outside of the motion or would leave a piece without frames.
+    """
+    bounds = [0, *at, take.frame_count]
+    for before, after in pairwise(bounds):
+        if after <= before:
+            raise EditError(
+                f"cuts at {', '.join(map(str, at))} leave a piece without frames; cuts increase, from 1 to "
+                f"{take.frame_count - 1}",
+                code="frames-missing",
+                where="at",
+            )
+    return tuple(
+        replace(take.moved(take.motion.sliced(start, stop)), pieces=(*take.pieces, number))
+        for number, (start, stop) in enumerate(pairwise(bounds), start=1)
+    )
+
 
 Floats = NDArray[np.float64]
 
@@ -129,3 +159,17 @@ def _faded_over(first: Motion, second: Motion, overlap: int) -> Motion:
     )
     kept = first.sliced(0, first.frame_count - overlap)
     return _in_a_row(_in_a_row(kept, middle), second.sliced(overlap, second.frame_count))
+
+
+def resample(take: Take, *, frame_rate_hz: float) -> Take:
+    """The same motion at another rate, first frames coinciding. Raises `EditError` where it gets too long."""
+    take.require_room(count_samples(take.frame_count, take.frame_rate_hz, frame_rate_hz))
+    motion = resample_motion(take.motion, take.frame_rate_hz, frame_rate_hz)
+    return replace(take, motion=motion, frame_rate_hz=frame_rate_hz)
+
+
+def retime(take: Take, *, speed: float) -> Take:
+    """The motion so many times as fast, at the same frame rate. Raises `EditError` where it gets too long."""
+    slowed_hz = take.frame_rate_hz / speed
+    take.require_room(count_samples(take.frame_count, take.frame_rate_hz, slowed_hz))
+    return take.moved(resample_motion(take.motion, take.frame_rate_hz, slowed_hz))
