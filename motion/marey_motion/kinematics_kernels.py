@@ -8,7 +8,8 @@ of a block stays in the first two cache levels.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from marey_motion.kernels import contracted, product
 
 # Frames per block, and the length of a row of scratch: an odd number of cache lines, because rows a power of two
 # apart would all compete for the same few cache sets.
@@ -17,23 +18,18 @@ ROW = 80
 QUATERNION = 4 * ROW
 VECTOR = 3 * ROW
 
-# Contraction to fused multiply-add is the only liberty taken with IEEE arithmetic.
-_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy", fastmath={"contract"})
 
-
-@_compiled
+@contracted
 def _turn(parent, joint):  # type: ignore[no-untyped-def]
     """Make a joint's local rotations global: joint = parent · joint."""
     for f in range(BLOCK):
         aw, ax, ay, az = parent[f], parent[ROW + f], parent[2 * ROW + f], parent[3 * ROW + f]
         bw, bx, by, bz = joint[f], joint[ROW + f], joint[2 * ROW + f], joint[3 * ROW + f]
-        joint[f] = aw * bw - ax * bx - ay * by - az * bz
-        joint[ROW + f] = aw * bx + ax * bw + ay * bz - az * by
-        joint[2 * ROW + f] = aw * by - ax * bz + ay * bw + az * bx
-        joint[3 * ROW + f] = aw * bz + ax * by - ay * bx + az * bw
+        w, x, y, z = product((aw, ax, ay, az), (bw, bx, by, bz))
+        joint[f], joint[ROW + f], joint[2 * ROW + f], joint[3 * ROW + f] = w, x, y, z
 
 
-@_compiled
+@contracted
 def _place(rotation, origin, point):  # type: ignore[no-untyped-def]
     """Make a point's local offsets global: point = origin + rotation · point."""
     for f in range(BLOCK):
@@ -47,7 +43,7 @@ def _place(rotation, origin, point):  # type: ignore[no-untyped-def]
         point[2 * ROW + f] = origin[2 * ROW + f] + pz + w * tz + x * ty - y * tx
 
 
-@_compiled
+@contracted
 def _load(block, first_column, rows, row_count):  # type: ignore[no-untyped-def]
     for c in range(row_count):
         row = rows[c * ROW : c * ROW + ROW]
@@ -55,7 +51,7 @@ def _load(block, first_column, rows, row_count):  # type: ignore[no-untyped-def]
             row[f] = block[f, first_column + c]
 
 
-@_compiled
+@contracted
 def _store(rows, block):  # type: ignore[no-untyped-def]
     for f in range(block.shape[0]):
         frame = block[f]
@@ -63,7 +59,7 @@ def _store(rows, block):  # type: ignore[no-untyped-def]
             frame[c] = rows[c * ROW + f]
 
 
-@_compiled
+@contracted
 def _load_offsets(offsets, translations, slots, start, count, points):  # type: ignore[no-untyped-def]
     for p in range(1, offsets.shape[0]):
         for c in range(3):
@@ -75,7 +71,7 @@ def _load_offsets(offsets, translations, slots, start, count, points):  # type: 
                     row[f] = translations[start + f, slots[p], c]
 
 
-@_compiled
+@contracted
 def positions(poses, offsets, parents, translations, slots, turned, out):  # type: ignore[no-untyped-def]
     """Fill `out` (F, 3·P) with global positions of P points: J joints, then end sites.
 
@@ -99,7 +95,7 @@ def positions(poses, offsets, parents, translations, slots, turned, out):  # typ
         _store(point, out[start : start + BLOCK])
 
 
-@_compiled
+@contracted
 def rotations(local, parents, out):  # type: ignore[no-untyped-def]
     """Fill `out` (F, 4·J) with global rotations of the local ones (F, 4·J)."""
     rotation = np.zeros(parents.shape[0] * QUATERNION, local.dtype)

@@ -3,27 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from marey_motion.kernels import compiled, inverse, product, put_rotation
 
 # How a joint of the target gets its rotation.
 AT_REST = 0
 MAPPED = 1
 CARRIED = 2
 
-_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
 
-
-@_compiled
-def _product(aw, ax, ay, az, bw, bx, by, bz):  # type: ignore[no-untyped-def]
-    return (
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    )
-
-
-@_compiled
+@compiled
 def rotations(local, parents, ways, sources, corrections, rests, target_parents, out):  # type: ignore[no-untyped-def]
     """Fill `out` (F, 4·K) with local rotations of the K target joints, continuous in sign from frame to frame.
 
@@ -38,29 +27,27 @@ def rotations(local, parents, ways, sources, corrections, rests, target_parents,
             w, x, y, z = local[f, 4 * j], local[f, 4 * j + 1], local[f, 4 * j + 2], local[f, 4 * j + 3]
             p = parents[j]
             if p >= 0:
-                w, x, y, z = _product(source[p, 0], source[p, 1], source[p, 2], source[p, 3], w, x, y, z)
+                w, x, y, z = product(source[p], (w, x, y, z))
             # Products of rounded quaternions shrink or grow along the chain.
             length = np.sqrt(w * w + x * x + y * y + z * z)
             source[j, 0], source[j, 1], source[j, 2], source[j, 3] = w / length, x / length, y / length, z / length
         for k in range(targets):
             p, s = target_parents[k], sources[k]
             if ways[k] == MAPPED:
-                c = corrections[k]
-                w, x, y, z = _product(source[s, 0], source[s, 1], source[s, 2], source[s, 3], c[0], c[1], c[2], c[3])
-                target[k, 0], target[k, 1], target[k, 2], target[k, 3] = w, x, y, z
+                w, x, y, z = product(source[s], corrections[k])
+                put_rotation(target, k, (w, x, y, z))
                 if p >= 0:
-                    w, x, y, z = _product(target[p, 0], -target[p, 1], -target[p, 2], -target[p, 3], w, x, y, z)
+                    w, x, y, z = product(inverse(target[p]), (w, x, y, z))
             else:
                 if ways[k] == CARRIED:
                     w, x, y, z = local[f, 4 * s], local[f, 4 * s + 1], local[f, 4 * s + 2], local[f, 4 * s + 3]
                 else:
                     w, x, y, z = rests[k, 0], rests[k, 1], rests[k, 2], rests[k, 3]
                 if p >= 0:
-                    t = _product(target[p, 0], target[p, 1], target[p, 2], target[p, 3], w, x, y, z)
-                    target[k, 0], target[k, 1], target[k, 2], target[k, 3] = t
+                    put_rotation(target, k, product(target[p], (w, x, y, z)))
                 else:
-                    target[k, 0], target[k, 1], target[k, 2], target[k, 3] = w, x, y, z
+                    put_rotation(target, k, (w, x, y, z))
             if last[k, 0] * w + last[k, 1] * x + last[k, 2] * y + last[k, 3] * z < 0.0:
                 w, x, y, z = -w, -x, -y, -z
-            last[k, 0], last[k, 1], last[k, 2], last[k, 3] = w, x, y, z
+            put_rotation(last, k, (w, x, y, z))
             out[f, 4 * k], out[f, 4 * k + 1], out[f, 4 * k + 2], out[f, 4 * k + 3] = w, x, y, z

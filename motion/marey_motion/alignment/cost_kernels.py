@@ -6,12 +6,11 @@ Inner loops run along the frames of the second motion, which therefore come last
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+from marey_motion.kernels import compiled
 
 
-@_compiled
+@compiled
 def _products(points, others, real, imaginary, heights):  # type: ignore[no-untyped-def]
     """Sums over points (P, 3), for each frame of others (P, 3, m): of z·z̄ on the ground, of squared rises."""
     real[:] = 0.0
@@ -27,7 +26,7 @@ def _products(points, others, real, imaginary, heights):  # type: ignore[no-unty
             heights[j] += rise * rise
 
 
-@_compiled
+@compiled
 def turned(rows, columns, energies, other_energies, costs):  # type: ignore[no-untyped-def]
     """Fill costs (n, m); rows (n, P, 3) and columns (P, 3, m) are centred in each frame."""
     n, m = costs.shape
@@ -39,7 +38,7 @@ def turned(rows, columns, energies, other_energies, costs):  # type: ignore[no-u
             costs[i, j] = max(0.0, energies[i] + other_energies[j] - 2.0 * overlap) + heights[j]
 
 
-@_compiled
+@compiled
 def turned_windows(a, b, window, costs):  # type: ignore[no-untyped-def]
     """Fill costs (n, m) of windows: sums along diagonals of what single frames have."""
     n, m = costs.shape
@@ -62,7 +61,7 @@ def turned_windows(a, b, window, costs):  # type: ignore[no-untyped-def]
             costs[i, j] = (max(0.0, ground) + sums[2, j]) / window
 
 
-@_compiled
+@compiled
 def _slide(history, row, window, sums):  # type: ignore[no-untyped-def]
     """Fill sums (c, m) with those over the window of rows that ends at `row`, along diagonals."""
     sums[:] = 0.0
@@ -74,7 +73,7 @@ def _slide(history, row, window, sums):  # type: ignore[no-untyped-def]
                 total[j] += values[j + step]
 
 
-@_compiled
+@compiled
 def _squares(points, others, row):  # type: ignore[no-untyped-def]
     row[:] = 0.0
     for p in range(points.shape[0]):
@@ -85,14 +84,14 @@ def _squares(points, others, row):  # type: ignore[no-untyped-def]
             row[j] += dx * dx + dy * dy + dz * dz
 
 
-@_compiled
+@compiled
 def plain(rows, columns, costs):  # type: ignore[no-untyped-def]
     """Fill costs (n, m) with squared distances as they are."""
     for i in range(costs.shape[0]):
         _squares(rows[i], columns, costs[i])
 
 
-@_compiled
+@compiled
 def plain_windows(rows, columns, window, costs):  # type: ignore[no-untyped-def]
     """As `plain`, the mean over windows."""
     n, m = costs.shape

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from marey_motion.kernels import compiled
 
 # Steps by which a cell is reached; of equal costs the lowest wins.
 BOTH, FIRST, SECOND = 0, 1, 2
 LANES = 4
 
-_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
 
-
-@_compiled
+@compiled
 def align(costs, path):  # type: ignore[no-untyped-def]
     """Fill `path` backwards from the end; the least total and the number of cells."""
     n, m = costs.shape
@@ -30,7 +29,7 @@ def align(costs, path):  # type: ignore[no-untyped-def]
     return totals[0, m], _walk_back(steps, path)
 
 
-@_compiled
+@compiled
 def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
     """The least of three totals and the step that has it, without branches, which could not be foreseen."""
     least = min(both, first, second)
@@ -38,7 +37,7 @@ def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
     return least, np.uint8(alone) + np.uint8(alone & (least < first))
 
 
-@_compiled
+@compiled
 def _cells(costs, before, totals, steps, start, stop):  # type: ignore[no-untyped-def]
     """Columns [start, stop) of one row; totals stand one column further than costs and steps."""
     for j in range(start, stop):
@@ -46,7 +45,7 @@ def _cells(costs, before, totals, steps, start, stop):  # type: ignore[no-untype
         totals[j + 1] = least + costs[j]
 
 
-@_compiled
+@compiled
 def _four_rows(costs, totals, steps):  # type: ignore[no-untyped-def]
     """Each cell waits for the one on its left. Rows that go a column behind the one above them do not wait for it."""
     m = costs.shape[1]
@@ -67,7 +66,7 @@ def _four_rows(costs, totals, steps):  # type: ignore[no-untyped-def]
         _cells(costs[row], totals[row], totals[row + 1], steps[row], m - row, m)
 
 
-@_compiled
+@compiled
 def _walk_back(steps, path):  # type: ignore[no-untyped-def]
     """Fill `path` backwards from the end; the number of cells."""
     i, j, length = steps.shape[0] - 1, steps.shape[1] - 1, 0
@@ -83,7 +82,7 @@ def _walk_back(steps, path):  # type: ignore[no-untyped-def]
             j -= 1
 
 
-@_compiled
+@compiled
 def total(costs):  # type: ignore[no-untyped-def]
     """The least total alone, in memory for one row."""
     n, m = costs.shape
@@ -98,7 +97,7 @@ def total(costs):  # type: ignore[no-untyped-def]
     return totals[m - 1]
 
 
-@_compiled
+@compiled
 def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
     """As `align`, with at most `max_run` steps 1-0, or 0-1, in a row."""
     n, m = costs.shape
@@ -112,7 +111,7 @@ def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
     return total, _walk_back_limited(costs, max_run, not_first, not_second, path) if np.isfinite(total) else 0
 
 
-@_compiled
+@compiled
 def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
     """The least total alone, infinite where no way keeps the limit, in memory for a few rows."""
     n, m = costs.shape
@@ -124,7 +123,7 @@ def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
     return min(not_first[(n - 1) % 2, m - 1], not_second[(n - 1) % 2, m - 1])
 
 
-@_compiled
+@compiled
 def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first, not_second):  # type: ignore[no-untyped-def]
     """One row of totals from the row before it; runs (max_run, m) are totals after 1, 2, ... steps 1-0 in a row.
 
@@ -159,7 +158,7 @@ def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first
         source = target
 
 
-@_compiled
+@compiled
 def _walk_back_limited(costs, max_run, not_first, not_second, path):  # type: ignore[no-untyped-def]
     """Fill `path` backwards: at each cell, the first of the least ways to it, runs as a whole."""
     i, j, length = costs.shape[0] - 1, costs.shape[1] - 1, 0
@@ -192,7 +191,7 @@ def _walk_back_limited(costs, max_run, not_first, not_second, path):  # type: ig
     return length + 1
 
 
-@_compiled
+@compiled
 def _distances_of_frame(points, others, row):  # type: ignore[no-untyped-def]
     """Fill row (m,) with the mean distance of points (P, 3) from each frame of others (P, 3, m)."""
     count = points.shape[0]
@@ -206,14 +205,14 @@ def _distances_of_frame(points, others, row):  # type: ignore[no-untyped-def]
         row[j] /= count
 
 
-@_compiled
+@compiled
 def distances(a, b, out):  # type: ignore[no-untyped-def]
     """Fill out (n, m); a (n, P, 3), b (P, 3, m)."""
     for i in range(a.shape[0]):
         _distances_of_frame(a[i], b, out[i])
 
 
-@_compiled
+@compiled
 def total_within(a, b, rest, limit):  # type: ignore[no-untyped-def]
     """Least total of a way through the distances of a (n, P, 3) and b (P, 3, m); infinite when it is above `limit`.
 
@@ -238,7 +237,7 @@ def total_within(a, b, rest, limit):  # type: ignore[no-untyped-def]
     return totals[m - 1] if totals[m - 1] <= limit else np.inf
 
 
-@_compiled
+@compiled
 def box_costs(a, low, high, out):  # type: ignore[no-untyped-def]
     """Fill out (n,) with the mean distance of the points of each frame of a (n, P, 3) from the nearest of B boxes.
 
@@ -261,7 +260,7 @@ def box_costs(a, low, high, out):  # type: ignore[no-untyped-def]
         out[i] = least / points
 
 
-@_compiled
+@compiled
 def range_bounds(points, starts, stops, low, high, one, others, limit, out):  # type: ignore[no-untyped-def]
     """Fill out (K,) with what aligning a range of frames with each of K others costs at least, or more than `limit`.
 
@@ -282,7 +281,7 @@ def range_bounds(points, starts, stops, low, high, one, others, limit, out):  # 
         out[k] = total / longer
 
 
-@_compiled
+@compiled
 def _mean_distance(a, b):  # type: ignore[no-untyped-def]
     total = 0.0
     for p in range(a.shape[0]):
@@ -290,7 +289,7 @@ def _mean_distance(a, b):  # type: ignore[no-untyped-def]
     return total / a.shape[0]
 
 
-@_compiled
+@compiled
 def _cost_from_box(points, start, stop, low, high, most):  # type: ignore[no-untyped-def]
     """Sum over frames of the mean distance of their points from a box; ends where it is more than `most`."""
     total = 0.0

@@ -7,15 +7,14 @@ by one, so that what comes out does not depend on how they were cut into pieces.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from marey_motion.kernels import compiled
 
 RECEIVED, SMOOTHED = 0, 1
 """Places in `take.counters`."""
 
-_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
 
-
-@_compiled
+@compiled
 def _estimate(take, smoother, frame, column):  # type: ignore[no-untyped-def]
     """A column of the raw root at a frame, by the polynomial through the frames around it."""
     width = smoother.shape[0]
@@ -26,7 +25,7 @@ def _estimate(take, smoother, frame, column):  # type: ignore[no-untyped-def]
     return total
 
 
-@_compiled
+@compiled
 def _add_step(take, place, left, ahead, length):  # type: ignore[no-untyped-def]
     """Put a step into the ring in place of the one a window ago. Sums are added up afresh with each round of it."""
     for column, value in enumerate((length, ahead, left)):
@@ -40,7 +39,7 @@ def _add_step(take, place, left, ahead, length):  # type: ignore[no-untyped-def]
             take.sums[column] = total
 
 
-@_compiled
+@compiled
 def _move_to(take, x, z, heading):  # type: ignore[no-untyped-def]
     """Take the smoothed root to its next frame."""
     frame, span = take.counters[SMOOTHED], take.steps.shape[0]
@@ -56,7 +55,7 @@ def _move_to(take, x, z, heading):  # type: ignore[no-untyped-def]
     take.counters[SMOOTHED] = frame + 1
 
 
-@_compiled
+@compiled
 def _smooth(take, filters, frame, shortest_mean):  # type: ignore[no-untyped-def]
     """Smooth the root at a frame and go there."""
     x = _estimate(take, filters.positions, frame, 0)
@@ -69,7 +68,7 @@ def _smooth(take, filters, frame, shortest_mean):  # type: ignore[no-untyped-def
     _move_to(take, x, z, np.arctan2(facing_x, facing_z))
 
 
-@_compiled
+@compiled
 def newest_window(take, duration_s, window):  # type: ignore[no-untyped-def]
     """Fill in speed, turn rate, forward and strafe of the last window; False where there is none yet."""
     frame, span = take.counters[SMOOTHED] - 1, take.steps.shape[0]
@@ -82,7 +81,7 @@ def newest_window(take, duration_s, window):  # type: ignore[no-untyped-def]
     return True
 
 
-@_compiled
+@compiled
 def receive(take, filters, frames, duration_s, shortest_mean, windows):  # type: ignore[no-untyped-def]
     """Take raw frames (n, 4) in; return how many windows they complete, which are written to `windows`."""
     width = take.raw.shape[0]
@@ -101,7 +100,7 @@ def receive(take, filters, frames, duration_s, shortest_mean, windows):  # type:
     return written
 
 
-@_compiled
+@compiled
 def finish(take, filters, duration_s, shortest_mean, windows):  # type: ignore[no-untyped-def]
     """Smooth the frames at the end of a take, which have none behind them to wait for; windows as in `receive`."""
     written = 0

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+from marey_motion.kernels import compiled
 
 
-@_compiled
+@compiled
 def nearest_of_others(queries, query_groups, points, groups, found):  # type: ignore[no-untyped-def]
     """Fill found (Q,) with the summed distance of each query (Q, P, 3) from the nearest of points (N, P, 3).
 

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from marey_motion.formats.asf import AsfSkeleton, Bone
 from marey_motion.formats.numeric_text import EXACT, LONG, ending_in_a_line, excerpt, parse_number
 from marey_motion.formats.text_lines import TextLines, number_problem
+from marey_motion.kernels import compiled
 
 # What stopped the scanner.
 _END, _BUFFER_FULL, _BAD_NUMBER, _UNKNOWN_BONE, _WRONG_WIDTH, _REPEATED_BONE, _MISSING_BONE = range(7)
@@ -73,7 +73,7 @@ def scan_frames(lines: TextLines, skeleton: AsfSkeleton) -> tuple[NDArray[np.flo
     return values[: state[_FRAME] + 1], int(state[_GAPS])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _scan(text, names, name_ends, first_columns, values, seen, long_tokens, state):  # type: ignore[no-untyped-def]
     end = text.size
     bones = name_ends.size
@@ -113,7 +113,7 @@ def _scan(text, names, name_ends, first_columns, values, seen, long_tokens, stat
         state[_POSITION] = stop
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _next_word(text, state):  # type: ignore[no-untyped-def]
     """The first byte of the next word, counting the lines on the way."""
     i = state[_POSITION]
@@ -125,7 +125,7 @@ def _next_word(text, state):  # type: ignore[no-untyped-def]
     return i
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _is_frame_number(text, start, stop):  # type: ignore[no-untyped-def]
     for i in range(start, stop):
         if not 48 <= text[i] <= 57:
@@ -133,7 +133,7 @@ def _is_frame_number(text, start, stop):  # type: ignore[no-untyped-def]
     return stop - start <= 18
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _begin_frame(text, start, stop, state):  # type: ignore[no-untyped-def]
     number = np.int64(0)
     for i in range(start, stop):
@@ -146,7 +146,7 @@ def _begin_frame(text, start, stop, state):  # type: ignore[no-untyped-def]
     state[_BONE] = 0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _bone_called(text, start, stop, names, name_ends, expected):  # type: ignore[no-untyped-def]
     """Index of the bone named at `text[start:stop]`, tried from `expected` on; -1 when there is none."""
     bones = name_ends.size
@@ -167,7 +167,7 @@ def _bone_called(text, start, stop, names, name_ends, expected):  # type: ignore
     return -1
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _read_bone(text, i, first_columns, values, long_tokens, state):  # type: ignore[no-untyped-def]
     """Read the numbers up to the end of the line; where they end, or -1 at one that is malformed."""
     bone, frame = state[_BONE], state[_FRAME]

@@ -7,7 +7,6 @@ that every loader reads. Positions replace offsets, as this project's reader and
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from marey_motion.clip import Clip
@@ -15,6 +14,7 @@ from marey_motion.errors import FormatError
 from marey_motion.formats.euler import euler_from_rotations
 from marey_motion.importing.source import SourceInfo
 from marey_motion.importing.units import unit_in_metres
+from marey_motion.kernels import compiled
 from marey_motion.skeleton import Skeleton
 
 DEFAULT_ORDER = "zxy"
@@ -127,7 +127,7 @@ def format_table(values: NDArray[np.float64]) -> bytes:
     return text[: _format(values, text)].tobytes()
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _format(values, text):  # type: ignore[no-untyped-def]
     """Write `values` into `text`; the number of bytes written."""
     digits = np.empty(24, np.uint8)

@@ -6,7 +6,8 @@ Angles are intrinsic: channels Z, X, Y mean R = Rz · Rx · Ry, each turn about 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from marey_motion.kernels import compiled
 
 NO_COLUMN = -1
 
@@ -19,7 +20,7 @@ _HALF_DEGREE = np.pi / 360.0
 _EXACTLY_REDUCED_DEG = 1e9
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _half_angle(angle_deg):  # type: ignore[no-untyped-def]
     """Cosine and sine of half an angle given in degrees.
 
@@ -43,7 +44,7 @@ def _half_angle(angle_deg):  # type: ignore[no-untyped-def]
     return sine, -cosine
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def rotations_from_euler(values, columns, axes, rotations):  # type: ignore[no-untyped-def]
     """Fill local rotations from channel values, with signs that do not jump between frames.
 
@@ -82,7 +83,7 @@ def rotations_from_euler(values, columns, axes, rotations):  # type: ignore[no-u
             rotations[frame, joint, 3] = z
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def euler_from_rotations(rotations, axes, angles_deg):  # type: ignore[no-untyped-def]
     """Fill Euler angles from quaternions by way of the rotation matrix; the inverse of `rotations_from_euler`.
 
@@ -123,7 +124,7 @@ def euler_from_rotations(rotations, axes, angles_deg):  # type: ignore[no-untype
             angles_deg[frame, joint, 2] = third * to_deg
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _fill_matrix(q, matrix):  # type: ignore[no-untyped-def]
     w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
     scale = 2.0 / (w * w + x * x + y * y + z * z)
@@ -138,7 +139,7 @@ def _fill_matrix(q, matrix):  # type: ignore[no-untyped-def]
     matrix[2, 2] = 1.0 - scale * (x * x + y * y)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _nearest_solution(first, middle, third, last0, last1, last2):  # type: ignore[no-untyped-def]
     turn = 2.0 * np.pi
     a0 = first + turn * np.rint((last0 - first) / turn)

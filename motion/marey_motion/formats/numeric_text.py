@@ -8,8 +8,9 @@ a vanishing part of real files, is handed to `float` token by token.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from marey_motion.kernels import compiled
 
 # What `parse_number` found, besides a value.
 EXACT, LONG, MALFORMED = 0, 1, 2
@@ -50,7 +51,7 @@ class BadToken(ValueError):
         self.in_line = in_line
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def parse_number(text, start):  # type: ignore[no-untyped-def]
     """Read one decimal number at `text[start:]`, which must end in a line feed: no loop looks for the end of the text.
 
@@ -111,7 +112,7 @@ def parse_number(text, start):  # type: ignore[no-untyped-def]
     return EXACT, -value if negative else value, i
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _scan(text, width, values, long_tokens, state):  # type: ignore[no-untyped-def]
     """Read numbers until the text ends, `values` or `long_tokens` is full (0) or a token is malformed (1)."""
     i, end = np.uint64(state[_POSITION]), np.uint64(text.size)

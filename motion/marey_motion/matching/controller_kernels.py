@@ -7,8 +7,8 @@ ticks. `index` is a `search.SearchIndex`, `wish`, `rules`, `playback` and `recor
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from marey_motion.kernels import compiled
 from marey_motion.matching.search_kernels import cost_of, nearest, nearest_weighted
 
 # How the wished trajectory is taken from the reference.
@@ -28,10 +28,8 @@ JUMP_RAD = np.pi / 6
 # The nearest point of the path is looked for so far from the last one, or a lap could be skipped.
 PATH_WINDOW_S = 0.5
 
-_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
 
-
-@_compiled
+@compiled
 def _arc(speed, turn_rate, elapsed):  # type: ignore[no-untyped-def]
     """Steps to the left and forward, and turn, after `elapsed` seconds at constant speed and turn rate."""
     half = 0.5 * turn_rate * elapsed
@@ -39,14 +37,14 @@ def _arc(speed, turn_rate, elapsed):  # type: ignore[no-untyped-def]
     return chord * np.sin(half), chord * np.cos(half), 2.0 * half
 
 
-@_compiled
+@compiled
 def _outward(heading, left, forward):  # type: ignore[no-untyped-def]
     """A step in a root's frame as (x, z) in the world."""
     sine, cosine = np.sin(heading), np.cos(heading)
     return left * cosine + forward * sine, forward * cosine - left * sine
 
 
-@_compiled
+@compiled
 def _wished(wish, when):  # type: ignore[no-untyped-def]
     """Position and heading of the wished path at `when` ticks; beyond its end it goes on with its last arc."""
     last = wish.headings.shape[0] - 1
@@ -62,7 +60,7 @@ def _wished(wish, when):  # type: ignore[no-untyped-def]
     return x, z, heading + rest * (wish.headings[tick + 1] - heading)
 
 
-@_compiled
+@compiled
 def _progress(wish, when, x, z):  # type: ignore[no-untyped-def]
     """Where on the wished path, in ticks, its nearest point to (x, z) lies, near the last one `when`."""
     window = int(PATH_WINDOW_S / wish.tick_s)
@@ -82,13 +80,13 @@ def _progress(wish, when, x, z):  # type: ignore[no-untyped-def]
     return max(0.0, best + min(0.5, max(-0.5, along)))
 
 
-@_compiled
+@compiled
 def _moment(rules, wish, when, tick, x, z):  # type: ignore[no-untyped-def]
     """The moment of the wished path, in ticks, that counts as now."""
     return _progress(wish, when, x, z) if rules.follow == BY_PATH else float(tick)
 
 
-@_compiled
+@compiled
 def moments_along(rules, wish, positions, out):  # type: ignore[no-untyped-def]
     """Fill `out` (T,) with the moment of the wished path that counted as now at each tick of a trial."""
     when = 0.0
@@ -98,7 +96,7 @@ def moments_along(rules, wish, positions, out):  # type: ignore[no-untyped-def]
         out[tick] = when
 
 
-@_compiled
+@compiled
 def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):  # type: ignore[no-untyped-def]
     """Fill the normalised query (D,): the pose of `row`, and the wish seen from a root at (x, z) with `heading`."""
     horizons = playback.horizons_s.shape[0]
@@ -122,7 +120,7 @@ def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):  
         query[d] = (query[d] - playback.offset[d]) / playback.scale[d]
 
 
-@_compiled
+@compiled
 def _distance_cost(index, points, row, other, query, first, limit):  # type: ignore[no-untyped-def]
     """Trajectory cost of the `other` row plus its pose joints' summed distance in metres to those of `row`.
 
@@ -143,7 +141,7 @@ def _distance_cost(index, points, row, other, query, first, limit):  # type: ign
     return cost
 
 
-@_compiled
+@compiled
 def _nearest_by_distance(index, points, row, query, first, skip_start, skip_stop):  # type: ignore[no-untyped-def]
     best_row, best_cost = -1, np.inf
     for other in range(index.rows.shape[0]):
@@ -154,7 +152,7 @@ def _nearest_by_distance(index, points, row, query, first, skip_start, skip_stop
     return best_row, best_cost
 
 
-@_compiled
+@compiled
 def _search(index, playback, rules, row, query, skip_start, skip_stop):  # type: ignore[no-untyped-def]
     if rules.by_distance:
         first = query.shape[0] - 4 * playback.horizons_s.shape[0]
@@ -162,7 +160,7 @@ def _search(index, playback, rules, row, query, skip_start, skip_stop):  # type:
     return nearest(index, query, row, skip_start, skip_stop)
 
 
-@_compiled
+@compiled
 def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
     """The row to go on from, its cost, and that of going on from `row` itself; NaN where its clip has ended.
 
@@ -184,7 +182,7 @@ def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
     return row, going_on, going_on
 
 
-@_compiled
+@compiled
 def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-untyped-def]
     """The row a trial starts with: nearest to the wished trajectory whatever its pose."""
     fill_query(index, playback, rules, wish, 0, 0.0, root[0], root[1], root[2], query)
@@ -193,7 +191,7 @@ def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-un
     return nearest_weighted(index, query, weights, 0, 0)
 
 
-@_compiled
+@compiled
 def _jumped(wish, before, when):  # type: ignore[no-untyped-def]
     """Whether the wished velocity or direction jumped between two moments."""
     last = wish.speeds.shape[0] - 1
@@ -203,7 +201,7 @@ def _jumped(wish, before, when):  # type: ignore[no-untyped-def]
     return x * x + z * z > JUMP_M_S * JUMP_M_S or abs(wish.headings[b] - wish.headings[a]) > JUMP_RAD
 
 
-@_compiled
+@compiled
 def _advance(playback, rules, row, offsets, root):  # type: ignore[no-untyped-def]
     """Move `root` (x, z, heading) by the step that follows `row`, and by what is left of blended velocities.
 
@@ -221,7 +219,7 @@ def _advance(playback, rules, row, offsets, root):  # type: ignore[no-untyped-de
         offsets[1, c] = rules.decay[1, 0] * offset + rules.decay[1, 1] * change
 
 
-@_compiled
+@compiled
 def _hold(rules, wish, when, root):  # type: ignore[no-untyped-def]
     """Pull the root towards the wished one, and hold it near."""
     x, z, heading = _wished(wish, when)
@@ -235,7 +233,7 @@ def _hold(rules, wish, when, root):  # type: ignore[no-untyped-def]
         root[1] = z + (root[1] - z) * rules.clamp_m / distance
 
 
-@_compiled
+@compiled
 def run(index, playback, wish, rules, record):  # type: ignore[no-untyped-def]
     """Play one trial into the arrays of `record`."""
     query = np.empty(index.rows.shape[1])

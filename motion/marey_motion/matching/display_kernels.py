@@ -8,27 +8,16 @@ their offsets and velocities are rotation vectors.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from marey_motion.kernels import compiled, product
 
 # Offsets below this, in metres or radians and the same per second, are below what float32 poses can show.
 FORGOTTEN = 1e-9
 # Half of an angle, squared, below which the first terms of the series are exact to the last bit.
 SMALL = 1e-4
 
-_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
 
-
-@_compiled
-def _product(aw, ax, ay, az, bw, bx, by, bz):  # type: ignore[no-untyped-def]
-    return (
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    )
-
-
-@_compiled
+@compiled
 def _exponential(x, y, z):  # type: ignore[no-untyped-def]
     """The rotation about (x, y, z) by its length in radians."""
     square = 0.25 * (x * x + y * y + z * z)
@@ -41,7 +30,7 @@ def _exponential(x, y, z):  # type: ignore[no-untyped-def]
     return cosine, scale * x, scale * y, scale * z
 
 
-@_compiled
+@compiled
 def _turn_to(pose, column, w, x, y, z):  # type: ignore[no-untyped-def]
     """The turn of at most half a circle, as a rotation vector, that takes a rotation of `pose` to (w, x, y, z)."""
     bw, bx, by, bz = (
@@ -50,7 +39,7 @@ def _turn_to(pose, column, w, x, y, z):  # type: ignore[no-untyped-def]
         np.float64(pose[column + 2]),
         np.float64(pose[column + 3]),
     )
-    w, x, y, z = _product(w, x, y, z, bw, -bx, -by, -bz)
+    w, x, y, z = product((w, x, y, z), (bw, -bx, -by, -bz))
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
     sine = np.sqrt(x * x + y * y + z * z)
@@ -58,7 +47,7 @@ def _turn_to(pose, column, w, x, y, z):  # type: ignore[no-untyped-def]
     return scale * x, scale * y, scale * z
 
 
-@_compiled
+@compiled
 def _add_velocity(poses, places, successors, joints, moved, row, rate, velocities):  # type: ignore[no-untyped-def]
     """Add `rate` times the step from a row to the next one to `velocities` (1 + M + K, 3)."""
     if successors[row] < 0:  # a clip's end goes on as it came
@@ -79,7 +68,7 @@ def _add_velocity(poses, places, successors, joints, moved, row, rate, velocitie
             velocities[o, c] += rate * turn[c]
 
 
-@_compiled
+@compiled
 def _show(pose, place, joints, moved, offsets, shown, shown_places):  # type: ignore[no-untyped-def]
     """Fill `shown` (3 + 4·K) and `shown_places` (M, 3) with a row and its offsets (1 + M + K, 3)."""
     for c in range(3):
@@ -89,12 +78,10 @@ def _show(pose, place, joints, moved, offsets, shown, shown_places):  # type: ig
     for k in range(joints.shape[0]):
         j, o, s = 3 + 4 * joints[k], 1 + moved.shape[0] + k, 3 + 4 * k
         turn = _exponential(offsets[o, 0], offsets[o, 1], offsets[o, 2])
-        shown[s], shown[s + 1], shown[s + 2], shown[s + 3] = _product(
-            turn[0], turn[1], turn[2], turn[3], pose[j], pose[j + 1], pose[j + 2], pose[j + 3]
-        )
+        shown[s], shown[s + 1], shown[s + 2], shown[s + 3] = product(turn, pose[j : j + 4])
 
 
-@_compiled
+@compiled
 def _show_row(pose, place, joints, moved, shown, shown_places):  # type: ignore[no-untyped-def]
     """`_show` without offsets."""
     shown[:3] = pose[:3]
@@ -104,7 +91,7 @@ def _show_row(pose, place, joints, moved, shown, shown_places):  # type: ignore[
         shown[3 + 4 * k : 7 + 4 * k] = pose[3 + 4 * joints[k] : 7 + 4 * joints[k]]
 
 
-@_compiled
+@compiled
 def _take_offsets(shown, shown_places, pose, place, joints, moved, offsets):  # type: ignore[no-untyped-def]
     """Fill `offsets` with what takes a row to what is shown."""
     for c in range(3):
@@ -117,7 +104,7 @@ def _take_offsets(shown, shown_places, pose, place, joints, moved, offsets):  # 
         offsets[o, 0], offsets[o, 1], offsets[o, 2] = turn
 
 
-@_compiled
+@compiled
 def _decay(decay, offsets, velocities):  # type: ignore[no-untyped-def]
     """One tick of all springs; whether anything is left of them."""
     left = 0.0
@@ -130,7 +117,7 @@ def _decay(decay, offsets, velocities):  # type: ignore[no-untyped-def]
     return left > FORGOTTEN
 
 
-@_compiled
+@compiled
 def inertialised(  # type: ignore[no-untyped-def]
     poses, places, successors, joints, moved, rows, cuts, decay, rate_hz, out, out_places
 ):

@@ -24,19 +24,14 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from marey_motion.kernels import compiled, inlined
 from marey_motion.matching.search_lanes import LANES, box_costs, row_costs
 
 # Rounding to the nearest float32 is relative to 2⁻²⁴ and, among denormal numbers or where those are taken as zero,
 # absolute to less than 1e-37.
 _ROUNDING = 2.0**-22
 _SMALLEST = 1e-36
-
-_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
-# Index and query are some hundred words; handing them to a function that is called per group would cost as much as
-# what it does.
-_inlined = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy", forceinline=True)
 
 
 class _Query(NamedTuple):
@@ -55,7 +50,7 @@ class _Query(NamedTuple):
     bounds: Any
 
 
-@_inlined
+@inlined
 def _cost(values, query, weights):  # type: ignore[no-untyped-def]
     cost = 0.0
     for d in range(query.shape[0]):
@@ -64,7 +59,7 @@ def _cost(values, query, weights):  # type: ignore[no-untyped-def]
     return cost
 
 
-@_compiled
+@compiled
 def cost_of(index, row, query):  # type: ignore[no-untyped-def]
     """Squared distance of a row, selectable or not, to the query (D,): float64, summed in the order of dimensions."""
     values = index.rows[row]
@@ -75,7 +70,7 @@ def cost_of(index, row, query):  # type: ignore[no-untyped-def]
     return cost
 
 
-@_compiled
+@compiled
 def _prepared(index, query, weights, skip_start, skip_stop):  # type: ignore[no-untyped-def]
     dimensions = index.blocks.shape[1]
     rounded = np.zeros(dimensions, np.float32)
@@ -103,14 +98,14 @@ def _prepared(index, query, weights, skip_start, skip_stop):  # type: ignore[no-
     )
 
 
-@_inlined
+@inlined
 def _limit(query, best):  # type: ignore[no-untyped-def]
     """The float32 cost that no row as near as `best` can exceed."""
     distance = np.sqrt(best) + query.reach
     return np.float32(distance * distance * query.margin + query.least)
 
 
-@_inlined
+@inlined
 def _lane_of_least(sums, lanes):  # type: ignore[no-untyped-def]
     """Which of the lanes, given as bits, holds the least sum."""
     best = -1
@@ -120,17 +115,17 @@ def _lane_of_least(sums, lanes):  # type: ignore[no-untyped-def]
     return best
 
 
-@_inlined
+@inlined
 def _screened_rows(index, query, block, limit):  # type: ignore[no-untyped-def]
     return row_costs(index.blocks, query.rounded, query.weights, query.sums, block, limit)
 
 
-@_inlined
+@inlined
 def _screened_boxes(boxes, query, number, sums, limit):  # type: ignore[no-untyped-def]
     return box_costs(boxes, query.rounded, query.weights, sums, number, limit)
 
 
-@_inlined
+@inlined
 def _choose_row(index, query, block, lanes, row, cost, limit):  # type: ignore[no-untyped-def]
     """The best of (row, cost) and those rows of a block, given as bits, that the screening left; and its limit."""
     while lanes:
@@ -147,7 +142,7 @@ def _choose_row(index, query, block, lanes, row, cost, limit):  # type: ignore[n
     return row, cost, limit
 
 
-@_inlined
+@inlined
 def _search_group(index, query, group, row, cost, limit):  # type: ignore[no-untyped-def]
     """The best of (row, cost) and the rows of a group's blocks, the nearest box first; and its limit."""
     boxes = _screened_boxes(index.boxes, query, group, query.bounds, limit)
@@ -164,7 +159,7 @@ def _search_group(index, query, group, row, cost, limit):  # type: ignore[no-unt
     return row, cost, limit
 
 
-@_compiled
+@compiled
 def _search_boxes(index, query, row, cost, limit):  # type: ignore[no-untyped-def]
     """The group with the nearest box first, for a tight limit; then those of the others that are left, in their order.
 
@@ -187,7 +182,7 @@ def _search_boxes(index, query, row, cost, limit):  # type: ignore[no-untyped-de
     return row, cost, limit
 
 
-@_compiled
+@compiled
 def _search_blocks(index, query, start, stop, row, cost, limit):  # type: ignore[no-untyped-def]
     """The best of (row, cost) and the rows of blocks [start, stop), all of them; and its limit."""
     for block in range(start, stop):
@@ -197,7 +192,7 @@ def _search_blocks(index, query, start, stop, row, cost, limit):  # type: ignore
     return row, cost, limit
 
 
-@_compiled
+@compiled
 def _nearest(index, query, weights, warm_row, skip_start, skip_stop):  # type: ignore[no-untyped-def]
     prepared = _prepared(index, query, weights, skip_start, skip_stop)
     row, cost, limit = np.int64(-1), np.inf, np.float32(np.inf)
@@ -211,7 +206,7 @@ def _nearest(index, query, weights, warm_row, skip_start, skip_stop):  # type: i
     return row, cost
 
 
-@_compiled
+@compiled
 def nearest(index, query, warm_row, skip_start, skip_stop):  # type: ignore[no-untyped-def]
     """The selectable row of least cost outside [skip_start, skip_stop) and its cost; (-1, inf) when there is none.
 
@@ -220,27 +215,27 @@ def nearest(index, query, warm_row, skip_start, skip_stop):  # type: ignore[no-u
     return _nearest(index, query, np.ones(query.shape[0]), warm_row, skip_start, skip_stop)
 
 
-@_compiled
+@compiled
 def nearest_weighted(index, query, weights, skip_start, skip_stop):  # type: ignore[no-untyped-def]
     """As `nearest`, each dimension's squared difference multiplied by its weight (D,), at least 0."""
     return _nearest(index, query, weights, -1, skip_start, skip_stop)
 
 
-@_compiled
+@compiled
 def nearest_of_each(index, queries, weights, warm_rows, skips, rows, costs):  # type: ignore[no-untyped-def]
     """Fill rows and costs (Q,) with the nearest of each query (Q, D); warm_rows (Q,), skips (Q, 2)."""
     for q in range(queries.shape[0]):
         rows[q], costs[q] = _nearest(index, queries[q], weights, warm_rows[q], skips[q, 0], skips[q, 1])
 
 
-@_compiled
+@compiled
 def all_costs(index, query, weights, costs):  # type: ignore[no-untyped-def]
     """Fill costs (N,) with every row's, selectable or not."""
     for row in range(costs.shape[0]):
         costs[row] = _cost(index.rows[row], query, weights)
 
 
-@_compiled
+@compiled
 def boxes_within(index, query, cost):  # type: ignore[no-untyped-def]
     """How many blocks have a box as near as `cost`: what the quickest order of search still has to look at."""
     prepared = _prepared(index, query, np.ones(query.shape[0]), 0, 0)

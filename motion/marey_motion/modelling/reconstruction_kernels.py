@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-_compiled = njit(cache=True, nogil=True)
+from marey_motion.kernels import compiled, inverse, product, put_rotation, rotate_vector
 
 
-@_compiled
+@compiled
 def _load_rotations(pose, rotations, lengths):  # type: ignore[no-untyped-def]
     """Unit local rotations (J, 4) and the lengths (J,) that the pose's quaternions had."""
     for joint in range(len(rotations)):
@@ -22,7 +21,7 @@ def _load_rotations(pose, rotations, lengths):  # type: ignore[no-untyped-def]
         rotations[joint, 3] = z / length
 
 
-@_compiled
+@compiled
 def _place_joints(pose, local, parents, offsets, world, positions):  # type: ignore[no-untyped-def]
     """Global rotations (J, 4) and positions (J, 3)."""
     world[0] = local[0]
@@ -30,11 +29,7 @@ def _place_joints(pose, local, parents, offsets, world, positions):  # type: ign
     for joint in range(1, len(parents)):
         parent = parents[joint]
         aw, ax, ay, az = world[parent]
-        bw, bx, by, bz = local[joint]
-        world[joint, 0] = aw * bw - ax * bx - ay * by - az * bz
-        world[joint, 1] = aw * bx + ax * bw + ay * bz - az * by
-        world[joint, 2] = aw * by - ax * bz + ay * bw + az * bx
-        world[joint, 3] = aw * bz + ax * by - ay * bx + az * bw
+        put_rotation(world, joint, product(world[parent], local[joint]))
         ox, oy, oz = offsets[joint]
         tx = 2.0 * (ay * oz - az * oy)
         ty = 2.0 * (az * ox - ax * oz)
@@ -44,7 +39,7 @@ def _place_joints(pose, local, parents, offsets, world, positions):  # type: ign
         positions[joint, 2] = positions[parent, 2] + oz + aw * tz + ax * ty - ay * tx
 
 
-@_compiled
+@compiled
 def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-untyped-def]
     """Fill `out` (B,) with the mean distance of joints from targets (T, J, 3), of poses (B, T, D) of any length."""
     joints = len(parents)
@@ -63,7 +58,7 @@ def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-un
         out[motion] = total / (poses.shape[1] * joints)
 
 
-@_compiled
+@compiled
 def squared_error_gradient(poses, parents, offsets, targets, gradient):  # type: ignore[no-untyped-def]
     """The sum of squared distances of joints from targets (F, J, 3); fill its gradient (F, D) by the poses (F, D).
 
@@ -99,11 +94,7 @@ def squared_error_gradient(poses, parents, offsets, targets, gradient):  # type:
                 torques[parent, 1] += ty + lz * fx - lx * fz
                 torques[parent, 2] += tz + lx * fy - ly * fx
                 # The torque in the frame that the local rotation turns in: that of the parent.
-                w, x, y, z = world[parent, 0], -world[parent, 1], -world[parent, 2], -world[parent, 3]
-                ux = 2.0 * (y * tz - z * ty)
-                uy = 2.0 * (z * tx - x * tz)
-                uz = 2.0 * (x * ty - y * tx)
-                tx, ty, tz = tx + w * ux + y * uz - z * uy, ty + w * uy + z * ux - x * uz, tz + w * uz + x * uy - y * ux
+                tx, ty, tz = rotate_vector(inverse(world[parent]), tx, ty, tz)
             qw, qx, qy, qz = local[joint]
             scale = 2.0 / lengths[joint]
             column = 3 + 4 * joint

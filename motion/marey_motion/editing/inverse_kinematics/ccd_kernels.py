@@ -18,15 +18,11 @@ from marey_motion.editing.inverse_kinematics.pose_kernels import (
 from marey_motion.editing.inverse_kinematics.rotation_kernels import (
     about,
     between,
-    compiled,
     direction,
     exponential,
-    inverse,
     logarithm,
     minus,
     plus,
-    product,
-    put_rotation,
     put_vector,
     rotated,
     rotation_at,
@@ -35,6 +31,7 @@ from marey_motion.editing.inverse_kinematics.rotation_kernels import (
     unit,
     vector_at,
 )
+from marey_motion.kernels import compiled, inverse, product, put_rotation
 
 # A sweep that improves the objective by less than this share, so often in a row, is the last one.
 STALLED_SHARE = 1e-4

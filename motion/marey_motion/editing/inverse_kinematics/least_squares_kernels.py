@@ -18,18 +18,14 @@ from marey_motion.editing.inverse_kinematics.pose_kernels import (
 )
 from marey_motion.editing.inverse_kinematics.rotation_kernels import (
     TINY,
-    compiled,
     cross,
     direction,
     dot,
     exponential,
-    inverse,
     length,
     logarithm,
     minus,
     plus,
-    product,
-    put_rotation,
     put_vector,
     rotated,
     rotation_at,
@@ -37,6 +33,7 @@ from marey_motion.editing.inverse_kinematics.rotation_kernels import (
     unit,
     vector_at,
 )
+from marey_motion.kernels import compiled, inverse, product, put_rotation
 
 LONGEST_STEP_RAD = 1.0
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e8

@@ -7,19 +7,15 @@ import math
 from marey_motion.editing.inverse_kinematics.rotation_kernels import (
     TINY,
     about,
-    compiled,
     cross,
     direction,
     dot,
     exponential,
-    inverse,
     length,
     logarithm,
     minus,
     perpendicular,
     plus,
-    product,
-    put_rotation,
     put_vector,
     rotated,
     rotation_at,
@@ -28,6 +24,7 @@ from marey_motion.editing.inverse_kinematics.rotation_kernels import (
     unit,
     vector_at,
 )
+from marey_motion.kernels import compiled, inverse, product, put_rotation
 
 # Kinds of targets.
 POSITION, ORIENTATION, LOOK_AT = 0, 1, 2

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
-compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
+from marey_motion.kernels import compiled, product
 
 # Below this length a direction is rounding noise.
 TINY = 1e-12
@@ -25,11 +23,6 @@ def rotation_at(array, row):  # type: ignore[no-untyped-def]
 @compiled
 def put_vector(array, row, v):  # type: ignore[no-untyped-def]
     array[row, 0], array[row, 1], array[row, 2] = v
-
-
-@compiled
-def put_rotation(array, row, q):  # type: ignore[no-untyped-def]
-    array[row, 0], array[row, 1], array[row, 2], array[row, 3] = q
 
 
 @compiled
@@ -79,22 +72,6 @@ def perpendicular(a):  # type: ignore[no-untyped-def]
     elif z < x:
         axis = (0.0, 0.0, 1.0)
     return direction(cross(a, axis))
-
-
-@compiled
-def product(a, b):  # type: ignore[no-untyped-def]
-    """The rotation that does `b`, then `a`."""
-    return (
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    )
-
-
-@compiled
-def inverse(a):  # type: ignore[no-untyped-def]
-    return a[0], -a[1], -a[2], -a[3]
 
 
 @compiled

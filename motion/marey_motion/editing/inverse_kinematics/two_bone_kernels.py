@@ -9,22 +9,19 @@ import numpy as np
 from marey_motion.editing.inverse_kinematics.pose_kernels import place_joints
 from marey_motion.editing.inverse_kinematics.rotation_kernels import (
     between,
-    compiled,
     cross,
     direction,
     dot,
-    inverse,
     length,
     minus,
     plus,
-    product,
-    put_rotation,
     rotated,
     rotation_at,
     scaled,
     unit,
     vector_at,
 )
+from marey_motion.kernels import compiled, inverse, product, put_rotation
 
 # Radians: a limb bent by less bends about its hinge, one bent by more about the axis that it is bent about now.
 HINGED, TOLD = math.radians(15.0), math.radians(30.0)

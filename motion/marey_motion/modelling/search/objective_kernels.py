@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from marey_motion.kernels import compiled, inverse, product, put_rotation, rotate_vector
 
 POSITION, ORIENTATION, DIRECTION, POINT, HEADING, TIME = range(6)
 
@@ -20,32 +21,8 @@ _TINY = 1e-9
 # Angle below which series replace quotients of small numbers.
 _SMALL = 1e-4
 
-_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
 
-
-@_compiled
-def _product(a, b, out):  # type: ignore[no-untyped-def]
-    """out = a · b, of quaternions; out may be neither of them."""
-    out[0] = a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3]
-    out[1] = a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2]
-    out[2] = a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1]
-    out[3] = a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0]
-
-
-@_compiled
-def _turned(q, x, y, z):  # type: ignore[no-untyped-def]
-    """A vector turned by a unit quaternion."""
-    tx = 2.0 * (q[2] * z - q[3] * y)
-    ty = 2.0 * (q[3] * x - q[1] * z)
-    tz = 2.0 * (q[1] * y - q[2] * x)
-    return (
-        x + q[0] * tx + q[2] * tz - q[3] * ty,
-        y + q[0] * ty + q[3] * tx - q[1] * tz,
-        z + q[0] * tz + q[1] * ty - q[2] * tx,
-    )
-
-
-@_compiled
+@compiled
 def _pose(chains, latent, channels, local, positions, rotations):  # type: ignore[no-untyped-def]
     """Channels of the constrained frames, and where the joints on their chains are; lengths of raw quaternions last."""
     channels[:] = chains.mean
@@ -63,19 +40,19 @@ def _pose(chains, latent, channels, local, positions, rotations):  # type: ignor
             rotations[node] = local[node, :4]
             positions[node] = channels[first - 3 : first]
         else:
-            _product(rotations[parent], local[node], rotations[node])
+            put_rotation(rotations, node, product(rotations[parent], local[node]))
             offset = chains.offsets[node]
-            dx, dy, dz = _turned(rotations[parent], offset[0], offset[1], offset[2])
+            dx, dy, dz = rotate_vector(rotations[parent], offset[0], offset[1], offset[2])
             positions[node, 0] = positions[parent, 0] + dx
             positions[node, 1] = positions[parent, 1] + dy
             positions[node, 2] = positions[parent, 2] + dz
 
 
-@_compiled
+@compiled
 def _items(chains, placement, positions, rotations, points, turns):  # type: ignore[no-untyped-def]
     """What is tracked, in the world: sums of joint positions, and the rotation of one joint of each."""
     cos, sin = math.cos(placement[0]), math.sin(placement[0])
-    yaw = np.array((math.cos(0.5 * placement[0]), 0.0, math.sin(0.5 * placement[0]), 0.0))
+    yaw = (math.cos(0.5 * placement[0]), 0.0, math.sin(0.5 * placement[0]), 0.0)
     for item in range(points.shape[0]):
         points[item] = 0.0
         for term in range(chains.term_starts[item], chains.term_starts[item + 1]):
@@ -84,10 +61,10 @@ def _items(chains, placement, positions, rotations, points, turns):  # type: ign
         x, z, held = points[item, 0], points[item, 2], chains.held[item]
         points[item, 0] = cos * x + sin * z + held * placement[1]
         points[item, 2] = cos * z - sin * x + held * placement[2]
-        _product(yaw, rotations[chains.turned[item]], turns[item])
+        put_rotation(turns, item, product(yaw, rotations[chains.turned[item]]))
 
 
-@_compiled
+@compiled
 def _times(clocks, latent, first, log_steps, times):  # type: ignore[no-untyped-def]
     """Seconds since the beginning at each clock; the steps that they add up stay in `log_steps`.
 
@@ -112,7 +89,7 @@ def _times(clocks, latent, first, log_steps, times):  # type: ignore[no-untyped-
     return factor, lasting
 
 
-@_compiled
+@compiled
 def _angle_factors(sine, cosine):  # type: ignore[no-untyped-def]
     """Angle over its sine, and the derivative of that by the cosine."""
     angle = math.atan2(sine, cosine)
@@ -122,13 +99,10 @@ def _angle_factors(sine, cosine):  # type: ignore[no-untyped-def]
     return angle / sine, -(sine - angle * cosine) / (sine * sine * sine)
 
 
-@_compiled
+@compiled
 def _rotation_error(turn, target, out):  # type: ignore[no-untyped-def]
     """The rotation vector that takes the target to where the joint is turned; its length is the geodesic distance."""
-    w = turn[0] * target[0] + turn[1] * target[1] + turn[2] * target[2] + turn[3] * target[3]
-    x = -turn[0] * target[1] + turn[1] * target[0] - turn[2] * target[3] + turn[3] * target[2]
-    y = -turn[0] * target[2] + turn[1] * target[3] + turn[2] * target[0] - turn[3] * target[1]
-    z = -turn[0] * target[3] - turn[1] * target[2] + turn[2] * target[1] + turn[3] * target[0]
+    w, x, y, z = product(turn, inverse(target))
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
     sine = math.sqrt(x * x + y * y + z * z)
@@ -136,12 +110,12 @@ def _rotation_error(turn, target, out):  # type: ignore[no-untyped-def]
     out[0], out[1], out[2] = factor * x, factor * y, factor * z
 
 
-@_compiled
+@compiled
 def _aims(kind, row, rows, points, turns, pointing, wanted):  # type: ignore[no-untyped-def]
     """Where a joint's axis points, where it should, both of length 1, and how far the point to look at is."""
     item = rows.items[row]
     axis, target = rows.axes[row], rows.targets[row]
-    pointing[0], pointing[1], pointing[2] = _turned(turns[item], axis[0], axis[1], axis[2])
+    pointing[0], pointing[1], pointing[2] = rotate_vector(turns[item], axis[0], axis[1], axis[2])
     wanted[:] = target[:3]
     distance = 1.0
     if kind == POINT:
@@ -154,7 +128,7 @@ def _aims(kind, row, rows, points, turns, pointing, wanted):  # type: ignore[no-
     return distance
 
 
-@_compiled
+@compiled
 def _crossed(a, b, out):  # type: ignore[no-untyped-def]
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
@@ -162,7 +136,7 @@ def _crossed(a, b, out):  # type: ignore[no-untyped-def]
     return math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
 
 
-@_compiled
+@compiled
 def _residual(row, rows, points, turns, times, room, out):  # type: ignore[no-untyped-def]
     """Fill `out` (3,) with a constraint's error: metres, radians or seconds."""
     kind, item, target = rows.kinds[row], rows.items[row], rows.targets[row]
@@ -193,7 +167,7 @@ def _residual(row, rows, points, turns, times, room, out):  # type: ignore[no-un
             out *= _angle_factors(sine, cosine)[0]
 
 
-@_compiled
+@compiled
 def errors(chains, clocks, rows, placement, latents, out):  # type: ignore[no-untyped-def]
     """Fill `out` (n, rows) with how far latent vectors (n, L) miss each constraint: metres, radians or seconds."""
     nodes, items = chains.parents.shape[0], chains.turned.shape[0]
@@ -215,7 +189,7 @@ def errors(chains, clocks, rows, placement, latents, out):  # type: ignore[no-un
             out[n, row] = math.sqrt(square)
 
 
-@_compiled
+@compiled
 def costs(prices, errors, out):  # type: ignore[no-untyped-def]
     """Fill `out` (n,) with sums of errors (n, rows) times their prices (rows,), in the order of the rows."""
     for n in range(out.shape[0]):
@@ -225,7 +199,7 @@ def costs(prices, errors, out):  # type: ignore[no-untyped-def]
         out[n] = total
 
 
-@_compiled
+@compiled
 def track(chains, placement, latents, out):  # type: ignore[no-untyped-def]
     """Fill `out` (n, items, 3) with what is tracked of the motions of latent vectors (n, L), in the world."""
     nodes, items = chains.parents.shape[0], chains.turned.shape[0]

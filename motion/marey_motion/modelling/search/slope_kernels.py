@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from marey_motion.kernels import compiled, rotate_vector
 from marey_motion.modelling.search.objective_kernels import (
     DIRECTION,
     HEADING,
@@ -26,16 +26,13 @@ from marey_motion.modelling.search.objective_kernels import (
     _pose,
     _residual,
     _times,
-    _turned,
 )
 
 # Below it the limit is nearer than the quotient of small differences.
 _SMALL_ANGLE = 1e-3
 
-_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
 
-
-@_compiled
+@compiled
 def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-untyped-def]
     """Velocities (V, 3, k) of joints and angular velocities (V, 3, k), in the canonical frame, by each score."""
     for node in range(chains.parents.shape[0]):
@@ -44,7 +41,7 @@ def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-u
         arm = np.zeros(3)
         if parent >= 0:
             offset = chains.offsets[node]
-            arm[0], arm[1], arm[2] = _turned(rotations[parent], offset[0], offset[1], offset[2])
+            arm[0], arm[1], arm[2] = rotate_vector(rotations[parent], offset[0], offset[1], offset[2])
         for score in range(chains.directions.shape[0]):
             a, b, c, d = chains.directions[score, first : first + 4]
             # Twice the vector part of dq · conj(q): what of dq changes the length alone falls out.
@@ -56,7 +53,7 @@ def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-u
                 for axis in range(3):
                     shifts[node, axis, score] = chains.directions[score, first - 3 + axis]
             else:
-                turn_x, turn_y, turn_z = _turned(rotations[parent], turn_x, turn_y, turn_z)
+                turn_x, turn_y, turn_z = rotate_vector(rotations[parent], turn_x, turn_y, turn_z)
                 px, py, pz = spins[parent, 0, score], spins[parent, 1, score], spins[parent, 2, score]
                 spins[node, 0, score] = px + turn_x
                 spins[node, 1, score] = py + turn_y
@@ -66,7 +63,7 @@ def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-u
                 shifts[node, 2, score] = shifts[parent, 2, score] + px * arm[1] - py * arm[0]
 
 
-@_compiled
+@compiled
 def track(chains, placement, moved, latent, first, points, turns, point_slopes, turn_slopes):  # type: ignore[no-untyped-def]
     """Fill what is tracked, points (n, 3) and turns (n, 4), and its derivatives (n, 3, W), in the world."""
     nodes, scores = chains.parents.shape[0], chains.directions.shape[0]
@@ -93,7 +90,7 @@ def track(chains, placement, moved, latent, first, points, turns, point_slopes, 
         _add_turned(cos, sin, 1.0, spins[chains.turned[item]], first, turn_slopes[item])
 
 
-@_compiled
+@compiled
 def _add_turned(cos, sin, sign, slopes, first, out):  # type: ignore[no-untyped-def]
     """Add derivatives (3, k) in the canonical frame to those in the world."""
     for score in range(slopes.shape[1]):
@@ -103,7 +100,7 @@ def _add_turned(cos, sin, sign, slopes, first, out):  # type: ignore[no-untyped-
         out[2, first + score] += sign * (cos * z - sin * x)
 
 
-@_compiled
+@compiled
 def keep_time(clocks, latent, first, times, slopes):  # type: ignore[no-untyped-def]
     """Fill seconds (n,) at the clocks and their derivatives (n, W); the temporal numbers begin at `first`."""
     steps = np.empty(clocks.mean.shape[0])
@@ -127,7 +124,7 @@ def keep_time(clocks, latent, first, times, slopes):  # type: ignore[no-untyped-
                 slopes[clock, first + number] = factor * total - times[clock] * longer / lasting
 
 
-@_compiled
+@compiled
 def _hat(v, out):  # type: ignore[no-untyped-def]
     """The matrix that takes a vector to v times it."""
     out[0, 0], out[0, 1], out[0, 2] = 0.0, -v[2], v[1]
@@ -135,7 +132,7 @@ def _hat(v, out):  # type: ignore[no-untyped-def]
     out[2, 0], out[2, 1], out[2, 2] = -v[1], v[0], 0.0
 
 
-@_compiled
+@compiled
 def _multiply(a, b):  # type: ignore[no-untyped-def]
     out = np.zeros((3, 3))
     for i in range(3):
@@ -145,7 +142,7 @@ def _multiply(a, b):  # type: ignore[no-untyped-def]
     return out
 
 
-@_compiled
+@compiled
 def _orientation_slope(residual, by_turn):  # type: ignore[no-untyped-def]
     """Inverse of the left Jacobian of a rotation vector: it has no pole, up to half a turn."""
     angle = math.sqrt(residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2)
@@ -160,7 +157,7 @@ def _orientation_slope(residual, by_turn):  # type: ignore[no-untyped-def]
             by_turn[i, j] = (1.0 if i == j else 0.0) - 0.5 * hat[i, j] + factor * square[i, j]
 
 
-@_compiled
+@compiled
 def _aim_slopes(pointing, wanted, distance, by_point, by_turn):  # type: ignore[no-untyped-def]
     """Derivatives of angle / sin(angle) · (pointing × wanted); `distance` is 0 where the point may not move it."""
     across = np.empty(3)
@@ -183,7 +180,7 @@ def _aim_slopes(pointing, wanted, distance, by_point, by_turn):  # type: ignore[
                 by_point[i, j] = (along * wanted[j] - by_aim[i, j]) / distance
 
 
-@_compiled
+@compiled
 def _slopes_of(row, rows, points, turns, residual, by_point, by_turn):  # type: ignore[no-untyped-def]
     """Fill the derivatives (3, 3) of a constraint's error by the point and by the turn it looks at."""
     kind, item = rows.kinds[row], rows.items[row]
@@ -203,7 +200,7 @@ def _slopes_of(row, rows, points, turns, residual, by_point, by_turn):  # type: 
         _aim_slopes(pointing, wanted, distance if kind == POINT else 0.0, by_point, by_turn)
 
 
-@_compiled
+@compiled
 def linearise(rows, points, turns, times, point_slopes, turn_slopes, time_slopes, residuals, slopes):  # type: ignore[no-untyped-def]
     """Fill errors (m, 3) of constraints and their derivatives (m, 3, W)."""
     room, by_point, by_turn = np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 3))

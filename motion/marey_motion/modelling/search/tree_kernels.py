@@ -6,15 +6,14 @@ Everything runs in one thread and in a fixed order: the same samples and the sam
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from marey_motion.kernels import compiled
 
 MOST_ROUNDS = 25
 """Rounds of Lloyd's algorithm; what is left to gain after them is little."""
 
-_compiled = njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")
 
-
-@_compiled
+@compiled
 def _square_distance(a, b):  # type: ignore[no-untyped-def]
     total = 0.0
     for d in range(a.shape[0]):
@@ -23,7 +22,7 @@ def _square_distance(a, b):  # type: ignore[no-untyped-def]
     return total
 
 
-@_compiled
+@compiled
 def _place_centres(features, members, randoms, nearest, centres):  # type: ignore[no-untyped-def]
     """Choose members as centres, far ones more likely, as k-means++ (Arthur and Vassilvitskii 2007); how many."""
     count = members.shape[0]
@@ -48,7 +47,7 @@ def _place_centres(features, members, randoms, nearest, centres):  # type: ignor
     return centres.shape[0]
 
 
-@_compiled
+@compiled
 def _assign(features, members, centres, labels):  # type: ignore[no-untyped-def]
     """Give each member to its nearest centre, the first of equals; how many changed."""
     changed = 0
@@ -63,7 +62,7 @@ def _assign(features, members, centres, labels):  # type: ignore[no-untyped-def]
     return changed
 
 
-@_compiled
+@compiled
 def _average(features, members, labels, centres, sizes):  # type: ignore[no-untyped-def]
     """Move each centre to the mean of what it was given; one that was given nothing stays."""
     sums = np.zeros(centres.shape)
@@ -77,7 +76,7 @@ def _average(features, members, labels, centres, sizes):  # type: ignore[no-unty
             centres[centre] = sums[centre] / sizes[centre]
 
 
-@_compiled
+@compiled
 def _split(features, members, randoms, sizes, room):  # type: ignore[no-untyped-def]
     """Order members by cluster, changed in place, and fill the clusters' sizes; how many clusters there are."""
     nearest, labels, ordered = room
@@ -107,7 +106,7 @@ def _split(features, members, randoms, sizes, room):  # type: ignore[no-untyped-
     return filled
 
 
-@_compiled
+@compiled
 def grow(features, randoms, branching, leaf_size, depth, order, starts, sizes, children):  # type: ignore[no-untyped-def]
     """Split samples (n, D) again and again, level by level; how many nodes there are.
 
@@ -138,7 +137,7 @@ def grow(features, randoms, branching, leaf_size, depth, order, starts, sizes, c
     return nodes
 
 
-@_compiled
+@compiled
 def locate(sizes, children, starts):  # type: ignore[no-untyped-def]
     """Fill each node's first sample: where its parent's begin, after those of the siblings before it."""
     starts[0] = 0
@@ -151,7 +150,7 @@ def locate(sizes, children, starts):  # type: ignore[no-untyped-def]
         following += children[node]
 
 
-@_compiled
+@compiled
 def average(samples, starts, sizes, means):  # type: ignore[no-untyped-def]
     """Fill the mean of each node's samples."""
     means[:] = 0.0
