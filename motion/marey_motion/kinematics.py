@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.arrays import AnyFloats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.floating[Any]]
 
 CONTACT_SPEED_M_S = 0.15
 CONTACT_WINDOW_S = 0.1
@@ -43,12 +42,12 @@ def global_rotations(clip: Clip) -> NDArray[np.float32]:
 
 def forward_kinematics(
     skeleton: Skeleton,
-    poses: Floats,
+    poses: AnyFloats,
     *,
-    translations: Floats | None = None,
+    translations: AnyFloats | None = None,
     translated_joints: Sequence[int] = (),
     end_sites: bool = False,
-) -> Floats:
+) -> AnyFloats:
     """Global joint positions (F, J, 3), in metres and the type of `poses`, of poses that need not belong to a clip.
 
     Parameters
@@ -85,7 +84,7 @@ def forward_kinematics(
     return out.reshape(len(poses), points, 3)
 
 
-def as_global_rotations(skeleton: Skeleton, rotations: Floats) -> Floats:
+def as_global_rotations(skeleton: Skeleton, rotations: AnyFloats) -> AnyFloats:
     """Global rotations (F, J, 4) of local ones (F, J, 4)."""
     from marey_motion import kinematics_kernels
 
@@ -106,25 +105,25 @@ def as_kernel_input(array: NDArray[Any]) -> NDArray[Any]:
     return view
 
 
-def as_local_rotations(skeleton: Skeleton, rotations: Floats) -> Floats:
+def as_local_rotations(skeleton: Skeleton, rotations: AnyFloats) -> AnyFloats:
     """Local rotations (..., J, 4) of global ones (..., J, 4)."""
     parents = rotations[..., skeleton.parents[1:], :]
     inner = quaternions.multiply(quaternions.conjugate(parents), rotations[..., 1:, :])
     return np.concatenate((rotations[..., :1, :], inner), axis=-2)
 
 
-def velocities(positions: Floats, frame_rate_hz: float) -> Floats:
+def velocities(positions: AnyFloats, frame_rate_hz: float) -> AnyFloats:
     """Velocities (F, ...) in m/s of positions (F, ...): central differences, linearly extrapolated at both ends."""
     steps = np.diff(np.asarray(positions, dtype=np.float64), axis=0) * frame_rate_hz
     return quaternions.rate_from_steps(steps, len(positions)).astype(positions.dtype, copy=False)
 
 
-def ground_projection(positions: Floats) -> Floats:
+def ground_projection(positions: AnyFloats) -> AnyFloats:
     """The (x, z) part (..., 2) of positions (..., 3)."""
     return positions[..., (0, 2)]
 
 
-def forward_directions(positions: Floats, left: Sequence[int], right: Sequence[int]) -> NDArray[np.float64]:
+def forward_directions(positions: AnyFloats, left: Sequence[int], right: Sequence[int]) -> NDArray[np.float64]:
     """Where the body faces on the ground: unit (x, z) directions (F, 2).
 
     Parameters
@@ -146,7 +145,7 @@ def forward_directions(positions: Floats, left: Sequence[int], right: Sequence[i
     return directions
 
 
-def forward_vectors(positions: Floats, left: Sequence[int], right: Sequence[int]) -> NDArray[np.float64]:
+def forward_vectors(positions: AnyFloats, left: Sequence[int], right: Sequence[int]) -> NDArray[np.float64]:
     """As `forward_directions`, not brought to length 1 (F, 2): one under `SHORTEST_LATERAL_M` tells no direction."""
     if not left or len(left) != len(right):
         raise MotionError("a heading needs at least one pair of left and right joints", code="heading-undefined")
@@ -154,18 +153,18 @@ def forward_vectors(positions: Floats, left: Sequence[int], right: Sequence[int]
     return np.stack((-lateral[:, 2], lateral[:, 0]), axis=1)
 
 
-def headings(directions: Floats) -> NDArray[np.float64]:
+def headings(directions: AnyFloats) -> NDArray[np.float64]:
     """Heading theta (F,) in radians, continuous in time, of directions (F, 2) on the ground."""
     return np.unwrap(np.arctan2(directions[:, 0], directions[:, 1]).astype(np.float64))
 
 
-def turn_rates(heading: Floats, frame_rate_hz: float) -> NDArray[np.float64]:
+def turn_rates(heading: AnyFloats, frame_rate_hz: float) -> NDArray[np.float64]:
     """Turning speed omega (F,) in rad/s, positive to the left, of continuous headings (F,)."""
     return np.asarray(velocities(heading, frame_rate_hz), dtype=np.float64)
 
 
 def foot_contacts(
-    toes: Floats,
+    toes: AnyFloats,
     frame_rate_hz: float,
     *,
     speed_limit_m_s: float = CONTACT_SPEED_M_S,

@@ -8,13 +8,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.arrays import Floats, Ints
 from marey_motion.motion import Motion
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 class LoopSeam(NamedTuple):

@@ -9,13 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.arrays import AnyInts, Floats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.integer]
 
 REFLECTION = np.diag([-1.0, 1.0, 1.0])
 HALF_TURN_ABOUT_X = np.array([0.0, 1.0, 0.0, 0.0])
@@ -44,7 +42,7 @@ class _Mirror:
     carried: NDArray[np.bool_]
 
 
-def mirror_clip(clip: Clip, partners: Ints) -> Clip:
+def mirror_clip(clip: Clip, partners: AnyInts) -> Clip:
     """The motion seen in a mirror, left limbs doing what right ones did: global positions reflected in x.
 
     Exact where both sides have the same bone lengths, whatever the rest pose and the joints' local axes; twice is the
@@ -69,7 +67,7 @@ def mirror_clip(clip: Clip, partners: Ints) -> Clip:
     return mirrored.as_clip(clip.skeleton, clip.frame_rate_hz)
 
 
-def mirror_motion(skeleton: Skeleton, partners: Ints, motion: Motion) -> Motion:
+def mirror_motion(skeleton: Skeleton, partners: AnyInts, motion: Motion) -> Motion:
     """As `mirror_clip`, in double precision."""
     mirror = _mirror_of(skeleton, tuple(int(partner) for partner in partners))
     rotations = quaternions.multiply(mirror.outer, motion.rotations[:, mirror.sources])

@@ -9,17 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import kinematics, quaternions
+from marey_motion.arrays import AnyFloats
 from marey_motion.clip import Clip
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.rigs.axes import bone_end
-
-Floats = NDArray[np.floating[Any]]
 
 # Bones that turn less are left as their joints' rotations have them.
 LEAST_TURN_DEG = 0.1
@@ -85,7 +83,7 @@ def follow_moved_bones(clip: Clip, joints: Mapping[str, int]) -> FollowedBones:
     return FollowedBones(local.reshape(len(own), -1).astype(np.float32), largest)
 
 
-def _turns(rigid: Floats, moved: Floats) -> Floats:
+def _turns(rigid: AnyFloats, moved: AnyFloats) -> AnyFloats:
     """The shortest rotations (F, 4) between bones (F, 3); none where one of them has no length."""
     turns = quaternions.identity(len(rigid)).astype(np.float64)
     lengths = [np.linalg.norm(bones, axis=1) for bones in (rigid, moved)]

@@ -13,10 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from marey_motion.arrays import AnyFloats, Floats
 from marey_motion.errors import RotationError
-
-Floats = NDArray[np.floating[Any]]
-Wide = NDArray[np.float64]
 
 # Below this length a direction is rounding noise.
 TINY = 1e-12
@@ -28,38 +26,38 @@ NEARLY_OPPOSITE = 0.1
 EULER_BLOCK = 4096
 
 
-def identity(*leading: int, dtype: type[np.floating[Any]] = np.float64) -> Floats:
+def identity(*leading: int, dtype: type[np.floating[Any]] = np.float64) -> AnyFloats:
     """Rotations that change nothing, shape (*leading, 4)."""
     result = np.zeros((*leading, 4), dtype=dtype)
     result[..., 0] = 1.0
     return result
 
 
-def multiply(a: ArrayLike, b: ArrayLike) -> Floats:
+def multiply(a: ArrayLike, b: ArrayLike) -> AnyFloats:
     """The rotation that does `b`, then `a`: the Hamilton product a·b, shape (..., 4)."""
     (a, b), dtype = _widened((a, 4), (b, 4))
     return _product(a, b).astype(dtype, copy=False)
 
 
-def conjugate(q: ArrayLike) -> Floats:
+def conjugate(q: ArrayLike) -> AnyFloats:
     """The inverse of unit rotations (..., 4)."""
     (q,), dtype = _widened((q, 4))
     return (q * (1.0, -1.0, -1.0, -1.0)).astype(dtype, copy=False)
 
 
-def normalise(q: ArrayLike) -> Floats:
+def normalise(q: ArrayLike) -> AnyFloats:
     """Quaternions (..., 4) at unit length; `RotationError` where one has no length."""
     (q,), dtype = _widened((q, 4))
     return _unit(q, "quaternion").astype(dtype, copy=False)
 
 
-def rotate_vectors(q: ArrayLike, v: ArrayLike) -> Floats:
+def rotate_vectors(q: ArrayLike, v: ArrayLike) -> AnyFloats:
     """Vectors (..., 3) turned by unit rotations (..., 4), shape (..., 3)."""
     (q, v), dtype = _widened((q, 4), (v, 3))
     return _rotated(q, v).astype(dtype, copy=False)
 
 
-def from_matrix(matrix: ArrayLike) -> Floats:
+def from_matrix(matrix: ArrayLike) -> AnyFloats:
     """Rotations (..., 4) of rotation matrices (..., 3, 3), which act on column vectors.
 
     All four of Shepperd's (1978) forms are laid out as rows of 4·q·qᵀ; the row with the largest diagonal is exact
@@ -81,7 +79,7 @@ def from_matrix(matrix: ArrayLike) -> Floats:
     return _unit(row, "quaternion").astype(dtype, copy=False)
 
 
-def as_matrix(q: ArrayLike) -> Floats:
+def as_matrix(q: ArrayLike) -> AnyFloats:
     """Rotation matrices (..., 3, 3), acting on column vectors, of unit rotations (..., 4)."""
     (q,), dtype = _widened((q, 4))
     w, x, y, z = _parts(q)
@@ -98,14 +96,14 @@ def as_matrix(q: ArrayLike) -> Floats:
     return m.astype(dtype, copy=False)
 
 
-def from_axis_angle(axis: ArrayLike, angle_rad: ArrayLike) -> Floats:
+def from_axis_angle(axis: ArrayLike, angle_rad: ArrayLike) -> AnyFloats:
     """Rotations (..., 4) by `angle_rad` (...) about the directions `axis` (..., 3), of any length but zero."""
     (axis,), dtype = _widened((axis, 3))
     half = 0.5 * np.asarray(angle_rad, dtype=np.float64)[..., None]
     return _joined(np.cos(half), _unit(axis, "axis") * np.sin(half)).astype(dtype, copy=False)
 
 
-def from_rotation_vector(vector: ArrayLike) -> Floats:
+def from_rotation_vector(vector: ArrayLike) -> AnyFloats:
     """Rotations (..., 4) about the vectors (..., 3) by their length in radians (the exponential map)."""
     (vector,), dtype = _widened((vector, 3))
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)
@@ -113,21 +111,21 @@ def from_rotation_vector(vector: ArrayLike) -> Floats:
     return _joined(np.cos(0.5 * angle), 0.5 * np.sinc(angle / (2.0 * np.pi)) * vector).astype(dtype, copy=False)
 
 
-def as_rotation_vector(q: ArrayLike) -> Floats:
+def as_rotation_vector(q: ArrayLike) -> AnyFloats:
     """Axis times angle (..., 3), of at most half a turn, of unit rotations (..., 4) (the logarithmic map)."""
     (q,), dtype = _widened((q, 4))
     return _rotation_vector(q).astype(dtype, copy=False)
 
 
-def angle_between(a: ArrayLike, b: ArrayLike) -> Floats:
+def angle_between(a: ArrayLike, b: ArrayLike) -> AnyFloats:
     """Angle (...) of the shortest rotation from `a` to `b`, both (..., 4), in 0 to pi."""
     (a, b), dtype = _widened((a, 4), (b, 4))
     turn = _product(a * (1.0, -1.0, -1.0, -1.0), b)
-    angle: Floats = 2.0 * np.arctan2(np.linalg.norm(turn[..., 1:], axis=-1), np.abs(turn[..., 0]))
+    angle: AnyFloats = 2.0 * np.arctan2(np.linalg.norm(turn[..., 1:], axis=-1), np.abs(turn[..., 0]))
     return angle.astype(dtype, copy=False)
 
 
-def from_euler(order: str, angles_rad: ArrayLike, *, intrinsic: bool = True) -> Floats:
+def from_euler(order: str, angles_rad: ArrayLike, *, intrinsic: bool = True) -> AnyFloats:
     """Rotations (..., 4) of angles (..., n) about the n axes named in `order`, one to three letters of x, y and z.
 
     Intrinsic rotations turn about the axes of the moving frame in the order written, as in the channels of BVH: "zxy"
@@ -143,7 +141,7 @@ def from_euler(order: str, angles_rad: ArrayLike, *, intrinsic: bool = True) -> 
     return result.reshape(*angles.shape[:-1], 4).astype(dtype, copy=False)
 
 
-def as_euler(q: ArrayLike, order: str, *, intrinsic: bool = True) -> Floats:
+def as_euler(q: ArrayLike, order: str, *, intrinsic: bool = True) -> AnyFloats:
     """Angles (..., 3) in radians about three axes, such as "zxy", of unit rotations (..., 4); see `from_euler`.
 
     The middle angle is in -pi/2 to pi/2, or in 0 to pi where first and last axis are the same. In gimbal lock only the
@@ -176,7 +174,7 @@ def as_euler(q: ArrayLike, order: str, *, intrinsic: bool = True) -> Floats:
     return (angles if intrinsic else angles[..., ::-1]).astype(dtype, copy=False)
 
 
-def slerp(a: ArrayLike, b: ArrayLike, t: ArrayLike) -> Floats:
+def slerp(a: ArrayLike, b: ArrayLike, t: ArrayLike) -> AnyFloats:
     """Rotations at fraction `t` (...) of the shorter arc from `a` to `b`, both (..., 4) (Shoemake 1985)."""
     (a, b), dtype = _widened((a, 4), (b, 4))
     t = np.asarray(t, dtype=np.float64)[..., None]
@@ -189,7 +187,7 @@ def slerp(a: ArrayLike, b: ArrayLike, t: ArrayLike) -> Floats:
     return _unit(result, "quaternion").astype(dtype, copy=False)
 
 
-def between_vectors(start: ArrayLike, end: ArrayLike, *, half_turn_axis: ArrayLike | None = None) -> Floats:
+def between_vectors(start: ArrayLike, end: ArrayLike, *, half_turn_axis: ArrayLike | None = None) -> AnyFloats:
     """The shortest rotations (..., 4) from directions `start` to directions `end`, both (..., 3).
 
     Opposite directions have no shortest rotation: those turn half about `half_turn_axis` (..., 3), made perpendicular
@@ -208,7 +206,7 @@ def between_vectors(start: ArrayLike, end: ArrayLike, *, half_turn_axis: ArrayLi
     return _unit(result, "quaternion").astype(dtype, copy=False)
 
 
-def perpendicular(vector: ArrayLike, direction: ArrayLike) -> Floats:
+def perpendicular(vector: ArrayLike, direction: ArrayLike) -> AnyFloats:
     """The unit part (..., 3) of `vector` at a right angle to `direction`; `RotationError` where they are parallel."""
     (vector, direction), dtype = _widened((vector, 3), (direction, 3))
     direction = _unit(direction, "direction")
@@ -216,7 +214,7 @@ def perpendicular(vector: ArrayLike, direction: ArrayLike) -> Floats:
     return _unit(rest, "perpendicular part").astype(dtype, copy=False)
 
 
-def twist_swing(q: ArrayLike, axis: ArrayLike) -> tuple[Floats, Floats]:
+def twist_swing(q: ArrayLike, axis: ArrayLike) -> tuple[AnyFloats, AnyFloats]:
     """Unit rotations (..., 4) as twist about the direction `axis` (..., 3), then swing: q = swing · twist.
 
     The swing's axis is perpendicular to `axis`. A swing of half a turn leaves the twist open; it is none then.
@@ -231,7 +229,7 @@ def twist_swing(q: ArrayLike, axis: ArrayLike) -> tuple[Floats, Floats]:
     return twist.astype(dtype, copy=False), swing.astype(dtype, copy=False)
 
 
-def unroll(q: ArrayLike, axis: int = 0) -> Floats:
+def unroll(q: ArrayLike, axis: int = 0) -> AnyFloats:
     """The same rotations (..., 4) with signs chosen so that neighbours along `axis` (time) are close.
 
     q and -q are one rotation; the first frame keeps its sign and each next one takes that of the nearer.
@@ -243,7 +241,7 @@ def unroll(q: ArrayLike, axis: int = 0) -> Floats:
     return np.moveaxis(q * np.cumprod(signs, axis=0)[..., None], 0, axis).astype(dtype, copy=False)
 
 
-def angular_velocity(q: ArrayLike, frame_rate_hz: float) -> Floats:
+def angular_velocity(q: ArrayLike, frame_rate_hz: float) -> AnyFloats:
     """Angular velocity (F, ..., 3) in rad/s, in the frame the rotations (F, ..., 4) map to.
 
     The shortest rotation to the next frame, averaged over both neighbours; at the ends, their linear extrapolation.
@@ -253,7 +251,7 @@ def angular_velocity(q: ArrayLike, frame_rate_hz: float) -> Floats:
     return rate_from_steps(steps, len(q)).astype(dtype, copy=False)
 
 
-def rate_from_steps(steps: Wide, frame_count: int) -> Wide:
+def rate_from_steps(steps: Floats, frame_count: int) -> Floats:
     """Rates at frames (F, ...) from those between frames (F - 1, ...): means inside, extrapolated at the ends."""
     rate = np.zeros((frame_count, *steps.shape[1:]))
     if frame_count == 2:
@@ -265,7 +263,7 @@ def rate_from_steps(steps: Wide, frame_count: int) -> Wide:
     return rate
 
 
-def _widened(*arguments: tuple[ArrayLike, int]) -> tuple[list[Wide], np.dtype[Any]]:
+def _widened(*arguments: tuple[ArrayLike, int]) -> tuple[list[Floats], np.dtype[Any]]:
     """The arguments as float64, their last axis checked, and the floating type the result should have."""
     arrays = [np.asarray(values) for values, _ in arguments]
     for array, (_, size) in zip(arrays, arguments, strict=True):
@@ -275,13 +273,13 @@ def _widened(*arguments: tuple[ArrayLike, int]) -> tuple[list[Wide], np.dtype[An
     return [array.astype(np.float64, copy=False) for array in arrays], np.result_type(*floating)
 
 
-def _euler_block(axes: tuple[int, ...], angles: Wide, result: Wide, *, intrinsic: bool) -> None:
+def _euler_block(axes: tuple[int, ...], angles: Floats, result: Floats, *, intrinsic: bool) -> None:
     """Fill `result` (4, n) from `angles` (turns, n), multiplying one turn about a coordinate axis at a time."""
     half = 0.5 * np.ascontiguousarray(angles)
     cosines, sines = np.cos(half), np.sin(half)
     turns = list(zip(axes, cosines, sines, strict=True))
-    w: Wide = np.ones(angles.shape[1])
-    v: list[Wide] = [np.zeros(angles.shape[1]) for _ in range(3)]
+    w: Floats = np.ones(angles.shape[1])
+    v: list[Floats] = [np.zeros(angles.shape[1]) for _ in range(3)]
     for axis, c, s in turns if intrinsic else reversed(turns):
         i, j, k = axis, (axis + 1) % 3, (axis + 2) % 3
         w, v[i], v[j], v[k] = w * c - v[i] * s, v[i] * c + w * s, v[j] * c + v[k] * s, v[k] * c - v[j] * s
@@ -289,11 +287,11 @@ def _euler_block(axes: tuple[int, ...], angles: Wide, result: Wide, *, intrinsic
     result[1:] = v
 
 
-def _parts(q: Wide) -> tuple[Wide, ...]:
+def _parts(q: Floats) -> tuple[Floats, ...]:
     return tuple(q[..., component] for component in range(q.shape[-1]))
 
 
-def _joined(scalar: Wide, vector: Wide) -> Wide:
+def _joined(scalar: Floats, vector: Floats) -> Floats:
     leading = np.broadcast_shapes(scalar.shape[:-1], vector.shape[:-1])
     result = np.empty((*leading, 4))
     result[..., :1] = scalar
@@ -301,7 +299,7 @@ def _joined(scalar: Wide, vector: Wide) -> Wide:
     return result
 
 
-def _product(a: Wide, b: Wide) -> Wide:
+def _product(a: Floats, b: Floats) -> Floats:
     aw, ax, ay, az = _parts(a)
     bw, bx, by, bz = _parts(b)
     result = np.empty((*np.broadcast_shapes(a.shape[:-1], b.shape[:-1]), 4))
@@ -312,7 +310,7 @@ def _product(a: Wide, b: Wide) -> Wide:
     return result
 
 
-def _cross(a: Wide, b: Wide) -> Wide:
+def _cross(a: Floats, b: Floats) -> Floats:
     ax, ay, az = _parts(a)
     bx, by, bz = _parts(b)
     result = np.empty(np.broadcast_shapes(a.shape, b.shape))
@@ -322,12 +320,12 @@ def _cross(a: Wide, b: Wide) -> Wide:
     return result
 
 
-def _rotated(q: Wide, v: Wide) -> Wide:
+def _rotated(q: Floats, v: Floats) -> Floats:
     twice = 2.0 * _cross(q[..., 1:], v)
     return v + q[..., :1] * twice + _cross(q[..., 1:], twice)
 
 
-def _between_opposite(start: Wide, end: Wide, wished: NDArray[Any] | None) -> Wide:
+def _between_opposite(start: Floats, end: Floats, wished: NDArray[Any] | None) -> Floats:
     """Half a turn about a perpendicular of `start`, then the small turn left from -start to `end`, all (n, 3)."""
     candidates = [_cross(start, end), np.eye(3)[np.argmin(np.abs(start), axis=-1)]]
     if wished is not None:
@@ -340,22 +338,22 @@ def _between_opposite(start: Wide, end: Wide, wished: NDArray[Any] | None) -> Wi
     return _product(_unit(rest, "quaternion"), _joined(np.zeros(1), _unit(axis, "axis")))
 
 
-def _rotation_vector(q: Wide) -> Wide:
+def _rotation_vector(q: Floats) -> Floats:
     q = np.where(q[..., :1] < 0.0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     half = np.arctan2(sine, q[..., :1])
-    vector: Wide = 2.0 * q[..., 1:] / np.sinc(half / np.pi)
+    vector: Floats = 2.0 * q[..., 1:] / np.sinc(half / np.pi)
     return vector
 
 
-def _unit(v: Wide, what: str) -> Wide:
-    length: Wide = np.linalg.norm(v, axis=-1, keepdims=True)
+def _unit(v: Floats, what: str) -> Floats:
+    length: Floats = np.linalg.norm(v, axis=-1, keepdims=True)
     if not np.all(length > TINY):
         raise RotationError(f"a {what} of length zero has no direction")
     return v / length
 
 
-def _check_orthonormal(m: Wide) -> None:
+def _check_orthonormal(m: Floats) -> None:
     error = np.abs(np.einsum("...ik,...jk->...ij", m, m) - np.eye(3)).max(axis=(-2, -1), initial=0.0)
     determinant = np.sum(_cross(m[..., 0, :], m[..., 1, :]) * m[..., 2, :], axis=-1)
     wrong = ~(error <= 1e-3) | ~(determinant > 0.0)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError
 from marey_motion.looping import LoopSeam, continue_motion
 from marey_motion.motion import Motion
-
-Floats = NDArray[np.float64]
 
 SAME_RATE = 1e-9
 # What a frame adds to a cubic spline falls to a quarter from one frame to the next: nothing is left after so many.

@@ -17,20 +17,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.arrays import AnyFloats
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, MappingError
 from marey_motion.moved_bones import FollowedBones, follow_moved_bones
 from marey_motion.rigs import ESSENTIAL_JOINTS, STANDARD_JOINTS, JointAxes, JointMapping
 from marey_motion.rigs.standard import SIDES
 from marey_motion.skeleton import Skeleton, same_hierarchy
-
-Floats = NDArray[np.floating[Any]]
 
 FEWEST_ESSENTIAL = 8  # of the essential joints: a pelvis, and more than the legs or the arms alone
 SAME_SKELETON_M = 1e-5  # by which offsets may differ that went through a file
@@ -299,22 +297,22 @@ def _are_same_rig(source: Skeleton, target: Skeleton) -> bool:
     return bool(np.all(turned < 1e-4) and np.all(along[1:] >= SAME_DIRECTION * lengths[1:]))
 
 
-def _position_in_world(clip: Clip, joint: int) -> Floats:
+def _position_in_world(clip: Clip, joint: int) -> AnyFloats:
     """Positions (F, 3) of one joint of a clip, metres."""
     moved = _offsets_by_joint(clip.translations, clip.translated_joints)
     return clip.root_translations + _position_from_root(clip.skeleton, clip.rotations, joint, moved)
 
 
-def _offsets_by_joint(translations: NDArray[np.float32] | None, joints: tuple[int, ...]) -> dict[int, Floats]:
+def _offsets_by_joint(translations: NDArray[np.float32] | None, joints: tuple[int, ...]) -> dict[int, AnyFloats]:
     """Offsets (F, 3) of the joints whose offset is not constant."""
     return {} if translations is None else {joint: translations[:, slot] for slot, joint in enumerate(joints)}
 
 
 def _position_from_root(
-    skeleton: Skeleton, rotations: Floats, joint: int, moved: Mapping[int, Floats] = MappingProxyType({})
-) -> Floats:
+    skeleton: Skeleton, rotations: AnyFloats, joint: int, moved: Mapping[int, AnyFloats] = MappingProxyType({})
+) -> AnyFloats:
     """Vectors (F, 3) from the root to one joint in the world; `moved` has the offsets (F, 3) that are not constant."""
-    position: Floats = np.zeros((len(rotations), 3))
+    position: AnyFloats = np.zeros((len(rotations), 3))
     for step in skeleton.path_to_root(joint)[:-1]:
         offset = moved.get(step, skeleton.offsets[step])
         rotation = rotations[:, skeleton.parents[step]].astype(np.float64)

@@ -7,13 +7,11 @@ the body leaves its path. So the body goes first here, and they follow.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.arrays import Floats
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.float64]
 
 STILL = 1e-5
 """Components of rotations that do not turn vary by less: single precision and its rounding."""

@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Placement
 from marey_motion.alignment.canonical import placed, to_canonical
@@ -28,6 +27,7 @@ from marey_motion.alignment.segments import (
 )
 from marey_motion.alignment.signs import consistent_signs
 from marey_motion.alignment.warp import inverse, warped
+from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
@@ -35,8 +35,6 @@ from marey_motion.mirroring import mirror_clip
 from marey_motion.motion import Motion
 from marey_motion.resampling import resample_motion
 from marey_motion.skeleton import Skeleton, same_hierarchy
-
-Floats = NDArray[np.float64]
 
 MEDOID, NEAREST_MEAN_LENGTH = "medoid", "nearest_mean_length"
 LEAST_CLIPS = 2

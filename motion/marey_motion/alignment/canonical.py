@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import quaternions
 from marey_motion.alignment.aligned import Placement
+from marey_motion.arrays import AnyFloats, Floats
 from marey_motion.kinematics import forward_directions, headings
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
 from marey_motion.root_carrier import carried_at, spins_of
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.float64]
 
 
 def to_canonical(motion: Motion, body: MatchingBody, *, keep_height: bool = True) -> tuple[Motion, Placement]:
@@ -59,7 +57,7 @@ def _turn(angle_rad: float) -> Floats:
     return np.asarray(quaternions.from_axis_angle((0.0, 1.0, 0.0), angle_rad), dtype=np.float64)
 
 
-def _carried(motion: Motion, skeleton: Skeleton, carrier: int, turn: Floats, places: quaternions.Floats) -> Motion:
+def _carried(motion: Motion, skeleton: Skeleton, carrier: int, turn: Floats, places: AnyFloats) -> Motion:
     """The motion with the joint `carrier` at `places` (F, 3), and turned in the world by `turn`."""
     spins = quaternions.multiply(turn, spins_of(motion, skeleton, carrier))
     return carried_at(motion, skeleton, carrier, np.asarray(places, np.float64), np.asarray(spins, np.float64))

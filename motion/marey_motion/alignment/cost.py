@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 
-Floats = NDArray[np.float64]
 CostMethod = Literal["turned", "plain"]
 
 LONGEST_WINDOW = 61

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
-
-Floats = NDArray[np.float64]
 
 FRAMES_PER_BOX = 16
 # A bound is a sum of many terms: lowered by more than its rounding, it stays one.

@@ -7,12 +7,11 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion.alignment.cost import CostOptions, CostPoints, costs_between
 from marey_motion.alignment.dtw import least_total
+from marey_motion.arrays import Floats
 
-Floats = NDArray[np.float64]
 Advance = Callable[[int, int], None]
 """Told how many alignments are done, and of how many."""
 

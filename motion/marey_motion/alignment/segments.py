@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from marey_motion.alignment.dtw import Alignment
 from marey_motion.alignment.warp import time_function
+from marey_motion.arrays import Floats
 from marey_motion.editing.annotations.layers import Layer
 from marey_motion.errors import AnnotationError
-
-Floats = NDArray[np.float64]
 
 
 class Cut(NamedTuple):

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import quaternions
-
-Floats = NDArray[np.float64]
+from marey_motion.arrays import Floats
 
 
 def consistent_signs(rotations: Floats, reference: Floats) -> Floats:

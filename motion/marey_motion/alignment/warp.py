@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marey_motion import quaternions
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.motion import Motion
-
-Floats = NDArray[np.float64]
 
 LEAST_SLOPE = 0.01
 # A slope is raised by a little more than needed, so that sums of slopes keep it in spite of rounding.

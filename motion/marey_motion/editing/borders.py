@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.arrays import Floats
 from marey_motion.editing.take import Take
-
-Floats = NDArray[np.float64]
 
 
 def range_weights(take: Take, frames: tuple[int, int | None] | None, border_s: float) -> tuple[slice, Floats]:

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import kinematics, quaternions
+from marey_motion.arrays import Floats, Ints
 from marey_motion.editing.allowance import PER_MEETING, PER_MET_NUMBER, Allowance
 from marey_motion.editing.displacement import displace, windows_around
 from marey_motion.editing.inverse_kinematics.solving import Limb, Solver, limb_targets, measure_residuals, solve
@@ -27,9 +27,6 @@ from marey_motion.editing.inverse_kinematics.targets import (
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 # Rounds in which constraints of different ranges are met in turn, and the metres or radians that they may still be
 # missed by to end them.

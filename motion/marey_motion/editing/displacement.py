@@ -13,14 +13,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.arrays import AnyInts, Floats
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.integer]
 
 # Values of a cubic B-spline at its control points' frames.
 WEIGHTS = np.array([1.0, 4.0, 1.0]) / 6.0
@@ -48,7 +45,7 @@ class Window(NamedTuple):
     smooth_stop: bool = True
 
 
-def windows_around(frames: Ints, blend_frames: int, frame_count: int) -> tuple[Window, ...]:
+def windows_around(frames: AnyInts, blend_frames: int, frame_count: int) -> tuple[Window, ...]:
     """Windows that blend the given frames in and out over so many frames; those that would overlap become one.
 
     Parameters
@@ -69,7 +66,7 @@ def windows_around(frames: Ints, blend_frames: int, frame_count: int) -> tuple[W
     return tuple(windows)
 
 
-def displace(motion: Motion, frames: Ints, changed: Motion, windows: Sequence[Window]) -> Motion:
+def displace(motion: Motion, frames: AnyInts, changed: Motion, windows: Sequence[Window]) -> Motion:
     """The motion with some frames changed and the change spread over windows; outside of them not a bit changes.
 
     Parameters
@@ -99,7 +96,7 @@ def displace(motion: Motion, frames: Ints, changed: Motion, windows: Sequence[Wi
     return motion._replace(root_translations=roots, rotations=rotations)
 
 
-def _check_windows(frames: Ints, windows: Sequence[Window]) -> None:
+def _check_windows(frames: AnyInts, windows: Sequence[Window]) -> None:
     """Each window must hold frames, and each frame must be in one, where it is smooth not at its very ends."""
     inside = np.zeros(len(frames), dtype=np.bool_)
     for window in windows:
@@ -112,7 +109,7 @@ def _check_windows(frames: Ints, windows: Sequence[Window]) -> None:
         raise EditError(f"frame {int(frames[~inside][0])} is not inside of a window", where="windows")
 
 
-def spread_displacements(frames: Ints, values: Floats, window: Window) -> Floats:
+def spread_displacements(frames: AnyInts, values: Floats, window: Window) -> Floats:
     """The displacement curve (stop - start, c) of a window through `values` (n, c) at `frames` (n,).
 
     It is the curve of least bending through values that are evened out along given frames in a row, and a tense one
@@ -127,7 +124,7 @@ def spread_displacements(frames: Ints, values: Floats, window: Window) -> Floats
     return spread + _curve(frames, values - spread[frames - window.start], window, SINGLE_SWING_SHARE * blend)
 
 
-def _evened(frames: Ints, values: Floats, reach: float) -> Floats:
+def _evened(frames: AnyInts, values: Floats, reach: float) -> Floats:
     """Values (n, c) smoothed along frames (n,) in a row; constant ones stay, and slopes at the ends become less."""
     from scipy.ndimage import gaussian_filter1d
 
@@ -135,7 +132,7 @@ def _evened(frames: Ints, values: Floats, reach: float) -> Floats:
     return np.concatenate([gaussian_filter1d(row, reach, axis=0, mode="nearest") for row in rows])
 
 
-def _curve(frames: Ints, values: Floats, window: Window, swing: float) -> Floats:
+def _curve(frames: AnyInts, values: Floats, window: Window, swing: float) -> Floats:
     """The curve (stop - start, c) of least bending through `values` (n, c) at `frames` (n,).
 
     Tension keeps it from swinging beyond them over more than about `swing` frames.

@@ -15,10 +15,10 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import convolve1d, maximum_filter1d
 
 from marey_motion import kinematics, quaternions
+from marey_motion.arrays import Flags, Floats
 from marey_motion.editing.annotations.contacts import runs, without_short
 from marey_motion.editing.displacement import spread_displacements, windows_around
 from marey_motion.editing.inverse_kinematics.solving import Limb, solve_two_bone
@@ -26,9 +26,6 @@ from marey_motion.editing.inverse_kinematics.targets import OrientationTarget, P
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 MOST_LOWERING_M = 0.1
 # Less than this is rounding.

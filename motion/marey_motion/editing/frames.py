@@ -8,7 +8,6 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion.editing.borders import blended, smooth_step
 from marey_motion.editing.offsets import VELOCITY_S, add_offset, dying_away, seam_offset
@@ -48,8 +47,6 @@ def split(take: Take, *, at: Sequence[int]) -> tuple[Take, ...]:
         for number, (start, stop) in enumerate(pairwise(bounds), start=1)
     )
 
-
-Floats = NDArray[np.float64]
 
 SAME_SKELETON_M = 1e-5
 

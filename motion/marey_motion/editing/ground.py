@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.editing.annotations.contacts import ContactOptions, Stance, find_stances
 from marey_motion.editing.placement import translate
 from marey_motion.editing.take import Finding, Take
 from marey_motion.importing.checks import sole_points
 from marey_motion.kinematics import forward_kinematics
-
-Floats = NDArray[np.float64]
 
 FEET = ("left_foot", "right_foot")
 LOWEST_SHARE = 0.05

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import kinematics, quaternions
+from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.editing.borders import blended, range_weights
 from marey_motion.editing.take import Take, motion_of
@@ -17,8 +17,6 @@ from marey_motion.errors import EditError
 from marey_motion.motion import Motion
 from marey_motion.resampling import sample_motion
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.float64]
 
 SAME_AXES_RAD = 0.02
 """Rest rotations up to so far apart count as the same axes: subjects of one rig are measured one by one."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.editing.offsets import VELOCITY_S, add_offset, dying_away, offset_to, step_of
 from marey_motion.editing.placement import body_track, carried, moved_over
 from marey_motion.editing.take import Take
@@ -12,8 +12,6 @@ from marey_motion.errors import EditError
 from marey_motion.looping import LoopSeam, about_vertical, loop_seam, rotated
 from marey_motion.motion import Motion
 from marey_motion.root_carrier import body_first, root_first, root_stands
-
-Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 4
 

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.arrays import Floats
 from marey_motion.looping import about_vertical
 from marey_motion.motion import Motion
-
-Floats = NDArray[np.float64]
 
 VELOCITY_S = 0.15
 """A difference of velocities is used up after this, so that long blends do not swing out."""

@@ -6,17 +6,15 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import kinematics, quaternions
+from marey_motion.arrays import Floats
 from marey_motion.editing.borders import smooth_step
 from marey_motion.editing.take import Take
 from marey_motion.errors import EditError
 from marey_motion.looping import LoopSeam, about_vertical
 from marey_motion.mirroring import mirror_motion
 from marey_motion.motion import Motion
-
-Floats = NDArray[np.float64]
 
 GROUND = np.array([1.0, 0.0, 1.0])
 

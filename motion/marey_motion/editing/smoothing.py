@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.arrays import Floats
 from marey_motion.editing.allowance import MOST_OF_TAPS, PER_TAP
 from marey_motion.editing.borders import blended, range_weights
 from marey_motion.editing.take import Take
 from marey_motion.errors import EditError
-
-Floats = NDArray[np.float64]
 
 LONG_WINDOW = 512
 """Means over more frames are computed by Fourier transforms, in which the length of the window costs little."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.editing.allowance import PER_NUMBER, Allowance
 from marey_motion.errors import EditError, MappingError
@@ -18,8 +19,6 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
 from marey_motion.rigs import JointMapping, map_joints, symmetric_joints
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.float64]
 
 MOST_NUMBERS = 200_000_000
 """Numbers of the motion that a command may make: 1.6 GB, or two and a half hours of 60 joints at 90 Hz."""

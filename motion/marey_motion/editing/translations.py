@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.float64]
 
 
 def translated(motion: Motion, skeleton: Skeleton, joints: tuple[int, ...]) -> Motion:

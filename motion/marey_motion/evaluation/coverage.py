@@ -13,12 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.result import Coverage
 from marey_motion.matching.database import MatchingDatabase
-
-Floats = NDArray[np.float64]
 
 WINDOW_S = 1.0
 SPEED_STEP_M_S, TURN_RATE_STEP_DEG_S = 0.25, 25.0

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import WINDOW_S, Windows
 from marey_motion.matching.simulation_root import (
@@ -24,8 +25,6 @@ from marey_motion.matching.simulation_root import (
     SHORTEST_WINDOW,
     window_frames,
 )
-
-Floats = NDArray[np.float64]
 
 LEAST_RATE_HZ, MOST_RATE_HZ = 10.0, 240.0
 

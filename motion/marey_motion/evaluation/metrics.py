@@ -14,14 +14,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Flags, Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.result import Metrics, TrialResult
 from marey_motion.evaluation.scenario import TIME_TOLERANCE_S, Reference, Trial
 from marey_motion.matching.record import Status, TrialRecord
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 REGIMES = ("approach", "base", "switched")
 RESPONSE_SHARE = 0.1
@@ -126,7 +124,7 @@ def _travel_turn_rates(steps: Floats, speeds: Floats, pieces: NDArray[np.int64],
     return np.concatenate(([np.nan], np.where(known, turned * rate, np.nan)))[: len(steps)]
 
 
-def _metrics(series: TrialSeries, record: TrialRecord, window: Mask) -> dict[str, float | None]:
+def _metrics(series: TrialSeries, record: TrialRecord, window: Flags) -> dict[str, float | None]:
     return {
         **_speed_metrics(series, window),
         **_offset_metrics(series, window),
@@ -136,7 +134,7 @@ def _metrics(series: TrialSeries, record: TrialRecord, window: Mask) -> dict[str
     }
 
 
-def _speed_metrics(series: TrialSeries, window: Mask) -> dict[str, float | None]:
+def _speed_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None]:
     metrics: dict[str, float | None] = {}
     degrees = 180.0 / np.pi
     for name, recorded, wanted, scale in (
@@ -164,7 +162,7 @@ def _pooled_spread(values: Floats, regimes: NDArray[np.int8]) -> float | None:
     return float(np.sqrt(squares / len(values)))
 
 
-def _offset_metrics(series: TrialSeries, window: Mask) -> dict[str, float | None]:
+def _offset_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None]:
     offsets = series.offsets_m[window]
     total = _of(np.sum, offsets)
     metrics = {
@@ -182,7 +180,7 @@ def _offset_metrics(series: TrialSeries, window: Mask) -> dict[str, float | None
     return metrics
 
 
-def _response_metrics(series: TrialSeries, window: Mask) -> dict[str, float | None]:
+def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None]:
     """Mean time to answer a switch, None when none was answered, and how many were not."""
     times = [
         _response_s(series, first, stop)
@@ -215,7 +213,7 @@ def _response_s(series: TrialSeries, first: int, stop: int) -> float | None:
     return float(np.argmax(held)) / series.rate_hz if held.any() else None
 
 
-def _switch_metrics(record: TrialRecord, window: Mask) -> dict[str, float | None]:
+def _switch_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]:
     """Transitions are chosen; that a clip ended or began again is not one."""
     status = record.status[1:][window]
     transitions = float(np.count_nonzero(status == Status.REPLACING))
@@ -226,7 +224,7 @@ def _switch_metrics(record: TrialRecord, window: Mask) -> dict[str, float | None
     }
 
 
-def _cost_metrics(record: TrialRecord, window: Mask) -> dict[str, float | None]:
+def _cost_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]:
     """A step's costs are those of the tick it starts from: what was searched and chosen there is displayed after it."""
     entered = window & (record.status[1:] == Status.REPLACING)
     series = {
@@ -244,7 +242,7 @@ def _cost_metrics(record: TrialRecord, window: Mask) -> dict[str, float | None]:
     return metrics
 
 
-def _literal_metrics(series: TrialSeries, window: Mask, grid: Grid) -> Metrics:
+def _literal_metrics(series: TrialSeries, window: Flags, grid: Grid) -> Metrics:
     """Equations 1 to 4 as printed: a sum of m + 1 terms over m, and the square of a sum over a count of settings."""
     metrics: dict[str, float | None] = {}
     for name, recorded, wanted, settings in (

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import (
@@ -30,8 +30,6 @@ from marey_motion.evaluation.scenario import Reference, Trial, reference
 from marey_motion.kinematics import SHORTEST_LATERAL_M, forward_vectors
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
-
-Floats = NDArray[np.float64]
 
 MOST_CELLS = 2000
 FARTHEST_M = 1e6

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.options import EvaluationOptions, Family
 from marey_motion.matching.options import TICK_RATE_HZ
-
-Floats = NDArray[np.float64]
 
 LOOK_AHEAD_S = 1.0
 # A boundary belongs to the tick that it falls on, however its time in seconds is rounded.

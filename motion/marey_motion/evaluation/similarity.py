@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.selection import clips_by_source
 from marey_motion.evaluation.result import Coverage
@@ -19,7 +20,6 @@ from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import Status, TrialRecord
 
-Floats = NDArray[np.float64]
 ProgressCallback = Callable[[int, int, str], None]
 
 MOST_FRAMES = 2_000

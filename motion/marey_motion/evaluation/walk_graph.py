@@ -13,13 +13,11 @@ from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Ints
 from marey_motion.evaluation.relevance import clip_starts, clips_of_rows, count_switches
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import TrialRecord
-
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve1d, minimum_filter1d
 
 from marey_motion import quaternions
+from marey_motion.arrays import AnyFloats
 from marey_motion.errors import MotionError
 from marey_motion.gait import style as styles
 from marey_motion.gait.footfalls import FootMotion, smooth_positive_part
-from marey_motion.gait.path import Floats, RootState
+from marey_motion.gait.path import RootState
 from marey_motion.gait.style import GaitStyle, eased
 from marey_motion.skeleton import Skeleton
 
@@ -37,8 +38,8 @@ class Moments:
     root : the exact path
     """
 
-    times_s: Floats
-    phases: Floats
+    times_s: AnyFloats
+    phases: AnyFloats
     root: RootState
 
     @property
@@ -46,13 +47,13 @@ class Moments:
         """Moments per second."""
         return (len(self.times_s) - 1) / float(self.times_s[-1] - self.times_s[0])
 
-    def settled(self, values: Floats, window_s: float = BLENDING_S) -> Floats:
+    def settled(self, values: AnyFloats, window_s: float = BLENDING_S) -> AnyFloats:
         """Values (n,) averaged over `window_s` before and after, more over the near ones (Hann)."""
         reach = _reach(window_s, self.frame_rate_hz)
         weights = np.hanning(2 * reach + 3)[1:-1]
         return np.asarray(convolve1d(values, weights / weights.sum(), mode="nearest"))
 
-    def settled_below(self, limits: Floats, window_s: float = SETTLING_S) -> Floats:
+    def settled_below(self, limits: AnyFloats, window_s: float = SETTLING_S) -> AnyFloats:
         """A smooth curve (n,) nowhere above `limits` (n,): an average of minima, each of which includes the moment."""
         lowest = minimum_filter1d(limits, 2 * _reach(window_s, self.frame_rate_hz) + 1, mode="nearest")
         return self.settled(lowest, window_s)
@@ -69,7 +70,7 @@ def padding_frames(frame_rate_hz: float) -> int:
 
 def pose_body(
     skeleton: Skeleton, style: GaitStyle, moments: Moments, feet: Mapping[str, FootMotion]
-) -> tuple[Floats, Floats]:
+) -> tuple[AnyFloats, AnyFloats]:
     """Root positions (n, 3) in metres and global rotations (n, J, 4) of the studio skeleton's joints.
 
     Raises
@@ -104,14 +105,14 @@ def _shank_m(skeleton: Skeleton) -> float:
     return -float(_offset(skeleton, "LeftFoot")[1])
 
 
-def _pelvis(style: GaitStyle, moments: Moments) -> Floats:
+def _pelvis(style: GaitStyle, moments: Moments) -> AnyFloats:
     """The heading, exactly, and a tilt that drops the side of the swinging leg; it leaves forward and left in place."""
     speeds = moments.settled(moments.root.speeds)
     tilts = style.bounce * 0.06 * eased(speeds / 1.4) * np.cos(2.0 * np.pi * moments.phases)
     return quaternions.from_euler("yz", np.stack((moments.root.headings, tilts), axis=-1))
 
 
-def _ankle(skeleton: Skeleton, side: str, foot: FootMotion, rotations: dict[str, Floats]) -> Floats:
+def _ankle(skeleton: Skeleton, side: str, foot: FootMotion, rotations: dict[str, AnyFloats]) -> AnyFloats:
     """Position (n, 3) of the ankle; notes the rotations of foot and toes."""
     name, toes = side + "Foot", side + "ToeBase"
     rotations[name] = quaternions.from_euler("yx", np.stack((foot.yaws, -foot.pitches), axis=-1))
@@ -123,10 +124,10 @@ def _pelvis_heights(
     skeleton: Skeleton,
     style: GaitStyle,
     moments: Moments,
-    pelvis: Floats,
-    ankles: Mapping[str, Floats],
+    pelvis: AnyFloats,
+    ankles: Mapping[str, AnyFloats],
     loaded: Mapping[str, NDArray[np.bool_]],
-) -> Floats:
+) -> AnyFloats:
     """Heights (n,) of the root: the gait's rise and fall, as far as the legs that stand reach the floor."""
     speeds = moments.settled(moments.root.speeds)
     leg = _thigh_m(skeleton) + _shank_m(skeleton)
@@ -152,11 +153,11 @@ def _pelvis_heights(
 def _bend_leg(
     skeleton: Skeleton,
     side: str,
-    hip: Floats,
-    ankle: Floats,
-    facing: Floats,
-    freedom: Floats,
-    rotations: dict[str, Floats],
+    hip: AnyFloats,
+    ankle: AnyFloats,
+    facing: AnyFloats,
+    freedom: AnyFloats,
+    rotations: dict[str, AnyFloats],
 ) -> None:
     """Two-bone inverse kinematics: knees bend to where pelvis and foot face, `facing` (n,) radians.
 
@@ -179,7 +180,7 @@ def _bend_leg(
         rotations[joint] = quaternions.from_matrix(np.stack((hinge, y, np.cross(hinge, y)), axis=-1))
 
 
-def _pose_trunk(style: GaitStyle, moments: Moments, rotations: dict[str, Floats]) -> None:
+def _pose_trunk(style: GaitStyle, moments: Moments, rotations: dict[str, AnyFloats]) -> None:
     """Lean into speed and turns, shoulders against the legs, a head that looks ahead."""
     root = moments.root
     forward = moments.settled(root.speeds * np.cos(root.travel_angles))
@@ -199,7 +200,7 @@ def _pose_trunk(style: GaitStyle, moments: Moments, rotations: dict[str, Floats]
     rotations["Head"] = _turned("yzx", root.headings + 0.15 * slow[0], -0.3 * bank, 0.2 * lean + 0.06 * slow[2])
 
 
-def _pose_arm(style: GaitStyle, moments: Moments, side: str, sign: int, rotations: dict[str, Floats]) -> None:
+def _pose_arm(style: GaitStyle, moments: Moments, side: str, sign: int, rotations: dict[str, AnyFloats]) -> None:
     """Arms that swing against the legs from hanging shoulders; elbows bend with speed."""
     speeds = moments.settled(moments.root.speeds)
     swing = style.arm_swing * sign * np.sin(2.0 * np.pi * moments.phases)
@@ -217,19 +218,19 @@ def _pose_arm(style: GaitStyle, moments: Moments, side: str, sign: int, rotation
     rotations[side + "HandMiddle1"] = quaternions.multiply(rotations[side + "Hand"], _turned("z", curl))
 
 
-def _shoulder_twist(style: GaitStyle, moments: Moments) -> Floats:
+def _shoulder_twist(style: GaitStyle, moments: Moments) -> AnyFloats:
     speeds = moments.settled(moments.root.speeds)
     size = styles.blended(0.10 * eased(speeds / 1.4), 0.14, speeds)
     return np.asarray(-style.sway * size * np.sin(2.0 * np.pi * moments.phases))
 
 
-def _drift(style: GaitStyle, moments: Moments, which: int) -> Floats:
+def _drift(style: GaitStyle, moments: Moments, which: int) -> AnyFloats:
     """A slow wave (n,) between -1 and 1, each with its own period and phase."""
     period_s = (9.1, 6.7, 4.9)[which]
     return np.asarray(np.sin(2.0 * np.pi * moments.times_s / period_s + style.wander_phases_rad[which]))
 
 
-def _turned(axes: str, *angles: Floats) -> Floats:
+def _turned(axes: str, *angles: AnyFloats) -> AnyFloats:
     """Rotations (n, 4) about the axes of the moving frame, in the order written; angles (n,) in radians."""
     result = quaternions.identity()
     for axis, angle in zip(axes, angles, strict=True):

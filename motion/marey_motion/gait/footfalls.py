@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import AnyFloats, Complexes
 from marey_motion.gait import style as styles
-from marey_motion.gait.path import Complexes, Floats, RootPath, RootState
+from marey_motion.gait.path import RootPath, RootState
 from marey_motion.gait.style import GaitStyle, eased
 
 LANDING_SHARE = 0.18  # of the stance, in which a foot that lands tilted comes down flat
@@ -56,7 +57,7 @@ class Cadence:
     style: GaitStyle
 
     @cached_property
-    def _pieces(self) -> Floats:
+    def _pieces(self) -> AnyFloats:
         """(4, pieces): start time, phase there, stride rate there and its slope."""
         pieces = self.path.pieces
         turn_rates = np.array([piece.turn_rate_rad_s for piece in pieces])
@@ -69,13 +70,13 @@ class Cadence:
         done = np.cumsum(0.5 * (first + last) * durations)[1:-1] - 0.5 * (first[0] + last[0]) * durations[0]
         return np.array([self.path.starts_s, np.concatenate(([0.0, 0.0], done)), first, (last - first) / durations])
 
-    def phase_at(self, times_s: Floats) -> Floats:
+    def phase_at(self, times_s: AnyFloats) -> AnyFloats:
         """Strides done since time 0, shape (n,)."""
         start, phase, rate, slope = self._pieces[:, self.path.piece_at(times_s)]
         elapsed = times_s - start
         return np.asarray(phase + rate * elapsed + 0.5 * slope * elapsed**2)
 
-    def time_at(self, phases: Floats) -> Floats:
+    def time_at(self, phases: AnyFloats) -> AnyFloats:
         """Seconds at which so many strides are done, shape (n,)."""
         piece = np.searchsorted(self._pieces[1, 1:], phases, side="right")
         start, phase, rate, slope = self._pieces[:, piece]
@@ -96,11 +97,11 @@ class FootMotion:
     heel_planted, ball_planted : (n,) bool    that point of the sole is fixed on the floor
     """
 
-    balls: Floats
-    yaws: Floats
-    pitches: Floats
-    toe_pitches: Floats
-    freedom: Floats
+    balls: AnyFloats
+    yaws: AnyFloats
+    pitches: AnyFloats
+    toe_pitches: AnyFloats
+    freedom: AnyFloats
     heel_planted: NDArray[np.bool_]
     ball_planted: NDArray[np.bool_]
 
@@ -109,11 +110,11 @@ class _Foot(NamedTuple):
     """A foot at n moments, loaded or free: the ball over the floor as z + i·x and above its height at rest."""
 
     ground: Complexes
-    heights: Floats
-    pitches: Floats
-    toe_pitches: Floats
-    yaws: Floats
-    freedom: Floats
+    heights: AnyFloats
+    pitches: AnyFloats
+    toe_pitches: AnyFloats
+    yaws: AnyFloats
+    freedom: AnyFloats
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,7 @@ class Footfalls:
     span_s: tuple[float, float]
 
     @cached_property
-    def centre_phases(self) -> Floats:
+    def centre_phases(self) -> AnyFloats:
         """Phase in the middle of each stance: whole for the left foot, half a stride later for the right."""
         first, last = self.cadence.phase_at(np.array(self.span_s))
         return np.arange(np.floor(first) - 2.0, np.ceil(last) + 3.0) + (0.0 if self.side > 0 else 0.5)
@@ -145,12 +146,12 @@ class Footfalls:
         return self.cadence.path.at(self.cadence.time_at(self.centre_phases))
 
     @cached_property
-    def strikes_s(self) -> Floats:
+    def strikes_s(self) -> AnyFloats:
         """When each stance begins."""
         return self.cadence.time_at(self.centre_phases - 0.5 * styles.stance_share(self.middles.speeds))
 
     @cached_property
-    def leaves_s(self) -> Floats:
+    def leaves_s(self) -> AnyFloats:
         """When each stance ends."""
         return self.cadence.time_at(self.centre_phases + 0.5 * styles.stance_share(self.middles.speeds))
 
@@ -172,13 +173,13 @@ class Footfalls:
         return np.asarray(root.positions + np.exp(1j * root.headings) * (ahead + 1j * lateral))
 
     @cached_property
-    def lifts_m(self) -> Floats:
+    def lifts_m(self) -> AnyFloats:
         """Greatest clearance of the step that follows each stance but the last."""
         way = np.abs(np.diff(self.footholds)) + 0.3 * np.abs(np.diff(self.middles.headings))
         highest = styles.clearance_m(0.5 * (self.middles.speeds[1:] + self.middles.speeds[:-1]))
         return np.asarray(self.cadence.style.lift * highest * -np.expm1(-way / SHORT_STEP_M))
 
-    def at(self, times_s: Floats) -> FootMotion:
+    def at(self, times_s: AnyFloats) -> FootMotion:
         """The foot at times within the span, shape (n,), seconds."""
         stance = np.searchsorted(self.strikes_s, times_s, side="right") - 1
         loaded = times_s < self.leaves_s[stance]
@@ -196,19 +197,19 @@ class Footfalls:
         )
 
     @cached_property
-    def _landing_pitches(self) -> Floats:
+    def _landing_pitches(self) -> AnyFloats:
         return styles.landing_pitch_rad(self.middles.speeds, self.middles.travel_angles)
 
     @cached_property
-    def _leaving_pitches(self) -> Floats:
+    def _leaving_pitches(self) -> AnyFloats:
         return styles.leaving_pitch_rad(self.middles.speeds, self.middles.travel_angles)
 
     @cached_property
-    def _leaving_pitch_rates(self) -> Floats:
+    def _leaving_pitch_rates(self) -> AnyFloats:
         """How fast each foot pitches at the end of its push-off, radians per second."""
         return np.asarray(self._leaving_pitches / ((1.0 - PUSH_OFF_START) * (self.leaves_s - self.strikes_s)))
 
-    def _standing(self, times_s: Floats, stance: NDArray[np.intp]) -> _Foot:
+    def _standing(self, times_s: AnyFloats, stance: NDArray[np.intp]) -> _Foot:
         """The loaded foot: rolls about the heel, stands, rolls about the ball."""
         share = (times_s - self.strikes_s[stance]) / (self.leaves_s - self.strikes_s)[stance]
         landing = 1.0 - eased(share / LANDING_SHARE)
@@ -223,15 +224,15 @@ class Footfalls:
             freedom=np.zeros_like(pitches),
         )
 
-    def _rolled(self, pitches: Floats, stance: NDArray[np.intp]) -> Complexes:
+    def _rolled(self, pitches: AnyFloats, stance: NDArray[np.intp]) -> Complexes:
         """Where the ball is over the floor when the foot has rolled about its heel by positive `pitches`."""
         back = self.shape.heel_length_m * (1.0 - np.cos(np.maximum(pitches, 0.0)))
         return np.asarray(self.footholds[stance] - back * np.exp(1j * self.middles.headings[stance]))
 
-    def _lift(self, stance: NDArray[np.intp]) -> Floats:
+    def _lift(self, stance: NDArray[np.intp]) -> AnyFloats:
         return self.lifts_m[np.minimum(stance, len(self.lifts_m) - 1)]
 
-    def _swinging(self, times_s: Floats, stance: NDArray[np.intp]) -> _Foot:
+    def _swinging(self, times_s: AnyFloats, stance: NDArray[np.intp]) -> _Foot:
         """The free foot, from the end of `stance` to the beginning of the next."""
         following = np.minimum(stance + 1, len(self.strikes_s) - 1)
         duration = self.strikes_s[following] - self.leaves_s[stance]
@@ -262,7 +263,7 @@ class Footfalls:
         )
 
     def _swing_ground(
-        self, times_s: Floats, stance: NDArray[np.intp], following: NDArray[np.intp], share: Floats
+        self, times_s: AnyFloats, stance: NDArray[np.intp], following: NDArray[np.intp], share: AnyFloats
     ) -> Complexes:
         """Way of the ball over the floor: a cubic in the root's frame that starts and ends at rest on the floor."""
         path = self.cadence.path
@@ -285,7 +286,7 @@ def _seen_from(root: RootState, points: Complexes, velocities: Complexes) -> tup
     return local, (velocities - root.velocities) * to_root - 1j * root.turn_rates * local
 
 
-def _cubic(share: Floats, start: Any, start_rate: Any, end: Any, end_rate: Any) -> Any:
+def _cubic(share: AnyFloats, start: Any, start_rate: Any, end: Any, end_rate: Any) -> Any:
     """Hermite's cubic over `share` in 0 to 1; rates are per unit of `share`."""
     s, r = share, 1.0 - share
     return (
@@ -293,6 +294,6 @@ def _cubic(share: Floats, start: Any, start_rate: Any, end: Any, end_rate: Any) 
     )
 
 
-def smooth_positive_part(values: Floats, width: Floats) -> Floats:
+def smooth_positive_part(values: AnyFloats, width: AnyFloats) -> AnyFloats:
     """max(values, 0), never below it, rounded over about `width` around zero."""
     return np.asarray(0.5 * (values + np.sqrt(values**2 + width**2)))

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import AnyFloats, Complexes
 from marey_motion.errors import MotionError
-
-Floats = NDArray[np.floating[Any]]
-Complexes = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
@@ -78,12 +75,12 @@ class RootState:
 
     positions: Complexes
     velocities: Complexes
-    headings: Floats
-    turn_rates: Floats
-    travel_angles: Floats
+    headings: AnyFloats
+    turn_rates: AnyFloats
+    travel_angles: AnyFloats
 
     @property
-    def speeds(self) -> Floats:
+    def speeds(self) -> AnyFloats:
         """(n,) metres per second."""
         return np.abs(self.velocities)
 
@@ -108,7 +105,7 @@ class RootPath:
         return float(self.starts_s[-1])
 
     @cached_property
-    def starts_s(self) -> Floats:
+    def starts_s(self) -> AnyFloats:
         """(pieces,) start of each piece that `pieces` lists, seconds; the first is where its formula is anchored."""
         ends = np.cumsum([segment.duration_s for segment in self.segments])
         return np.concatenate(([0.0, 0.0], ends))
@@ -136,11 +133,11 @@ class RootPath:
             )
         )
 
-    def piece_at(self, times_s: Floats) -> NDArray[np.intp]:
+    def piece_at(self, times_s: AnyFloats) -> NDArray[np.intp]:
         """Index into `pieces` for each time."""
         return np.searchsorted(self.starts_s[1:], times_s, side="right")
 
-    def at(self, times_s: Floats) -> RootState:
+    def at(self, times_s: AnyFloats) -> RootState:
         """Exact state at any times, shape (n,), seconds."""
         times_s = np.asarray(times_s, dtype=np.float64)
         piece = self.piece_at(times_s)
@@ -158,13 +155,13 @@ class RootPath:
         )
 
     @cached_property
-    def _columns(self) -> Floats:
+    def _columns(self) -> AnyFloats:
         """(4, pieces): speed, acceleration, turn rate and travel angle."""
         rows = [(p.speed_m_s, p.acceleration_m_s2, p.turn_rate_rad_s, p.travel_angle_rad) for p in self.pieces]
         return np.array(rows).T
 
     @cached_property
-    def _anchors(self) -> tuple[Complexes, Floats]:
+    def _anchors(self) -> tuple[Complexes, AnyFloats]:
         """Position and heading where each piece starts."""
         positions, headings = [0j, 0j], [0.0, 0.0]
         for segment in self.segments:
@@ -197,14 +194,14 @@ def start_and_stop(
     )
 
 
-def _moment_0(turn_rate: Floats, elapsed: Floats) -> Complexes:
+def _moment_0(turn_rate: AnyFloats, elapsed: AnyFloats) -> Complexes:
     """∫ e^(i·turn_rate·s) ds from 0 to `elapsed`."""
     half_angle = 0.5 * turn_rate * elapsed
     result: Complexes = elapsed * np.exp(1j * half_angle) * np.sinc(half_angle / np.pi)
     return result
 
 
-def _moment_1(turn_rate: Floats, elapsed: Floats) -> Complexes:
+def _moment_1(turn_rate: AnyFloats, elapsed: AnyFloats) -> Complexes:
     """∫ s·e^(i·turn_rate·s) ds from 0 to `elapsed`."""
     angle = np.asarray(turn_rate * elapsed)
     # The closed form cancels to nothing for small angles, where the power series converges in a few terms.

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.arrays import AnyFloats
 from marey_motion.errors import SkeletonError
 from marey_motion.skeleton import EndSite, Skeleton
 
 STUDIO_STATURE_M = 1.78
 
-Floats = NDArray[np.floating[Any]]
 Point = tuple[float, float, float]
 
 
@@ -121,7 +120,7 @@ def game_skeleton() -> Skeleton:
     for _, (parent, position) in reversed(bones.items()):
         if parent is not None:
             aims[parent] = position  # ends as the first child
-    rotations: dict[str, Floats] = {}
+    rotations: dict[str, AnyFloats] = {}
     for name, (parent, position) in bones.items():
         if parent is None:
             rotations[name] = quaternions.from_axis_angle((1.0, 0.0, 0.0), -0.5 * np.pi)
@@ -134,7 +133,7 @@ def game_skeleton() -> Skeleton:
 
 def _both_sides(
     table: Mapping[str, _Bone], tips: Mapping[str, Point], sides: tuple[str, str]
-) -> tuple[dict[str, tuple[str | None, Floats]], dict[str, Floats]]:
+) -> tuple[dict[str, tuple[str | None, AnyFloats]], dict[str, AnyFloats]]:
     """Joints depth first as {name: (parent, position)} and tips as {name: position}, left and mirrored right."""
 
     def expanded(name: str) -> list[tuple[str, int, str]]:
@@ -142,12 +141,12 @@ def _both_sides(
             return [(name, 1, sides[0])]
         return [(name.format(side=side), sign, side) for side, sign in zip(sides, (1, -1), strict=True)]
 
-    children: dict[str | None, list[tuple[str, Floats]]] = {}
+    children: dict[str | None, list[tuple[str, AnyFloats]]] = {}
     for template, bone in table.items():
         for name, sign, side in expanded(template):
             parent = bone.parent.format(side=side) if bone.parent else None
             children.setdefault(parent, []).append((name, np.array(bone.position) * (sign, 1, 1)))
-    ordered: dict[str, tuple[str | None, Floats]] = {}
+    ordered: dict[str, tuple[str | None, AnyFloats]] = {}
 
     def visit(parent: str | None) -> None:
         for name, position in children.get(parent, ()):
@@ -155,13 +154,13 @@ def _both_sides(
             visit(name)
 
     visit(None)
-    ends: dict[str, Floats] = {
+    ends: dict[str, AnyFloats] = {
         name: np.array(tip) * (sign, 1, 1) for key, tip in tips.items() for name, sign, _ in expanded(key)
     }
     return ordered, ends
 
 
-def _rotation_along(direction: Floats, *, against: bool) -> Floats:
+def _rotation_along(direction: AnyFloats, *, against: bool) -> AnyFloats:
     """Global rotation whose x axis is `direction` or its opposite and whose y axis is as near to forward as can be."""
     x = direction / np.linalg.norm(direction) * (-1.0 if against else 1.0)
     hint = (0.0, 1.0, 0.0) if abs(x[2]) > 0.8 else (0.0, 0.0, 1.0)
@@ -170,7 +169,7 @@ def _rotation_along(direction: Floats, *, against: bool) -> Floats:
 
 
 def _assembled(
-    bones: Mapping[str, tuple[str | None, Floats]], tips: Mapping[str, Floats], rotations: Mapping[str, Floats]
+    bones: Mapping[str, tuple[str | None, AnyFloats]], tips: Mapping[str, AnyFloats], rotations: Mapping[str, AnyFloats]
 ) -> Skeleton:
     """A skeleton from global rest positions and global rest rotations."""
     index = {name: joint for joint, name in enumerate(bones)}

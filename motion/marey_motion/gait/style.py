@@ -7,12 +7,11 @@ they shape steps and swings and never touch the root's path.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.floating[Any]]
+from marey_motion.arrays import AnyFloats
+
 GRAVITY_M_S2 = 9.81
 STEERING_RADIUS_M = 0.3  # turning on the spot needs steps like walking at this radius
 BANK_LIMIT_RAD = 0.35
@@ -68,26 +67,26 @@ class GaitStyle:
         )
 
 
-def eased(x: Floats | float) -> Floats:
+def eased(x: AnyFloats | float) -> AnyFloats:
     """From 0 at x <= 0 to 1 at x >= 1 with level ends."""
     x = np.clip(x, 0.0, 1.0)
-    result: Floats = np.asarray(x * x * (3.0 - 2.0 * x))
+    result: AnyFloats = np.asarray(x * x * (3.0 - 2.0 * x))
     return result
 
 
-def running_share(speed_m_s: Floats | float) -> Floats:
+def running_share(speed_m_s: AnyFloats | float) -> AnyFloats:
     """0 for a walk, 1 for a run, between them where people change over."""
     return eased((np.asarray(speed_m_s) - 1.9) / 0.5)
 
 
-def blended(walk: Floats | float, run: Floats | float, speed_m_s: Floats | float) -> Floats:
+def blended(walk: AnyFloats | float, run: AnyFloats | float, speed_m_s: AnyFloats | float) -> AnyFloats:
     """The walk's value, the run's, or between, as the speed asks."""
     share = running_share(speed_m_s)
-    result: Floats = np.asarray((1.0 - share) * walk + share * run)
+    result: AnyFloats = np.asarray((1.0 - share) * walk + share * run)
     return result
 
 
-def stride_rate_hz(speed_m_s: Floats, turn_rate_rad_s: Floats, travel_angle_rad: Floats) -> Floats:
+def stride_rate_hz(speed_m_s: AnyFloats, turn_rate_rad_s: AnyFloats, travel_angle_rad: AnyFloats) -> AnyFloats:
     """Strides (two steps) per second."""
     stepping = np.hypot(speed_m_s, STEERING_RADIUS_M * turn_rate_rad_s)
     forward = blended(0.45 + 0.36 * stepping, 1.15 + 0.075 * stepping, stepping)
@@ -95,30 +94,30 @@ def stride_rate_hz(speed_m_s: Floats, turn_rate_rad_s: Floats, travel_angle_rad:
     return np.asarray(forward * shorter)
 
 
-def stance_share(speed_m_s: Floats) -> Floats:
+def stance_share(speed_m_s: AnyFloats) -> AnyFloats:
     """Part of a stride in which a foot is on the floor."""
     return blended(0.68 - 0.05 * speed_m_s, np.maximum(0.46 - 0.035 * speed_m_s, 0.20), speed_m_s)
 
 
-def landing_pitch_rad(speed_m_s: Floats, travel_angle_rad: Floats) -> Floats:
+def landing_pitch_rad(speed_m_s: AnyFloats, travel_angle_rad: AnyFloats) -> AnyFloats:
     """Pitch of the foot when it lands, toes up positive: heel first going forward, ball first going backward."""
     along = np.cos(travel_angle_rad)
     size = np.where(along > 0.0, blended(0.33, 0.12, speed_m_s), 0.30)
     return np.asarray(along * size * eased(speed_m_s / 1.2))
 
 
-def leaving_pitch_rad(speed_m_s: Floats, travel_angle_rad: Floats) -> Floats:
+def leaving_pitch_rad(speed_m_s: AnyFloats, travel_angle_rad: AnyFloats) -> AnyFloats:
     """Pitch of the foot when it leaves the floor: off the ball going forward, off the heel going backward."""
     along = np.cos(travel_angle_rad)
     size = np.where(along > 0.0, blended(1.05, 1.15, speed_m_s), 0.15)
     return np.asarray(-along * size * eased(speed_m_s / 1.2))
 
 
-def clearance_m(speed_m_s: Floats) -> Floats:
+def clearance_m(speed_m_s: AnyFloats) -> AnyFloats:
     """Height of the sole above the floor in the middle of a long step."""
     return blended(0.035, 0.04 + 0.045 * speed_m_s, speed_m_s)
 
 
-def bank_rad(speeds: Floats, turn_rates: Floats) -> Floats:
+def bank_rad(speeds: AnyFloats, turn_rates: AnyFloats) -> AnyFloats:
     """Lean into a turn that balances the centrifugal force, to a limit; positive leans left."""
     return BANK_LIMIT_RAD * np.tanh(np.arctan(speeds * turn_rates / GRAVITY_M_S2) / BANK_LIMIT_RAD)

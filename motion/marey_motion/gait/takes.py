@@ -10,11 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from marey_motion import kinematics, quaternions
+from marey_motion.arrays import AnyFloats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.gait.body import SIDES, Moments, padding_frames, pose_body
 from marey_motion.gait.footfalls import Cadence, Footfalls, FootMotion, FootShape
-from marey_motion.gait.path import Floats, PathSegment, RootPath, start_and_stop, straight_or_arc
+from marey_motion.gait.path import PathSegment, RootPath, start_and_stop, straight_or_arc
 from marey_motion.gait.skeletons import STUDIO_STATURE_M, studio_skeleton
 from marey_motion.gait.style import GaitStyle
 from marey_motion.skeleton import Skeleton
@@ -93,7 +94,7 @@ def generate_along(
 
 
 def foot_motions(
-    path: RootPath, times_s: Floats, *, stature_m: float = STUDIO_STATURE_M, style: GaitStyle | None = None
+    path: RootPath, times_s: AnyFloats, *, stature_m: float = STUDIO_STATURE_M, style: GaitStyle | None = None
 ) -> dict[str, FootMotion]:
     """What the "Left" and "Right" foot of `generate_along` do at increasing `times_s` (n,): the truth about contacts.
 
@@ -105,7 +106,7 @@ def foot_motions(
     return {side: replace(foot, balls=size * foot.balls) for side, foot in feet.items()}
 
 
-def _at_studio_size(path: RootPath, times_s: Floats, size: float) -> tuple[RootPath, Floats]:
+def _at_studio_size(path: RootPath, times_s: AnyFloats, size: float) -> tuple[RootPath, AnyFloats]:
     """Path and times at which the studio skeleton moves like one of `size` times its stature on `path`.
 
     Bodies of all sizes move alike when times grow with the root of their lengths (equal Froude numbers, Alexander and
@@ -114,7 +115,7 @@ def _at_studio_size(path: RootPath, times_s: Floats, size: float) -> tuple[RootP
     return path.rescaled(length=1.0 / size, time=size**-0.5), times_s * size**-0.5
 
 
-def _feet(path: RootPath, style: GaitStyle, times_s: Floats) -> dict[str, FootMotion]:
+def _feet(path: RootPath, style: GaitStyle, times_s: AnyFloats) -> dict[str, FootMotion]:
     cadence, shape = Cadence(path, style), _foot_shape(studio_skeleton())
     span_s = (float(times_s[0]), float(times_s[-1]))
     return {side: Footfalls(cadence, shape, sign, span_s).at(times_s) for side, sign in SIDES.items()}

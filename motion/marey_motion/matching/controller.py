@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import as_kernel_input
 from marey_motion.matching.database import MatchingDatabase
@@ -15,8 +16,6 @@ from marey_motion.matching.inertialisation import decay_matrix
 from marey_motion.matching.options import ControllerOptions
 from marey_motion.matching.record import TrialRecord
 from marey_motion.matching.search import SearchIndex
-
-Floats = NDArray[np.float64]
 
 
 class Guide(Protocol):

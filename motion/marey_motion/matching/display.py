@@ -6,14 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.kinematics import as_kernel_input, forward_kinematics
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.inertialisation import decay_matrix
 from marey_motion.matching.options import ControllerOptions
 from marey_motion.matching.record import TrialRecord
-
-Floats = NDArray[np.float64]
 
 
 def displayed_clip(database: MatchingDatabase, record: TrialRecord, options: ControllerOptions) -> Clip:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.matching.controller import Guide, Playback, Rules, Wish, playback_of, rules_of, wish_of
 from marey_motion.matching.database import MatchingDatabase
@@ -16,7 +16,6 @@ from marey_motion.matching.options import ControllerOptions
 from marey_motion.matching.record import TrialRecord
 from marey_motion.matching.search import SearchIndex
 
-Floats = NDArray[np.float64]
 Reason = Literal["started", "not_searched", "continued", "switched", "clip_ended"]
 
 POSE_DISTANCE = "pose_distance"

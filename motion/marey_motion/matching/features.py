@@ -9,13 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.looping import loop_seam, moves_of_rounds, rotated
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.options import DatabaseOptions
 from marey_motion.matching.simulation_root import SimulationRoot
-
-Floats = NDArray[np.float64]
 
 
 class FeatureGroup(NamedTuple):

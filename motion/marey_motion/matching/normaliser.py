@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.matching.features import FeatureLayout
-
-Floats = NDArray[np.float64]
 
 LEAST_SCALE = 1e-3
 """Smaller scales are raised to this: what does not vary must not decide."""

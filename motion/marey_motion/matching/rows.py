@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import kinematics, quaternions
+from marey_motion.arrays import Floats
 from marey_motion.looping import LoopSeam, about_vertical, continue_motion
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.features import FeatureLayout, extract_features, in_root_frame, look_ahead
@@ -21,8 +22,6 @@ from marey_motion.matching.simulation_root import (
     window_frames,
 )
 from marey_motion.motion import Motion
-
-Floats = NDArray[np.float64]
 
 CLAMPED_S = 1 / 3
 """Of a clip's end, whose futures clamp to the last frame, are not selectable."""

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import quaternions
+from marey_motion.arrays import Floats
 from marey_motion.kinematics import forward_directions, headings
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
-
-Floats = NDArray[np.float64]
 
 POSITION_WINDOW_S = 0.5
 DIRECTION_WINDOW_S = 1.0

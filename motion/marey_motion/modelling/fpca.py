@@ -7,13 +7,12 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.modelling.primitive import FunctionalComponents
 from marey_motion.modelling.splines import SplineBasis
 
-Floats = NDArray[np.float64]
 InnerProduct = Literal["coefficients", "l2"]
 
 SMALLEST_RELATIVE_DEVIATION = 2e-7

@@ -10,12 +10,11 @@ from importlib import import_module
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import ModelError
 from marey_motion.modelling.mixture import LatentMixture
 
-Floats = NDArray[np.float64]
 Refusal = Literal["", "small-component", "held-out"]
 
 LEAST_EXAMPLES_PER_COMPONENT = 5

@@ -6,16 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.modelling.mixture import LatentMixture
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.modelling.time_model import fit_log_slopes
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.float64]
 
 MOST_FRAMES = 100_000
 """Of one motion."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import ModelError
 from marey_motion.modelling.mixture import LatentMixture
 from marey_motion.modelling.mixture_fitting import Candidate
@@ -24,7 +25,6 @@ from marey_motion.skeleton import Skeleton
 PRIMITIVE_SCHEMA = "marey/motion-primitive@1"
 
 Tree = dict[str, Any]
-Floats = NDArray[np.float64]
 
 
 def primitive_to_tree(primitive: MotionPrimitive, skeleton: Mapping[str, Any]) -> Tree:

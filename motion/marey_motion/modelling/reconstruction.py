@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.modelling.fpca import PrincipalExamples
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.skeleton import Skeleton
 
-Floats = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 
 MOST_DIMENSIONS = 200

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import kinematics
+from marey_motion.arrays import Floats
 from marey_motion.kinematics import CONTACT_SPEED_M_S
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.float64]
 
 CM_PER_M = 100.0
 

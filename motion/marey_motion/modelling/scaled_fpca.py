@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import kinematics
+from marey_motion.arrays import Floats
 from marey_motion.modelling.fpca import InnerProduct, Keep, dual_coefficients, find_components
 from marey_motion.modelling.reconstruction import comparison_frames
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.float64]
 
 SMALLEST_WEIGHT = 1e-2
 LARGEST_WEIGHT = 1e3

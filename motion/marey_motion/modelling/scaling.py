@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import kinematics
+from marey_motion.arrays import Floats
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.float64]
 
 LEAST_ROOT_EXTENT_M = 1e-3
 """A root axis that stays within a millimetre is not blown up to the size of the others."""

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
-
-Floats = NDArray[np.float64]
 
 DEGREE = 3
 LEAST_COEFFICIENTS = 7

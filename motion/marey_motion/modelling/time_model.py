@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.modelling.splines import SplineBasis
-
-Floats = NDArray[np.float64]
 
 
 def fit_log_slopes(basis: SplineBasis, time_functions: Floats) -> Floats:

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.alignment.signs import consistent_poses
+from marey_motion.arrays import Floats
 from marey_motion.errors import ModelError
 from marey_motion.modelling.fpca import Keep, PrincipalExamples, find_components
 from marey_motion.modelling.mixture_fitting import FittedMixture, MixtureOptions, fit_mixture, one_thread
@@ -22,7 +22,6 @@ from marey_motion.modelling.time_model import equalising_weight, fit_log_slopes
 from marey_motion.modelling.training_report import TrainingReport, report_on
 from marey_motion.modelling.training_warnings import Warned, warnings_of
 
-Floats = NDArray[np.float64]
 Progress = Callable[[int, int | None, str], None]
 
 MOST_EXAMPLES = 5000

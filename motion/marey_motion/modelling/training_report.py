@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import AlignedSet
+from marey_motion.arrays import Floats
 from marey_motion.importing.landmarks import find_landmarks
 from marey_motion.modelling.fpca import PrincipalExamples
 from marey_motion.modelling.mixture_fitting import Candidate, FittedMixture
@@ -17,7 +17,6 @@ from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.reconstruction import ReconstructionErrors, reconstruction_errors
 from marey_motion.modelling.sample_quality import FootQuality, foot_quality, standing_steps, toe_positions
 
-Floats = NDArray[np.float64]
 Progress = Callable[[int, int | None, str], None]
 
 MORE_COMPONENTS_SHOWN = 10

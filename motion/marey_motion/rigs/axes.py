@@ -15,16 +15,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import kinematics, quaternions
+from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, MappingError
 from marey_motion.rigs.mapping import JointMapping
 from marey_motion.rigs.standard import CENTRE_JOINTS, FINGERS, SIDES, STANDARD_JOINTS
 from marey_motion.skeleton import Skeleton, same_hierarchy
 
-Vectors = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
 # Frames of a motion that are looked at, evenly spaced.
@@ -140,10 +139,10 @@ class _Body:
 
     skeleton: Skeleton
     joints: Mapping[str, int]
-    positions: Vectors
-    rotations: Vectors
+    positions: Floats
+    rotations: Floats
 
-    def way(self, start: str, end: str) -> Vectors | None:
+    def way(self, start: str, end: str) -> Floats | None:
         """Unit directions (K, 3) between standard joints; zero where they coincide, None where one is not mapped."""
         if start not in self.joints or end not in self.joints:
             return None
@@ -158,24 +157,24 @@ class _Body:
             where=end,
         )
 
-    def in_joint(self, standard: str, vectors: Vectors) -> Vectors:
+    def in_joint(self, standard: str, vectors: Floats) -> Floats:
         """Mean (3,) of global vectors (K, 3) seen from a joint."""
         inverse = quaternions.conjugate(self.rotations[:, self.joints[standard]])
-        mean: Vectors = quaternions.rotate_vectors(inverse, vectors).astype(np.float64).mean(axis=0)
+        mean: Floats = quaternions.rotate_vectors(inverse, vectors).astype(np.float64).mean(axis=0)
         return mean
 
     @cached_property
-    def hips_left(self) -> Vectors:
+    def hips_left(self) -> Floats:
         across = self.way("right_hip", "left_hip")
         return self.shoulders_left if across is None else across
 
     @cached_property
-    def shoulders_left(self) -> Vectors:
+    def shoulders_left(self) -> Floats:
         across = self.way("right_shoulder", "left_shoulder")
         return self.hips_left if across is None else across
 
     @cached_property
-    def up(self) -> Vectors:
+    def up(self) -> Floats:
         """From the pelvis to the middle of the shoulders, or what comes next to that, perpendicular to the hips."""
         levels = [level for level in map(self._level, _LEVELS) if level is not None]
         if len(levels) < 2:
@@ -183,12 +182,12 @@ class _Body:
         trunk = levels[0] - levels[1]
         return _unit(trunk - _dot(trunk, self.hips_left) * self.hips_left)
 
-    def _level(self, names: tuple[str, ...]) -> Vectors | None:
+    def _level(self, names: tuple[str, ...]) -> Floats | None:
         """Positions (K, 3) of the first of these that is mapped; both sides of it where it has sides."""
         for name in names:
             joints = (name,) if name in CENTRE_JOINTS else tuple(f"{side}_{name}" for side in SIDES)
             if all(joint in self.joints for joint in joints):
-                middle: Vectors = self.positions[:, [self.joints[joint] for joint in joints]].mean(axis=1)
+                middle: Floats = self.positions[:, [self.joints[joint] for joint in joints]].mean(axis=1)
                 return middle
         return None
 
@@ -207,7 +206,7 @@ class _Body:
                 parts.add(f"{side} arm")
         return frozenset(parts)
 
-    def foot(self, side: str) -> Vectors | None:
+    def foot(self, side: str) -> Floats | None:
         """Directions (K, 3) from ankle to toe; to the tip of the toe where its joint lies straight below the ankle."""
         shank, foot = self.way(f"{side}_knee", f"{side}_ankle"), self.way(f"{side}_ankle", f"{side}_toe")
         if foot is None or shank is None or float(np.mean(np.sum(foot * shank, axis=-1))) < ALONG:
@@ -219,13 +218,13 @@ class _Body:
         end = self.positions[:, toe] + quaternions.rotate_vectors(self.rotations[:, toe], tip)
         return _unit(end - self.positions[:, self.joints[f"{side}_ankle"]])
 
-    def _leg_stands(self, side: str, up: Vectors) -> bool:
+    def _leg_stands(self, side: str, up: Floats) -> bool:
         thigh, shank = self.way(f"{side}_hip", f"{side}_knee"), self.way(f"{side}_knee", f"{side}_ankle")
         foot = self.foot(side)
         straight = all(bone is None or bone[0] @ up < -0.7 for bone in (thigh, shank))
         return straight and (foot is None or shank is None or abs(float(foot[0] @ shank[0])) < ALONG)
 
-    def _arm_hangs_or_reaches_out(self, side: str, up: Vectors, outwards: Vectors) -> bool:
+    def _arm_hangs_or_reaches_out(self, side: str, up: Floats, outwards: Floats) -> bool:
         bones = (self.way(f"{side}_shoulder", f"{side}_elbow"), self.way(f"{side}_elbow", f"{side}_wrist"))
         return all(bone is None or (bone[0] @ up < 0.5 and bone[0] @ outwards > -0.3) for bone in bones)
 
@@ -237,7 +236,7 @@ def _part(standard: str) -> str:
     return f"{side} leg" if joint in _LEG else f"{side} arm"
 
 
-def _twist(standard: str, body: _Body) -> Vectors:
+def _twist(standard: str, body: _Body) -> Floats:
     """Unit direction (3,) of a joint's bone in its frame."""
     side, _, joint = standard.partition("_")
     prefix, joint = (f"{side}_", joint) if side in SIDES else ("", standard)
@@ -256,7 +255,7 @@ def _twist(standard: str, body: _Body) -> Vectors:
     return _unit(body.in_joint(standard, body.up))
 
 
-def _tip(skeleton: Skeleton, joint: int) -> Vectors | None:
+def _tip(skeleton: Skeleton, joint: int) -> Floats | None:
     """Offset (3,) of the farthest child or end site that can be the end of the joint's bone."""
     ends = [skeleton.offsets[child] for child in skeleton.children[joint]]
     ends += [site.offset for site in skeleton.end_sites if site.joint == joint]
@@ -267,7 +266,7 @@ def _tip(skeleton: Skeleton, joint: int) -> Vectors | None:
     return max(ends, key=lambda end: float(np.linalg.norm(end))) if ends else None
 
 
-def _swing(standard: str, body: _Body) -> Vectors:
+def _swing(standard: str, body: _Body) -> Floats:
     """Global directions (K, 3) whose mean in the joint's frame is its swing axis."""
     side, _, joint = standard.partition("_")
     if side not in SIDES:
@@ -289,7 +288,7 @@ def _swing(standard: str, body: _Body) -> Vectors:
     return _arm_hinge(side, joint, body)
 
 
-def _leg_hinge(side: str, body: _Body) -> Vectors:
+def _leg_hinge(side: str, body: _Body) -> Floats:
     """The axis a knee bends about, which turns the shank backwards; the body's left where it does not bend."""
     thigh, shank = body.way(f"{side}_hip", f"{side}_knee"), body.way(f"{side}_knee", f"{side}_ankle")
     if len(body.positions) > 1 and thigh is not None and shank is not None:
@@ -299,7 +298,7 @@ def _leg_hinge(side: str, body: _Body) -> Vectors:
     return body.hips_left
 
 
-def _arm_hinge(side: str, joint: str, body: _Body) -> Vectors:
+def _arm_hinge(side: str, joint: str, body: _Body) -> Floats:
     """The axis an elbow stretches about; where it does not bend, left, carried along as the arm is raised."""
     upper, fore = body.way(f"{side}_shoulder", f"{side}_elbow"), body.way(f"{side}_elbow", f"{side}_wrist")
     if len(body.positions) > 1 and upper is not None and fore is not None:
@@ -317,7 +316,7 @@ def _arm_hinge(side: str, joint: str, body: _Body) -> Vectors:
     return quaternions.rotate_vectors(raised, body.hips_left).astype(np.float64)
 
 
-def _across(swing: Vectors, twist: Vectors) -> Vectors:
+def _across(swing: Floats, twist: Floats) -> Floats:
     """The unit part of a swing axis perpendicular to the twist axis; any perpendicular where nothing is left of it."""
     across = swing - (swing @ twist) * twist
     if np.linalg.norm(across) < 1e-6:
@@ -325,17 +324,17 @@ def _across(swing: Vectors, twist: Vectors) -> Vectors:
     return _unit(across)
 
 
-def _unit(v: Vectors) -> Vectors:
+def _unit(v: Floats) -> Floats:
     length = np.linalg.norm(v, axis=-1, keepdims=True)
-    unit: Vectors = v / np.where(length > quaternions.TINY, length, 1.0)
+    unit: Floats = v / np.where(length > quaternions.TINY, length, 1.0)
     return np.where(length > quaternions.TINY, unit, 0.0)
 
 
-def _dot(a: Vectors, b: Vectors) -> Vectors:
-    dot: Vectors = np.sum(a * b, axis=-1, keepdims=True)
+def _dot(a: Floats, b: Floats) -> Floats:
+    dot: Floats = np.sum(a * b, axis=-1, keepdims=True)
     return dot
 
 
-def _triple(v: Vectors) -> Triple:
+def _triple(v: Floats) -> Triple:
     x, y, z = (float(component) for component in v)
     return x, y, z

@@ -12,11 +12,9 @@ from itertools import combinations, product
 from math import log
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.rigs.limbs import BoneTree, LimbPair
-
-Vector = NDArray[np.float64]
 
 # Joints nearer than this to their parent are rigging aids.
 SHORTEST_BONE_M = 1e-3
@@ -159,12 +157,12 @@ def _worth_together(tree: BoneTree, legs: LimbReading, arms: LimbReading, trunk:
     return worth + AGAINST_TRUNK * float(np.mean([1.0 + way @ up for way in down]))
 
 
-def _ends(positions: Vector, legs: LimbReading) -> Iterator[tuple[Vector, Vector]]:
+def _ends(positions: Floats, legs: LimbReading) -> Iterator[tuple[Floats, Floats]]:
     for limb in legs.pair.limbs:
         yield positions[limb.chain[legs.places[0]]], positions[limb.chain[legs.places[2]]]
 
 
-def unit(vector: Vector) -> Vector:
+def unit(vector: Floats) -> Floats:
     length = float(np.linalg.norm(vector))
     return vector / length if length > SHORTEST_BONE_M else np.zeros(3)
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from marey_motion import quaternions
-from marey_motion.rigs.body_plans import SHORTEST_BONE_M, BodyPlan, LimbReading, Vector, body_plans, commonness, unit
+from marey_motion.arrays import Floats
+from marey_motion.rigs.body_plans import SHORTEST_BONE_M, BodyPlan, LimbReading, body_plans, commonness, unit
 from marey_motion.rigs.limbs import BoneTree
 from marey_motion.rigs.names import parse_name
 from marey_motion.rigs.standard import SIDES
@@ -141,20 +142,20 @@ def _branches(tree: BoneTree, joint: int) -> list[int]:
     return [child for child, extent in extents.items() if extent >= SMALL_BRANCH * max(extents.values())]
 
 
-def _left_direction(skeleton: Skeleton, legs: LimbReading, joints: dict[str, int]) -> Vector | None:
+def _left_direction(skeleton: Skeleton, legs: LimbReading, joints: dict[str, int]) -> Floats | None:
     """Up crossed with where the feet point, in the rest pose; None where that pose is too degenerate to tell."""
     positions = skeleton.rest_global_positions
     up = positions[joints.get("head", joints["pelvis"])] - positions[joints["pelvis"]]
     forward = sum((_foot(skeleton, legs.joint(side, 2), legs.joint(side, 3)) for side in range(2)), start=np.zeros(3))
-    left: Vector = np.cross(up, forward)
+    left: Floats = np.cross(up, forward)
     scale = float(np.linalg.norm(up) * np.linalg.norm(forward))
     return left if np.linalg.norm(left) > 0.2 * scale > 0.0 else None
 
 
-def _foot(skeleton: Skeleton, ankle: int | None, toe: int | None) -> Vector:
+def _foot(skeleton: Skeleton, ankle: int | None, toe: int | None) -> Floats:
     """From an ankle to its toe, or to the tip of a foot without one; zero where there is neither."""
     if ankle is not None and toe is not None:
-        way: Vector = skeleton.rest_global_positions[toe] - skeleton.rest_global_positions[ankle]
+        way: Floats = skeleton.rest_global_positions[toe] - skeleton.rest_global_positions[ankle]
         return way
     tips = [site.offset for site in skeleton.end_sites if site.joint == ankle]
     if ankle is None or not tips:
@@ -162,7 +163,7 @@ def _foot(skeleton: Skeleton, ankle: int | None, toe: int | None) -> Vector:
     return np.asarray(quaternions.rotate_vectors(skeleton.rest_global_rotations[ankle], tips[0]), dtype=np.float64)
 
 
-def _left_and_right(skeleton: Skeleton, reading: LimbReading, left: Vector) -> tuple[tuple[int, int], bool]:
+def _left_and_right(skeleton: Skeleton, reading: LimbReading, left: Floats) -> tuple[tuple[int, int], bool]:
     """The sides of a pair of limbs, left one first, and whether their names say so."""
     first, second = reading.pair.limbs
     sides = [

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import AnyFloats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Body, Camera, Stances, body_of, stances_at
@@ -22,7 +22,6 @@ from marey_schemas.wording import counted
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = NDArray[np.floating[Any]]
 
 MAX_TAKES = 100
 MAX_MOMENTS = 12
@@ -96,7 +95,7 @@ class _Row:
     """A take made ready for the page: bodies and stances of source and result, and from where they are seen."""
 
     take: TakePair
-    times_s: Floats
+    times_s: AnyFloats
     actors: tuple[tuple[Body, Stances], tuple[Body, Stances]]
     camera: Camera
 
@@ -141,7 +140,7 @@ class _Stage:
     scale: float
     ground: str
 
-    def placed(self, seen: Floats) -> Floats:
+    def placed(self, seen: AnyFloats) -> AnyFloats:
         """Points (..., 2) on the page of points (..., 3) that a camera sees."""
         return seen[..., :2] * self.scale + self.centre
 
@@ -189,7 +188,7 @@ def _draw_titles(axes: Axes, row: _Row, top: float) -> None:
     _write(axes, (PAGE_WIDTH - MARGIN, top - 0.2), about, 9.5, QUIET, ha="right")
 
 
-def _draw_floor(axes: Axes, stage: _Stage, camera: Camera, facing: Floats | None, radius_m: float) -> None:
+def _draw_floor(axes: Axes, stage: _Stage, camera: Camera, facing: AnyFloats | None, radius_m: float) -> None:
     """The stage's ground, the floor line, the spot of floor under the figure and an arrow where it faces."""
     from matplotlib.patches import Ellipse, Rectangle
 
@@ -204,7 +203,7 @@ def _draw_floor(axes: Axes, stage: _Stage, camera: Camera, facing: Floats | None
         axes.annotate("", tuple(tip), stage.centre, arrowprops=ARROW)
 
 
-def _draw_body(axes: Axes, stage: _Stage, body: Body, seen: Floats, head_m: float) -> None:
+def _draw_body(axes: Axes, stage: _Stage, body: Body, seen: AnyFloats, head_m: float) -> None:
     """Bones from back to front, each with an edge in the colour of the ground that sets it off from those behind."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Circle

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import kinematics
+from marey_motion.arrays import AnyFloats, Indices
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.rigs import JointMapping, map_joints
 from marey_motion.rigs.standard import SIDES
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.floating[Any]]
-Indices = NDArray[np.intp]
 
 LEFT, CENTRE, RIGHT = -1, 0, 1
 TIP_SHARE = 0.25  # of the body's size: longer ends are markers of something else
@@ -30,7 +26,7 @@ class Camera:
     direction_rad: float
     tilt_rad: float
 
-    def seen(self, points: Floats) -> Floats:
+    def seen(self, points: AnyFloats) -> AnyFloats:
         """Points (..., 3) as (right, up, towards the viewer) in metres, shape (..., 3)."""
         turn, tilt = self.direction_rad, self.tilt_rad
         right = points[..., 0] * np.cos(turn) - points[..., 2] * np.sin(turn)
@@ -70,8 +66,8 @@ class Stances:
     facing : (K, 2) unit (x, z) directions, None where the body does not tell
     """
 
-    points: Floats
-    facing: Floats | None
+    points: AnyFloats
+    facing: AnyFloats | None
 
 
 def body_of(skeleton: Skeleton) -> Body:
@@ -126,7 +122,7 @@ def stances_at(clip: Clip, body: Body, frames: Indices) -> Stances:
         translated_joints=clip.translated_joints,
         end_sites=True,
     )
-    facing: Floats | None = None
+    facing: AnyFloats | None = None
     if body.facing[0]:
         try:
             facing = kinematics.forward_directions(points, *body.facing)

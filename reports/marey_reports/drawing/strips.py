@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats, Indices
 from marey_reports.drawing.paper import COLOURS, HAIRLINE, INK, PAPER, QUIET, REFERENCE, TEXT, new_figure, write
-from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Body, Camera, Indices, runs_of
+from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Body, Camera, runs_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.patches import Rectangle
     from matplotlib.path import Path
 
-Floats = NDArray[np.float64]
 
 SIDE_COLOURS = {LEFT: COLOURS[0], CENTRE: INK, RIGHT: COLOURS[1]}
 CAMERA_TILT_RAD = np.radians(10.0)

@@ -7,11 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.evaluation.result import Coverage
 from marey_motion.evaluation.scenario import STRAIGHT_DEG_S
 from marey_reports.drawing.words import span
-
-Floats = NDArray[np.float64]
 
 
 class Hole(NamedTuple):

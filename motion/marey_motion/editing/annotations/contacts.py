@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from marey_motion import kinematics
+from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
-
-Floats = NDArray[np.float64]
 
 LEAVING_FACTOR = 1.6
 SMOOTHING_S = 0.045

@@ -8,17 +8,15 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from marey_motion import kinematics
+from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.editing.annotations.contacts import runs
 from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import MappingError, MotionError
 from marey_motion.matching.body import SIDES, MatchingBody
-
-Floats = NDArray[np.float64]
 
 PAUSE = "pause"
 MOVEMENT = "movement"

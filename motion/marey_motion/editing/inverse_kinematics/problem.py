@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Flags, Floats, Ints
 from marey_motion.editing.inverse_kinematics.targets import (
     ANGLE_LENGTH_M,
     Freedom,
@@ -22,10 +22,6 @@ from marey_motion.editing.inverse_kinematics.targets import (
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 _KINDS: dict[type, int] = {PositionTarget: 0, OrientationTarget: 1, LookAtTarget: 2}
 

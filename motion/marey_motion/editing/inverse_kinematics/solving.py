@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.editing.inverse_kinematics.problem import Found, Problem, pose_problem
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
@@ -27,7 +28,6 @@ from marey_motion.motion import Motion
 from marey_motion.rigs import JointAxes, JointMapping
 from marey_motion.skeleton import Skeleton
 
-Floats = NDArray[np.float64]
 Solver = Literal["auto", "ccd", "two_bone", "least_squares"]
 Ending = Literal["carried", "held"]
 

@@ -11,14 +11,13 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from marey_motion import quaternions
+from marey_motion.arrays import Floats
 from marey_motion.errors import EditError
 from marey_motion.rigs import JointAxes
 from marey_motion.skeleton import Skeleton
-
-Floats = NDArray[np.float64]
 
 ANGLE_LENGTH_M = 0.01 / math.radians(5.0)
 """Metres that a radian counts for beside positions: five degrees are as bad as a centimetre."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.improvement.selection import clips_by_source, same_skeleton
 from marey_motion.evaluation.options import EvaluationOptions
@@ -16,7 +17,6 @@ from marey_motion.evaluation.similarity import every_kth, nearest_poses, window_
 from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
 
-Floats = NDArray[np.float64]
 ProgressCallback = Callable[[int, int, str], None]
 
 MOST_FRAMES = 200

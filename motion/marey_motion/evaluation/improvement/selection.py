@@ -11,14 +11,12 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Flags
 from marey_motion.errors import MotionError
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 from marey_motion.matching.preparing import SAME_OFFSET_M
 from marey_motion.skeleton import same_hierarchy
-
-Mask = NDArray[np.bool_]
 
 
 def source_of(clip: DatabaseClip) -> str:
@@ -41,7 +39,7 @@ def require_sources(known: Collection[str], wanted: Collection[str]) -> None:
         raise MotionError(f"there is no clip {unknown[0]}", code="unknown-clip", where=unknown[0])
 
 
-def rows_of_sources(clips: Sequence[DatabaseClip], sources: Collection[str]) -> Mask:
+def rows_of_sources(clips: Sequence[DatabaseClip], sources: Collection[str]) -> Flags:
     """(N,) rows of the clips of these sources. Raises `MotionError` for a source that has no clip."""
     require_sources({source_of(clip) for clip in clips}, sources)
     rows = np.zeros(clips[-1].stop if clips else 0, dtype=np.bool_)
@@ -57,7 +55,7 @@ def without_sources(database: MatchingDatabase, sources: Collection[str]) -> Mat
     return _gathered(database, [clip for clip in database.clips if not removed[clip.start]], ~removed)
 
 
-def without_rows(database: MatchingDatabase, removed: Mask) -> MatchingDatabase:
+def without_rows(database: MatchingDatabase, removed: Flags) -> MatchingDatabase:
     """The database without these rows (N,); where rows inside a clip go, what is left of it are clips of their own.
 
     A part of a clip is named by its uid and its frames, as "walk#120-480". Its last row cannot be chosen, since nothing
@@ -79,7 +77,7 @@ def without_rows(database: MatchingDatabase, removed: Mask) -> MatchingDatabase:
     return _gathered(replace(database, selectable=selectable), pieces, ~removed)
 
 
-def _gathered(database: MatchingDatabase, clips: Sequence[DatabaseClip], kept: Mask) -> MatchingDatabase:
+def _gathered(database: MatchingDatabase, clips: Sequence[DatabaseClip], kept: Flags) -> MatchingDatabase:
     """The rows of `clips`, which are all that are `kept`, in one database."""
     if not clips:
         raise MotionError("no clip is left", code="no-clips")

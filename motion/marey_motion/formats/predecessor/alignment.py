@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import FormatError
 from marey_motion.formats.document_fields import field_of, number_array
 from marey_motion.formats.predecessor.encoding import decode_document, encode_document
-
-Floats = NDArray[np.float64]
 
 TIME_FUNCTION, SECTIONS = "time_function", "sections"
 LEAST_SLOPE = 0.01

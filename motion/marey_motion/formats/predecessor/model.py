@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import FormatError, FormatLimit, MotionError
 from marey_motion.formats.conversion import convert
 from marey_motion.formats.document_fields import field_of, number_array, text_list
@@ -35,7 +36,6 @@ from marey_motion.modelling.splines import DEGREE, SplineBasis
 from marey_motion.skeleton import Skeleton
 
 Layout = Literal["1", "2", "3", "static"]
-Floats = NDArray[np.float64]
 Document = Mapping[str, Any]
 
 DEFAULT_FRAME_TIME_S = 1.0 / 30.0

@@ -9,15 +9,13 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.formats.predecessor.encoding import Encoding, encode_document
 from marey_motion.formats.predecessor.model import columns_of
 from marey_motion.formats.predecessor.skeleton import CENTIMETRE_M, skeleton_document
 from marey_motion.formats.predecessor.time_functions import as_coefficients, as_increments
 from marey_motion.modelling.primitive import MotionPrimitive
-
-Floats = NDArray[np.float64]
 
 
 def write_predecessor_model(

@@ -16,13 +16,12 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import FormatError
 from marey_motion.modelling.primitive import MOST_LOG_SLOPE, FunctionalComponents, MotionPrimitive
 from marey_motion.modelling.splines import DEGREE, SplineBasis
 
-Floats = NDArray[np.float64]
 TimeForm = Literal["coefficients", "increments"]
 
 DRAWN, SEED = 512, 0

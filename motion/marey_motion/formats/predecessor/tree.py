@@ -11,15 +11,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Ints
 from marey_motion.errors import FormatError, MotionError
 from marey_motion.formats.document_fields import field_of, number_array
 from marey_motion.formats.predecessor.encoding import Encoding, decode_document, encode_document
 from marey_motion.modelling.search.tree import SampleTree
 
 Node = Mapping[str, Any]
-Integers = NDArray[np.int64]
 
 MOST_NODES = 1_000_000
 MOST_LEVELS = 64
@@ -89,9 +88,9 @@ def write_predecessor_tree(tree: SampleTree, spatial: int, branching: int, *, en
     return encode_document(document, encoding)
 
 
-def _by_levels(root: Node, count: int, file: str) -> tuple[list[Integers], list[int]]:
+def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]]:
     """Samples and number of children of each node, level by level; a child's samples are some of its parent's."""
-    indices: list[Integers] = []
+    indices: list[Ints] = []
     children: list[int] = []
     waiting: deque[tuple[Node, str, int]] = deque([(root, "root", 0)])
     while waiting:
@@ -114,10 +113,10 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Integers], list[
     return indices, children
 
 
-def _in_tree_order(indices: list[Integers], children: list[int]) -> Integers:
+def _in_tree_order(indices: list[Ints], children: list[int]) -> Ints:
     """Samples so that those of each node stand side by side: those of the leaves, from the first to the last."""
     first = np.concatenate(([1], 1 + np.cumsum(children)[:-1]))
-    order: list[Integers] = []
+    order: list[Ints] = []
     path = [0]
     while path:
         node = path.pop()

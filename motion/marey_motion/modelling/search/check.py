@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import AlignedSet
+from marey_motion.arrays import Floats
 from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.reconstruction import CM_PER_M
 from marey_motion.modelling.sample_quality import toe_positions
@@ -18,8 +19,6 @@ from marey_motion.modelling.search.step_search import search_steps
 from marey_motion.modelling.search.steps import Step
 from marey_motion.modelling.search.tree import TreeOptions, build_tree
 from marey_motion.modelling.training import train_primitive
-
-Floats = NDArray[np.float64]
 
 REACHING = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
 """Standard joints."""

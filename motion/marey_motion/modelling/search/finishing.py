@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion.editing.constraining import Constraint as Constrained
 from marey_motion.editing.finish import finish
@@ -23,8 +22,6 @@ from marey_motion.modelling.search.constraints import (
 from marey_motion.modelling.search.found_motions import FoundMotion
 from marey_motion.modelling.search.steps import Step
 from marey_motion.rigs import JointAxes, JointMapping, guess_axes
-
-Floats = NDArray[np.float64]
 
 FAR_AWAY_M = 1000.0
 """Looking at a point so far away is looking in its direction."""

@@ -6,18 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion import quaternions
 from marey_motion.alignment.aligned import Placement
+from marey_motion.arrays import Floats
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search.constraints import ConstraintError, Moment, frame_at
 from marey_motion.modelling.search.step_search import Sequel
 from marey_motion.modelling.search.steps import Step
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton, same_hierarchy
-
-Floats = NDArray[np.float64]
 
 SAME_OFFSET_M = 1e-3
 

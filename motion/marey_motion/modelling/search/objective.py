@@ -8,9 +8,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import Placement
+from marey_motion.arrays import Floats, Ints
 from marey_motion.errors import MotionError
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search import objective_kernels as kernels
@@ -38,9 +38,6 @@ from marey_motion.modelling.search.tracking import (
     track_times,
 )
 
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
-
 MOST_CONSTRAINTS = 256
 AT_ORIGIN = Placement(0.0, 0.0, 0.0)
 
@@ -56,8 +53,8 @@ class Rows(NamedTuple):
     axes : (m, 3) for positions 1 where the coordinate counts, for directions the joint's own axis
     """
 
-    kinds: Indices
-    items: Indices
+    kinds: Ints
+    items: Ints
     targets: Floats
     axes: Floats
 

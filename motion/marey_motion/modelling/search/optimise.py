@@ -13,12 +13,10 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.modelling.mixture import LatentMixture
-
-Floats = NDArray[np.float64]
 
 MOST_ITERATIONS = 50
 FIRST_DAMPING = 1e-3

@@ -8,12 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats, Indices
 from marey_motion.errors import MotionError
 from marey_motion.modelling.search.objective import Objective
 from marey_motion.modelling.search.tree import SampleTree
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 CANDIDATES = 8
 """Four are the published number; eight come a sixth nearer in a millisecond."""

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import Placement
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.modelling.search.constraints import START, JointPosition
 from marey_motion.modelling.search.objective import AT_ORIGIN, build_objective
@@ -23,8 +23,6 @@ from marey_motion.modelling.search.steps import (
     TransitionOptions,
 )
 from marey_motion.modelling.search.tree import SampleTree
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,9 +12,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import Placement
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.modelling.mixture import LatentMixture
 from marey_motion.modelling.primitive import MotionPrimitive
@@ -22,8 +22,6 @@ from marey_motion.modelling.search import slope_kernels
 from marey_motion.modelling.search.constraints import Constraint, ConstraintError
 from marey_motion.modelling.search.objective import AT_ORIGIN, Linearised, Objective, as_row, build_objective
 from marey_motion.modelling.search.tracking import Chains, Tracked, facing, standing, track_points
-
-Floats = NDArray[np.float64]
 
 MOST_STEPS = 32
 TRANSITION_JOINTS = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")

@@ -10,13 +10,10 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats, Ints
 from marey_motion.errors import MappingError
 from marey_motion.modelling.primitive import MotionPrimitive
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 LEFTS, RIGHTS = ("left_hip", "left_shoulder"), ("right_hip", "right_shoulder")
 """Standard joints whose difference tells where a body faces."""
@@ -53,14 +50,14 @@ class Chains(NamedTuple):
 
     mean: Floats
     directions: Floats
-    columns: Indices
-    parents: Indices
+    columns: Ints
+    parents: Ints
     offsets: Floats
-    term_starts: Indices
-    term_nodes: Indices
+    term_starts: Ints
+    term_nodes: Ints
     term_signs: Floats
     held: Floats
-    turned: Indices
+    turned: Ints
 
 
 class Clocks(NamedTuple):

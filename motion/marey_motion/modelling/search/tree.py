@@ -14,14 +14,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats, Ints32
 from marey_motion.errors import MotionError
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search import objective_kernels
 from marey_motion.modelling.search import tree_kernels as kernels
 from marey_motion.modelling.search.tracking import Tracked, track_points
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int32]
 FeatureKind = Literal["latent", "end_effectors"]
 
 END_EFFECTORS = ("left_wrist", "right_wrist", "left_ankle", "right_ankle", "head")
@@ -82,8 +81,8 @@ class SampleTree:
     """
 
     samples: NDArray[np.float32]
-    sizes: Integers
-    children: Integers
+    sizes: Ints32
+    children: Ints32
 
     def __post_init__(self) -> None:
         nodes = len(self.sizes)
@@ -105,12 +104,12 @@ class SampleTree:
         return int(self.samples.shape[1])
 
     @cached_property
-    def first_children(self) -> Integers:
+    def first_children(self) -> Ints32:
         """(M,) first child of each node, as far as it has any."""
         return np.asarray(1 + np.cumsum(self.children) - self.children, dtype=np.int32)
 
     @cached_property
-    def starts(self) -> Integers:
+    def starts(self) -> Ints32:
         """(M,) first sample of each node."""
         starts = np.zeros(len(self.sizes), dtype=np.int32)
         kernels.locate(self.sizes, self.children, starts)

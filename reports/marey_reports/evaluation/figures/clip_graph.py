@@ -6,8 +6,8 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Ints
 from marey_motion.evaluation.relevance import clips_of_rows
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import (
@@ -27,8 +27,6 @@ from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MOST_CLIPS = 24
 MOST_LINES = 400

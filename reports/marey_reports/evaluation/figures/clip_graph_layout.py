@@ -7,10 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from marey_motion.arrays import Floats, Ints
 
 SMALLEST, LARGEST = 0.45, 1.0  # radius of a circle; the square root of its frames decides between
 BETWEEN = 0.28  # room between circles

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import AnyFloats
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import (
     COLOURS,
@@ -27,7 +27,6 @@ from marey_schemas.wording import counted
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = NDArray[np.floating[Any]]
 
 ROW = 0.235
 TRANSITIONS = "Transitions"
@@ -73,7 +72,7 @@ def draw_usage(subjects: Sequence[Subject], trial: str | None, options: FigureOp
 
 
 def _draw_bars(
-    panel: Axes, places: Floats, values: Sequence[int], use: _Use, number: int, thick: float, others: bool
+    panel: Axes, places: AnyFloats, values: Sequence[int], use: _Use, number: int, thick: float, others: bool
 ) -> None:
     """A subject's bars with their numbers: clips, then the others, then the transitions, which are hatched."""
     total = sum(use.ticks.values())

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.evaluation.result import Coverage
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import (
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Floats = NDArray[np.float64]
 
 FINE = 144  # cells of the drawn map per axis
 BANDWIDTH = 0.35  # standard deviation of the smoothing, in cells of the trial grid

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import AnyFloats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.scenario import demand
 from marey_reports.drawing.drawn import Sketch
@@ -18,7 +18,6 @@ from marey_reports.evaluation.figures.subjects import FigureOptions, Subject, Tr
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = NDArray[np.floating[Any]]
 
 BINS = 48
 LEAST_BIN = 0.001  # m/s or deg/s
@@ -28,7 +27,7 @@ FINE = 400
 class _Errors(NamedTuple):
     """Errors of one quantity over a trial, and both fits."""
 
-    values: Floats
+    values: AnyFloats
     one: Normals
     two: Normals
 
@@ -93,7 +92,7 @@ def _errors(view: TrialView, negate: bool) -> tuple[_Errors, _Errors]:
     )
 
 
-def _edges(values: Sequence[Floats]) -> Floats:
+def _edges(values: Sequence[AnyFloats]) -> AnyFloats:
     """Bins that hold all but the outermost thousandths, with zero on an edge; wider than what is rounding."""
     together = np.concatenate(values)
     low, high = np.quantile(together, (0.001, 0.999))
@@ -104,7 +103,7 @@ def _edges(values: Sequence[Floats]) -> Floats:
 
 
 def _draw(
-    panel: Axes, errors: _Errors, edges: Floats, heights: Floats, view: TrialView, colour: str, unit: str
+    panel: Axes, errors: _Errors, edges: AnyFloats, heights: AnyFloats, view: TrialView, colour: str, unit: str
 ) -> None:
     panel.stairs(heights, edges, fill=True, color=colour, alpha=0.35, lw=0)
     seconds = len(errors.values) / view.record.rate_hz * (edges[1] - edges[0])
@@ -126,8 +125,8 @@ def _tabulate(
     label: str,
     quantity: str,
     errors: _Errors,
-    edges: Floats,
-    heights: Floats,
+    edges: AnyFloats,
+    heights: AnyFloats,
 ) -> None:
     for low, high, seconds in zip(edges[:-1], edges[1:], heights, strict=True):
         _append(tables["histogram"], (label, quantity, float(low), float(high), float(seconds)))

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats, Ints
 from marey_motion.evaluation.result import ClipUsage
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import (
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 STRETCHES = 200
 ROW = 0.235

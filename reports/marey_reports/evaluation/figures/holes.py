@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import (
@@ -30,8 +29,6 @@ from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
-
-Floats = NDArray[np.float64]
 
 
 def draw_holes(subjects: Sequence[Subject], _trial: str | None, _options: FigureOptions) -> Sketch:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.floating[Any]]
+from marey_motion.arrays import AnyFloats
 
 MOST_STEPS = 500
 TOLERANCE = 1e-9
@@ -18,21 +18,21 @@ NARROWEST = 1e-3  # of the spread of all values: a component may not collapse on
 class Normals(NamedTuple):
     """A mixture of normal distributions: weight, mean and standard deviation of each, by ascending mean."""
 
-    weights: Floats
-    means: Floats
-    deviations: Floats
+    weights: AnyFloats
+    means: AnyFloats
+    deviations: AnyFloats
 
-    def density(self, values: Floats) -> Floats:
+    def density(self, values: AnyFloats) -> AnyFloats:
         """Of the mixture at each value."""
         return np.asarray(_densities(values, self).sum(axis=1), dtype=np.float64)
 
 
-def fit_one(values: Floats) -> Normals:
+def fit_one(values: AnyFloats) -> Normals:
     """Mean and population standard deviation."""
     return Normals(np.ones(1), np.array([values.mean()]), np.array([max(values.std(), LEAST_DEVIATION)]))
 
 
-def fit_two(values: Floats, second: NDArray[np.bool_]) -> Normals:
+def fit_two(values: AnyFloats, second: NDArray[np.bool_]) -> Normals:
     """Two normal distributions by expectation maximisation, begun at the two groups that `second` makes.
 
     A begin that is known, as from the wished speed of each tick, makes the fit repeatable. Where one group is empty the
@@ -59,13 +59,13 @@ def fit_two(values: Floats, second: NDArray[np.bool_]) -> Normals:
     return Normals(fit.weights[order], fit.means[order], fit.deviations[order])
 
 
-def _maximised(values: Floats, shares: Floats, narrowest: float) -> Normals:
+def _maximised(values: AnyFloats, shares: AnyFloats, narrowest: float) -> Normals:
     held = np.maximum(shares.sum(axis=0), np.finfo(float).tiny)
     means = shares.T @ values / held
     variances = (shares * (values[:, None] - means) ** 2).sum(axis=0) / held
     return Normals(held / len(values), means, np.maximum(np.sqrt(variances), narrowest))
 
 
-def _densities(values: Floats, fit: Normals) -> Floats:
+def _densities(values: AnyFloats, fit: Normals) -> AnyFloats:
     scaled = (values[:, None] - fit.means) / fit.deviations
     return np.asarray(fit.weights / (fit.deviations * np.sqrt(2.0 * np.pi)) * np.exp(-0.5 * scaled**2))

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.evaluation.options import Family
 from marey_motion.evaluation.scenario import Reference, Trial, reference
 from marey_reports.drawing.drawn import Sketch
@@ -17,7 +17,6 @@ from marey_reports.evaluation.figures.subjects import FigureOptions, Subject, ch
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = NDArray[np.float64]
 
 SIDE, GAP = 3.9, 0.75
 # Where within a section its number may stand, the middle first.

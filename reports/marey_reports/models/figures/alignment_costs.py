@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from marey_motion.alignment.aligned import AlignedClip, AlignedSet
 from marey_motion.alignment.aligning import restore
 from marey_motion.alignment.cost import CostOptions, frame_costs
+from marey_motion.arrays import Floats
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import (
     DARK,
@@ -23,8 +24,6 @@ from marey_reports.drawing.paper import (
     told_apart,
 )
 from marey_reports.models.figures.subjects import evenly
-
-Floats = NDArray[np.float64]
 
 SIDE = 2.7
 MOST_CELLS = 200

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import REFERENCE
 from marey_reports.drawing.strips import StripRow, draw_strips
 from marey_reports.models.figures.subjects import ModelSubject, position_table
-
-Floats = NDArray[np.float64]
 
 DEVIATIONS = (-2.0, -1.0, 0.0, 1.0, 2.0)
 CELL_IN = (1.2, 1.3)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.modelling.training_report import DEVIATION_OF_MEDIAN, OUTLIER_DEVIATIONS, ExampleReport
 from marey_reports.drawing.drawn import Sketch, Tables
 from marey_reports.drawing.paper import (
@@ -27,7 +27,6 @@ from marey_reports.models.figures.subjects import ModelSubject
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = NDArray[np.float64]
 
 SCATTERED_SAMPLES = 400
 ELLIPSE_DEVIATIONS = 2.0

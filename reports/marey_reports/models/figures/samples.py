@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.rigs import map_joints
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import COLOURS, REFERENCE, Place, add_keys, add_panel, new_figure
@@ -17,7 +18,6 @@ from marey_reports.models.figures.subjects import ModelSubject, evenly, position
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = NDArray[np.float64]
 
 CELL_IN = (1.2, 1.9)
 SHOWN = 20

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import COLOURS, REFERENCE, Place, add_keys, add_panel, new_figure, tick_whole_numbers
 from marey_reports.drawing.words import amount
 from marey_reports.models.figures.subjects import ModelSubject
-
-Floats = NDArray[np.float64]
 
 BINS = 30
 

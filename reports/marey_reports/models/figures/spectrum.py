@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_reports.drawing.drawn import Sketch, Tables
 from marey_reports.drawing.paper import (
     COLOURS,
@@ -26,7 +26,6 @@ from marey_reports.models.figures.subjects import ModelSubject
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = NDArray[np.float64]
 
 MOST_BARS = 40
 

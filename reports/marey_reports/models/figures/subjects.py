@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from marey_motion import kinematics
 from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.alignment.signs import consistent_poses
+from marey_motion.arrays import Floats
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search.check import SearchCheck
 from marey_motion.modelling.training_report import TrainingReport
@@ -19,8 +20,6 @@ from marey_motion.skeleton import Skeleton
 from marey_reports.drawing.paper import shortened, told_apart
 from marey_reports.drawing.stick_figures import Body, body_of
 from marey_reports.drawing.strips import Moments
-
-Floats = NDArray[np.float64]
 
 MOMENTS = 7
 SAMPLES = 16

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import AlignedSet
+from marey_motion.arrays import Floats
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import (
     COLOURS,
@@ -27,7 +27,6 @@ from marey_reports.models.figures.canonical_time import CANONICAL_TIME, mark_key
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = NDArray[np.float64]
 
 NAMED = 4
 POINTS = 12_000

@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import COLOURS, INK, REFERENCE, Place, add_keys, add_panel, new_figure
 from marey_reports.models.figures.canonical_time import CANONICAL_TIME, mark_keyframes, percents
 from marey_reports.models.figures.components import DEVIATIONS, written
 from marey_reports.models.figures.subjects import ModelSubject
-
-Floats = NDArray[np.float64]
 
 MOST_COMPONENTS = 3
 COUNTED_SAMPLES = 1000
