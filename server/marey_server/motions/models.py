@@ -17,8 +17,9 @@ from marey_server.store.items.reading import FoundPart
 from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:
+    from marey_motion.arrays import Floats
     from marey_motion.clip import Clip
-    from marey_motion.modelling.primitive import Floats, MotionPrimitive
+    from marey_motion.modelling.primitive import MotionPrimitive
 
 
 MIB = 1 << 20
