@@ -129,7 +129,7 @@ def errors_page() -> str:
         "# Errors\n\nErrors are `application/problem+json` (RFC 9457). `code` is stable; `instance` is the request id"
         " to quote when asking for help; `errors` points at single fields.\n\n"
     )
-    classes = {one.__name__: one for one in _subclasses(errors.MareyError)}
+    classes = {one.__name__: one for one in _subclasses(errors.ApiProblem)}
     found = {(one.code, one.status): one.__doc__.strip().splitlines()[0] for one in classes.values() if one.__doc__}
     for code, name, detail in _raised(classes):
         found.setdefault((code, classes[name].status), detail)
@@ -140,13 +140,13 @@ def errors_page() -> str:
     return NOTE + text + _table(("code", "status", "says"), rows)
 
 
-def _subclasses(base: type[errors.MareyError]) -> Iterator[type[errors.MareyError]]:
+def _subclasses(base: type[errors.ApiProblem]) -> Iterator[type[errors.ApiProblem]]:
     yield base
     for each in base.__subclasses__():
         yield from _subclasses(each)
 
 
-def _raised(classes: dict[str, type[errors.MareyError]]) -> Iterator[tuple[str, str, str]]:
+def _raised(classes: dict[str, type[errors.ApiProblem]]) -> Iterator[tuple[str, str, str]]:
     """Code, class and text of every error that is made with a code of its own."""
     for file in sorted((ROOT / "server").rglob("*.py")):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):

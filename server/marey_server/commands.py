@@ -121,7 +121,7 @@ def admin_token(*, user: str | None = None, **settings: Any) -> None:
     """A new token of an administrator in place of the data folder's `admin.token`, when that one is lost."""
     from marey_server.access.principal import SYSTEM
     from marey_server.app import connect_database
-    from marey_server.errors import NotFound
+    from marey_server.errors import NotFoundProblem
     from marey_server.process.administrators import TOKEN_FILE, give_token
 
     chosen = read_settings(**settings)
@@ -132,7 +132,7 @@ def admin_token(*, user: str | None = None, **settings: Any) -> None:
     with _database_of(chosen), closing(connect_database(chosen)) as database:
         try:
             database.write(SYSTEM, partial(give_token, name="made where the server is"), user, file)
-        except NotFound:
+        except NotFoundProblem:
             reason = f"no administrator who is not disabled is called {user!r}; say who with --user"
             raise CommandFailed(reason) from None
     _say(f"{file} holds a new token; earlier ones still work, see `marey token ls` and `marey token revoke`")

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from marey_schemas.problems import FieldError
 
 
-class MareyError(Exception):
+class ApiProblem(Exception):
     """The request could not be carried out."""
 
     status: ClassVar[int] = 500
@@ -42,7 +42,7 @@ class MareyError(Exception):
 # 400
 
 
-class BadRequest(MareyError):
+class BadRequestProblem(ApiProblem):
     """The request is malformed."""
 
     status = 400
@@ -52,21 +52,21 @@ class BadRequest(MareyError):
 # 401, 403, 404: who may know what
 
 
-class Unauthenticated(MareyError):
+class UnauthenticatedProblem(ApiProblem):
     """A valid credential is needed."""
 
     status = 401
     code = "unauthenticated"
 
 
-class Forbidden(MareyError):
+class ForbiddenProblem(ApiProblem):
     """You may see this, but not do that."""
 
     status = 403
     code = "forbidden"
 
 
-class NotFound(MareyError):
+class NotFoundProblem(ApiProblem):
     """There is nothing here that you may see."""
 
     status = 404
@@ -76,35 +76,35 @@ class NotFound(MareyError):
 # 405 to 415: how the request is made
 
 
-class MethodNotAllowed(MareyError):
+class MethodNotAllowedProblem(ApiProblem):
     """The resource does not know this method."""
 
     status = 405
     code = "method-not-allowed"
 
 
-class NotAcceptable(MareyError):
+class NotAcceptableProblem(ApiProblem):
     """No offered media type is accepted."""
 
     status = 406
     code = "not-acceptable"
 
 
-class UnsupportedMediaType(MareyError):
+class UnsupportedMediaTypeProblem(ApiProblem):
     """The body's media type is not understood."""
 
     status = 415
     code = "unsupported-media-type"
 
 
-class TooLarge(MareyError):
+class TooLargeProblem(ApiProblem):
     """The request is larger than the limit."""
 
     status = 413
     code = "too-large"
 
 
-class RangeNotSatisfiable(MareyError):
+class RangeNotSatisfiableProblem(ApiProblem):
     """The range lies outside the resource."""
 
     status = 416
@@ -114,27 +114,27 @@ class RangeNotSatisfiable(MareyError):
 # 409, 412, 428: the state of things
 
 
-class Conflict(MareyError):
+class ConflictProblem(ApiProblem):
     """The state of the resource does not allow this."""
 
     status = 409
     code = "conflict"
 
 
-class LeaseLost(Conflict):
+class LeaseLostProblem(ConflictProblem):
     """The lease is held by somebody else or has ended; stop working on the job."""
 
     code = "lease-lost"
 
 
-class PreconditionFailed(MareyError):
+class PreconditionFailedProblem(ApiProblem):
     """The resource has changed since you read it."""
 
     status = 412
     code = "precondition-failed"
 
 
-class PreconditionRequired(MareyError):
+class PreconditionRequiredProblem(ApiProblem):
     """Say which state you are changing: send If-Match."""
 
     status = 428
@@ -144,14 +144,14 @@ class PreconditionRequired(MareyError):
 # 422, 429
 
 
-class Invalid(MareyError):
+class InvalidProblem(ApiProblem):
     """The request is well formed, but what it asks for makes no sense."""
 
     status = 422
     code = "invalid"
 
 
-class TooManyRequests(MareyError):
+class TooManyRequestsProblem(ApiProblem):
     """Too many requests; wait and try again."""
 
     status = 429
@@ -161,14 +161,14 @@ class TooManyRequests(MareyError):
 # 5xx: ours
 
 
-class Unavailable(MareyError):
+class UnavailableProblem(ApiProblem):
     """The server cannot answer just now; try again."""
 
     status = 503
     code = "unavailable"
 
 
-class StorageFull(MareyError):
+class StorageFullProblem(ApiProblem):
     """There is no room left to store this."""
 
     status = 507

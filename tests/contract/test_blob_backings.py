@@ -7,7 +7,7 @@ import pytest
 from tests.support.store_fixtures import Lab
 
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import Invalid, NotFound, StorageFull
+from marey_server.errors import InvalidProblem, NotFoundProblem, StorageFullProblem
 from marey_server.store import blobs, garbage
 from marey_server.store.blob_backings import CHUNK_BYTES, DatabaseBlobs, DirectoryBlobs
 from marey_server.store.blobs import Spool, digest_of
@@ -70,9 +70,9 @@ class BlobBackingContract:
         assert store.read(blobs.read_blob, digest_of(data), who=store.stranger) == data
 
     def test_bytes_that_are_not_the_announced_ones_are_refused(self, store):
-        with pytest.raises(Invalid):
+        with pytest.raises(InvalidProblem):
             store.write(blobs.put_blob, b"changed", expected=digest_of(b"original"))
-        with pytest.raises(NotFound):
+        with pytest.raises(NotFoundProblem):
             store.read(blobs.require_readable, digest_of(b"changed"))
 
     def test_bytes_of_a_write_that_failed_do_not_exist(self, store):
@@ -82,7 +82,7 @@ class BlobBackingContract:
 
         with pytest.raises(RuntimeError):
             store.write(fail)
-        with pytest.raises(NotFound):
+        with pytest.raises(NotFoundProblem):
             store.read(blobs.require_readable, digest_of(b"never"))
         assert store.write(blobs.put_blob, b"never") == digest_of(b"never")
         assert store.read(blobs.read_blob, digest_of(b"never")) == b"never"
@@ -94,9 +94,9 @@ class BlobBackingContract:
 
         with monkeypatch.context() as full:
             full.setattr(type(backing), "write", fill_up)
-            with pytest.raises(StorageFull):
+            with pytest.raises(StorageFullProblem):
                 store.write(blobs.put_blob, b"too much")
-        with pytest.raises(NotFound):
+        with pytest.raises(NotFoundProblem):
             store.read(blobs.require_readable, digest_of(b"too much"))
 
     def test_garbage_is_collected_with_its_bytes(self, store, backing, clock):
@@ -104,7 +104,7 @@ class BlobBackingContract:
         assert garbage.collect_garbage(store.database).blobs == 0
         clock.advance(OLD_US / 1e6)
         assert garbage.collect_garbage(store.database).blobs == 1
-        with pytest.raises(NotFound):
+        with pytest.raises(NotFoundProblem):
             store.read(blobs.require_readable, digest)
         garbage.collect_garbage(store.database, grace_us=-1)
         assert store.read(lambda tx: b"".join(tx.blobs.read(tx.connection, digest, 0, 8))) == b""

@@ -10,7 +10,7 @@ from tests.support.store_fixtures import Lab, skeleton_tree
 
 from marey_schemas.items import CollectionChange, CollectionCreate, ItemCreate
 from marey_schemas.kinds import Kind
-from marey_server.errors import MareyError
+from marey_server.errors import ApiProblem
 from marey_server.store import collections, items
 from marey_server.store.database.connections import Database
 from marey_server.store.items import ItemFilters
@@ -67,7 +67,7 @@ def test_what_is_put_into_a_folder_while_it_is_deleted_goes_with_it_or_stands_in
 
     steps = [Step(lab.database, lab.owner, puts(below)), Step(other, lab.owner, delete)]
     for outcome in interleave(*(steps if first == "put" else reversed(steps))):
-        assert not isinstance(outcome, MareyError), outcome
+        assert not isinstance(outcome, ApiProblem), outcome
     require_whole_trees(lab)
     if first == "put":
         assert living(lab) == []
@@ -86,7 +86,7 @@ def test_what_is_put_into_a_folder_while_it_moves_goes_along_or_stands_in_a_new_
 
     steps = [Step(lab.database, lab.owner, puts(below)), Step(other, lab.owner, move)]
     for outcome in interleave(*(steps if first == "put" else reversed(steps))):
-        assert not isinstance(outcome, MareyError), outcome
+        assert not isinstance(outcome, ApiProblem), outcome
     require_whole_trees(lab)
     if first == "put":
         assert places(lab) == [f"{below.replace('old', 'new')}/rig"]

@@ -10,7 +10,7 @@ from tests.support.queue_desk import Desk
 
 from marey_schemas.jobs import JobCreate
 from marey_schemas.worker_protocol import CompleteRequest, Lease
-from marey_server.errors import MareyError
+from marey_server.errors import ApiProblem
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs import completion, reading, submission
 from marey_server.store.jobs.retrying import retry_job
@@ -60,7 +60,7 @@ def test_a_job_that_is_cancelled_while_it_gets_its_inputs_ends_with_its_tasks(
     done = completes(desk, desk.database, lease)
     cancel = Step(other, desk.user, lambda tx: reading.cancel_job(tx, job))
     outcomes = interleave(done, cancel) if order == "complete first" else interleave(cancel, done)
-    assert not any(isinstance(outcome, MareyError) for outcome in outcomes), outcomes
+    assert not any(isinstance(outcome, ApiProblem) for outcome in outcomes), outcomes
     assert desk.state(lease.job) == "succeeded"
     assert desk.state(job) == "cancelled"
     assert set(desk.job(job).children) <= {"cancelled"}
@@ -105,7 +105,7 @@ def test_two_tries_of_what_failed_with_a_job_do_not_hinder_each_other(desk: Desk
     of_maker = Step(desk.database, desk.user, lambda tx: retry_job(tx, lease.job))
     of_job = Step(other, desk.user, lambda tx: retry_job(tx, job))
     outcomes = interleave(of_maker, of_job)
-    assert not any(isinstance(outcome, MareyError) for outcome in outcomes), outcomes
+    assert not any(isinstance(outcome, ApiProblem) for outcome in outcomes), outcomes
     maker = desk.claim()
     desk.stage(maker, "thing")
     desk.complete(maker)

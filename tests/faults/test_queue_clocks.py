@@ -10,7 +10,7 @@ from tests.support.queue_desk import Desk
 
 from marey_schemas.worker_protocol import ClaimRequest
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import LeaseLost
+from marey_server.errors import LeaseLostProblem
 from marey_server.store.database.clock import DatabaseClock
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs.reaper import StartGrace, claim_after_reaping, correct_times, reap_page
@@ -97,7 +97,7 @@ def test_after_an_outage_workers_have_a_whole_lease_to_come_back_before_anything
     assert tick() == 1  # the dead one's job, taken back and given to the next
     assert desk.job(dead).attempt == 2
     desk.complete(leases[alive])
-    with pytest.raises(LeaseLost):
+    with pytest.raises(LeaseLostProblem):
         desk.complete(leases[dead])
 
 

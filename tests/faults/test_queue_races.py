@@ -16,7 +16,7 @@ from tests.support.queue_desk import Desk, output
 from marey_schemas.jobs import JobCreate
 from marey_schemas.worker_protocol import ClaimRequest, CompleteRequest, FailRequest, Heartbeat, Lease
 from marey_server.access.principal import SYSTEM, Principal
-from marey_server.errors import Conflict, LeaseLost, MareyError
+from marey_server.errors import ApiProblem, ConflictProblem, LeaseLostProblem
 from marey_server.store import leader
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs import completion, fencing, logs, queue, reading, staging, submission
@@ -100,10 +100,10 @@ def test_a_job_has_one_end_whichever_of_two_comes_first(desk: Desk, other: Datab
     desk.clock.advance(61)
     one, two = interleave(bout.does(first, desk.database), bout.does(second, other))
     for outcome in (one, two):
-        assert not isinstance(outcome, MareyError) or isinstance(outcome, Conflict), outcome
+        assert not isinstance(outcome, ApiProblem) or isinstance(outcome, ConflictProblem), outcome
     if {first, second} == {"complete", "reap"}:
         completed = one if first == "complete" else two
-        assert isinstance(completed, LeaseLost) == (desk.state(bout.job) == "queued")
+        assert isinstance(completed, LeaseLostProblem) == (desk.state(bout.job) == "queued")
     bout.assert_sound()
 
 
@@ -117,14 +117,14 @@ def test_what_was_rolled_back_leaves_the_way_free_for_the_other(
     one, two = interleave(bout.does(first, desk.database), bout.does(second, other), commit=False)
     assert isinstance(one, Abandoned)
     if first == second == "complete":
-        assert not isinstance(two, MareyError)
+        assert not isinstance(two, ApiProblem)
     bout.assert_sound()
 
 
 def test_the_first_of_complete_and_cancel_to_commit_decides(desk: Desk, other: Database) -> None:
     bout = Bout(desk, other)
     _, cancelled = interleave(bout.does("complete", desk.database), bout.does("cancel", other))
-    assert isinstance(cancelled, Conflict)
+    assert isinstance(cancelled, ConflictProblem)
     assert desk.state(bout.job) == "succeeded"
 
 
@@ -292,7 +292,7 @@ def stale_worker_story(desk: Desk, act: Callable[[Desk, Lease], object]) -> None
     desk.clock.advance(61)
     assert desk.reap() == 1
     awake = desk.claim()
-    with pytest.raises(LeaseLost):
+    with pytest.raises(LeaseLostProblem):
         act(desk, slept)
     assert desk.state(job) == "running"
     desk.stage(awake, "second")
@@ -328,5 +328,5 @@ def test_without_the_fence_the_stale_worker_gets_through(desk: Desk, act: str, m
 
     monkeypatch.setattr(fencing, "same_fence", no_fence)
     monkeypatch.setattr(completion, "held_parameters", any_fence)
-    with pytest.raises((pytest.fail.Exception, AssertionError, LookupError, MareyError)):
+    with pytest.raises((pytest.fail.Exception, AssertionError, LookupError, ApiProblem)):
         stale_worker_story(desk, STALE_ACTS[act])

@@ -10,7 +10,7 @@ from tests.support.store_fixtures import Lab, skeleton_tree
 
 from marey_schemas.access import MemberChange, Role
 from marey_schemas.kinds import Kind
-from marey_server.errors import Forbidden, NotFound
+from marey_server.errors import ForbiddenProblem, NotFoundProblem
 from marey_server.store import items, members, projects
 from marey_server.store.database.connections import Database
 from marey_server.store.items import Draft
@@ -46,7 +46,7 @@ def test_an_owner_who_is_being_ousted_changes_no_member_any_more(lab: Lab, other
         "to remove the other": removes(stays.user_name),
     }[wants]
     _, refused = interleave(Step(lab.database, stays, ousting), Step(other, goes, wish))
-    assert isinstance(refused, NotFound | Forbidden)
+    assert isinstance(refused, NotFoundProblem | ForbiddenProblem)
     found = {one.user: one.role for one in lab.read(members.list_members, "lab").items}
     assert {name for name, role in found.items() if role is Role.OWNER} == {stays.user_name}
     assert lab.stranger.user_name not in found

@@ -17,7 +17,7 @@ from tests.support.rest_server import Server, running
 
 from marey_schemas.encoding import codecs
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs import reaper
 from marey_server.store.transaction import Transaction
@@ -241,7 +241,7 @@ def test_jobs_of_lost_workers_are_taken_back_whatever_becomes_of_the_other_chore
 
     def share_nothing(tx: Transaction) -> int:
         tried.set()
-        raise Invalid("This result is not to be had.")
+        raise InvalidProblem("This result is not to be had.")
 
     monkeypatch.setattr(reaper, "share_waiting", share_nothing)
     with running(database, tmp_path, lease_ttl_s=1, heartbeat_s=0.3) as server:

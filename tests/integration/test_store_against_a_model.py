@@ -18,7 +18,7 @@ from tests.support.store_fixtures import Lab
 
 from marey_schemas.items import ItemChange, ItemCreate
 from marey_schemas.kinds import Kind
-from marey_server.errors import Conflict, NotFound, PreconditionFailed
+from marey_server.errors import ConflictProblem, NotFoundProblem, PreconditionFailedProblem
 from marey_server.store import fsck, garbage, items
 
 NAMES = st.sampled_from(["walk", "run", "Über"])
@@ -75,11 +75,11 @@ class ItemsMachine(RuleBasedStateMachine):
         expected_rev = {"any": None, "right": model.rev, "wrong": model.rev + 7}[expected]
         error = None
         if model.deleted:
-            error = NotFound
+            error = NotFoundProblem
         elif expected == "wrong":
-            error = PreconditionFailed
+            error = PreconditionFailedProblem
         elif blocked:
-            error = Conflict
+            error = ConflictProblem
         with pytest.raises(error) if error else nullcontext():
             change(expected_rev)
         return error is None
@@ -89,7 +89,7 @@ class ItemsMachine(RuleBasedStateMachine):
         request = ItemCreate(name=name, collection=place, tags=tags, parts={"study": {"text": text}})
         try:
             made = self.lab.write(items.create_item, self.lab.name, Kind.STUDY, request)
-        except Conflict:
+        except ConflictProblem:
             assert self.world.occupied(name, place)
             return multiple()
         assert not self.world.occupied(name, place)
@@ -129,9 +129,9 @@ class ItemsMachine(RuleBasedStateMachine):
         blocked = self.world.occupied(model.name, model.place, item_id)
         try:
             self.write(items.restore_item, item_id)
-        except NotFound:
+        except NotFoundProblem:
             assert not model.deleted
-        except Conflict:
+        except ConflictProblem:
             assert model.deleted
             assert blocked
         else:

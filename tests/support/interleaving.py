@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from marey_server.access.principal import Principal
-from marey_server.errors import MareyError
+from marey_server.errors import ApiProblem
 from marey_server.store.database.connections import Database
 from marey_server.store.transaction import Transaction
 
@@ -61,5 +61,5 @@ def interleave(first: Step, second: Step, *, commit: bool = True) -> tuple[Any, 
 def _outcome(future: Future[Any]) -> Any:
     try:
         return future.result(60)
-    except (MareyError, Abandoned) as error:
+    except (ApiProblem, Abandoned) as error:
         return error

@@ -7,7 +7,7 @@ from functools import partial
 from marey_schemas.access import Login, Me, NewToken, Token, TokenCreate, User, UserChange, UserCreate
 from marey_server.access import passwords
 from marey_server.access.principal import Principal
-from marey_server.errors import Forbidden
+from marey_server.errors import ForbiddenProblem
 from marey_server.http.declarations import Access, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
@@ -173,7 +173,10 @@ class UserResource(Resource):
         )
 
     async def _verify(self, user: str, body: UserChange) -> str | None:
-        """The stored hash that the current password fits. Raises `Forbidden` where one was given that does not."""
+        """The stored hash that the current password fits.
+
+        Raises `ForbiddenProblem` where one was given that does not.
+        """
         if body.current_password is None:
             return None
         self.services.limit_sign_in(user, self.request.remote_ip or "")
@@ -181,7 +184,7 @@ class UserResource(Resource):
         check = partial(passwords.password_matches, body.current_password.get_secret_value(), stored)
         async with self.services.sign_in_places:
             if not await self.compute(check):
-                raise Forbidden("The current password is wrong.", code="wrong-password")
+                raise ForbiddenProblem("The current password is wrong.", code="wrong-password")
         return stored
 
     @writes(access=Access.ADMINISTRATOR, scope="admin", precondition="required")

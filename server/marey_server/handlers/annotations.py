@@ -5,7 +5,7 @@ from __future__ import annotations
 from marey_schemas.editing.annotation_commands import AnnotationChange, AnnotationImport
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
-from marey_server.errors import Conflict, NotFound, PreconditionFailed
+from marey_server.errors import ConflictProblem, NotFoundProblem, PreconditionFailedProblem
 from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
 from marey_server.http.declarations import Access, Body, writes
 from marey_server.http.reply import Rendered, Reply
@@ -38,17 +38,17 @@ class AnnotationCommands(Resource):
         at it.
         """
         if kind_of(kind) is not Kind.ANNOTATION:
-            raise NotFound(f"There are no commands for {kind}; only for annotations.", code="no-commands")
+            raise NotFoundProblem(f"There are no commands for {kind}; only for annotations.", code="no-commands")
         expected_rev = self.precondition.expected_rev
         for _ in range(MOST_TRIES):
             found = await self.look_up(items.find_annotation, project, item)
             changed = await self.compute(apply_commands, found, body, expected_rev=expected_rev)
             try:
                 return await self.answer(items.put_changed, project, item, changed, body.message)
-            except PreconditionFailed:
+            except PreconditionFailedProblem:
                 if expected_rev is not None:
                     raise
-        raise Conflict("Others keep changing this annotation; try again.", code="changed-meanwhile")
+        raise ConflictProblem("Others keep changing this annotation; try again.", code="changed-meanwhile")
 
 
 class ClipAnnotations(Resource):
@@ -68,7 +68,7 @@ class ClipAnnotations(Resource):
     async def post(self, project: str, kind: str, item: str, body: AnnotationImport) -> Rendered:
         """Make an annotation of a clip (kind `clips`) from a document of the predecessor, beside the clip."""
         if kind_of(kind) is not Kind.CLIP:
-            raise NotFound(f"Clips are annotated, not {kind}.", code="no-annotations")
+            raise NotFoundProblem(f"Clips are annotated, not {kind}.", code="no-annotations")
         clip = await self.look_up(items.find_annotated_clip, project, item)
         prepared = await self.compute(prepare_annotation, clip, body)
         return await self.answer_with(

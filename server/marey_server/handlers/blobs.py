@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from marey_schemas.items import BlobsMissing, BlobsQuery
-from marey_server.errors import NotFound
+from marey_server.errors import NotFoundProblem
 from marey_server.http.calls import only_identify
 from marey_server.http.declarations import MIB, Access, Body, Bytes, reads, writes
 from marey_server.http.receiving import Receiver
@@ -20,9 +20,9 @@ _DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
 
 
 def require_digest(text: str) -> str:
-    """The text, if it can name a blob. Raises `NotFound`."""
+    """The text, if it can name a blob. Raises `NotFoundProblem`."""
     if not _DIGEST.fullmatch(text):
-        raise NotFound("Blobs are named sha256: and 64 hexadecimal digits.", code="no-blob")
+        raise NotFoundProblem("Blobs are named sha256: and 64 hexadecimal digits.", code="no-blob")
     return text
 
 

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from marey_schemas.base import Request
 from marey_schemas.items import Event, Page
-from marey_server.errors import BadRequest
+from marey_server.errors import BadRequestProblem
 from marey_server.http.declarations import Access, reads
 from marey_server.http.negotiation import EVENT_STREAM
 from marey_server.http.reply import Reply
@@ -59,7 +59,7 @@ class Events(Resource):
         if text is None:
             return query.after
         if not text.isascii() or not text.isdigit() or len(text) > 18:
-            raise BadRequest("Last-Event-ID is the number of an event.", code="bad-event-id")
+            raise BadRequestProblem("Last-Event-ID is the number of an event.", code="bad-event-id")
         return int(text)
 
     async def _follow(self, project: str, after: int, found: list[Event]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from marey_schemas.base import Answer
-from marey_server.errors import Unavailable
+from marey_server.errors import UnavailableProblem
 from marey_server.http.declarations import Access, Bytes, reads
 from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
@@ -42,10 +42,10 @@ class Readyz(Resource):
     async def get(self) -> Reply:
         """Can the server serve: database reachable, its schema current, blobs writable, not draining."""
         if self.services.draining.is_set():
-            raise Unavailable("The server is stopping.", code="draining", headers={"Retry-After": "5"})
+            raise UnavailableProblem("The server is stopping.", code="draining", headers={"Retry-After": "5"})
         faults = await self.look_up(fsck.find_faults)
         if faults:
-            raise Unavailable("; ".join(faults), code="not-ready", headers={"Retry-After": "5"})
+            raise UnavailableProblem("; ".join(faults), code="not-ready", headers={"Retry-After": "5"})
         return Reply(Health(status="ready"), headers={"Cache-Control": "no-store"})
 
 

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from marey_schemas.imports import ImportAnswer, ImportEntry, ImportRequest, Refusal
 from marey_schemas.jobs import Job, JobCreate
 from marey_schemas.options.imports import ImportOptions
-from marey_server.errors import BadRequest, Invalid, MareyError, TooLarge
+from marey_server.errors import ApiProblem, BadRequestProblem, InvalidProblem, TooLargeProblem
 from marey_server.field_errors import field_errors
 from marey_server.http.declarations import MIB, Access, Body, Files, writes
 from marey_server.http.multipart import MultipartReader, PartHead, Piece, boundary_of
@@ -65,7 +65,7 @@ class Imports(Resource):
         if self.parts is None:
             self.body += chunk
             if len(self.body) > MIB:
-                raise TooLarge(f"A list of files may have {MIB} bytes.")
+                raise TooLargeProblem(f"A list of files may have {MIB} bytes.")
             return
         for piece in self.parts.feed(chunk):
             await self._take(piece)
@@ -81,7 +81,7 @@ class Imports(Resource):
         elif isinstance(piece, bytes) and self._field is not None:
             self._field += piece
             if sum(map(len, self.fields.values())) > MAX_FORM_BYTES:
-                raise TooLarge(f"The form fields may have {MAX_FORM_BYTES} bytes together.")
+                raise TooLargeProblem(f"The form fields may have {MAX_FORM_BYTES} bytes together.")
         elif self._file is not None:
             await self._take_file(*self._file)
             self._file = None
@@ -123,7 +123,7 @@ class Imports(Resource):
             options = ImportOptions.model_validate(request.model_dump(exclude={"files"}, exclude_unset=True))
             self.files = await self.look_up(_stored_files, request)
         if not self.files:
-            raise BadRequest("The request holds no files.", code="no-files")
+            raise BadRequestProblem("The request holds no files.", code="no-files")
         if self._is_large(self.files):
             return await self._submit(project, options)
         return Reply(ImportAnswer(entries=tuple(await self._import_now(project, options))))
@@ -195,7 +195,7 @@ class Imports(Resource):
             sources = [by_name[name] for name in (planned.name, planned.companion) if name is not None]
             try:
                 entry = importing.entry_of(prepared, await self.change(importing.publish, project, prepared, sources))
-            except MareyError as error:
+            except ApiProblem as error:
                 if error.status in REFUSED_ALTOGETHER:
                     raise
                 refusal = Refusal(code=error.error_code, detail=error.detail)
@@ -212,22 +212,22 @@ class Imports(Resource):
 
 
 def _form_options(form: dict[str, bytearray]) -> ImportOptions:
-    """Options from form fields. Raises `Invalid` naming the field."""
+    """Options from form fields. Raises `InvalidProblem` naming the field."""
     try:
         values: dict[str, Any] = {name: value.decode() for name, value in form.items()}
     except UnicodeDecodeError:
-        raise BadRequest("Form fields are UTF-8.", code="bad-multipart") from None
+        raise BadRequestProblem("Form fields are UTF-8.", code="bad-multipart") from None
     if "tags" in values:
         values["tags"] = [tag for tag in values["tags"].split(",") if tag]
     try:
         return ImportOptions.model_validate(values)
     except ValidationError as error:
         faults = field_errors(error, values)
-        raise Invalid(f"{faults[0].pointer}: {faults[0].detail}", code="invalid-form", errors=faults) from None
+        raise InvalidProblem(f"{faults[0].pointer}: {faults[0].detail}", code="invalid-form", errors=faults) from None
 
 
 def _stored_files(tx: Transaction, request: ImportRequest) -> list[SourceFile]:
-    """Files named by digest. Raises `NotFound` where the caller may not read one."""
+    """Files named by digest. Raises `NotFoundProblem` where the caller may not read one."""
     return [SourceFile(file.name, file.blob, blobs.require_readable(tx, file.blob), None) for file in request.files]
 
 

@@ -7,7 +7,7 @@ from pydantic import Field
 from marey_schemas.base import Request
 from marey_schemas.items import Item, ItemChange, ItemCreate, Lineage, Revision, Staleness
 from marey_schemas.kinds import Kind
-from marey_server.errors import NotFound
+from marey_server.errors import NotFoundProblem
 from marey_server.http.declarations import MIB, Access, Body, reads, writes
 from marey_server.http.queries import MAX_INTEGER, CommaSeparated, CountedPageQuery, PageQuery
 from marey_server.http.reply import Rendered, Reply
@@ -55,11 +55,11 @@ class ItemsQuery(CountedPageQuery):
 
 
 def kind_of(plural: str) -> Kind:
-    """The kind that a segment of the address names. Raises `NotFound`."""
+    """The kind that a segment of the address names. Raises `NotFoundProblem`."""
     try:
         return Kind.from_plural(plural)
     except KeyError:
-        raise NotFound(f"There is no kind of item called {plural!r}.", code="no-kind") from None
+        raise NotFoundProblem(f"There is no kind of item called {plural!r}.", code="no-kind") from None
 
 
 class Items(Resource):

@@ -11,7 +11,7 @@ from marey_schemas.base import Request
 from marey_schemas.items import Event, Page
 from marey_schemas.job_kinds import UnknownKindError, find_kind, job_kinds
 from marey_schemas.jobs import Attempt, Job, JobBatch, JobCreate, JobKind, JobList, JobOutput, JobState, TaskResult
-from marey_server.errors import NotFound
+from marey_server.errors import NotFoundProblem
 from marey_server.http.declarations import MIB, Access, Body, Bytes, reads, writes
 from marey_server.http.queries import CommaSeparated, CommaSeparatedOf, CountedPageQuery, PageQuery
 from marey_server.http.reply import Rendered, Reply
@@ -54,7 +54,7 @@ class JobKindResource(Resource):
         try:
             return Reply(find_kind(job_kind).document())
         except UnknownKindError as error:
-            raise NotFound(f"{error}.".capitalize(), code="no-kind") from None
+            raise NotFoundProblem(f"{error}.".capitalize(), code="no-kind") from None
 
 
 class JobsQuery(CountedPageQuery):

@@ -20,7 +20,7 @@ from marey_schemas.worker_protocol import (
     StageAnswer,
     StageRequest,
 )
-from marey_server.errors import BadRequest
+from marey_server.errors import BadRequestProblem
 from marey_server.http.declarations import KIB, MIB, Access, Body, Bytes, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
@@ -110,7 +110,7 @@ class AttemptLog(Resource):
         """Append to the attempt's log at `Upload-Offset`; 409 with the true offset where it goes on elsewhere."""
         text = self.request.headers.get("Upload-Offset", "")
         if not (text.isascii() and text.isdigit() and len(text) <= 15):
-            raise BadRequest("Upload-Offset says how many bytes the log has already.", code="bad-upload-offset")
+            raise BadRequestProblem("Upload-Offset says how many bytes the log has already.", code="bad-upload-offset")
         policy = self.services.queue_policy
         return await self.answer(logs.append_log, job, fence, int(text), body or b"", policy)
 

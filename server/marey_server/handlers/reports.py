@@ -10,7 +10,7 @@ from marey_schemas.base import Request
 from marey_schemas.documents.reports import REPORTS, StoredFigure, StoredFile
 from marey_schemas.documents.reports import Report as ReportDocument
 from marey_schemas.kinds import Kind
-from marey_server.errors import NotFound
+from marey_server.errors import NotFoundProblem
 from marey_server.handlers.items import kind_of
 from marey_server.http.declarations import Access, Bytes, reads
 from marey_server.http.queries import MAX_INTEGER
@@ -109,7 +109,7 @@ def _scripts(report: ReportDocument) -> str:
 
 
 def read_report(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ReportDocument:
-    """The report of an item, of whichever kind it is. Raises `NotFound`."""
+    """The report of an item, of whichever kind it is. Raises `NotFoundProblem`."""
     part: dict[str, Any] = items.read_part(tx, project, kind, item_id, "report", revision=revision, arrays="none").tree
     return _REPORT_OF[part["schema"]].model_validate(part)
 
@@ -118,27 +118,27 @@ _REPORT_OF = {str(one.model_fields["schema_"].default): one for one in REPORTS}
 
 
 def find_figure(report: ReportDocument, name: str, trial: str | None) -> StoredFigure:
-    """A figure of a report. Raises `NotFound`, and says what there is."""
+    """A figure of a report. Raises `NotFoundProblem`, and says what there is."""
     named = [figure for figure in report.figures if figure.name == name]
     for figure in named:
         if figure.trial == trial:
             return figure
     if not named:
         known = ", ".join(dict.fromkeys(figure.name for figure in report.figures))
-        raise NotFound(f"The report has no figure {name!r}; it has {known or 'none'}.", code="no-figure")
+        raise NotFoundProblem(f"The report has no figure {name!r}; it has {known or 'none'}.", code="no-figure")
     trials = ", ".join(str(figure.trial) for figure in named if figure.trial is not None)
     told = f"for the trials {trials}" if trials else "for the whole, without a trial"
-    raise NotFound(f"The report has the figure {name!r} {told}.", code="no-figure")
+    raise NotFoundProblem(f"The report has the figure {name!r} {told}.", code="no-figure")
 
 
 def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:
-    """The form of a figure that is asked for. Raises `NotFound`."""
+    """The form of a figure that is asked for. Raises `NotFoundProblem`."""
     if query.format != "csv":
         return {"png": figure.png, "svg": figure.svg, "json": figure.json_}[query.format]
     table = query.table or next(iter(figure.csv), None)
     if table not in figure.csv:
         tables = ", ".join(figure.csv) or "none"
-        raise NotFound(f"The figure has no table {query.table!r}; it has {tables}.", code="no-table")
+        raise NotFoundProblem(f"The figure has no table {query.table!r}; it has {tables}.", code="no-table")
     return figure.csv[table]
 
 

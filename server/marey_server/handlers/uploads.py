@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from marey_schemas.items import Upload, UploadCreate
-from marey_server.errors import BadRequest, Conflict
+from marey_server.errors import BadRequestProblem, ConflictProblem
 from marey_server.http.declarations import MIB, Access, Body, Bytes, reads, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
@@ -56,7 +56,7 @@ class UploadResource(Resource):
         """Check where the piece belongs before it comes."""
         text = self.request.headers.get("Upload-Offset", "")
         if not text.isascii() or not text.isdigit() or len(text) > 12:
-            raise BadRequest("Say in Upload-Offset where the piece starts.", code="bad-offset")
+            raise BadRequestProblem("Say in Upload-Offset where the piece starts.", code="bad-offset")
         self.upload_id, self.offset, self.piece = upload, int(text), bytearray()
         await self._append()
 
@@ -71,7 +71,7 @@ class UploadResource(Resource):
         self.piece.clear()
         try:
             moved = await self.change(uploads.append, self.upload_id, self.offset, data)
-        except Conflict as error:
+        except ConflictProblem as error:
             error.headers["Upload-Offset"] = str(error.context.get("offset", ""))
             raise
         self.offset = moved.offset

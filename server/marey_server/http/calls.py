@@ -11,7 +11,7 @@ from typing import Any
 
 from marey_server.access import scopes
 from marey_server.access.principal import ANONYMOUS, Principal
-from marey_server.errors import Forbidden, Unauthenticated
+from marey_server.errors import ForbiddenProblem, UnauthenticatedProblem
 from marey_server.http.declarations import Access, Operation
 from marey_server.http.reply import AnswerCache, Form, Rendered, Reply, render
 from marey_server.store import idempotency, projects, tokens
@@ -31,7 +31,7 @@ class Caller:
     def identify(self, tx: Transaction) -> None:
         """Resolve the credential and let the transaction act for its owner, within what the operation allows.
 
-        The store enforces the role that the operation declares. Raises `Unauthenticated` or `Forbidden`.
+        The store enforces the role that the operation declares. Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
         """
         self.principal = ANONYMOUS if self.token is None else tokens.resolve_token(tx, self.token)
         require_access(self.operation, self.principal)
@@ -40,23 +40,26 @@ class Caller:
 
 
 def require_access(operation: Operation, principal: Principal) -> None:
-    """Refuse callers who may never do this, whatever it is done to. Raises `Unauthenticated` or `Forbidden`."""
+    """Refuse callers who may never do this, whatever it is done to.
+
+    Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
+    """
     access = operation.access
     guests = access is Access.ANYONE or (access is Access.READER and operation.public)
     if principal.kind == "anonymous":
         if not guests:
-            raise Unauthenticated("Send a token: Authorization: Bearer <token>.", headers=CHALLENGE)
+            raise UnauthenticatedProblem("Send a token: Authorization: Bearer <token>.", headers=CHALLENGE)
         return
     if access is Access.ATTEMPT and principal.kind != "attempt":
-        raise Forbidden("Only the token of a running job attempt may do this.", code="attempt-only")
+        raise ForbiddenProblem("Only the token of a running job attempt may do this.", code="attempt-only")
     if principal.kind == "attempt":
         if access in (Access.USER, Access.ADMINISTRATOR, Access.WORKER):
-            raise Forbidden("The token of a job attempt may not do this.", code="not-for-attempts")
+            raise ForbiddenProblem("The token of a job attempt may not do this.", code="not-for-attempts")
         return
     if access is Access.ADMINISTRATOR and not principal.administrator:
-        raise Forbidden("Only administrators may do this.", code="administrators-only")
+        raise ForbiddenProblem("Only administrators may do this.", code="administrators-only")
     if operation.scope is not None and not scopes.reaches_somewhere(principal.scopes, operation.scope):
-        raise Forbidden(
+        raise ForbiddenProblem(
             f"The token lacks the scope {operation.scope!r}.", code="scope-missing", context={"scope": operation.scope}
         )
 

@@ -102,16 +102,16 @@ def _type(schema: Schema) -> str:
 
 
 def _problems() -> Iterator[str]:
-    known: list[type[errors.MareyError]] = [
-        errors.MareyError,
-        *sorted(_subclasses(errors.MareyError), key=lambda error: (error.status, error.code)),
+    known: list[type[errors.ApiProblem]] = [
+        errors.ApiProblem,
+        *sorted(_subclasses(errors.ApiProblem), key=lambda error: (error.status, error.code)),
     ]
     for error in known:
         code, title = escape(error.code), escape(_first_line(error.__doc__ or ""))
         yield f"<tr id='problem-{code}'><td>{error.status}<td><code>{code}</code><td>{title}"
 
 
-def _subclasses(base: type[errors.MareyError]) -> Iterator[type[errors.MareyError]]:
+def _subclasses(base: type[errors.ApiProblem]) -> Iterator[type[errors.ApiProblem]]:
     for found in base.__subclasses__():
         yield found
         yield from _subclasses(found)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from marey_server.errors import BadRequest, PreconditionFailed, PreconditionRequired
+from marey_server.errors import BadRequestProblem, PreconditionFailedProblem, PreconditionRequiredProblem
 from marey_server.store.revs import ExpectedRev
 
 MOST_STATES = 100
@@ -41,7 +41,7 @@ def entity_tag(state: int | str, form: str) -> str:
 
 
 def parse_tags(header: str) -> list[str]:
-    """The opaque values of a list of tags, weak or strong; `["*"]` for the star. Raises `BadRequest`."""
+    """The opaque values of a list of tags, weak or strong; `["*"]` for the star. Raises `BadRequestProblem`."""
     if header.strip() == "*":
         return ["*"]
     tags: list[str] = []
@@ -49,14 +49,16 @@ def parse_tags(header: str) -> list[str]:
     while position < len(header):
         match = _TAG.match(header, position)
         if match is None:
-            raise BadRequest(f'Entity tags stand in quotation marks, as in "7.json"; this does not: {header[:200]}')
+            raise BadRequestProblem(
+                f'Entity tags stand in quotation marks, as in "7.json"; this does not: {header[:200]}'
+            )
         tags.append(match[2])
         position = match.end()
         if position < len(header) and header[position] != ",":
-            raise BadRequest(f"Entity tags are separated by commas: {header[:200]}")
+            raise BadRequestProblem(f"Entity tags are separated by commas: {header[:200]}")
         position += 1
     if not tags:
-        raise BadRequest("The header names no entity tag.")
+        raise BadRequestProblem("The header names no entity tag.")
     return tags
 
 
@@ -71,22 +73,22 @@ def matches(if_none_match: str | None, tag: str) -> bool:
 def write_precondition(if_match: str | None, if_none_match: str | None, *, may_create: bool = False) -> Precondition:
     """The precondition of a change.
 
-    Raises `PreconditionRequired` where the caller sent none, `PreconditionFailed` where none of the tags can ever
-    match, `BadRequest` where they are malformed.
+    Raises `PreconditionRequiredProblem` where the caller sent none, `PreconditionFailedProblem` where none of the tags
+    can ever match, `BadRequestProblem` where they are malformed.
     """
     if if_none_match is not None and may_create:
         if if_none_match.strip() != "*":
-            raise BadRequest("If-None-Match of a change can only be *: create, never replace.")
+            raise BadRequestProblem("If-None-Match of a change can only be *: create, never replace.")
         return ABSENT
     if if_match is None:
         hint = "If-Match with the ETag you read, or *" + (", or If-None-Match: * to create" if may_create else "")
-        raise PreconditionRequired(f"Say which state you are changing: {hint}.")
+        raise PreconditionRequiredProblem(f"Say which state you are changing: {hint}.")
     tags = parse_tags(if_match)
     if tags == ["*"]:
         return ANY_STATE
     revs = sorted({int(rev) for tag in tags if _REV.fullmatch(rev := tag.partition(".")[0])})
     if not revs:
-        raise PreconditionFailed(f"{if_match[:200]} is no state of this; read it again.")
+        raise PreconditionFailedProblem(f"{if_match[:200]} is no state of this; read it again.")
     if len(revs) > MOST_STATES:
-        raise BadRequest(f"If-Match names {len(revs)} states; at most {MOST_STATES} are possible.")
+        raise BadRequestProblem(f"If-Match names {len(revs)} states; at most {MOST_STATES} are possible.")
     return Precondition(revs[0] if len(revs) == 1 else frozenset(revs))

@@ -12,7 +12,7 @@ from tornado.iostream import StreamClosedError
 from tornado.web import HTTPError, RequestHandler
 
 from marey_schemas.problems import MEDIA_TYPE, Problem
-from marey_server.errors import MareyError, MethodNotAllowed, Unauthenticated
+from marey_server.errors import ApiProblem, MethodNotAllowedProblem, UnauthenticatedProblem
 from marey_server.http.declarations import Declared, Operation
 from marey_server.http.etags import entity_tag
 from marey_server.http.reply import API, Rendered
@@ -92,7 +92,7 @@ class Exchange(RequestHandler):
             self.request.connection.close()  # type: ignore[union-attr]
             raise StreamClosedError from None
 
-    async def refuse(self, error: MareyError) -> None:
+    async def refuse(self, error: ApiProblem) -> None:
         """Answer before the body is read. The rest of it is read and dropped: closing at once could lose the answer."""
         self.refused = True
         self._write_problem(error)
@@ -101,10 +101,10 @@ class Exchange(RequestHandler):
         elif self.expects_body():
             await self.flush()
 
-    def method_not_allowed(self) -> MethodNotAllowed:
+    def method_not_allowed(self) -> MethodNotAllowedProblem:
         """The refusal of a method that was not declared."""
         allowed = ", ".join(sorted({*self.operations, *(["HEAD"] if "GET" in self.operations else [])}))
-        return MethodNotAllowed(f"Here one can {allowed}.", headers={"Allow": allowed})
+        return MethodNotAllowedProblem(f"Here one can {allowed}.", headers={"Allow": allowed})
 
     def is_awaited(self) -> bool:
         """Whether an answer still has somebody to go to, and the server time to make one."""
@@ -167,7 +167,7 @@ class Exchange(RequestHandler):
 
 def render_problem(error: BaseException, request_id: str) -> Rendered:
     """The problem document of an error. Of faults that are not refusals it says nothing but the request id."""
-    if isinstance(error, MareyError):
+    if isinstance(error, ApiProblem):
         problem = _of_refusal(error, request_id)
         headers = dict(error.headers)
     elif isinstance(error, HTTPError):
@@ -176,7 +176,7 @@ def render_problem(error: BaseException, request_id: str) -> Rendered:
         headers = {}
     else:
         detail = "Something went wrong here. It is in the server's log under this request id."
-        problem = _problem(500, MareyError.code, "The server failed.", detail, request_id)
+        problem = _problem(500, ApiProblem.code, "The server failed.", detail, request_id)
         headers = {}
     if problem.status == 401:
         headers.setdefault("WWW-Authenticate", 'Bearer realm="marey"')
@@ -186,7 +186,7 @@ def render_problem(error: BaseException, request_id: str) -> Rendered:
     return Rendered(problem.status, headers, problem.model_dump_json(by_alias=True).encode())
 
 
-def _of_refusal(error: MareyError, request_id: str) -> Problem:
+def _of_refusal(error: ApiProblem, request_id: str) -> Problem:
     problem = _problem(error.status, error.error_code, error.title, error.detail, request_id)
     return problem.model_copy(update={"errors": error.errors, "context": error.context})
 
@@ -199,6 +199,6 @@ def _problem(status: int, code: str, title: str, detail: str, request_id: str) -
 
 def log_fault(error: BaseException, request_id: str, method: str, path: str) -> None:
     """Write a fault of ours to the log, with its traceback."""
-    if isinstance(error, MareyError | HTTPError | StreamClosedError | Unauthenticated):
+    if isinstance(error, ApiProblem | HTTPError | StreamClosedError | UnauthenticatedProblem):
         return
     log.error("%s %s failed", method, path, exc_info=error, extra={"request_id": request_id})

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum, auto
 
-from marey_server.errors import BadRequest, TooLarge, UnsupportedMediaType
+from marey_server.errors import BadRequestProblem, TooLargeProblem, UnsupportedMediaTypeProblem
 
 MAX_HEAD_BYTES = 16 * 1024
 _BOUNDARY = re.compile(r'boundary=(?:"([^"]{1,70})"|([^\s;,"]{1,70}))', re.IGNORECASE)
@@ -38,12 +38,14 @@ class _State(Enum):
 
 
 def boundary_of(content_type: str) -> bytes:
-    """The boundary of a Content-Type header. Raises `UnsupportedMediaType` or `BadRequest`."""
+    """The boundary of a Content-Type header. Raises `UnsupportedMediaTypeProblem` or `BadRequestProblem`."""
     if not content_type.lower().startswith("multipart/form-data"):
-        raise UnsupportedMediaType(f"Files are sent as multipart/form-data, not {content_type or 'without a type'}.")
+        raise UnsupportedMediaTypeProblem(
+            f"Files are sent as multipart/form-data, not {content_type or 'without a type'}."
+        )
     match = _BOUNDARY.search(content_type)
     if match is None:
-        raise BadRequest("The Content-Type names no boundary.", code="bad-multipart")
+        raise BadRequestProblem("The Content-Type names no boundary.", code="bad-multipart")
     return (match[1] or match[2]).encode("latin-1")
 
 
@@ -57,7 +59,7 @@ class MultipartReader:
         self._parts_left = max_parts
 
     def feed(self, data: bytes) -> Iterator[Piece]:
-        """What the next bytes of the stream complete. Raises `BadRequest` or `TooLarge`."""
+        """What the next bytes of the stream complete. Raises `BadRequestProblem` or `TooLargeProblem`."""
         self._buffer += data
         while True:
             if self._state is _State.HEAD:
@@ -79,9 +81,9 @@ class MultipartReader:
                     yield PartEnd()
 
     def finish(self) -> None:
-        """The stream has ended. Raises `BadRequest` where it ended too early."""
+        """The stream has ended. Raises `BadRequestProblem` where it ended too early."""
         if self._state is not _State.EPILOGUE:
-            raise BadRequest("The multipart body ends before its closing boundary.", code="bad-multipart")
+            raise BadRequestProblem("The multipart body ends before its closing boundary.", code="bad-multipart")
 
     def _take_until_delimiter(self) -> tuple[bytes, bool]:
         """Bytes before the next delimiter, and whether it was found whole; then what follows it is next."""
@@ -94,7 +96,9 @@ class MultipartReader:
             return before, False
         before, after = bytes(self._buffer[:at]), bytes(self._buffer[end : end + 2])
         if after not in (b"\r\n", b"--"):
-            raise BadRequest("A boundary of the multipart body is followed by other bytes.", code="bad-multipart")
+            raise BadRequestProblem(
+                "A boundary of the multipart body is followed by other bytes.", code="bad-multipart"
+            )
         del self._buffer[: end + 2]
         self._state = _State.HEAD if after == b"\r\n" else _State.EPILOGUE
         return before, True
@@ -102,11 +106,11 @@ class MultipartReader:
     def _take_head(self) -> PartHead | None:
         at = self._buffer.find(b"\r\n\r\n")
         if at > MAX_HEAD_BYTES or (at < 0 and len(self._buffer) > MAX_HEAD_BYTES):
-            raise TooLarge(f"The head of a part is longer than {MAX_HEAD_BYTES} bytes.")
+            raise TooLargeProblem(f"The head of a part is longer than {MAX_HEAD_BYTES} bytes.")
         if at < 0:
             return None
         if self._parts_left == 0:
-            raise TooLarge("The request has too many parts.", code="too-many-parts")
+            raise TooLargeProblem("The request has too many parts.", code="too-many-parts")
         self._parts_left -= 1
         head = bytes(self._buffer[:at])
         del self._buffer[: at + 4]
@@ -121,12 +125,12 @@ def _parse_head(head: bytes) -> PartHead:
             try:
                 text = value.decode("utf-8").strip()
             except UnicodeDecodeError:
-                raise BadRequest("The head of a part is not UTF-8.", code="bad-multipart") from None
+                raise BadRequestProblem("The head of a part is not UTF-8.", code="bad-multipart") from None
             found = {key.lower(): _unquoted(quoted) or bare for key, quoted, bare in _PARAMETER.findall(text)}
             if not text.lower().startswith("form-data") or "name" not in found:
                 break
             return PartHead(found["name"], found.get("filename"))
-    raise BadRequest("A part lacks Content-Disposition: form-data with a name.", code="bad-multipart")
+    raise BadRequestProblem("A part lacks Content-Disposition: form-data with a name.", code="bad-multipart")
 
 
 def _unquoted(text: str) -> str:

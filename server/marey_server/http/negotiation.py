@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import Literal
 
 from marey_schemas.encoding import codecs
-from marey_server.errors import NotAcceptable, Unauthenticated, UnsupportedMediaType
+from marey_server.errors import NotAcceptableProblem, UnauthenticatedProblem, UnsupportedMediaTypeProblem
 
 MAX_RANGES = 64
 
@@ -62,11 +62,16 @@ class _Range:
 
 
 def choose(accept: str | None, offers: tuple[MediaType, ...]) -> MediaType:
-    """The offer the caller likes best; the first offer wins ties. Raises `NotAcceptable`, listing what is offered."""
+    """The offer the caller likes best; the first offer wins ties.
+
+    Raises `NotAcceptableProblem`, listing what is offered.
+    """
     chosen = _best(accept, offers) if accept else offers[0]
     if chosen is None:
         names = ", ".join(map(str, offers))
-        raise NotAcceptable(f"This is offered as {names}.", context={"offered": [str(offer) for offer in offers]})
+        raise NotAcceptableProblem(
+            f"This is offered as {names}.", context={"offered": [str(offer) for offer in offers]}
+        )
     return chosen
 
 
@@ -106,30 +111,38 @@ def _split_parameters(text: str) -> tuple[str, dict[str, str]]:
 
 
 def body_type(content_type: str | None, known: tuple[str, ...] = codecs.MEDIA_TYPES) -> str:
-    """The media type of a body; JSON if it names none. Raises `UnsupportedMediaType`, listing what is understood."""
+    """The media type of a body; JSON if it names none.
+
+    Raises `UnsupportedMediaTypeProblem`, listing what is understood.
+    """
     if not content_type:
         return codecs.JSON
     name, params = _split_parameters(content_type)
     if name not in known:
-        raise UnsupportedMediaType(
+        raise UnsupportedMediaTypeProblem(
             f"A body may be {', '.join(known)}, not {name}.", context={"understood": list(known)}
         )
     if params.get("charset", "utf-8") not in ("utf-8", "utf8", "us-ascii"):
-        raise UnsupportedMediaType(f"Text is read as UTF-8, not {params['charset']}.")
+        raise UnsupportedMediaTypeProblem(f"Text is read as UTF-8, not {params['charset']}.")
     return name
 
 
 def require_plain_encoding(content_encoding: str | None) -> None:
-    """Refuse compressed bodies, so that no small request unfolds into a large one. Raises `UnsupportedMediaType`."""
+    """Refuse compressed bodies, so that no small request unfolds into a large one.
+
+    Raises `UnsupportedMediaTypeProblem`.
+    """
     if content_encoding and content_encoding.strip().lower() not in ("", "identity"):
-        raise UnsupportedMediaType(f"Bodies are read as they are; leave out Content-Encoding: {content_encoding}.")
+        raise UnsupportedMediaTypeProblem(
+            f"Bodies are read as they are; leave out Content-Encoding: {content_encoding}."
+        )
 
 
 def bearer_token(authorization: str | None) -> str | None:
-    """The token of an Authorization header, None without one. Raises `Unauthenticated` where it is malformed."""
+    """The token of an Authorization header, None without one. Raises `UnauthenticatedProblem` where it is malformed."""
     if authorization is None:
         return None
     scheme, _, token = authorization.strip().partition(" ")
     if scheme.lower() != "bearer" or not token.strip() or len(token) > 1024:
-        raise Unauthenticated("The Authorization header must read: Bearer <token>.", code="bad-authorization")
+        raise UnauthenticatedProblem("The Authorization header must read: Bearer <token>.", code="bad-authorization")
     return token.strip()

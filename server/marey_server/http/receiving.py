@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from marey_server.errors import StorageFull
+from marey_server.errors import StorageFullProblem
 from marey_server.process.services import Services
 from marey_server.store.blobs import Spool
 
@@ -43,4 +43,4 @@ class Receiver:
         try:
             self.spool.write(batch)
         except OSError as error:
-            raise StorageFull(f"There is no room to take this in: {error.strerror}.") from error
+            raise StorageFullProblem(f"There is no room to take this in: {error.strerror}.") from error

@@ -30,7 +30,7 @@ from pydantic import BaseModel
 from tornado.web import stream_request_body
 
 from marey_server.access.principal import ANONYMOUS, Principal
-from marey_server.errors import BadRequest, MareyError, TooLarge
+from marey_server.errors import ApiProblem, BadRequestProblem, TooLargeProblem
 from marey_server.http import negotiation
 from marey_server.http.calls import Call, Caller, only_identify, require_access, run_call, run_plain
 from marey_server.http.declarations import Bytes, Declared, Document, Operation
@@ -184,7 +184,7 @@ class Resource(Exchange):
                 await self.begin(**self.path_variables)
             elif self.declared_length() > EARLY_CHECK_BYTES:
                 await self.look_up(only_identify)
-        except MareyError as error:
+        except ApiProblem as error:
             await self.refuse(error)
 
     def _check_head(self) -> None:
@@ -226,7 +226,9 @@ class Resource(Exchange):
         if body is None or not self.expects_body():
             return
         if self.declared_length() > body.max_bytes:
-            raise TooLarge(f"The body has {self.declared_length()} bytes; at most {body.max_bytes} are taken here.")
+            raise TooLargeProblem(
+                f"The body has {self.declared_length()} bytes; at most {body.max_bytes} are taken here."
+            )
         if body.content is not Bytes and not body.streamed:
             self.body_type = negotiation.body_type(self.request.headers.get("Content-Type"))
 
@@ -246,12 +248,12 @@ class Resource(Exchange):
         try:
             limit = body.max_bytes if body is not None else 0
             if self.received_bytes > limit:
-                raise TooLarge(f"The body is longer than the {limit} bytes that are taken here.")
+                raise TooLargeProblem(f"The body is longer than the {limit} bytes that are taken here.")
             if body is not None and body.streamed:
                 await self.receive(chunk)
             else:
                 self._received += chunk
-        except MareyError as error:
+        except ApiProblem as error:
             await self.refuse(error)
 
     async def perform(self, method: Callable[..., Awaitable[Reply | Rendered | None]]) -> None:
@@ -279,7 +281,7 @@ class Resource(Exchange):
             return data
         if not data:
             if body.required:
-                raise BadRequest("A body is needed.", code="body-missing")
+                raise BadRequestProblem("A body is needed.", code="body-missing")
             return None
         read = partial(_decode, data, self.body_type, body.content)
         return read() if len(data) <= INLINE_BYTES else await self.compute(read)
@@ -291,7 +293,9 @@ class Resource(Exchange):
             return None
         key = self.request.headers.get("Idempotency-Key")
         if key is not None and not _KEY.fullmatch(key):
-            raise BadRequest("An Idempotency-Key has 1 to 255 visible ASCII characters.", code="bad-idempotency-key")
+            raise BadRequestProblem(
+                "An Idempotency-Key has 1 to 255 visible ASCII characters.", code="bad-idempotency-key"
+            )
         return key
 
     def _fingerprint(self) -> str:

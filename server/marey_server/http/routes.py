@@ -12,7 +12,7 @@ from tornado.httputil import HTTPMessageDelegate, HTTPServerRequest
 from tornado.routing import Router
 from tornado.web import Application
 
-from marey_server.errors import NotFound
+from marey_server.errors import NotFoundProblem
 from marey_server.http.declarations import Operation
 from marey_server.http.resource import Resource
 
@@ -52,7 +52,7 @@ class UnknownPath(Resource):
     tag = ""
 
     def _check_head(self) -> None:
-        raise NotFound("No resource has this address.")
+        raise NotFoundProblem("No resource has this address.")
 
 
 class RouteTable(Router):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from urllib.parse import quote
 
-from marey_server.errors import RangeNotSatisfiable, Unavailable
+from marey_server.errors import RangeNotSatisfiableProblem, UnavailableProblem
 from marey_server.http.declarations import MIB
 from marey_server.http.etags import entity_tag, matches
 from marey_server.http.reply import Rendered
@@ -35,14 +35,14 @@ class ByteRange:
     last: int | None
 
     def within(self, size: int) -> tuple[int, int]:
-        """Start and stop in a representation of `size` bytes. Raises `RangeNotSatisfiable`."""
+        """Start and stop in a representation of `size` bytes. Raises `RangeNotSatisfiableProblem`."""
         if self.first is None:
             start, stop = max(size - (self.last or 0), 0), size
         else:
             start, stop = self.first, size if self.last is None else min(self.last + 1, size)
         if start >= stop:
             headers = {"Content-Range": f"bytes */{size}"}
-            raise RangeNotSatisfiable(f"It has {size} bytes; none of the range is among them.", headers=headers)
+            raise RangeNotSatisfiableProblem(f"It has {size} bytes; none of the range is among them.", headers=headers)
         return start, stop
 
 
@@ -96,7 +96,7 @@ class BlobSender(Resource):
         cache_control: str = IMMUTABLE,
         headers: Mapping[str, str] = MappingProxyType({}),
     ) -> Rendered | None:
-        """Answer with the blob, as far as Range, If-Range and If-None-Match ask for it. Raises `NotFound`.
+        """Answer with the blob, as far as Range, If-Range and If-None-Match ask for it. Raises `NotFoundProblem`.
 
         `cache_control` is for addresses that do not name the blob itself; `headers` go with the bytes.
         """
@@ -130,6 +130,6 @@ class BlobSender(Resource):
             stop = min(opened.stop, position + PIECE_BYTES)
             piece = await self.look_up(blobs.read_range, digest, position, stop)
             if len(piece) != stop - position:
-                raise Unavailable(f"Bytes of {digest} are lost.", code="blob-damaged")
+                raise UnavailableProblem(f"Bytes of {digest} are lost.", code="blob-damaged")
             self.write(piece)
             position = stop

@@ -11,14 +11,14 @@ from pydantic import BaseModel, ValidationError
 from marey_schemas.encoding import codecs
 from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.problems import FieldError
-from marey_server.errors import BadRequest, Invalid, TooLarge
+from marey_server.errors import BadRequestProblem, InvalidProblem, TooLargeProblem
 from marey_server.field_errors import MAX_ERRORS, field_errors, json_pointer
 
 Model = TypeVar("Model", bound=BaseModel)
 
 
 def parse_query(model: type[Model] | None, arguments: Mapping[str, Sequence[bytes]]) -> Model | None:
-    """The query parameters as `model`. Raises `BadRequest` naming each unknown, repeated or unfit parameter."""
+    """The query parameters as `model`. Raises `BadRequestProblem` naming each unknown, repeated or unfit parameter."""
     known = {field.alias or name: field for name, field in model.model_fields.items()} if model else {}
     values: dict[str, str] = {}
     faults = []
@@ -50,25 +50,28 @@ def _known_parameters(known: Mapping[str, Any]) -> str:
     return f"Known here: {', '.join(sorted(known))}." if known else "Nothing is known here."
 
 
-def _bad_query(faults: list[FieldError]) -> BadRequest:
+def _bad_query(faults: list[FieldError]) -> BadRequestProblem:
     names = ", ".join(dict.fromkeys(fault.pointer for fault in faults))
-    return BadRequest(f"Query parameters: {names}.", code="bad-query", errors=faults[:MAX_ERRORS])
+    return BadRequestProblem(f"Query parameters: {names}.", code="bad-query", errors=faults[:MAX_ERRORS])
 
 
 def decode_body(data: bytes, media_type: str) -> Any:
-    """The tree a body holds. Raises `BadRequest` where it is none, `Invalid` where it holds what may not travel."""
+    """The tree a body holds.
+
+    Raises `BadRequestProblem` where it is none, `InvalidProblem` where it holds what may not travel.
+    """
     try:
         return codecs.decode_tree(data, media_type)
     except codecs.CodecError as error:
         fault = FieldError(pointer=error.pointer, code=error.code, detail=error.detail)
         if error.code == "too-large":
-            raise TooLarge(error.detail, errors=[fault]) from None
-        refusal = BadRequest if error.code == "bad-syntax" else Invalid
+            raise TooLargeProblem(error.detail, errors=[fault]) from None
+        refusal = BadRequestProblem if error.code == "bad-syntax" else InvalidProblem
         raise refusal(f"The body cannot be read: {error}.", code=error.code, errors=[fault]) from None
 
 
 def validate_body(model: type[Model], tree: Any) -> Model:
-    """A tree as `model`, without guessing: "5" is no number. Raises `Invalid` with a JSON Pointer per fault."""
+    """A tree as `model`, without guessing: "5" is no number. Raises `InvalidProblem` with a JSON Pointer per fault."""
     try:
         if survey(tree):
             return model.model_validate(tree)
@@ -76,16 +79,19 @@ def validate_body(model: type[Model], tree: Any) -> Model:
     except ValidationError as error:
         faults = field_errors(error, tree)
         first = f"{faults[0].pointer or 'the body'}: {faults[0].detail}"
-        raise Invalid(f"The body does not fit: {first}", code="invalid-body", errors=faults) from None
+        raise InvalidProblem(f"The body does not fit: {first}", code="invalid-body", errors=faults) from None
 
 
 def survey(tree: Any, steps: tuple[str, ...] = ()) -> bool:
-    """Whether a tree holds arrays. Raises `Invalid` at a text with a NUL character, which databases do not store."""
+    """Whether a tree holds arrays.
+
+    Raises `InvalidProblem` at a text with a NUL character, which databases do not store.
+    """
     if isinstance(tree, Mapping):
         return sum(survey(member, (*steps, key)) for key, member in tree.items()) > 0
     if isinstance(tree, list):
         return sum(survey(item, (*steps, str(index))) for index, item in enumerate(tree)) > 0
     if isinstance(tree, str) and "\0" in tree:
         fault = FieldError(pointer=json_pointer(steps), code="bad-text", detail="A text may not contain NUL.")
-        raise Invalid(f"{fault.pointer}: {fault.detail}", code="bad-text", errors=[fault])
+        raise InvalidProblem(f"{fault.pointer}: {fault.detail}", code="bad-text", errors=[fault])
     return isinstance(tree, np.ndarray)

@@ -9,7 +9,7 @@ from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
 from marey_schemas.problems import FieldError
-from marey_server.errors import Invalid, MareyError, TooLarge
+from marey_server.errors import ApiProblem, InvalidProblem, TooLargeProblem
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.items import prepare_part, prepare_parts
 from marey_server.store.items.annotating import AnnotatedClip, ChangedAnnotation, FoundAnnotation
@@ -31,7 +31,7 @@ def apply_commands(
         return ChangedAnnotation(found.rev, moved_on(found.rev))
     try:
         return ChangedAnnotation(found.rev, _changed(found, change))
-    except MareyError as refusal:
+    except ApiProblem as refusal:
         return ChangedAnnotation(found.rev, refusal)
 
 
@@ -46,7 +46,7 @@ def _changed(found: FoundAnnotation, change: AnnotationChange) -> PreparedDocume
     for index, command in enumerate(change.commands):
         work += len(layer.segments) + len(layer.keyframes)
         if work > MOST_WORK:
-            raise TooLarge(
+            raise TooLargeProblem(
                 f"{len(change.commands)} commands are too many at once for {len(layer.segments)} segments and "
                 f"{len(layer.keyframes)} keyframes; send at most {index} at a time.",
                 code="too-many-commands",
@@ -56,13 +56,16 @@ def _changed(found: FoundAnnotation, change: AnnotationChange) -> PreparedDocume
         except MotionError as error:
             wrong = FieldError(pointer=f"/commands/{index}", code=error.code, detail=str(error))
             detail = f"Command {index} ({command.command}) cannot be carried out, so none was: {error}"
-            raise Invalid(detail, code="command-refused", errors=[wrong]) from error
+            raise InvalidProblem(detail, code="command-refused", errors=[wrong]) from error
     changed = documents.layer_to_document(layer, annotation.clip, annotation.layer, annotation.made_by)
     return prepare_part(Kind.ANNOTATION, "annotation", changed.model_dump(mode="json", by_alias=True))
 
 
 def prepare_annotation(clip: AnnotatedClip, given: AnnotationImport) -> ItemCreate:
-    """Convert a document of the predecessor into an annotation of a clip, in the clip's folder. Raises `Invalid`."""
+    """Convert a document of the predecessor into an annotation of a clip, in the clip's folder.
+
+    Raises `InvalidProblem`.
+    """
     from marey_motion import documents
     from marey_motion.errors import MotionError
     from marey_motion.formats.predecessor.annotation import layer_of_document
@@ -73,7 +76,7 @@ def prepare_annotation(clip: AnnotatedClip, given: AnnotationImport) -> ItemCrea
         )
     except MotionError as error:
         wrong = FieldError(pointer="/document", code=error.code, detail=str(error))
-        raise Invalid(f"This is no annotation of the clip: {error}", code=error.code, errors=[wrong]) from error
+        raise InvalidProblem(f"This is no annotation of the clip: {error}", code=error.code, errors=[wrong]) from error
     ref = RevisionRef(item=clip.item.id, revision=clip.item.revision)
     annotation = documents.layer_to_document(layer, ref, given.layer)
     return ItemCreate(

@@ -29,7 +29,7 @@ from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
-from marey_server.errors import Invalid, NotFound
+from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.store import items, projects
 from marey_server.store.coverage_streams import NewStream, Step, Stream, answered_before, require_offset
 from marey_server.store.transaction import Transaction
@@ -53,7 +53,7 @@ class Given:
 
 
 def read_given(tx: Transaction, project: str, request: CoverageStreamCreate) -> Given:
-    """What a new stream refers to, for who may make one. Raises `NotFound`."""
+    """What a new stream refers to, for who may make one. Raises `NotFoundProblem`."""
     projects.require(tx, project)
     skeleton = rig = evaluation = measured = None
     if request.skeleton is not None:
@@ -71,7 +71,7 @@ def read_given(tx: Transaction, project: str, request: CoverageStreamCreate) -> 
 def _mapping(tx: Transaction, project: str, skeleton: str, revision: int) -> Tree | None:
     try:
         return items.read_part(tx, project, Kind.SKELETON, skeleton, "mapping", revision=revision).tree
-    except NotFound:  # an optional part: it is then guessed
+    except NotFoundProblem:  # an optional part: it is then guessed
         return None
 
 
@@ -116,7 +116,8 @@ def look(stream: Stream) -> CoverageStreamState:
 def advance(held: Stream, frames: CoverageFrames) -> Step | Tree:
     """Where frames take a stream, or the answer to the same request before.
 
-    Raises `CoverageOffset` where they do not go on where the stream is, `Invalid` where they are no frames of it.
+    Raises `CoverageOffset` where they do not go on where the stream is, `InvalidProblem` where they are no frames of
+    it.
     """
     said = _said(frames)
     if (answer := answered_before(held, said)) is not None:
@@ -150,7 +151,7 @@ def _add_poses(online: OnlineCoverage, held: Stream, frames: CoverageFrames) -> 
 
     if held.rig is None:
         fault = _fault("/poses", "no-skeleton", "These need a skeleton.")
-        raise Invalid(
+        raise InvalidProblem(
             "The stream was made without a skeleton; send roots, or make one with it.",
             code="no-skeleton",
             errors=[fault],
@@ -211,11 +212,13 @@ def refusing(field: str) -> Iterator[None]:
     try:
         yield
     except MotionError as error:
-        raise Invalid(str(error), code=error.code, errors=[_fault(f"/{field}", error.code, str(error))]) from error
+        raise InvalidProblem(
+            str(error), code=error.code, errors=[_fault(f"/{field}", error.code, str(error))]
+        ) from error
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         detail = ": ".join((*map(str, first["loc"]), first["msg"].removeprefix("Value error, ")))
-        raise Invalid(f"{field}: {detail}", errors=[_fault(f"/{field}", "invalid", detail)]) from error
+        raise InvalidProblem(f"{field}: {detail}", errors=[_fault(f"/{field}", "invalid", detail)]) from error
 
 
 def _fault(pointer: str, code: str, detail: str) -> FieldError:

@@ -12,7 +12,7 @@ from marey_schemas.encoding import codecs
 from marey_schemas.formats import ExportFormat
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
-from marey_server.errors import Invalid, NotFound
+from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.predecessor_exports import PredecessorOptions, unchanged_original, write_predecessor
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
@@ -51,7 +51,7 @@ class OriginalFile:
 
 
 def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ExportSource:
-    """Everything that a file of an item can need. Raises `NotFound`."""
+    """Everything that a file of an item can need. Raises `NotFoundProblem`."""
     found = items.read_item(tx, project, kind, item_id)
     number = found.revision if revision is None else revision
     held = items.read_revision(tx, project, kind, item_id, number).parts
@@ -66,7 +66,10 @@ def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revisio
 def find_unchanged_original(
     tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None, options: PredecessorOptions
 ) -> OriginalFile | None:
-    """The file that a model, a tree or a graph was imported from, if that still says the same. Raises `NotFound`."""
+    """The file that a model, a tree or a graph was imported from, if that still says the same.
+
+    Raises `NotFoundProblem`.
+    """
     if kind not in (Kind.MODEL, Kind.GRAPH):
         return None
     found = items.read_item(tx, project, kind, item_id)
@@ -83,7 +86,10 @@ def find_unchanged_original(
 def find_original(
     tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None, options: PredecessorOptions
 ) -> OriginalFile:
-    """The file that an item, or a model's tree, was imported from. Raises `NotFound` where it was made otherwise."""
+    """The file that an item, or a model's tree, was imported from.
+
+    Raises `NotFoundProblem` where it was made otherwise.
+    """
     if kind in (Kind.MODEL, Kind.GRAPH):
         asked = PredecessorOptions(part=options.part)  # in whatever layout it came
         unchanged = find_unchanged_original(tx, project, kind, item_id, revision, asked)
@@ -95,15 +101,17 @@ def find_original(
         if source.get("file"):
             name = str(source.get("file_name") or item_id).replace("\\", "/").rpartition("/")[2]
             return OriginalFile(name, source["file"])
-    raise NotFound("It was not made from a file; ask for another format, such as bvh.", code="no-original")
+    raise NotFoundProblem("It was not made from a file; ask for another format, such as bvh.", code="no-original")
 
 
 def write_file(
     source: ExportSource, file_format: ExportFormat, unit: str, time: ExportTime, options: PredecessorOptions
 ) -> ExportedFile:
-    """The file of an item. Raises `Invalid` where the format cannot hold it."""
+    """The file of an item. Raises `InvalidProblem` where the format cannot hold it."""
     if time == "source" and source.item.kind is not Kind.PROCESSED:
-        raise Invalid("Only an aligned clip has a time of its own and that of its source.", code="no-such-export")
+        raise InvalidProblem(
+            "Only an aligned clip has a time of its own and that of its source.", code="no-such-export"
+        )
     beside = source.item.kind is Kind.PROCESSED and options.part == "alignment"
     if file_format == "predecessor" and (beside or source.item.kind not in WITH_MOTION):
         name, data = write_predecessor(source.item.kind, source.item.name, source.parts, source.hierarchy, options)
@@ -111,7 +119,7 @@ def write_file(
     if file_format == "json":
         return ExportedFile(f"{source.item.name}.json", codecs.JSON, codecs.encode_tree(_as_tree(source), codecs.JSON))
     if source.item.kind not in WITH_MOTION or source.hierarchy is None:
-        raise Invalid(f"A {source.item.kind} is exported as json.", code="no-such-export")
+        raise InvalidProblem(f"A {source.item.kind} is exported as json.", code="no-such-export")
     from marey_motion.alignment.aligned_documents import restored_clip
     from marey_motion.documents import clip_from_document, skeleton_from_document
     from marey_motion.errors import MotionError
@@ -124,7 +132,7 @@ def write_file(
             clip = restored_clip(clip, AlignmentInfo.model_validate(source.parts["info"]).model_dump())
         written = write_clip_file(clip, file_format, unit=unit, info=source.parts.get("info"))
     except MotionError as error:
-        raise Invalid(str(error), code="cannot-be-exported") from error
+        raise InvalidProblem(str(error), code="cannot-be-exported") from error
     return ExportedFile(source.item.name + written.suffix, written.media_type, written.data)
 
 

@@ -12,7 +12,7 @@ from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, Refusal
 from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
-from marey_server.errors import MareyError
+from marey_server.errors import ApiProblem
 from marey_server.motions.importing_graphs import ImportedGraph, graph_draft, graph_to_import
 from marey_server.store import blobs, items, projects
 from marey_server.store.blobs import Spool
@@ -72,7 +72,7 @@ def require_importer(tx: Transaction, project: str) -> None:
 
 
 def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
-    """The skeleton that an import names. Raises `NotFound`."""
+    """The skeleton that an import names. Raises `NotFoundProblem`."""
     part = items.read_part(tx, project, Kind.SKELETON, item_id, "hierarchy")
     return GivenSkeleton(item_id, part.revision, part.tree)
 
@@ -122,7 +122,7 @@ def prepare(
         )
     except MotionError as error:
         return PreparedImport(planned.name, refusal=_refusal(error))
-    except MareyError as error:
+    except ApiProblem as error:
         return PreparedImport(planned.name, refusal=Refusal(code=error.error_code, detail=error.detail))
 
 

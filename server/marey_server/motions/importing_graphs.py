@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from marey_schemas.documents.originals import original_of
 from marey_schemas.kinds import Kind
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 from marey_server.store import items
 from marey_server.store.documents import prepare_document
 from marey_server.store.items import Draft, ItemFilters
@@ -47,7 +47,8 @@ def graph_to_import(
 def graph_draft(tx: Transaction, project: str, wanted: ImportedGraph) -> Draft:
     """The graph with models of the project: those called like its nodes, best beside it.
 
-    Raises `Invalid` where there is none, or several in other folders, and where the graph does not hold together.
+    Raises `InvalidProblem` where there is none, or several in other folders, and where the graph does not hold
+    together.
     """
     graph = wanted.graph
     models = {name: _find_model(tx, project, name, wanted.collection) for _, name in graph.nodes}
@@ -77,4 +78,4 @@ def _find_model(tx: Transaction, project: str, name: str, collection: str) -> di
     places = ", ".join(one.path for one in page.items)
     there = f"{page.count} models are called {name!r} ({places})" if page.count else f"no model is called {name!r}"
     advice = "import the models of a graph first, beside it"
-    raise Invalid(f"The graph has a node {name!r}, but {there}; {advice}.", code="no-model")
+    raise InvalidProblem(f"The graph has a node {name!r}, but {there}; {advice}.", code="no-model")

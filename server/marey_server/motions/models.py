@@ -11,7 +11,7 @@ from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.formats import MotionFormat
 from marey_schemas.kinds import Kind
-from marey_server.errors import Invalid, NotFound
+from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.store import items
 from marey_server.store.items.reading import FoundPart
 from marey_server.store.transaction import Transaction
@@ -57,15 +57,15 @@ class UsableModel:
 
 
 def find_model(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> FoundModel:
-    """A model by its item. Raises `NotFound`."""
+    """A model by its item. Raises `NotFoundProblem`."""
     if kind is not Kind.MODEL:
-        raise NotFound(f"A {kind} generates no motion; only models do.", code="not-a-model")
+        raise NotFoundProblem(f"A {kind} generates no motion; only models do.", code="not-a-model")
     part = items.find_part(tx, project, kind, item_id, "model", revision=revision)
     return FoundModel(item_id, items.read_item(tx, project, kind, item_id).name, part)
 
 
 def load_model(tx: Transaction, project: str, found: FoundModel) -> LoadedModel:
-    """Its documents. Raises `NotFound` where its skeleton is gone."""
+    """Its documents. Raises `NotFoundProblem` where its skeleton is gone."""
     model = items.load_part(tx, found.part, arrays="decoded")
     ref = model["skeleton"]
     skeleton = items.read_part(tx, project, Kind.SKELETON, ref["item"], "hierarchy", revision=ref["revision"])
@@ -73,7 +73,7 @@ def load_model(tx: Transaction, project: str, found: FoundModel) -> LoadedModel:
 
 
 def parse_model(loaded: LoadedModel) -> UsableModel:
-    """The model itself. Raises `Invalid` where its numbers describe none."""
+    """The model itself. Raises `InvalidProblem` where its numbers describe none."""
     from marey_motion.documents import skeleton_from_document
     from marey_motion.errors import MotionError
     from marey_motion.modelling.primitive_documents import primitive_from_tree
@@ -83,7 +83,7 @@ def parse_model(loaded: LoadedModel) -> UsableModel:
         primitive = primitive_from_tree(loaded.model, skeleton)
         primitive.mixture.cholesky  # noqa: B018    computed here so that an impossible mixture is told of here
     except MotionError as error:
-        raise Invalid(f"The model cannot be used: {error}", code=error.code) from error
+        raise InvalidProblem(f"The model cannot be used: {error}", code=error.code) from error
     return UsableModel(primitive, RevisionRef.model_validate(loaded.model["skeleton"]))
 
 
@@ -99,7 +99,7 @@ def size_bytes(model: UsableModel) -> int:
 
 
 def sample_document(found: FoundModel, model: UsableModel, count: int, seed: int) -> dict[str, Any]:
-    """Samples as a document: latent vectors, likelihoods, motions. Raises `Invalid` where they are too many."""
+    """Samples as a document: latent vectors, likelihoods, motions. Raises `InvalidProblem` where they are too many."""
     from marey_motion.documents import clip_to_document
 
     latents, clips = _draw(model.primitive, count, seed)
@@ -125,7 +125,7 @@ class SampleFile:
 def sample_file(
     found: FoundModel, model: UsableModel, count: int, seed: int, file_format: MotionFormat, unit: str
 ) -> SampleFile:
-    """One sample as a file, or several as a ZIP archive of files. Raises `Invalid`."""
+    """One sample as a file, or several as a ZIP archive of files. Raises `InvalidProblem`."""
     from marey_motion.errors import MotionError
     from marey_motion.exporting import write_clip_file
 
@@ -133,7 +133,7 @@ def sample_file(
     try:
         files = [write_clip_file(clip, file_format, unit=unit) for clip in clips]
     except MotionError as error:
-        raise Invalid(str(error), code="cannot-be-exported") from error
+        raise InvalidProblem(str(error), code="cannot-be-exported") from error
     stem = f"{found.name}_{seed}"
     if count == 1:
         return SampleFile(stem + files[0].suffix, files[0].media_type, files[0].data)
@@ -157,6 +157,6 @@ def _draw(primitive: MotionPrimitive, count: int, seed: int) -> tuple[Floats, li
     size = frames * primitive.spatial.mean.shape[1] * 4
     if not size <= LARGEST_ANSWER_BYTES:
         shown = f"{size / MIB:,.0f} MiB of poses, over {LARGEST_ANSWER_BYTES // MIB}"
-        raise Invalid(f"These samples are {shown}; ask for fewer at a time.", code="samples-too-large")
+        raise InvalidProblem(f"These samples are {shown}; ask for fewer at a time.", code="samples-too-large")
     motions = primitive.motions(latents)
     return latents, [motion.as_clip(primitive.skeleton, primitive.frame_rate_hz) for motion in motions]

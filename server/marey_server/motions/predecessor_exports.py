@@ -16,7 +16,7 @@ from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.sample_trees import SampleTreeDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.kinds import Kind
-from marey_server.errors import Invalid, NotFound
+from marey_server.errors import InvalidProblem, NotFoundProblem
 
 Parts = Mapping[str, dict[str, Any]]
 
@@ -39,11 +39,11 @@ class PredecessorOptions:
     layout: Literal["2", "3"] | None = None
 
     def require_part_of(self, kind: Kind) -> None:
-        """Raise `Invalid` where a part is asked for that items of a kind do not have."""
+        """Raise `InvalidProblem` where a part is asked for that items of a kind do not have."""
         if self.part is not None and self.part not in PARTS_OF.get(kind, ()):
             held = " or ".join(PARTS_OF.get(kind, ())) or "none"
             detail = f"A {kind} has no part {self.part!r} of its own as a file of the predecessor; it has {held}."
-            raise Invalid(detail, code="no-part")
+            raise InvalidProblem(detail, code="no-part")
 
 
 def unchanged_original(kind: Kind, parts: Parts, options: PredecessorOptions) -> StoredOriginal | None:
@@ -73,13 +73,16 @@ def _if_unchanged(part: str, document: Mapping[str, Any] | None, known: StoredOr
 def write_predecessor(
     kind: Kind, name: str, parts: Parts, hierarchy: Mapping[str, Any] | None, options: PredecessorOptions
 ) -> tuple[str, bytes]:
-    """Name and bytes of a file. Raises `Invalid` where the item has none, `NotFound` for a model without a tree."""
+    """Name and bytes of a file.
+
+    Raises `InvalidProblem` where the item has none, `NotFoundProblem` for a model without a tree.
+    """
     from marey_motion.errors import MotionError
 
     try:
         ending, data = _written(kind, parts, hierarchy, options)
     except MotionError as error:
-        raise Invalid(str(error), code="cannot-be-exported") from error
+        raise InvalidProblem(str(error), code="cannot-be-exported") from error
     return f"{name}{ending}", data
 
 
@@ -96,9 +99,9 @@ def _written(
         if options.part != "tree":
             return "_mm.json", _model(parts["model"], hierarchy, options.layout or "3")
         if "tree" not in parts:
-            raise NotFound("The model has no tree.", code="no-part")
+            raise NotFoundProblem("The model has no tree.", code="no-part")
         return "_cluster_tree.json", _tree(parts["model"], parts["tree"])
-    raise Invalid(f"A {kind} is exported as json.", code="no-such-export")
+    raise InvalidProblem(f"A {kind} is exported as json.", code="no-such-export")
 
 
 def _annotation(part: Mapping[str, Any], options: PredecessorOptions) -> bytes:

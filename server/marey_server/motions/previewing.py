@@ -15,7 +15,7 @@ from marey_schemas.editing.previews import EditPreview, EditPreviewRequest
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
 from marey_schemas.wording import counted
-from marey_server.errors import Invalid, NotFound, TooLarge
+from marey_server.errors import InvalidProblem, NotFoundProblem, TooLargeProblem
 from marey_server.field_errors import field_errors
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
@@ -49,9 +49,9 @@ class PreviewSource:
 
 
 def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, request: EditPreviewRequest) -> PreviewSource:
-    """What a preview is made from. Raises `NotFound`, and `TooLarge` for what should be a job."""
+    """What a preview is made from. Raises `NotFoundProblem`, and `TooLargeProblem` for what should be a job."""
     if kind is not Kind.CLIP:
-        raise NotFound(f"A {kind} is not edited; clips are.", code="not-a-clip")
+        raise NotFoundProblem(f"A {kind} is not edited; clips are.", code="not-a-clip")
     edit = EditDocument(commands=request.commands) if request.edit is None else _read_edit(tx, project, request)
     motion = items.read_part(tx, project, Kind.CLIP, item_id, "motion", revision=request.revision).tree
     numbers = _size(motion)
@@ -60,7 +60,7 @@ def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, reques
         source.sources[name] = items.read_part(tx, project, Kind.CLIP, name, "motion").tree
         numbers += _size(source.sources[name])
     if numbers > MOST_NUMBERS:
-        raise TooLarge("The motions are too long for a preview; hand in a job.", code="preview-too-large")
+        raise TooLargeProblem("The motions are too long for a preview; hand in a job.", code="preview-too-large")
     for one in (motion, *source.sources.values()):
         skeleton, revision = one["skeleton"]["item"], one["skeleton"]["revision"]
         hierarchy = items.read_part(tx, project, Kind.SKELETON, skeleton, "hierarchy", revision=revision)
@@ -71,7 +71,10 @@ def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, reques
 
 
 def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
-    """The document of the preview. Raises `Invalid` where the commands cannot be applied or there is no such frame."""
+    """The document of the preview.
+
+    Raises `InvalidProblem` where the commands cannot be applied or there is no such frame.
+    """
     from marey_motion.documents import clip_to_document, commands_of_edit
     from marey_motion.editing.registry import edit_clip
     from marey_motion.errors import MotionError
@@ -84,7 +87,7 @@ def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
         made = edit_clip(clip, commands, body=body, sources=sources, most_numbers=MOST_NUMBERS, most_work=MOST_WORK)
     except MotionError as error:
         if error.code in ("edit-too-large", "edit-too-long"):
-            raise TooLarge(f"{error}; hand in a job.", code="preview-too-large") from error
+            raise TooLargeProblem(f"{error}; hand in a job.", code="preview-too-large") from error
         raise _invalid("/commands", error.code, str(error)) from error
     if request.piece >= len(made):
         raise _invalid("/piece", "no-piece", f"The edit makes {counted(len(made), 'clip')}, counted from 0.")
@@ -95,7 +98,7 @@ def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
         raise _invalid("/frames", "no-frames", f"The result has {counted(wanted.clip.frame_count, 'frame')}.")
     shown = wanted.clip.sliced(start, stop)
     if shown.poses.size > MOST_SHOWN:
-        raise TooLarge(
+        raise TooLargeProblem(
             f"{stop - start} frames are too many for one preview; ask for some of them.", code="preview-too-large"
         )
     skeleton = Motion.model_validate(source.motion).skeleton
@@ -149,5 +152,5 @@ def _clip_of(source: PreviewSource, tree: Tree) -> tuple[Clip, EditedBody]:
     return clip_from_document(Motion.model_validate(tree), skeleton), EditedBody(skeleton, find_mapping)
 
 
-def _invalid(pointer: str, code: str, detail: str) -> Invalid:
-    return Invalid(detail, code=code, errors=[FieldError(pointer=pointer, code=code, detail=detail)])
+def _invalid(pointer: str, code: str, detail: str) -> InvalidProblem:
+    return InvalidProblem(detail, code=code, errors=[FieldError(pointer=pointer, code=code, detail=detail)])

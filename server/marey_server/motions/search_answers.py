@@ -13,7 +13,7 @@ from marey_schemas.documents.references import RevisionRef
 from marey_schemas.formats import MotionFormat
 from marey_schemas.problems import FieldError
 from marey_schemas.search import ConstraintError, FoundStep, SearchAnswer, SearchRequest, StartPlacement
-from marey_server.errors import Invalid, TooLarge
+from marey_server.errors import InvalidProblem, TooLargeProblem
 from marey_server.motions.models import LARGEST_ANSWER_BYTES, SampleFile
 from marey_server.motions.searching import FoundSearchable, Searchable
 
@@ -59,7 +59,8 @@ class SearchResult:
 def search(searchables: Sequence[Searchable], request: SearchRequest) -> SearchResult:
     """Find the motions that a request asks for.
 
-    Raises `Invalid` that points at the constraint that is wrong, `TooLarge` for what takes more than some seconds.
+    Raises `InvalidProblem` that points at the constraint that is wrong, `TooLargeProblem` for what takes more than some
+    seconds.
     """
     from marey_motion.errors import MotionError
     from marey_motion.modelling.search import work as search_work
@@ -90,7 +91,7 @@ def search(searchables: Sequence[Searchable], request: SearchRequest) -> SearchR
 
 def _require_quick(work: float) -> None:
     if work > MOST_WORK:
-        raise TooLarge(
+        raise TooLargeProblem(
             f"This takes about {work / MOST_WORK:.1f} times as long as a search may; ask for fewer steps, constraints, "
             "candidates, passes or iterations.",
             code="search-too-large",
@@ -102,7 +103,7 @@ def _require_room(steps: Sequence[Step], sequel: Sequel) -> None:
     frames = sum(float(primitive.time_functions(latent)[0, -1]) + 1.5 for primitive, latent in pairs)
     size = frames * steps[0].primitive.spatial.mean.shape[1] * 4
     if not size <= LARGEST_ANSWER_BYTES:
-        raise TooLarge(
+        raise TooLargeProblem(
             f"What was found lasts {frames:,.0f} frames, too many for an answer; ask for fewer steps.",
             code="search-too-large",
         )
@@ -126,14 +127,14 @@ def _steps_of(searchables: Sequence[Searchable], request: SearchRequest) -> tupl
     return tuple(steps)
 
 
-def _invalid(request: SearchRequest, error: Any) -> Invalid:
+def _invalid(request: SearchRequest, error: Any) -> InvalidProblem:
     """A refusal with a JSON Pointer to what the error names."""
     where = str(error.where or "")
     if not request.steps:
         where = where.removeprefix("steps[0]").removeprefix(".")
     pointer = "".join(f"/{part}" for part in where.replace("[", ".").replace("]", "").split(".") if part)
     problem = FieldError(pointer=pointer, code=error.code, detail=error.message)
-    return Invalid(str(error.message), code=error.code, errors=[problem])
+    return InvalidProblem(str(error.message), code=error.code, errors=[problem])
 
 
 # -- telling -----------------------------------------------------------------------------------------------------------
@@ -159,14 +160,14 @@ def answer_of(
 
 
 def file_of(result: SearchResult, found: Sequence[FoundSearchable], file_format: MotionFormat, unit: str) -> SampleFile:
-    """All steps as one file. Raises `Invalid` where the format cannot hold it."""
+    """All steps as one file. Raises `InvalidProblem` where the format cannot hold it."""
     from marey_motion.errors import MotionError
     from marey_motion.exporting import write_clip_file
 
     try:
         file = write_clip_file(result.clip, file_format, unit=unit)
     except MotionError as error:
-        raise Invalid(str(error), code="cannot-be-exported") from error
+        raise InvalidProblem(str(error), code="cannot-be-exported") from error
     name = " ".join(dict.fromkeys(one.model.name for one in found))
     return SampleFile(f"{name} found{file.suffix}", file.media_type, file.data)
 

@@ -9,7 +9,7 @@ from marey_schemas.documents.models import log_likelihoods
 from marey_schemas.documents.skeletons import SkeletonMapping
 from marey_schemas.kinds import Kind
 from marey_schemas.search import SearchRequest
-from marey_server.errors import Invalid, NotFound, TooLarge
+from marey_server.errors import InvalidProblem, NotFoundProblem, TooLargeProblem
 from marey_server.motions import models
 from marey_server.motions.models import FoundModel, LoadedModel, UsableModel
 from marey_server.store import items
@@ -73,16 +73,16 @@ class Searchable:
 def find_searchables(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: SearchRequest
 ) -> list[FoundSearchable]:
-    """The model of each step. Raises `NotFound`."""
+    """The model of each step. Raises `NotFoundProblem`."""
     if kind is not Kind.MODEL:
-        raise NotFound(f"A {kind} cannot be searched; models can.", code="not-a-model")
+        raise NotFoundProblem(f"A {kind} cannot be searched; models can.", code="not-a-model")
     wanted = [step.model or item_id for step in request.asked_steps]
     found = {item: _find(tx, project, item) for item in dict.fromkeys(wanted)}
     return [found[item] for item in wanted]
 
 
 def load_searchable(tx: Transaction, project: str, found: FoundSearchable) -> LoadedSearchable:
-    """Its documents. Raises `NotFound` where its skeleton is gone."""
+    """Its documents. Raises `NotFoundProblem` where its skeleton is gone."""
     tree, mapping = (
         None if part is None else items.load_part(tx, part, arrays="decoded") for part in (found.tree, found.mapping)
     )
@@ -92,7 +92,7 @@ def load_searchable(tx: Transaction, project: str, found: FoundSearchable) -> Lo
 def parse_searchable(loaded: LoadedSearchable, seed: int) -> Searchable:
     """The model itself, with a tree.
 
-    Raises `Invalid` where its numbers describe none, `TooLarge` where drawing a tree takes too long.
+    Raises `InvalidProblem` where its numbers describe none, `TooLargeProblem` where drawing a tree takes too long.
     """
     from marey_motion.documents import mapping_from_document
     from marey_motion.errors import MotionError
@@ -119,16 +119,16 @@ def parse_searchable(loaded: LoadedSearchable, seed: int) -> Searchable:
             tree = build_tree(primitive, seed, end_effectors=known)
         tree.means, tree.starts  # noqa: B018    computed here, once for all searches
     except MotionError as error:
-        raise Invalid(f"The model cannot be searched: {error}", code=error.code) from error
+        raise InvalidProblem(f"The model cannot be searched: {error}", code=error.code) from error
     stored = loaded.tree is not None
     likelihoods = tuple(sorted(log_likelihoods(loaded.model.model)))
     return Searchable(usable, tree, stored, work, mapping, standard_joints, likelihoods)
 
 
 def require_drawable(work: float) -> None:
-    """Refuse to draw trees for a request that take more than some seconds. Raises `TooLarge`."""
+    """Refuse to draw trees for a request that take more than some seconds. Raises `TooLargeProblem`."""
     if work > MOST_DRAWING_WORK:
-        raise TooLarge(
+        raise TooLargeProblem(
             "Drawing samples of so many keyframes, joints or models takes too long for a search; give each model a "
             "tree of its own first: a job of the kind `tree`, or `marey tree`.",
             code="tree-missing",

@@ -22,7 +22,7 @@ def give_token(tx: Transaction, administrator: str | None, token_file: Path, *, 
     """A new token of an administrator (None: who was made first), of every scope and without end, in a private file.
 
     The file is written before the transaction commits: if the process dies in between, the next one makes both anew.
-    Raises `NotFound` where no active administrator has that name.
+    Raises `NotFoundProblem` where no active administrator has that name.
     """
     tx.principal = users.administrator_principal(tx, administrator)
     wanted = TokenCreate(name=name, scopes=tx.principal.scopes, expires_in_s=None)

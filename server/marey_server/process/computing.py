@@ -19,7 +19,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from typing import ParamSpec, TypeVar
 
-from marey_server.errors import Unavailable
+from marey_server.errors import UnavailableProblem
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -50,11 +50,11 @@ class ComputeThreads:
 
     @asynccontextmanager
     async def long_place(self) -> AsyncIterator[None]:
-        """A place for what may take seconds. Raises `Unavailable` where none gets free."""
+        """A place for what may take seconds. Raises `UnavailableProblem` where none gets free."""
         try:
             await asyncio.wait_for(self._long_places.acquire(), LONGEST_WAIT_S)
         except TimeoutError:
-            raise Unavailable(
+            raise UnavailableProblem(
                 "Others are computing; try again in some seconds.",
                 code="computing",
                 headers={"Retry-After": str(ASK_AGAIN_S)},

@@ -14,7 +14,7 @@ from contextlib import asynccontextmanager
 from typing import Concatenate, ParamSpec, TypeVar
 
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import MareyError, Unavailable
+from marey_server.errors import ApiProblem, UnavailableProblem
 from marey_server.process.services import Services
 from marey_server.store import leader
 from marey_server.store.garbage import collect_garbage
@@ -61,7 +61,7 @@ async def _give_up_lead(services: Services, holder: str) -> None:
     """Let another process lead at once; without a database it does when the lease has run out."""
     try:
         await _write(services, leader.give_up_lead, LEAD, holder)
-    except MareyError as error:
+    except ApiProblem as error:
         log.warning("another process leads only in %d s: %s", LEAD_TTL_US / 1_000_000, error.detail)
 
 
@@ -71,7 +71,7 @@ async def _repeat(services: Services, holder: str, first_s: float, every_s: floa
     while True:
         try:
             await chore(services, holder)
-        except MareyError as error:
+        except ApiProblem as error:
             log.warning("housekeeping was interrupted: %s", error.detail)
         except Exception:
             log.exception("housekeeping failed")
@@ -84,7 +84,7 @@ async def _reap(services: Services, holder: str) -> None:
         leads, may_reap = await _write(services, _look_round, holder, services.start_grace)
         if leads and may_reap:
             await _reap_pages(services)
-    except Unavailable:
+    except UnavailableProblem:
         services.start_grace.restart()
         raise
 

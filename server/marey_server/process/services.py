@@ -11,7 +11,7 @@ from typing import Any
 
 from marey_schemas.lru import LruCache
 from marey_server.access.principal import SYSTEM, Principal
-from marey_server.errors import TooManyRequests
+from marey_server.errors import TooManyRequestsProblem
 from marey_server.motions.models import UsableModel
 from marey_server.motions.models import size_bytes as model_bytes
 from marey_server.motions.searching import Searchable, SearchableKey
@@ -48,14 +48,14 @@ class TryLimit:
         self._buckets: LruCache[str, tuple[float, float]] = LruCache(max_entries=NAMES_REMEMBERED)
 
     def take(self, key: str) -> None:
-        """Count one try. Raises `TooManyRequests`, saying when the next is allowed."""
+        """Count one try. Raises `TooManyRequestsProblem`, saying when the next is allowed."""
         now = self._clock()
         left, since = self._buckets.get(key) or (float(self._per_minute), now)
         left = min(float(self._per_minute), left + (now - since) * self._per_minute / 60)
         if left < 1:
             self._buckets.put(key, (left, now))
             wait_s = math.ceil((1 - left) * 60 / self._per_minute)
-            raise TooManyRequests(f"Too many tries; wait {wait_s} s.", headers={"Retry-After": str(wait_s)})
+            raise TooManyRequestsProblem(f"Too many tries; wait {wait_s} s.", headers={"Retry-After": str(wait_s)})
         self._buckets.put(key, (left - 1, now))
 
 
@@ -97,7 +97,7 @@ class Services:
         self.start_grace = StartGrace(self.queue_policy)
 
     def limit_sign_in(self, name: str, address: str) -> None:
-        """Count one attempt to sign in. Raises `TooManyRequests`."""
+        """Count one attempt to sign in. Raises `TooManyRequestsProblem`."""
         self._tries_by_address.take(address)
         self._tries_by_name.take(name)
 

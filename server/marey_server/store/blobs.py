@@ -15,7 +15,13 @@ from sqlalchemy import ColumnElement, Select, Table, select, update
 from marey_schemas.problems import FieldError
 from marey_server import faults
 from marey_server.access.principal import Principal
-from marey_server.errors import Conflict, Forbidden, Invalid, NotFound, Unauthenticated
+from marey_server.errors import (
+    ConflictProblem,
+    ForbiddenProblem,
+    InvalidProblem,
+    NotFoundProblem,
+    UnauthenticatedProblem,
+)
 from marey_server.store.blob_backings import CHUNK_BYTES
 from marey_server.store.projects import is_visible
 from marey_server.store.tables import (
@@ -93,12 +99,14 @@ def digest_of(data: bytes) -> str:
 def put_blob(tx: Transaction, content: bytes | Spool, *, expected: str | None = None) -> str:
     """Store bytes that the caller sent; from now on the caller may refer to them by their digest.
 
-    Raises `Invalid` where they are not the bytes that `expected` names.
+    Raises `InvalidProblem` where they are not the bytes that `expected` names.
     """
     require_sender(tx.principal)
     digest = digest_of(content) if isinstance(content, bytes) else content.digest
     if expected is not None and digest != expected:
-        raise Invalid(f"The bytes are {digest}, not {expected}: they were changed on the way.", code="digest-mismatch")
+        raise InvalidProblem(
+            f"The bytes are {digest}, not {expected}: they were changed on the way.", code="digest-mismatch"
+        )
     store_blob(tx, digest, content)
     add_holder(tx, digest)
     faults.point("blob.put.before_commit")
@@ -109,9 +117,9 @@ def put_blob(tx: Transaction, content: bytes | Spool, *, expected: str | None = 
 def require_sender(principal: Principal) -> None:
     """Raise unless the caller may send bytes: users with the scope `write`, whatever it is bound to, and attempts."""
     if principal.kind == "anonymous":
-        raise Unauthenticated("Sign in to send bytes.")
+        raise UnauthenticatedProblem("Sign in to send bytes.")
     if principal.kind == "user" and not any(held.partition("!")[0] == "write" for held in principal.scopes):
-        raise Forbidden("This token may not write.", code="insufficient-scope")
+        raise ForbiddenProblem("This token may not write.", code="insufficient-scope")
 
 
 def store_blob(tx: Transaction, digest: str, content: bytes | Spool | Pieces) -> None:
@@ -162,7 +170,7 @@ def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
 def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
     """Keep blobs that a job's parameters or result name; who may read the job's project may read them.
 
-    Raises `Conflict` (`missing-blobs`) where the caller may not refer to one, or it is not there.
+    Raises `ConflictProblem` (`missing-blobs`) where the caller may not refer to one, or it is not there.
     """
     wanted = set(digests)
     if lacking := wanted - hold(tx, wanted):
@@ -171,10 +179,10 @@ def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
         tx.execute(tx.insert_or_ignore(job_blob, {"job_id": job_id, "blob_digest": digest}))
 
 
-def missing_blobs(digests: Iterable[str], errors: Sequence[FieldError] = ()) -> Conflict:
+def missing_blobs(digests: Iterable[str], errors: Sequence[FieldError] = ()) -> ConflictProblem:
     """Something names blobs that are not here."""
     detail = "This names blobs that are not here; send them first."
-    return Conflict(detail, code="missing-blobs", context={"missing": sorted(set(digests))}, errors=errors)
+    return ConflictProblem(detail, code="missing-blobs", context={"missing": sorted(set(digests))}, errors=errors)
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -194,10 +202,10 @@ def missing(tx: Transaction, digests: Iterable[str]) -> list[str]:
 
 
 def require_readable(tx: Transaction, digest: str) -> int:
-    """Size of a blob in bytes. Raises `NotFound` where there is none that the caller may read."""
+    """Size of a blob in bytes. Raises `NotFoundProblem` where there is none that the caller may read."""
     size = tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar()
     if size is None or not readable(tx, [digest]):
-        raise NotFound(f"There is no blob {digest} that you may read.")
+        raise NotFoundProblem(f"There is no blob {digest} that you may read.")
     return int(size)
 
 

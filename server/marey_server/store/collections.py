@@ -9,7 +9,7 @@ from sqlalchemy import ColumnElement, Row, func, literal, or_, select, update
 
 from marey_schemas.access import Role
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Page
-from marey_server.errors import Conflict, Invalid, NotFound
+from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
@@ -51,9 +51,11 @@ def _lock(tx: Transaction, project_id: str, path: str) -> str | None:
 
 
 def check_length(path: str) -> None:
-    """Raise `Invalid` for a path that is too long to be stored."""
+    """Raise `InvalidProblem` for a path that is too long to be stored."""
     if len(path) > MAX_PATH_LENGTH or len(path.encode()) > MAX_PATH_BYTES:
-        raise Invalid(f"A path has at most {MAX_PATH_LENGTH} characters and {MAX_PATH_BYTES} bytes.", code="long-path")
+        raise InvalidProblem(
+            f"A path has at most {MAX_PATH_LENGTH} characters and {MAX_PATH_BYTES} bytes.", code="long-path"
+        )
 
 
 def at_or_below(path: str) -> ColumnElement[bool]:
@@ -97,7 +99,7 @@ def list_collections(
 def _find(
     tx: Transaction, project_row: ProjectRow, collection_id: str, state: ColumnElement[bool], *, lock: bool = False
 ) -> Row[Any]:
-    """Row of a collection; with `lock`, nobody else changes it before this write ends. Raises `NotFound`."""
+    """Row of a collection; with `lock`, nobody else changes it before this write ends. Raises `NotFoundProblem`."""
     statement = select(collection).where(
         collection.c.id == collection_id, collection.c.project_id == project_row.id, state
     )
@@ -107,8 +109,8 @@ def _find(
     return row
 
 
-def _no_collection(collection_id: str) -> NotFound:
-    return NotFound(f"There is no collection {collection_id!r} here.", code="no-collection")
+def _no_collection(collection_id: str) -> NotFoundProblem:
+    return NotFoundProblem(f"There is no collection {collection_id!r} here.", code="no-collection")
 
 
 def _shown(row: Row[Any]) -> Collection:
@@ -122,26 +124,26 @@ def _shown(row: Row[Any]) -> Collection:
 
 
 def create_collection(tx: Transaction, project: str, request: CollectionCreate) -> Collection:
-    """A new folder, with those above it. Raises `Conflict` where there is one at this path."""
+    """A new folder, with those above it. Raises `ConflictProblem` where there is one at this path."""
     project_row = projects.require(tx, project)
     if _lock(tx, project_row.id, request.path) is not None:
         raise _path_taken(request.path)
     return _shown(_find(tx, project_row, ensure(tx, project_row, request.path), _ALIVE))
 
 
-def _path_taken(path: str) -> Conflict:
-    return Conflict(f"There is a collection {path!r} already.", code="path-taken")
+def _path_taken(path: str) -> ConflictProblem:
+    return ConflictProblem(f"There is a collection {path!r} already.", code="path-taken")
 
 
 def move_collection(
     tx: Transaction, project: str, collection_id: str, request: CollectionChange, *, expected_rev: ExpectedRev
 ) -> Collection:
-    """Rename or move a folder with all it holds. Raises `Conflict` where there is a folder at the new path."""
+    """Rename or move a folder with all it holds. Raises `ConflictProblem` where there is a folder at the new path."""
     project_row = projects.require(tx, project)
     old, new = _find(tx, project_row, collection_id, _ALIVE, lock=True).path, request.path
     _require_no_root(old)
     if new.startswith(f"{old}/"):
-        raise Invalid(f"{old!r} cannot move into itself.", code="into-itself")
+        raise InvalidProblem(f"{old!r} cannot move into itself.", code="into-itself")
     if new != old:
         ensure(tx, project_row, new.rpartition("/")[0])
     with taken(_path_taken(new)):
@@ -206,7 +208,10 @@ def delete_collection(tx: Transaction, project: str, collection_id: str, *, expe
 def restore_collection(
     tx: Transaction, project: str, collection_id: str, *, expected_rev: ExpectedRev = None
 ) -> Collection:
-    """Bring back a folder with what was deleted along with it. Raises `Conflict` where its path is taken again."""
+    """Bring back a folder with what was deleted along with it.
+
+    Raises `ConflictProblem` where its path is taken again.
+    """
     project_row = projects.require(tx, project)
     gone = _find(tx, project_row, collection_id, collection.c.deleted_us.is_not(None), lock=True)
     ensure(tx, project_row, gone.path.rpartition("/")[0])
@@ -231,4 +236,4 @@ def restore_collection(
 
 def _require_no_root(path: str) -> None:
     if not path:
-        raise Invalid("The root of a project cannot be moved or deleted.", code="is-root")
+        raise InvalidProblem("The root of a project cannot be moved or deleted.", code="is-root")

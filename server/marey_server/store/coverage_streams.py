@@ -13,7 +13,7 @@ from sqlalchemy import ColumnElement, Row, delete, func, insert, select, update
 
 from marey_schemas.coverage_streams import CoverageStream
 from marey_schemas.items import Page
-from marey_server.errors import Conflict, NotFound
+from marey_server.errors import ConflictProblem, NotFoundProblem
 from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.ids import new_id
@@ -29,7 +29,7 @@ LIFETIME_US = 86400 * 1_000_000
 Tree = dict[str, Any]
 
 
-class CoverageOffset(Conflict):
+class CoverageOffset(ConflictProblem):
     """The stream goes on at another offset."""
 
     code = "coverage-offset"
@@ -86,12 +86,12 @@ class Step:
 
 
 def create_stream(tx: Transaction, project: str, new: NewStream) -> Stream:
-    """A new stream. Raises `Conflict` where the project has too many."""
+    """A new stream. Raises `ConflictProblem` where the project has too many."""
     project_row = projects.require(tx, project)
     tx.lock(f"coverage:{project_row.id}")
     count = select(func.count()).where(coverage_stream.c.project_id == project_row.id, ~_is_old(tx))
     if tx.execute(count).scalar_one() >= MOST_STREAMS:
-        raise Conflict(
+        raise ConflictProblem(
             f"A project has at most {MOST_STREAMS} coverage streams; delete those that are no longer used.",
             code="too-many-streams",
         )
@@ -113,19 +113,20 @@ def list_streams(
 
 
 def read_stream(tx: Transaction, project: str, stream_id: str) -> Stream:
-    """A stream, for who may read it. Raises `NotFound`."""
+    """A stream, for who may read it. Raises `NotFoundProblem`."""
     return _find(tx, projects.require(tx, project).id, stream_id)
 
 
 def read_to_advance(tx: Transaction, project: str, stream_id: str) -> Stream:
-    """A stream, for who may send frames to it. Raises `NotFound`."""
+    """A stream, for who may send frames to it. Raises `NotFoundProblem`."""
     return _find(tx, projects.require(tx, project).id, stream_id)
 
 
 def advance_stream(tx: Transaction, project: str, held: Stream, step: Step) -> Tree:
     """Move a stream on from where `held` was, and return the answer.
 
-    Raises `CoverageOffset` with the true offset where somebody else moved it in between, `NotFound` where it is gone.
+    Raises `CoverageOffset` with the true offset where somebody else moved it in between, `NotFoundProblem` where it is
+    gone.
     """
     project_row = projects.require(tx, project)
     where = coverage_stream.c.id == held.id, coverage_stream.c.rev == held.rev
@@ -157,7 +158,7 @@ def _elsewhere(stream: Stream) -> CoverageOffset:
 
 
 def delete_stream(tx: Transaction, project: str, stream_id: str) -> None:
-    """Drop a stream. Raises `NotFound`."""
+    """Drop a stream. Raises `NotFoundProblem`."""
     project_row = projects.require(tx, project)
     found = _find(tx, project_row.id, stream_id)
     tx.execute(delete(coverage_stream).where(coverage_stream.c.id == found.id))
@@ -186,7 +187,7 @@ def _find(tx: Transaction, project_id: str, stream_id: str) -> Stream:
     )
     row = tx.execute(statement).first()
     if row is None:
-        raise NotFound(
+        raise NotFoundProblem(
             f"There is no coverage stream {stream_id!r} here; after a day without frames they are dropped.",
             code="no-stream",
         )

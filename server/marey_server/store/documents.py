@@ -20,7 +20,7 @@ from marey_schemas.encoding import blocks
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import canonical_json, detach_arrays
 from marey_schemas.problems import FieldError
-from marey_server.errors import Invalid, NotFound
+from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.field_errors import field_errors
 from marey_server.store import blobs
 from marey_server.store.tables import blob, document, document_blob
@@ -54,7 +54,7 @@ class PreparedDocument:
 def prepare_document(tree: Any, *, schema: str | None = None) -> PreparedDocument:
     """Check a document against its schema (`schema` if given, else the one it names) and encode its arrays.
 
-    Raises `Invalid` with one entry per thing that is wrong.
+    Raises `InvalidProblem` with one entry per thing that is wrong.
     """
     name = _check(tree, schema)
     tree = {**tree, "schema": name}
@@ -67,9 +67,9 @@ def prepare_document(tree: Any, *, schema: str | None = None) -> PreparedDocumen
     try:
         canonical = canonical_json(detach_arrays(tree, keep))
     except (ValueError, TypeError, RecursionError) as error:
-        raise Invalid(f"This cannot be stored as a document: {error}", code="bad-document") from error
+        raise InvalidProblem(f"This cannot be stored as a document: {error}", code="bad-document") from error
     if _NUL.search(canonical):
-        raise Invalid("Text in documents must not hold the character U+0000.", code="bad-text")
+        raise InvalidProblem("Text in documents must not hold the character U+0000.", code="bad-text")
     body = json.loads(canonical)
     leaves, files = references_of(name, body)
     arrays = {
@@ -86,7 +86,7 @@ def prepared(content: Any, *, schema: str | None = None) -> PreparedDocument:
     if not isinstance(content, PreparedDocument):
         return prepare_document(content, schema=schema)
     if schema not in (None, OPEN_SCHEMA, content.schema):
-        raise Invalid(f"This part holds {schema}, not {content.schema}.", code="bad-schema")
+        raise InvalidProblem(f"This part holds {schema}, not {content.schema}.", code="bad-schema")
     return content
 
 
@@ -98,20 +98,22 @@ def with_body(content: PreparedDocument, body: Tree) -> PreparedDocument:
 
 def _check(tree: Any, schema: str | None) -> str:
     if not isinstance(tree, Mapping):
-        raise Invalid("A document is an object.", code="bad-document")
+        raise InvalidProblem("A document is an object.", code="bad-document")
     named = tree.get("schema", schema)
     if schema is not None and schema != OPEN_SCHEMA and named != schema:
-        raise Invalid(f"This part holds {schema}, not {named!r}.", code="bad-schema")
+        raise InvalidProblem(f"This part holds {schema}, not {named!r}.", code="bad-schema")
     for pointer, leaf in _members(tree):
         if _is_reference(leaf):
             detail = "Send the array itself (dtype, shape, data); a reference to content is no document's own."
-            raise Invalid(detail, errors=[FieldError(pointer=pointer, code="array-reference", detail=detail)])
+            raise InvalidProblem(detail, errors=[FieldError(pointer=pointer, code="array-reference", detail=detail)])
     model = SCHEMAS.get(str(named)) or SCHEMAS[OPEN_SCHEMA]
     try:
         model.model_validate(tree)
     except ValidationError as error:
         errors = field_errors(error, tree)
-        raise Invalid(f"This is no valid {named}: {errors[0].pointer}: {errors[0].detail}", errors=errors) from error
+        raise InvalidProblem(
+            f"This is no valid {named}: {errors[0].pointer}: {errors[0].detail}", errors=errors
+        ) from error
     return str(named or OPEN_SCHEMA)
 
 
@@ -149,7 +151,7 @@ def _check_pointers(pointers: list[str]) -> None:
     for pointer in pointers:
         if len(pointer) > _POINTER_LENGTH:
             detail = f"Arrays and files must lie at a JSON Pointer of at most {_POINTER_LENGTH} characters."
-            raise Invalid(
+            raise InvalidProblem(
                 detail, errors=[FieldError(pointer=pointer[:_POINTER_LENGTH], code="too-deep", detail=detail)]
             )
 
@@ -160,7 +162,7 @@ def _check_pointers(pointers: list[str]) -> None:
 def store_document(tx: Transaction, content: Any, *, schema: str | None = None) -> str:
     """Store a document, given as a tree or prepared, and return its digest. The same document again adds no rows.
 
-    Raises `Conflict` (`missing-blobs`) where it names blobs that the caller has not sent and may not read.
+    Raises `ConflictProblem` (`missing-blobs`) where it names blobs that the caller has not sent and may not read.
     """
     ready = prepared(content, schema=schema)
     if ready.files:
@@ -236,7 +238,7 @@ def load_body(tx: Transaction, digest: str) -> Tree:
     """The document with references in place of its arrays."""
     body = tx.execute(select(document.c.body).where(document.c.digest == digest)).scalar()
     if body is None:
-        raise NotFound(f"There is no document {digest}.")
+        raise NotFoundProblem(f"There is no document {digest}.")
     return dict(body)
 
 

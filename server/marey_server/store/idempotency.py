@@ -13,7 +13,7 @@ from sqlalchemy import ColumnElement, delete, select, update
 
 from marey_schemas.encoding.canonical import canonical_json
 from marey_server.access.principal import Principal
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 from marey_server.store.tables import idempotency_key
 from marey_server.store.transaction import Transaction
 
@@ -33,8 +33,8 @@ def begin(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
     """Claim `key` for a request (None), or tell what the same request was answered.
 
     `fingerprint` tells requests apart; one that was sent with a token of another reach is another request, so that no
-    narrower token hears what it may not ask for. Raises `Invalid` where the key stands for another request. The caller
-    says `finish` in the same transaction.
+    narrower token hears what it may not ask for. Raises `InvalidProblem` where the key stands for another request. The
+    caller says `finish` in the same transaction.
     """
     fingerprint = _with_reach(fingerprint, tx.principal)
     mine = _mine(tx.principal, key)
@@ -48,7 +48,7 @@ def begin(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
     stored = tx.execute(select(idempotency_key).where(*mine)).one()
     if stored.fingerprint != fingerprint:
         detail = "This Idempotency-Key was used for another request, or with a token of other scopes."
-        raise Invalid(detail, code="idempotency-key-reused")
+        raise InvalidProblem(detail, code="idempotency-key-reused")
     return StoredAnswer(stored.status, dict(stored.headers), bytes(stored.body))
 
 

@@ -15,7 +15,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Row, Select, UnaryExpression, and_, or_, select
 
 from marey_schemas.encoding.canonical import canonical_json
-from marey_server.errors import BadRequest
+from marey_server.errors import BadRequestProblem
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.tables import server_state
 from marey_server.store.transaction import Transaction
@@ -50,13 +50,13 @@ class Order:
 
 
 def parse_order(text: str, keys: Mapping[str, ColumnElement[Any]], unique: str = "id") -> Order:
-    """Order from `sort=-created_at,name`. Raises `BadRequest` where a key is unknown or stands twice."""
+    """Order from `sort=-created_at,name`. Raises `BadRequestProblem` where a key is unknown or stands twice."""
     names = [part.strip() for part in text.split(",") if part.strip()]
     bare = [name.removeprefix("-") for name in names]
     if unknown := [name for name in bare if name not in keys]:
-        raise BadRequest(f"This cannot be sorted by {unknown[0]!r}; by {', '.join(keys)}.", code="bad-sort")
+        raise BadRequestProblem(f"This cannot be sorted by {unknown[0]!r}; by {', '.join(keys)}.", code="bad-sort")
     if len(set(bare)) != len(bare):
-        raise BadRequest("A sort key stands twice.", code="bad-sort")
+        raise BadRequestProblem("A sort key stands twice.", code="bad-sort")
     if unique in bare:
         names = names[: bare.index(unique) + 1]
     else:
@@ -71,7 +71,10 @@ def make_cursor(tx: Transaction, order: Order, identity: Any, values: Sequence[A
 
 
 def read_cursor(tx: Transaction, cursor: str, order: Order, identity: Any) -> list[Any]:
-    """Values of the row a page ended with. Raises `BadRequest` where the cursor is not ours or of another list."""
+    """Values of the row a page ended with.
+
+    Raises `BadRequestProblem` where the cursor is not ours or of another list.
+    """
     try:
         data = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
     except (ValueError, binascii.Error) as error:
@@ -81,12 +84,12 @@ def read_cursor(tx: Transaction, cursor: str, order: Order, identity: Any) -> li
         raise _bad_cursor()
     text, fingerprint, values = json.loads(payload)
     if text != order.text or fingerprint != _fingerprint(identity):
-        raise BadRequest("The cursor belongs to a list with other filters or another order.", code="bad-cursor")
+        raise BadRequestProblem("The cursor belongs to a list with other filters or another order.", code="bad-cursor")
     return list(values)
 
 
-def _bad_cursor() -> BadRequest:
-    return BadRequest("This is no cursor of this server; start again without one.", code="bad-cursor")
+def _bad_cursor() -> BadRequestProblem:
+    return BadRequestProblem("This is no cursor of this server; start again without one.", code="bad-cursor")
 
 
 def _fingerprint(identity: Any) -> str:
@@ -112,7 +115,7 @@ def read_page(
     `identity` is JSON that tells this list from every other: what it lists, by which filters.
     """
     if not 1 <= limit <= MAX_LIMIT:
-        raise BadRequest(f"limit must lie between 1 and {MAX_LIMIT}.", code="bad-limit")
+        raise BadRequestProblem(f"limit must lie between 1 and {MAX_LIMIT}.", code="bad-limit")
     if cursor is not None:
         statement = statement.where(order.after(read_cursor(tx, cursor, order, identity)))
     rows = tx.execute(statement.order_by(*order.clauses()).limit(limit + 1)).all()

@@ -8,7 +8,7 @@ from sqlalchemy import Row, delete, func, select
 
 from marey_schemas.access import Member, MemberChange, Role
 from marey_schemas.items import Page
-from marey_server.errors import Conflict, NotFound, PreconditionFailed
+from marey_server.errors import ConflictProblem, NotFoundProblem, PreconditionFailedProblem
 from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.projects import ProjectRow
@@ -50,19 +50,19 @@ def put_member(
 ) -> Member:
     """Make somebody a member, or change the role. `absent`: only if he is none yet.
 
-    Raises `NotFound` where there is no such user, `Conflict` where the project would lose its last owner.
+    Raises `NotFoundProblem` where there is no such user, `ConflictProblem` where the project would lose its last owner.
     """
     project_row = _lock(tx, project_name)
     user_id = tx.execute(select(user.c.id).where(user.c.name == user_name, user.c.disabled.is_(False))).scalar()
     if user_id is None:
-        raise NotFound(f"There is no user {user_name!r}.", code="no-user")
+        raise NotFoundProblem(f"There is no user {user_name!r}.", code="no-user")
     which = (member.c.project_id == project_row.id, member.c.user_id == user_id)
     row = {"project_id": project_row.id, "user_id": user_id, "role": request.role.value, "since_us": tx.now_us}
     added = None
     if expected_rev is None:
         added = tx.execute(tx.insert_or_ignore(member, row).returning(*member.c)).first()
         if added is None and absent:
-            raise PreconditionFailed(f"{user_name!r} is a member already.", code="member-exists")
+            raise PreconditionFailedProblem(f"{user_name!r} is a member already.", code="member-exists")
     changed = added or change_row(
         tx, member, which, {"role": request.role.value}, expected_rev=expected_rev, absent=_no_member(user_name)
     )
@@ -78,7 +78,7 @@ def put_member(
 
 
 def remove_member(tx: Transaction, project_name: str, user_name: str, *, expected_rev: ExpectedRev) -> None:
-    """End a membership. Raises `Conflict` where the project would lose its last owner."""
+    """End a membership. Raises `ConflictProblem` where the project would lose its last owner."""
     project_row = _lock(tx, project_name)
     which = (
         member.c.project_id == project_row.id,
@@ -101,11 +101,13 @@ def _lock(tx: Transaction, project_name: str) -> ProjectRow:
 def _require_owner(tx: Transaction, project_row: ProjectRow) -> None:
     owners = select(func.count()).where(member.c.project_id == project_row.id, member.c.role == Role.OWNER.value)
     if tx.execute(owners).scalar_one() == 0:
-        raise Conflict("A project keeps at least one owner; make somebody else an owner first.", code="last-owner")
+        raise ConflictProblem(
+            "A project keeps at least one owner; make somebody else an owner first.", code="last-owner"
+        )
 
 
-def _no_member(user_name: str) -> NotFound:
-    return NotFound(f"{user_name!r} is no member of this project.", code="no-member")
+def _no_member(user_name: str) -> NotFoundProblem:
+    return NotFoundProblem(f"{user_name!r} is no member of this project.", code="no-member")
 
 
 def _shown(name: str, row: Row[Any]) -> Member:

@@ -24,7 +24,7 @@ from marey_schemas.access import Project, ProjectChange, ProjectCreate, Role, Vi
 from marey_schemas.items import Page
 from marey_server.access import roles, scopes
 from marey_server.access.principal import Principal
-from marey_server.errors import Conflict, Forbidden, NotFound, Unauthenticated
+from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem, UnauthenticatedProblem
 from marey_server.store import listing
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
@@ -82,8 +82,8 @@ def require(
     """Return the project `name` if the caller has the role and the scope that the transaction's operation declares.
 
     `at_least` raises the declared role and never lowers it. `deleted=True` looks for the project of this name that was
-    deleted last. Raises `NotFound` if the caller may not know the project, `Forbidden` if the caller may not do this in
-    it, `Unauthenticated` if signing in could help.
+    deleted last. Raises `NotFoundProblem` if the caller may not know the project, `ForbiddenProblem` if the caller may
+    not do this in it, `UnauthenticatedProblem` if signing in could help.
     """
     required = tx.required_role
     need = at_least if roles.includes(at_least, required.role) else required.role
@@ -91,13 +91,13 @@ def require(
     row = tx.first(_DELETED_BY_NAME if deleted else _ALIVE_BY_NAME, {"name": name, "me": me})
     seen = None if row is None else _as_seen(tx.principal, row)
     if seen is None or (seen.guest and deleted):
-        raise NotFound(f"There is no project {name!r} that you may see.", code="no-project")
+        raise NotFoundProblem(f"There is no project {name!r} that you may see.", code="no-project")
     if not roles.includes(seen.role, need) or (seen.guest and not required.guests):
         if tx.principal.kind == "anonymous":
-            raise Unauthenticated(f"Sign in to do this in {name!r}.")
-        raise Forbidden(f"This needs the role {need.value} in {name!r}.", code="insufficient-role")
+            raise UnauthenticatedProblem(f"Sign in to do this in {name!r}.")
+        raise ForbiddenProblem(f"This needs the role {need.value} in {name!r}.", code="insufficient-role")
     if not seen.guest and not scopes.allows(tx.principal.scopes, required.scope, name):
-        raise Forbidden(f"This token does not reach {required.scope!r} in {name!r}.", code="insufficient-scope")
+        raise ForbiddenProblem(f"This token does not reach {required.scope!r} in {name!r}.", code="insufficient-scope")
     return seen
 
 
@@ -176,12 +176,12 @@ def list_projects(
 
 
 def create_project(tx: Transaction, request: ProjectCreate) -> Project:
-    """A new project, owned by the caller. Raises `Conflict` where the name is taken."""
+    """A new project, owned by the caller. Raises `ConflictProblem` where the name is taken."""
     principal = tx.principal
     if principal.kind == "anonymous":
-        raise Unauthenticated("Sign in to create a project.")
+        raise UnauthenticatedProblem("Sign in to create a project.")
     if principal.kind == "attempt" or not scopes.allows(principal.scopes, "write", request.name):
-        raise Forbidden("This token may not create projects.", code="insufficient-scope")
+        raise ForbiddenProblem("This token may not create projects.", code="insufficient-scope")
     made = ProjectRow(
         new_id("project"), request.name, request.title, request.description, request.visibility,
         tx.now_us, tx.now_us, None, 1, Role.OWNER, False,
@@ -199,8 +199,8 @@ def create_project(tx: Transaction, request: ProjectCreate) -> Project:
     return made.shown()
 
 
-def _name_taken(name: str) -> Conflict:
-    return Conflict(f"The name {name!r} is taken by another project.", code="name-taken")
+def _name_taken(name: str) -> ConflictProblem:
+    return ConflictProblem(f"The name {name!r} is taken by another project.", code="name-taken")
 
 
 def change_project(tx: Transaction, name: str, request: ProjectChange, *, expected_rev: ExpectedRev) -> Project:
@@ -223,7 +223,10 @@ def delete_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev) -> 
 
 
 def restore_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev = None) -> Project:
-    """Bring back the project of this name that was deleted last. Raises `Conflict` where the name is taken again."""
+    """Bring back the project of this name that was deleted last.
+
+    Raises `ConflictProblem` where the name is taken again.
+    """
     seen = require(tx, name, deleted=True)
     with taken(_name_taken(name)):
         restored = _change(tx, seen, {"deleted_us": None}, expected_rev, project.c.deleted_us.is_not(None))
@@ -236,6 +239,6 @@ def _change(
 ) -> Project:
     row = change_row(
         tx, project, (project.c.id == seen.id, state), {**values, "updated_us": tx.now_us},
-        expected_rev=expected_rev, absent=NotFound(f"There is no project {seen.name!r}.", code="no-project"),
+        expected_rev=expected_rev, absent=NotFoundProblem(f"There is no project {seen.name!r}.", code="no-project"),
     )  # fmt: skip
     return _row(row, seen.role, guest=False).shown()

@@ -6,7 +6,7 @@ from typing import Any
 
 from sqlalchemy import Column, ColumnElement, Row, Table, select, true, update
 
-from marey_server.errors import MareyError, PreconditionFailed
+from marey_server.errors import ApiProblem, PreconditionFailedProblem
 from marey_server.store.transaction import Transaction
 
 ExpectedRev = int | frozenset[int] | None
@@ -32,11 +32,11 @@ def change_row(
     values: dict[str, Any],
     *,
     expected_rev: ExpectedRev,
-    absent: MareyError,
+    absent: ApiProblem,
 ) -> Row[Any]:
     """Change the one row that meets `which`, if its `rev` is an expected one.
 
-    Raises `absent` where there is no such row, `PreconditionFailed` with the current `rev` where it has changed.
+    Raises `absent` where there is no such row, `PreconditionFailedProblem` with the current `rev` where it has changed.
     """
     expected = at_rev(table.c.rev, expected_rev)
     statement = update(table).where(*which, expected).values(**values, rev=table.c.rev + 1).returning(*table.c)
@@ -47,9 +47,9 @@ def change_row(
     raise absent if current is None else moved_on(current)
 
 
-def moved_on(current_rev: int) -> PreconditionFailed:
+def moved_on(current_rev: int) -> PreconditionFailedProblem:
     """Somebody else was faster; `context.rev` tells the state now."""
-    return PreconditionFailed(
+    return PreconditionFailedProblem(
         f"This has changed since you read it (it is at rev {current_rev} now). Read it again, then repeat the change.",
         context={"rev": current_rev},
     )

@@ -18,7 +18,7 @@ from marey_server.access.secret_tokens import (
     secret_matches,
     split_user_token,
 )
-from marey_server.errors import Forbidden, NotFound, Unauthenticated
+from marey_server.errors import ForbiddenProblem, NotFoundProblem, UnauthenticatedProblem
 from marey_server.store import listing
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
@@ -48,7 +48,7 @@ _ATTEMPT_TOKEN = Prepared(
 
 
 def resolve_token(tx: Transaction, text: str) -> Principal:
-    """The principal that a bearer token stands for. Raises `Unauthenticated` where it stands for nobody."""
+    """The principal that a bearer token stands for. Raises `UnauthenticatedProblem` where it stands for nobody."""
     if (secret := attempt_secret(text)) is not None:
         return _resolve_attempt(tx, secret)
     if (parts := split_user_token(text)) is not None:
@@ -56,8 +56,8 @@ def resolve_token(tx: Transaction, text: str) -> Principal:
     raise _unknown()
 
 
-def _unknown() -> Unauthenticated:
-    return Unauthenticated("The token is unknown, expired or revoked.", code="bad-token")
+def _unknown() -> UnauthenticatedProblem:
+    return UnauthenticatedProblem("The token is unknown, expired or revoked.", code="bad-token")
 
 
 def _resolve_user(tx: Transaction, prefix: str, secret: str) -> Principal:
@@ -71,7 +71,7 @@ def _resolve_user(tx: Transaction, prefix: str, secret: str) -> Principal:
 
 def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
     """An attempt lives while its fence is the job's. Once the job has ended, the token only serves to hear again what
-    `complete` or `fail` answered: it reads nothing any more. Raises `LeaseLost` once the fence has moved on.
+    `complete` or `fail` answered: it reads nothing any more. Raises `LeaseLostProblem` once the fence has moved on.
     """
     row = tx.first(_ATTEMPT_TOKEN, {"hash": hash_secret(secret)})
     if row is None:
@@ -97,7 +97,7 @@ def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
     """A new token of the caller, reaching no further than the credential it is made with. The secret is shown once."""
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
-        raise Forbidden(f"Your own credential does not reach {beyond[0]!r}.", code="insufficient-scope")
+        raise ForbiddenProblem(f"Your own credential does not reach {beyond[0]!r}.", code="insufficient-scope")
     issued = issue_user_token()
     lifetime_s = request.expires_in_s
     row = {
@@ -120,7 +120,7 @@ def list_tokens(tx: Transaction, *, cursor: str | None = None, limit: int = list
 
 
 def revoke_token(tx: Transaction, token_id: str) -> None:
-    """End one of the caller's tokens, or as an administrator anybody's. Raises `NotFound`.
+    """End one of the caller's tokens, or as an administrator anybody's. Raises `NotFoundProblem`.
 
     A token may always end itself.
     """
@@ -131,7 +131,7 @@ def revoke_token(tx: Transaction, token_id: str) -> None:
     if not (principal.administrator and scopes.allows(principal.scopes, "admin")):
         statement = statement.where(token.c.user_id == principal.user_id)
     if tx.execute(statement).rowcount == 0:
-        raise NotFound(f"You have no token {token_id!r}.", code="no-token")
+        raise NotFoundProblem(f"You have no token {token_id!r}.", code="no-token")
     tx.emit("token.revoked", token_id)
 
 
@@ -152,11 +152,11 @@ def note_use(tx: Transaction, token_id: str) -> None:
 
 def _require_user(principal: Principal, scope: str) -> str:
     if principal.kind == "anonymous":
-        raise Unauthenticated("Sign in to see your tokens.")
+        raise UnauthenticatedProblem("Sign in to see your tokens.")
     if principal.kind != "user" or principal.user_id is None:
-        raise Forbidden("Only users have tokens.", code="users-only")
+        raise ForbiddenProblem("Only users have tokens.", code="users-only")
     if not scopes.allows(principal.scopes, scope):
-        raise Forbidden(f"This token does not reach {scope!r}.", code="insufficient-scope")
+        raise ForbiddenProblem(f"This token does not reach {scope!r}.", code="insufficient-scope")
     return principal.user_id
 
 

@@ -12,7 +12,14 @@ from typing import Any
 
 from sqlalchemy import Row, delete, insert, select, update
 
-from marey_server.errors import Conflict, Forbidden, Invalid, NotFound, TooLarge, Unauthenticated
+from marey_server.errors import (
+    ConflictProblem,
+    ForbiddenProblem,
+    InvalidProblem,
+    NotFoundProblem,
+    TooLargeProblem,
+    UnauthenticatedProblem,
+)
 from marey_server.store import blobs
 from marey_server.store.blob_backings import CHUNK_BYTES
 from marey_server.store.ids import new_id
@@ -38,7 +45,7 @@ def create_upload(tx: Transaction, length: int, *, digest: str | None = None) ->
     """Announce `length` bytes; with `digest`, they must turn out to be these."""
     user_id = _sender(tx)
     if not 0 < length <= MAX_UPLOAD_BYTES:
-        raise TooLarge(f"An upload holds 1 to {MAX_UPLOAD_BYTES} bytes.")
+        raise TooLargeProblem(f"An upload holds 1 to {MAX_UPLOAD_BYTES} bytes.")
     upload_id = new_id("upload")
     row = {
         "id": upload_id, "user_id": user_id, "length": length, "offset": 0, "digest": digest,
@@ -49,20 +56,22 @@ def create_upload(tx: Transaction, length: int, *, digest: str | None = None) ->
 
 
 def read_upload(tx: Transaction, upload_id: str) -> Upload:
-    """How far an upload of the caller is. Raises `NotFound`."""
+    """How far an upload of the caller is. Raises `NotFoundProblem`."""
     return _shown(_find(tx, upload_id))
 
 
 def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> Upload:
     """Append a piece of at most a few MiB that starts at `offset`.
 
-    Raises `Conflict` with the true offset in `context.offset` where the upload is elsewhere.
+    Raises `ConflictProblem` with the true offset in `context.offset` where the upload is elsewhere.
     """
     found = _find(tx, upload_id)
     if found.finished_digest is not None or found.offset != offset:
         raise _elsewhere(found.offset)
     if offset + len(data) > found.length:
-        raise TooLarge(f"The upload was announced with {found.length} bytes; this would make {offset + len(data)}.")
+        raise TooLargeProblem(
+            f"The upload was announced with {found.length} bytes; this would make {offset + len(data)}."
+        )
     if not data:
         return _shown(found)
     moved = (
@@ -81,8 +90,8 @@ def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> Upload:
 def finish(tx: Transaction, upload_id: str) -> str:
     """Make a blob of a complete upload and return its digest; the same again once it is finished.
 
-    Raises `Conflict` where bytes are lacking, and `Invalid` for bytes that are not the announced ones; they stay until
-    the upload is abandoned or given up.
+    Raises `ConflictProblem` where bytes are lacking, and `InvalidProblem` for bytes that are not the announced ones;
+    they stay until the upload is abandoned or given up.
     """
     found = _find(tx, upload_id)
     if found.finished_digest is not None:
@@ -95,7 +104,7 @@ def finish(tx: Transaction, upload_id: str) -> str:
     digest = f"sha256:{hashed.hexdigest()}"
     if found.digest not in (None, digest):
         detail = f"The bytes are {digest}, not {found.digest}. Upload them again."
-        raise Invalid(detail, code="digest-mismatch")
+        raise InvalidProblem(detail, code="digest-mismatch")
     claimed = update(upload).where(upload.c.id == upload_id, upload.c.finished_digest.is_(None))
     if tx.execute(claimed.values(finished_digest=digest, updated_us=tx.now_us)).rowcount == 0:
         return digest
@@ -143,22 +152,22 @@ def _even(pieces: Iterator[bytes]) -> Iterator[bytes]:
 def _sender(tx: Transaction) -> str:
     blobs.require_sender(tx.principal)
     if tx.principal.user_id is None:
-        raise Forbidden("Only users and their jobs upload.", code="users-only")
+        raise ForbiddenProblem("Only users and their jobs upload.", code="users-only")
     return tx.principal.user_id
 
 
 def _find(tx: Transaction, upload_id: str) -> Row[Any]:
     if tx.principal.kind == "anonymous":
-        raise Unauthenticated("Sign in to upload.")
+        raise UnauthenticatedProblem("Sign in to upload.")
     statement = select(upload).where(upload.c.id == upload_id, upload.c.user_id == (tx.principal.user_id or ""))
     row = tx.execute(statement).first()
     if row is None:
-        raise NotFound(f"You have no upload {upload_id!r}.", code="no-upload")
+        raise NotFoundProblem(f"You have no upload {upload_id!r}.", code="no-upload")
     return row
 
 
-def _elsewhere(offset: int) -> Conflict:
-    return Conflict(
+def _elsewhere(offset: int) -> ConflictProblem:
+    return ConflictProblem(
         f"The upload is at byte {offset}; go on from there.", code="wrong-offset", context={"offset": offset}
     )
 

@@ -10,7 +10,13 @@ from marey_schemas.access import Scope, User, UserChange, UserCreate
 from marey_schemas.items import Page
 from marey_server.access import passwords, scopes
 from marey_server.access.principal import Principal
-from marey_server.errors import Conflict, Forbidden, NotFound, PreconditionFailed, Unauthenticated
+from marey_server.errors import (
+    ConflictProblem,
+    ForbiddenProblem,
+    NotFoundProblem,
+    PreconditionFailedProblem,
+    UnauthenticatedProblem,
+)
 from marey_server.store import listing
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
@@ -26,7 +32,7 @@ _ADMINISTRATORS = "administrators"
 def create_user(tx: Transaction, request: UserCreate, *, password_hash: str | None = None) -> User:
     """A new user. `password_hash` comes from `passwords.hash_password`, which takes too long for a transaction.
 
-    Raises `Conflict` where the name is taken.
+    Raises `ConflictProblem` where the name is taken.
     """
     require_administrator(tx.principal)
     return _insert(tx, request.name, request.display_name, request.administrator, password_hash)
@@ -39,14 +45,14 @@ def _insert(
         "id": new_id("user"), "name": name, "display_name": display_name, "password_hash": password_hash,
         "administrator": administrator, "disabled": False, "created_us": tx.now_us, "rev": 1,
     }  # fmt: skip
-    with taken(Conflict(f"The name {name!r} is taken by another user.", code="name-taken")):
+    with taken(ConflictProblem(f"The name {name!r} is taken by another user.", code="name-taken")):
         made = tx.execute(insert(user).values(**row).returning(*user.c)).one()
     tx.emit("user.created", made.id, name=name, administrator=administrator)
     return _shown(made)
 
 
 def find_user(tx: Transaction, name: str) -> User:
-    """A user, for administrators and for himself. Raises `NotFound`."""
+    """A user, for administrators and for himself. Raises `NotFoundProblem`."""
     if tx.principal.kind != "user" or tx.principal.user_name != name:
         require_administrator(tx.principal, hidden=_no_user(name))
     row = tx.execute(select(user).where(user.c.name == name)).first()
@@ -82,22 +88,22 @@ def change_user(
     if not itself:
         require_administrator(tx.principal, hidden=_no_user(name))
     elif not scopes.allows(tx.principal.scopes, "write"):
-        raise Forbidden("This token may not change the user.", code="insufficient-scope")
+        raise ForbiddenProblem("This token may not change the user.", code="insufficient-scope")
     if not administrates and (request.administrator is not None or request.disabled is not None):
-        raise Forbidden("Only administrators make administrators and disable users.", code="administrators-only")
+        raise ForbiddenProblem("Only administrators make administrators and disable users.", code="administrators-only")
     which: tuple[ColumnElement[bool], ...] = (user.c.name == name,)
     if request.password is not None and itself:
         if verified_hash is None:
-            raise Forbidden("Give the current password too.", code="wrong-password")
+            raise ForbiddenProblem("Give the current password too.", code="wrong-password")
         which += (user.c.password_hash == verified_hash,)
     values = _values(request, password_hash)
     tx.lock(_ADMINISTRATORS)
     try:
         row = change_row(tx, user, which, values, expected_rev=expected_rev, absent=_no_user(name))
-    except NotFound:
+    except NotFoundProblem:
         if verified_hash is None:
             raise
-        raise PreconditionFailed("The password was changed meanwhile.", code="wrong-password") from None
+        raise PreconditionFailedProblem("The password was changed meanwhile.", code="wrong-password") from None
     _require_some_administrator(tx)
     tx.emit("user.changed", row.id, name=name, fields=sorted(values))
     return _shown(row)
@@ -124,7 +130,7 @@ def delete_user(tx: Transaction, name: str, *, expected_rev: ExpectedRev) -> Non
 def _require_some_administrator(tx: Transaction) -> None:
     left = select(func.count()).where(user.c.administrator.is_(True), user.c.disabled.is_(False))
     if tx.execute(left).scalar_one() == 0:
-        raise Conflict("Somebody must stay an administrator.", code="last-administrator")
+        raise ConflictProblem("Somebody must stay an administrator.", code="last-administrator")
 
 
 # -- signing in -------------------------------------------------------------------------------------------------------
@@ -140,11 +146,11 @@ def stored_hash(tx: Transaction, name: str) -> str | None:
 def verify_password(tx: Transaction, name: str, password: str) -> Principal:
     """Who signs in with this name and password; run it as a read, it takes 0.1 s whether the user exists or not.
 
-    Raises `Unauthenticated`.
+    Raises `UnauthenticatedProblem`.
     """
     row = tx.execute(select(user).where(user.c.name == name, user.c.disabled.is_(False))).first()
     if not passwords.password_matches(password, None if row is None else row.password_hash) or row is None:
-        raise Unauthenticated("Name or password is wrong.", code="wrong-password")
+        raise UnauthenticatedProblem("Name or password is wrong.", code="wrong-password")
     return _principal(row)
 
 
@@ -164,7 +170,7 @@ def ensure_first_administrator(tx: Transaction) -> User | None:
 def administrator_principal(tx: Transaction, name: str | None = None) -> Principal:
     """An administrator by name, or the one who was made first, for who has the database in hands anyway.
 
-    Raises `NotFound` where no such administrator is active; one always is.
+    Raises `NotFoundProblem` where no such administrator is active; one always is.
     """
     administrators = select(user).where(user.c.administrator.is_(True), user.c.disabled.is_(False))
     if name is not None:
@@ -183,17 +189,17 @@ def is_administrator(principal: Principal) -> bool:
     return principal.administrator and scopes.allows(principal.scopes, "admin")
 
 
-def require_administrator(principal: Principal, *, hidden: NotFound | None = None) -> None:
-    """Raise `Forbidden` (or `hidden`) unless the caller administrates the server."""
+def require_administrator(principal: Principal, *, hidden: NotFoundProblem | None = None) -> None:
+    """Raise `ForbiddenProblem` (or `hidden`) unless the caller administrates the server."""
     if is_administrator(principal):
         return
     if principal.kind == "anonymous":
-        raise Unauthenticated("Sign in as an administrator.")
-    raise hidden or Forbidden("Only administrators may do this.", code="administrators-only")
+        raise UnauthenticatedProblem("Sign in as an administrator.")
+    raise hidden or ForbiddenProblem("Only administrators may do this.", code="administrators-only")
 
 
-def _no_user(name: str) -> NotFound:
-    return NotFound(f"There is no user {name!r} that you may see.", code="no-user")
+def _no_user(name: str) -> NotFoundProblem:
+    return NotFoundProblem(f"There is no user {name!r} that you may see.", code="no-user")
 
 
 def _shown(row: Row[Any]) -> User:

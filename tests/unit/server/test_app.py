@@ -13,7 +13,7 @@ from tests.support.rest_server import running
 from marey_schemas.access import UserChange, UserCreate
 from marey_server.access.principal import SYSTEM
 from marey_server.app import make_worker_token
-from marey_server.errors import NotFound, Unauthenticated, Unavailable
+from marey_server.errors import NotFoundProblem, UnauthenticatedProblem, UnavailableProblem
 from marey_server.process.administrators import give_token, make_first_administrator
 from marey_server.process.settings import Settings
 from marey_server.store import leader, tokens, users
@@ -48,7 +48,7 @@ def test_a_token_is_given_to_administrators_alone_and_a_refusal_leaves_the_file(
     admin = database.read(SYSTEM, users.administrator_principal)
     database.write(admin, users.create_user, UserCreate(name="guest"))
     for name in ("guest", "nobody"):
-        with pytest.raises(NotFound):
+        with pytest.raises(NotFoundProblem):
             database.write(SYSTEM, partial(give_token, name="again"), name, file)
     assert file.read_text() == held
     assert not file.with_suffix(".partial").exists()
@@ -71,7 +71,7 @@ def test_a_server_that_starts_again_replaces_its_workers_token_and_no_other_serv
     again = make_worker_token(database, one)
     for secret in (beside, again):
         assert "work" in database.read(SYSTEM, tokens.resolve_token, secret).scopes
-    with pytest.raises(Unauthenticated):
+    with pytest.raises(UnauthenticatedProblem):
         database.read(SYSTEM, tokens.resolve_token, first)
 
 
@@ -88,7 +88,7 @@ def test_a_server_whose_database_is_away_stops_all_the_same(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
     def without_database(*_: object) -> None:
-        raise Unavailable("The database does not answer.")
+        raise UnavailableProblem("The database does not answer.")
 
     with running(database, tmp_path):
         monkeypatch.setattr(leader, "give_up_lead", without_database)

@@ -5,7 +5,7 @@ import pytest
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import Principal
-from marey_server.errors import Conflict, Forbidden, NotFound, Unauthenticated
+from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem, UnauthenticatedProblem
 from marey_server.store import blobs, items, projects
 from marey_server.store.blobs import GRACE_US, digest_of
 
@@ -26,7 +26,7 @@ def readers(lab):
 def test_who_sent_the_bytes_may_read_them_and_nobody_else(lab):
     lab.write(blobs.put_blob, FILE, who=lab.contributor)
     assert readers(lab) == {lab.contributor.user_name}
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         lab.read(blobs.read_range, DIGEST, 0, 5, who=lab.owner)
     assert lab.read(blobs.read_range, DIGEST, 0, 5, who=lab.contributor) == b"HIERA"
 
@@ -45,12 +45,12 @@ def test_a_document_shares_what_it_names_with_the_readers_of_its_project(lab):
 def test_nobody_gets_bytes_by_naming_their_digest(lab):
     lab.write(blobs.put_blob, FILE, who=lab.contributor)
     for body in ({"figures": [{"blob": DIGEST}]}, {"blob": DIGEST}):
-        with pytest.raises(Conflict) as refused:
+        with pytest.raises(ConflictProblem) as refused:
             study(lab, lab.owner, **body)
         assert refused.value.context == {"missing": [DIGEST]}
         assert refused.value.errors[0].pointer.endswith("/blob")
     rig = lab.add_skeleton()
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         lab.add_clip(rig, info={"source": {"file": DIGEST}})
     assert readers(lab) == {lab.contributor.user_name}
 
@@ -66,7 +66,7 @@ def test_a_stored_document_gives_no_access_to_who_stores_it_again_without_the_by
     lab.write(blobs.put_blob, FILE, who=lab.contributor)
     made = study(lab, lab.contributor, "mine", blob=DIGEST)
     lab.write(items.delete_item, "lab", Kind.STUDY, made.id, expected_rev=None)
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         study(lab, lab.owner, "theirs", blob=DIGEST)
 
 
@@ -97,9 +97,9 @@ def test_what_may_soon_be_collected_must_be_sent_again(lab, clock):
 
 
 def test_sending_bytes_needs_a_credential_that_writes(lab):
-    with pytest.raises(Unauthenticated):
+    with pytest.raises(UnauthenticatedProblem):
         lab.write(blobs.put_blob, FILE, who=lab.anonymous)
-    with pytest.raises(Forbidden):
+    with pytest.raises(ForbiddenProblem):
         lab.write(blobs.put_blob, FILE, who=Principal("user", lab.owner.user_id, "o", scopes=("read", "jobs")))
     bound = Principal("user", lab.owner.user_id, "o", scopes=("write!project=lab",))
     assert lab.write(blobs.put_blob, FILE, who=bound) == DIGEST

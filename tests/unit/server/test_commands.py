@@ -7,7 +7,7 @@ import pytest
 
 from marey_server import commands
 from marey_server.app import open_database
-from marey_server.errors import StorageFull
+from marey_server.errors import StorageFullProblem
 from marey_server.process.settings import Settings
 from marey_server.store.database.opening import DatabaseUnusable
 
@@ -110,7 +110,7 @@ def test_a_file_that_is_no_database_is_told_and_left_as_it_is(tmp_path, command)
 @pytest.mark.parametrize("command", [start, commands.upgrade])
 def test_a_disk_without_room_for_the_tables_is_told(tmp_path, command, monkeypatch):
     def full(_tx):
-        raise StorageFull("The disk has no room left.")
+        raise StorageFullProblem("The disk has no room left.")
 
     monkeypatch.setattr("marey_server.store.database.schema.make_cursor_key", full)
     with pytest.raises((commands.CommandFailed, DatabaseUnusable), match="for writing: The disk has no room"):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from marey_server.errors import Unavailable
+from marey_server.errors import UnavailableProblem
 from marey_server.process import computing
 from marey_server.process.computing import ComputeThreads
 
@@ -39,7 +39,7 @@ def test_who_waits_too_long_is_told_to_ask_again(monkeypatch: pytest.MonkeyPatch
     async def main() -> None:
         threads = ComputeThreads(2)
         async with threads.long_place():
-            with pytest.raises(Unavailable) as refused:
+            with pytest.raises(UnavailableProblem) as refused:
                 async with threads.long_place():
                     pass
         assert int(refused.value.headers["Retry-After"]) > 0

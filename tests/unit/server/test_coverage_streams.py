@@ -5,7 +5,7 @@ from tests.support.interleaving import Step as Half
 from tests.support.interleaving import interleave
 from tests.support.store_fixtures import WRITE, requiring
 
-from marey_server.errors import Conflict, Forbidden, NotFound
+from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem
 from marey_server.store import coverage_streams, garbage
 from marey_server.store.coverage_streams import LIFETIME_US, MOST_STREAMS, CoverageOffset, NewStream, Step
 
@@ -98,14 +98,14 @@ def test_contributors_send_readers_look_on_and_nobody_else_knows_of_it(lab, stre
     shown = lab.read(coverage_streams.read_stream, "lab", stream.id, who=lab.reader)
     assert shown == stream
     for attempt in (coverage_streams.read_to_advance, coverage_streams.delete_stream):
-        with pytest.raises(Forbidden):
+        with pytest.raises(ForbiddenProblem):
             lab.write(attempt, "lab", stream.id, who=lab.reader)
-    with pytest.raises(Forbidden):
+    with pytest.raises(ForbiddenProblem):
         lab.write(coverage_streams.advance_stream, "lab", stream, step(10), who=lab.reader)
-    with pytest.raises(Forbidden):
+    with pytest.raises(ForbiddenProblem):
         lab.write(coverage_streams.create_stream, "lab", NEW, who=lab.reader)
     for who in (lab.stranger, lab.anonymous):
-        with pytest.raises(NotFound):
+        with pytest.raises(NotFoundProblem):
             lab.read(coverage_streams.read_stream, "lab", stream.id, who=who)
 
 
@@ -114,7 +114,7 @@ def test_a_stream_is_known_in_its_own_project_only(lab, stream):
 
     Lab(lab.database, "other")
     admin = lab.sign_up("root", administrator=True)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         lab.read(coverage_streams.read_stream, "other", stream.id, who=admin)
 
 
@@ -131,7 +131,7 @@ def test_lists_show_the_newest_first_without_what_is_only_needed_to_go_on(lab):
 def test_a_project_has_so_many_streams_and_no_more(lab):
     for _ in range(MOST_STREAMS):
         last = lab.write(coverage_streams.create_stream, "lab", NEW)
-    with pytest.raises(Conflict) as refused:
+    with pytest.raises(ConflictProblem) as refused:
         lab.write(coverage_streams.create_stream, "lab", NEW)
     assert refused.value.error_code == "too-many-streams"
     lab.write(coverage_streams.delete_stream, "lab", last.id)
@@ -147,7 +147,7 @@ def test_the_last_place_is_given_once(lab, open_database):
     ]
     first, second = interleave(*halves)
     assert first.offset == 0
-    assert isinstance(second, Conflict)
+    assert isinstance(second, ConflictProblem)
 
 
 def test_what_nobody_uses_for_a_day_is_dropped_and_what_is_used_stays(lab, stream, clock):
@@ -157,7 +157,7 @@ def test_what_nobody_uses_for_a_day_is_dropped_and_what_is_used_stays(lab, strea
     assert garbage.collect_garbage(lab.database).coverage_streams == 0
     clock.advance(0.5 * DAY_S)
     for gone in (coverage_streams.read_stream, coverage_streams.read_to_advance):
-        with pytest.raises(NotFound, match="after a day"):  # even before it is swept
+        with pytest.raises(NotFoundProblem, match="after a day"):  # even before it is swept
             lab.read(gone, "lab", stream.id)
     assert [one.id for one in lab.read(coverage_streams.list_streams, "lab").items] == [used.id]
     assert garbage.collect_garbage(lab.database).coverage_streams == 1
@@ -167,5 +167,5 @@ def test_what_nobody_uses_for_a_day_is_dropped_and_what_is_used_stays(lab, strea
 
 def test_a_stream_that_is_dropped_while_frames_are_worked_on_is_gone(lab, stream):
     lab.write(coverage_streams.delete_stream, "lab", stream.id)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         lab.write(coverage_streams.advance_stream, "lab", stream, step(10), who=lab.contributor)

@@ -10,7 +10,7 @@ import pytest
 import sqlalchemy
 
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import Invalid, StorageFull, Unavailable
+from marey_server.errors import InvalidProblem, StorageFullProblem, UnavailableProblem
 from marey_server.store.database import connections as database_module
 from marey_server.store.database.clock import DatabaseClock
 from marey_server.store.database.connections import Database
@@ -52,7 +52,7 @@ def test_a_failure_says_nothing_of_what_was_to_be_written(database):
 
 
 def test_a_read_cannot_write(database):
-    with pytest.raises((sqlalchemy.exc.DBAPIError, Unavailable)):
+    with pytest.raises((sqlalchemy.exc.DBAPIError, UnavailableProblem)):
         database.read(SYSTEM, add_user)
     assert database.read(SYSTEM, user_names) == []
 
@@ -160,7 +160,7 @@ def test_a_commit_whose_answer_is_lost_is_not_done_twice(database, monkeypatch):
 
     with monkeypatch.context() as lossy:
         lossy.setattr(type(database.engine.dialect), "do_commit", commit_then_lose)
-        with pytest.raises(Unavailable):
+        with pytest.raises(UnavailableProblem):
             database.write(SYSTEM, work)
     assert database.read(SYSTEM, user_names) == ["u1"]
 
@@ -168,7 +168,7 @@ def test_a_commit_whose_answer_is_lost_is_not_done_twice(database, monkeypatch):
 def test_a_database_that_is_not_there_is_unavailable():
     database = Database("postgresql://nobody@127.0.0.1:1/none")
     for run in (database.read, database.write):
-        with pytest.raises(Unavailable) as refused:
+        with pytest.raises(UnavailableProblem) as refused:
             run(SYSTEM, user_names)
         assert refused.value.headers["Retry-After"]
         assert "127.0.0.1" not in refused.value.detail
@@ -184,7 +184,7 @@ def test_a_full_database_says_so_and_keeps_what_was_there(database):
         for number in range(5000):
             add_user(tx, f"{number:050d}")
 
-    with pytest.raises(StorageFull):
+    with pytest.raises(StorageFullProblem):
         database.write(SYSTEM, too_much)
     database.engine.dispose()
     assert database.read(SYSTEM, user_names) == ["before"]
@@ -196,7 +196,7 @@ def test_values_beyond_what_can_be_stored_are_the_callers_mistake(database, colu
     def write(tx):
         tx.execute(sqlalchemy.update(user).values({column: value}))
 
-    with pytest.raises(Invalid):
+    with pytest.raises(InvalidProblem):
         database.write(SYSTEM, write)
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from marey_server.errors import BadRequest, PreconditionFailed, PreconditionRequired
+from marey_server.errors import BadRequestProblem, PreconditionFailedProblem, PreconditionRequiredProblem
 from marey_server.http.etags import ABSENT, ANY_STATE, entity_tag, matches, parse_tags, write_precondition
 
 
@@ -32,12 +32,12 @@ def test_a_change_may_name_several_states():
 def test_more_states_than_a_statement_should_take_are_refused():
     tags = [f'"{number}.json"' for number in range(1, 102)]
     assert write_precondition(",".join(tags[:100]), None).expected_rev == frozenset(range(1, 101))
-    with pytest.raises(BadRequest, match="101 states; at most 100"):
+    with pytest.raises(BadRequestProblem, match="101 states; at most 100"):
         write_precondition(",".join(tags), None)
 
 
 def test_a_change_without_a_precondition_is_refused():
-    with pytest.raises(PreconditionRequired):
+    with pytest.raises(PreconditionRequiredProblem):
         write_precondition(None, None)
 
 
@@ -47,19 +47,19 @@ def test_the_star_accepts_any_state():
 
 def test_creating_only_is_a_precondition_where_things_can_be_created():
     assert write_precondition(None, "*", may_create=True) is ABSENT
-    with pytest.raises(PreconditionRequired):
+    with pytest.raises(PreconditionRequiredProblem):
         write_precondition(None, "*")
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequestProblem):
         write_precondition(None, '"7.json"', may_create=True)
 
 
 @pytest.mark.parametrize("header", ['"33a64df5"', '"\xb2"', '"\xb2.json"', '"9999999999.json"'])
 def test_a_foreign_tag_can_never_match(header):
-    with pytest.raises(PreconditionFailed):
+    with pytest.raises(PreconditionFailedProblem):
         write_precondition(header, None)
 
 
 @pytest.mark.parametrize("header", ["7.json", '"7.json', '"7.json" "8.json"', '"\n"'])
 def test_malformed_tags_are_refused(header):
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequestProblem):
         parse_tags(header)

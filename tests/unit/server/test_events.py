@@ -8,7 +8,13 @@ from tests.support.store_fixtures import declared
 from marey_schemas.access import ProjectChange
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import Principal
-from marey_server.errors import Conflict, Forbidden, Invalid, NotFound, Unauthenticated
+from marey_server.errors import (
+    ConflictProblem,
+    ForbiddenProblem,
+    InvalidProblem,
+    NotFoundProblem,
+    UnauthenticatedProblem,
+)
 from marey_server.store import events, idempotency, items, projects
 from marey_server.store.idempotency import LIFETIME_US, StoredAnswer
 
@@ -44,7 +50,7 @@ def test_the_feed_goes_on_after_the_last_event_received(lab):
 
 def test_what_failed_did_not_happen(lab):
     before = feed(lab)
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         lab.write(projects.create_project, projects.ProjectCreate(name="lab"))
     assert feed(lab) == before
 
@@ -78,12 +84,12 @@ def test_no_event_is_missed_however_transactions_overlap(lab, open_database):
 def test_events_are_for_members_and_administrators(lab):
     required = declared("GET", "/projects/{project}/events")
     lab.make_public()
-    with pytest.raises(Unauthenticated):
+    with pytest.raises(UnauthenticatedProblem):
         lab.read(events.list_events, "lab", who=lab.anonymous, required=required)
-    with pytest.raises(Forbidden):
+    with pytest.raises(ForbiddenProblem):
         lab.read(events.list_events, "lab", who=lab.stranger, required=required)
     assert lab.read(events.list_events, "lab", who=lab.reader, required=required)
-    with pytest.raises(Forbidden):
+    with pytest.raises(ForbiddenProblem):
         lab.read(events.list_events, who=lab.owner)
     chief = lab.sign_up("chief", administrator=True)
     kinds = {event.kind for event in lab.read(events.list_events, who=chief)}
@@ -101,7 +107,7 @@ def once(tx, key="k", fingerprint="f", *, fail=False):
     before = projects.read_project(tx, "lab").title or ""
     projects.change_project(tx, "lab", ProjectChange(title=before + "I"), expected_rev=None)
     if fail:
-        raise Invalid("no")
+        raise InvalidProblem("no")
     idempotency.finish(tx, key, 201, {"Location": "/x"}, b"body")
     return None
 
@@ -125,7 +131,7 @@ def test_a_request_sent_by_many_connections_at_once_is_done_once(lab):
 
 def test_a_key_stands_for_one_request_of_one_caller(lab):
     lab.write(once)
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         lab.write(once, fingerprint="other")
     assert refused.value.error_code == "idempotency-key-reused"
     admin = Principal("user", lab.owner.user_id + "x", "o", administrator=True, scopes=lab.owner.scopes)
@@ -134,7 +140,7 @@ def test_a_key_stands_for_one_request_of_one_caller(lab):
 
 
 def test_a_request_that_failed_may_be_sent_again(lab):
-    with pytest.raises(Invalid):
+    with pytest.raises(InvalidProblem):
         lab.write(once, fail=True)
     assert lab.write(once) is None
     assert count(lab) == 1
@@ -148,5 +154,5 @@ def test_a_key_expires(lab, clock):
 
 
 def test_hidden_projects_have_no_feed(lab):
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         lab.read(events.list_events, "lab", who=lab.stranger)

@@ -5,7 +5,7 @@ from pydantic import ValidationError
 
 from marey_schemas.editing.commands import Trim
 from marey_schemas.editing.edits import EditDocument
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 from marey_server.field_errors import MAX_ERRORS, field_errors, json_pointer
 from marey_server.store import documents
 
@@ -30,7 +30,7 @@ def test_a_rule_of_ours_is_told_in_its_own_words():
 
 def test_a_fault_of_a_document_is_told_as_one_of_a_body():
     tree = {"schema": "marey/edit@1", "commands": [BACKWARDS | {"name/of~it": 1}]}
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         documents.prepare_document(tree)
     assert list(refused.value.errors) == told(EditDocument, tree)
     first = refused.value.errors[0]

@@ -8,7 +8,7 @@ import sqlalchemy
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import Conflict
+from marey_server.errors import ConflictProblem
 from marey_server.store import blobs, documents, fsck, garbage, items
 from marey_server.store.blobs import GRACE_US, digest_of
 from marey_server.store.tables import attempt, blob, document, job, staged_output
@@ -84,7 +84,7 @@ def test_what_a_running_attempt_has_staged_stays_for_as_long_as_it_runs(lab, clo
 
 def test_a_job_cannot_keep_what_its_author_may_not_refer_to(lab):
     lab.write(blobs.put_blob, FILE, who=lab.reader)
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         lab.write(blobs.keep_for_job, "job_1", [digest_of(FILE)])
 
 
@@ -118,7 +118,7 @@ def test_whoever_takes_something_up_while_it_is_collected_gets_it_or_is_told(lab
         acted.wait(10)
         try:
             outcome.append(other.write(lab.owner if follows is take else SYSTEM, follows))
-        except Conflict as error:
+        except ConflictProblem as error:
             outcome.append(error.error_code)
 
     thread = threading.Thread(target=follow)
@@ -144,7 +144,7 @@ def test_nothing_is_lost_while_everybody_is_busy(lab, clock):
             try:
                 lab.write(blobs.put_blob, FILE)
                 lab.write(publish_study, f"{number}-{turn}")
-            except Conflict as error:
+            except ConflictProblem as error:
                 if error.error_code != "missing-blobs":
                     errors.append(error)
 

@@ -5,7 +5,7 @@ from tests.support.predecessor_models import imported
 
 from marey_motion.formats.predecessor.graph import GraphNode, PredecessorGraph
 from marey_schemas.kinds import Kind
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 from marey_server.motions.importing_graphs import ImportedGraph, graph_draft
 from marey_server.store import items, projects
 from marey_server.store.items import Draft
@@ -43,7 +43,7 @@ def models_of(lab, *names):
 
 def test_a_node_whose_name_ends_in_an_asterisk_is_no_search_by_the_start_of_names(lab, parts):
     add_models(lab, parts, "g/stand")
-    with pytest.raises(Invalid, match=r"no model is called 'stan\*'"):
+    with pytest.raises(InvalidProblem, match=r"no model is called 'stan\*'"):
         models_of(lab, "stan*")
     ids = add_models(lab, parts, "g/stan*")
     assert models_of(lab, "stan*") == [ids["g/stan*"]]
@@ -58,5 +58,5 @@ def test_the_only_model_elsewhere_is_taken_and_one_of_several_is_not_guessed(lab
     ids = add_models(lab, parts, "far/stand")
     assert models_of(lab, "stand") == [ids["far/stand"]]
     add_models(lab, parts, "farther/stand")
-    with pytest.raises(Invalid, match="2 models are called 'stand'"):
+    with pytest.raises(InvalidProblem, match="2 models are called 'stand'"):
         models_of(lab, "stand")

@@ -11,7 +11,14 @@ from tests.support.store_fixtures import declared, motion_tree, skeleton_tree
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.items import CollectionChange, CollectionCreate, ItemChange, ItemCreate
 from marey_schemas.kinds import Kind
-from marey_server.errors import Conflict, Forbidden, Invalid, NotFound, PreconditionFailed, Unauthenticated
+from marey_server.errors import (
+    ConflictProblem,
+    ForbiddenProblem,
+    InvalidProblem,
+    NotFoundProblem,
+    PreconditionFailedProblem,
+    UnauthenticatedProblem,
+)
 from marey_server.store import collections, items, projects
 
 
@@ -108,12 +115,12 @@ def test_slices_cut_translations_along(lab, rig, arrays):
 )
 def test_a_cut_that_makes_no_sense_is_refused(lab, rig, cut):
     clip = lab.add_clip(rig, frames=5)
-    with pytest.raises(Invalid):
+    with pytest.raises(InvalidProblem):
         lab.read(cut_part, Kind.CLIP, clip.id, "motion", **cut)
 
 
 def test_only_motions_are_cut(lab, rig):
-    with pytest.raises(Invalid):
+    with pytest.raises(InvalidProblem):
         lab.read(cut_part, Kind.SKELETON, rig.id, "hierarchy", frames=slice(0, 1))
 
 
@@ -147,7 +154,7 @@ def test_old_revisions_stay_readable(lab, rig):
 
     assert (subject(), subject(revision=1), subject(revision=2)) == ("Ben", "Ann", "Ben")
     for number in (0, 3, 10**12):
-        with pytest.raises((NotFound, Invalid)):
+        with pytest.raises((NotFoundProblem, InvalidProblem)):
             subject(revision=number)
 
 
@@ -180,7 +187,7 @@ def test_a_change_of_a_state_that_has_passed_is_refused_and_changes_nothing(lab,
         lambda: put_info(lab, clip, 99),
         lambda: lab.write(items.delete_item, "lab", Kind.CLIP, clip.id, expected_rev=clip.rev),
     ):
-        with pytest.raises(PreconditionFailed) as refused:
+        with pytest.raises(PreconditionFailedProblem) as refused:
             attempt()
         assert refused.value.context == {"rev": renamed.rev}
     assert read(lab, clip) == renamed
@@ -221,7 +228,7 @@ def test_of_two_changes_at_once_one_wins(lab, rig, open_database, second):
                 )
             else:
                 outcome.append(other.write(lab.owner, items.delete_item, "lab", Kind.CLIP, clip.id, expected_rev=1))
-        except PreconditionFailed as error:
+        except PreconditionFailedProblem as error:
             outcome.append(error.context)
 
     thread = threading.Thread(target=run_second)
@@ -251,16 +258,16 @@ def test_many_changes_at_once_without_a_precondition_all_happen(lab, rig):
 
 def test_a_name_stands_once_per_kind_and_collection(lab, rig):
     clip = lab.add_clip(rig, "walk", collection="a")
-    with pytest.raises(Conflict) as taken:
+    with pytest.raises(ConflictProblem) as taken:
         lab.add_clip(rig, "walk", collection="a", seed=9)
     assert taken.value.error_code == "name-taken"
     lab.add_clip(rig, "walk", collection="b")
     lab.add_skeleton("walk")
     other = lab.add_clip(rig, "run", collection="a")
     for fields in ({"name": "walk"}, {"name": "walk", "collection": "a"}):
-        with pytest.raises(Conflict):
+        with pytest.raises(ConflictProblem):
             change(lab, other, **fields)
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         change(lab, clip, collection="b")
 
 
@@ -273,7 +280,7 @@ def test_two_creators_of_one_name_make_one_item(lab, rig):
     ]
     errors = [future.exception(60) for future in futures]
     assert sum(error is None for error in errors) == 1
-    assert {type(error) for error in errors} == {type(None), Conflict}
+    assert {type(error) for error in errors} == {type(None), ConflictProblem}
     assert len(lab.read(items.list_items, "lab", Kind.CLIP).items) == 1
 
 
@@ -288,9 +295,9 @@ def test_renaming_moving_and_tagging(lab, rig):
 def test_a_deleted_item_is_gone_until_it_is_restored(lab, rig):
     clip = lab.add_clip(rig, "walk", collection="a")
     lab.write(items.delete_item, "lab", Kind.CLIP, clip.id, expected_rev=clip.rev)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         read(lab, clip)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         lab.read(items.read_part, "lab", Kind.CLIP, clip.id, "motion")
     assert lab.read(items.list_items, "lab", Kind.CLIP).items == ()
     bin_ = lab.read(items.list_items, "lab", Kind.CLIP, items.ItemFilters(deleted=True)).items
@@ -303,7 +310,7 @@ def test_restoring_needs_the_name(lab, rig):
     clip = lab.add_clip(rig, "walk")
     lab.write(items.delete_item, "lab", Kind.CLIP, clip.id, expected_rev=None)
     lab.add_clip(rig, "walk", seed=5)
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         lab.write(items.restore_item, "lab", Kind.CLIP, clip.id)
 
 
@@ -317,7 +324,7 @@ def test_collections_take_their_contents_along(lab, rig):
     )
     assert read(lab, clip).collection == "new/raw/a"
     lab.write(collections.delete_collection, "lab", raw.id, expected_rev=moved.rev)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         read(lab, clip)
     assert [one.path for one in lab.read(collections.list_collections, "lab").items] == ["new"]
     lab.write(collections.restore_collection, "lab", raw.id)
@@ -353,15 +360,15 @@ def test_a_folder_moved_by_two_at_once_without_a_precondition_ends_at_one_place(
 def test_collections_refuse_what_would_tangle_them(lab):
     a = lab.write(collections.create_collection, "lab", CollectionCreate(path="a"))
     lab.write(collections.create_collection, "lab", CollectionCreate(path="ab/c"))
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         lab.write(collections.create_collection, "lab", CollectionCreate(path="a"))
-    with pytest.raises(Invalid):
+    with pytest.raises(InvalidProblem):
         lab.write(collections.move_collection, "lab", a.id, CollectionChange(path="a/b"), expected_rev=None)
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         lab.write(collections.move_collection, "lab", a.id, CollectionChange(path="ab"), expected_rev=None)
-    with pytest.raises(PreconditionFailed):
+    with pytest.raises(PreconditionFailedProblem):
         lab.write(collections.move_collection, "lab", a.id, CollectionChange(path="z"), expected_rev=7)
-    with pytest.raises(Invalid):
+    with pytest.raises(InvalidProblem):
         lab.write(collections.create_collection, "lab", CollectionCreate(path="/".join(["歩" * 200] * 5)))
     assert [one.path for one in lab.read(collections.list_collections, "lab").items] == ["a", "ab", "ab/c"]
     assert [one.path for one in lab.read(collections.list_collections, "lab", path="a").items] == ["a"]
@@ -371,7 +378,7 @@ def test_collections_refuse_what_would_tangle_them(lab):
 
 
 def refused(lab, kind, parts):
-    with pytest.raises(Invalid) as error:
+    with pytest.raises(InvalidProblem) as error:
         lab.write(items.create_item, "lab", kind, ItemCreate(name="x", parts=parts))
     assert lab.read(items.list_items, "lab", kind, items.ItemFilters(name="x")).items == ()
     return error.value
@@ -439,10 +446,10 @@ def test_readers_read_contributors_change_maintainers_delete(lab, rig):
     clip = lab.add_clip(rig)
     request = ItemChange(name="n")
     for who, can_read, can_change, can_delete in (
-        (lab.anonymous, NotFound, NotFound, NotFound),
-        (lab.stranger, NotFound, NotFound, NotFound),
-        (lab.reader, None, Forbidden, Forbidden),
-        (lab.contributor, None, None, Forbidden),
+        (lab.anonymous, NotFoundProblem, NotFoundProblem, NotFoundProblem),
+        (lab.stranger, NotFoundProblem, NotFoundProblem, NotFoundProblem),
+        (lab.reader, None, ForbiddenProblem, ForbiddenProblem),
+        (lab.contributor, None, None, ForbiddenProblem),
         (lab.maintainer, None, None, None),
     ):
         read_as, write_as = partial(lab.read, who=who), partial(lab.write, who=who)
@@ -459,7 +466,7 @@ def test_readers_read_contributors_change_maintainers_delete(lab, rig):
             with pytest.raises(refusal) if refusal else nullcontext():
                 run(function, "lab", Kind.CLIP, clip.id, *more, **expected)
     restoring = declared("POST", "/projects/{project}/{kind}/{item}/restore")
-    with pytest.raises(Forbidden):
+    with pytest.raises(ForbiddenProblem):
         lab.write(items.restore_item, "lab", Kind.CLIP, clip.id, who=lab.contributor, required=restoring)
 
 
@@ -467,9 +474,9 @@ def test_guests_of_a_public_project_read_and_change_nothing(lab, rig):
     clip = lab.add_clip(rig)
     lab.make_public()
     assert read(lab, clip, who=lab.anonymous).id == clip.id
-    with pytest.raises(Unauthenticated):
+    with pytest.raises(UnauthenticatedProblem):
         lab.write(items.delete_item, "lab", Kind.CLIP, clip.id, expected_rev=None, who=lab.anonymous)
-    with pytest.raises(Forbidden):
+    with pytest.raises(ForbiddenProblem):
         lab.write(items.put_part, "lab", Kind.CLIP, clip.id, "info", {}, expected_rev=None, who=lab.stranger)
 
 
@@ -477,10 +484,10 @@ def test_an_item_is_found_only_under_its_own_kind_and_project(lab, rig, database
     from tests.support.store_fixtures import Lab
 
     elsewhere = Lab(database, "elsewhere")
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         lab.read(items.read_item, "lab", Kind.CLIP, rig.id)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         elsewhere.read(items.read_item, "elsewhere", Kind.SKELETON, rig.id)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         elsewhere.write(items.delete_item, "elsewhere", Kind.SKELETON, rig.id, expected_rev=None)
     assert lab.read(projects.read_project, "lab").name == "lab"

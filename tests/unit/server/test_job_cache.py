@@ -7,7 +7,7 @@ from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import motion_tree, skeleton_tree
 
 from marey_schemas.kinds import Kind
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 from marey_server.store import blobs, items
 from marey_server.store.items.drafts import Draft
 
@@ -34,7 +34,7 @@ def submit(desk: Desk, kind: str, inputs: dict[str, Any], params: dict[str, Any]
 
 
 def refused(desk: Desk, kind: str, inputs: dict[str, Any], params: dict[str, Any], **fields: Any) -> tuple[str, str]:
-    with pytest.raises(Invalid) as raised:
+    with pytest.raises(InvalidProblem) as raised:
         submit(desk, kind, inputs, params, **fields)
     (error,) = raised.value.errors
     return error.pointer, error.code

@@ -4,7 +4,7 @@ import pytest
 from tests.support.queue_desk import Desk
 
 from marey_schemas.worker_protocol import Lease, LogAnswer
-from marey_server.errors import LeaseLost
+from marey_server.errors import LeaseLostProblem
 from marey_server.store.jobs import logs, reading
 from marey_server.store.jobs.logs import LogOffset, LogPage
 from marey_server.store.jobs.policy import QueuePolicy
@@ -54,7 +54,7 @@ def test_the_log_of_a_job_is_that_of_its_attempts_in_order_and_sealed_at_the_end
     first = desk.claim()
     append(desk, first, 0, b"first\n")
     desk.fail(first)
-    with pytest.raises(LeaseLost):
+    with pytest.raises(LeaseLostProblem):
         append(desk, first, 6, b"late")
     desk.clock.advance(11)
     second = desk.claim()

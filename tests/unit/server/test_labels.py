@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 from marey_server.store.jobs.labels import MOST_LABELS, keys_within, labels_key
 
 names = st.text(min_size=1, max_size=8)
@@ -30,7 +30,7 @@ def test_a_worker_with_all_its_labels_matches_every_subset() -> None:
 
 
 def test_labels_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(Invalid):
+    with pytest.raises(InvalidProblem):
         labels_key({f"label{n}": "x" for n in range(MOST_LABELS + 1)})
-    with pytest.raises(Invalid):
+    with pytest.raises(InvalidProblem):
         labels_key({"name": "x" * 600})

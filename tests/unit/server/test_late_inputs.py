@@ -13,7 +13,7 @@ from marey_schemas.access import ProjectCreate
 from marey_schemas.jobs import InputSpec, JobCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import Conflict, Invalid
+from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import items, projects
 from marey_server.store.items.drafts import Draft
 from marey_server.store.jobs import inputs as job_inputs
@@ -364,14 +364,14 @@ def test_makers_that_are_not_there_are_refused_with_their_place(
     desk: Desk, inputs: dict[str, Any], pointer: str
 ) -> None:
     desk.things(1)
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         desk.submit("square", inputs=inputs)
     assert [(error.pointer, error.code) for error in refused.value.errors] == [(pointer, "unknown-job")]
 
 
 def test_a_maker_that_makes_no_such_thing_is_refused(desk: Desk) -> None:
     errand = desk.submit()
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         desk.submit_many(squares_of(errand))
     assert (refused.value.errors[0].pointer, refused.value.errors[0].code) == ("/inputs/things/job", "wrong-kind")
 
@@ -381,7 +381,7 @@ def test_a_job_of_another_project_is_as_unknown_as_none(desk: Desk) -> None:
     (elsewhere,) = desk.database.write(desk.user, submission.submit, "other", [JobCreate(kind="sum")])
     told = []
     for job in (elsewhere.id, "job_nowhere"):
-        with pytest.raises(Invalid) as refused:
+        with pytest.raises(InvalidProblem) as refused:
             desk.submit_many(squares_of(job))
         told.append(refused.value.detail.replace(job, "X"))
     assert told[0] == told[1]
@@ -500,5 +500,5 @@ def test_a_job_that_only_shared_the_result_of_a_failed_one_does_not_need_that(de
 def test_a_job_that_ran_cannot_be_tried_again_before_it_ends(desk: Desk) -> None:
     maker = desk.submit("sum")
     (job,) = desk.submit_many(squares_of(maker))
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         again(desk, job)

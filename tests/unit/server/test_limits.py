@@ -2,7 +2,7 @@
 
 import pytest
 
-from marey_server.errors import TooManyRequests
+from marey_server.errors import TooManyRequestsProblem
 from marey_server.process.services import NAMES_REMEMBERED, TryLimit
 
 
@@ -11,13 +11,13 @@ def test_tries_are_limited_by_key_and_come_back_with_time():
     limit = TryLimit(3, clock=lambda: now[0])
     for _ in range(3):
         limit.take("ann")
-    with pytest.raises(TooManyRequests) as refusal:
+    with pytest.raises(TooManyRequestsProblem) as refusal:
         limit.take("ann")
     assert refusal.value.headers["Retry-After"] == "20"
     limit.take("ben")
     now[0] += 20
     limit.take("ann")
-    with pytest.raises(TooManyRequests):
+    with pytest.raises(TooManyRequestsProblem):
         limit.take("ann")
 
 

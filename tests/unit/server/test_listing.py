@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from marey_schemas.kinds import Kind
-from marey_server.errors import BadRequest, Invalid
+from marey_server.errors import BadRequestProblem, InvalidProblem
 from marey_server.store import items, listing
 from marey_server.store.items import ItemFilters
 
@@ -92,13 +92,13 @@ def test_keys_of_an_order_have_directions_of_their_own(filled):
 
 @pytest.mark.parametrize("sort", ["nose", "name,nose", "name,-name", "-", ",,nose"])
 def test_unknown_orders_are_refused(filled, sort):
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequestProblem):
         names(filled, sort=sort)
 
 
 @pytest.mark.parametrize("limit", [0, -1, 1001])
 def test_limits_out_of_range_are_refused(filled, limit):
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequestProblem):
         filled.read(items.list_items, "lab", Kind.CLIP, limit=limit)
 
 
@@ -106,7 +106,7 @@ def test_fields_choose_what_is_shown(filled):
     page = filled.read(items.list_items, "lab", Kind.CLIP, ItemFilters(name="walk 2"), fields=("id", "name", "tags"))
     assert page.items[0].keys() == {"id", "name", "tags"}
     assert page.items[0]["tags"] == ["slow", "walk"]
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequestProblem):
         filled.read(items.list_items, "lab", Kind.CLIP, fields=("nose",))
 
 
@@ -172,7 +172,7 @@ def test_a_cursor_serves_only_the_list_it_came_from(filled):
         lambda: ask("é€", sort="name"),
         lambda: ask("A" * 300, sort="name"),
     ):
-        with pytest.raises(BadRequest):
+        with pytest.raises(BadRequestProblem):
             wrong()
 
 
@@ -184,7 +184,7 @@ def test_cursors_of_one_server_are_worth_nothing_on_another(filled):
         listing.make_cursor_key(tx)
 
     filled.write(forget)
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequestProblem):
         filled.read(items.list_items, "lab", Kind.CLIP, limit=2, cursor=cursor)
 
 
@@ -195,5 +195,5 @@ def test_no_filter_value_breaks_a_list(filled, text, number):
     texts += [{"directly_in": text}]
     numbers = [{"frames_gte": number}, {"frames_lte": number}]
     for filters in (*texts, {"collection": text}, {"skeleton": text}, *numbers):
-        with suppress(Invalid):
+        with suppress(InvalidProblem):
             assert set(names(filled, **filters)) <= {name for name, *_ in CLIPS}

@@ -15,7 +15,7 @@ from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.primitive_documents import primitive_to_tree
 from marey_motion.modelling.training import train_primitive
 from marey_schemas.lru import LruCache
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 from marey_server.motions.models import FoundModel, LoadedModel, parse_model, sample_document, sample_file, size_bytes
 from marey_server.store.items.reading import FoundPart
 
@@ -68,14 +68,14 @@ def test_samples_that_would_be_too_large_are_refused_before_they_are_made(loaded
         duration_range_s=None,
         log_slope_range=None,
     )
-    with pytest.raises(Invalid, match="ask for fewer"):
+    with pytest.raises(InvalidProblem, match="ask for fewer"):
         sample_document(FOUND, dataclasses.replace(model, primitive=slow), 2, 0)
 
 
 def test_a_model_that_describes_nothing_is_refused(loaded):
     broken = {**loaded.model, "mixture": {**loaded.model["mixture"]}}
     broken["mixture"]["covariances"] = np.zeros_like(loaded.model["mixture"]["covariances"])
-    with pytest.raises(Invalid, match="positive definite"):
+    with pytest.raises(InvalidProblem, match="positive definite"):
         parse_model(LoadedModel(broken, loaded.hierarchy))
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marey_server.errors import BadRequest, TooLarge, UnsupportedMediaType
+from marey_server.errors import BadRequestProblem, TooLargeProblem, UnsupportedMediaTypeProblem
 from marey_server.http.multipart import MultipartReader, PartEnd, PartHead, boundary_of
 
 BOUNDARY = b"frontier"
@@ -84,21 +84,21 @@ def test_what_comes_before_the_first_part_is_ignored():
     ],
 )
 def test_broken_bodies_are_refused(body):
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequestProblem):
         read(body)
 
 
 def test_endless_heads_and_too_many_parts_are_refused():
-    with pytest.raises(TooLarge):
+    with pytest.raises(TooLargeProblem):
         read(b"--frontier\r\nX: " + b"y" * 20_000)
-    with pytest.raises(TooLarge):
+    with pytest.raises(TooLargeProblem):
         read(body_of([(head("x"), b"1")] * 3), max_parts=2)
 
 
 def test_the_boundary_is_read_with_and_without_quotation_marks():
     assert boundary_of("multipart/form-data; boundary=abc") == b"abc"
     assert boundary_of('multipart/form-data; charset=utf-8; boundary="a b"') == b"a b"
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequestProblem):
         boundary_of("multipart/form-data")
-    with pytest.raises(UnsupportedMediaType):
+    with pytest.raises(UnsupportedMediaTypeProblem):
         boundary_of("text/plain")

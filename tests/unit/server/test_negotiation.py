@@ -2,7 +2,7 @@
 
 import pytest
 
-from marey_server.errors import NotAcceptable, Unauthenticated, UnsupportedMediaType
+from marey_server.errors import NotAcceptableProblem, UnauthenticatedProblem, UnsupportedMediaTypeProblem
 from marey_server.http import negotiation
 from marey_server.http.negotiation import BSON, DOCUMENT_FORMS, JSON, MODEL_FORMS, MSGPACK, MSGPACK_BLOCKS, choose
 
@@ -29,14 +29,14 @@ def test_blocks_are_sent_only_to_those_who_ask_for_them():
 
 
 def test_a_caller_who_accepts_nothing_on_offer_is_told_what_is():
-    with pytest.raises(NotAcceptable) as refusal:
+    with pytest.raises(NotAcceptableProblem) as refusal:
         choose("image/png, application/json;q=0, application/msgpack;q=0, application/bson;q=0", MODEL_FORMS)
     assert refusal.value.context["offered"] == ["application/json", "application/msgpack", "application/bson"]
 
 
 @pytest.mark.parametrize("accept", ["application/json;q=high", "json", ";;;", "application/json;q=-1"])
 def test_malformed_ranges_match_nothing(accept):
-    with pytest.raises(NotAcceptable):
+    with pytest.raises(NotAcceptableProblem):
         choose(accept, MODEL_FORMS)
 
 
@@ -46,12 +46,12 @@ def test_a_body_without_a_type_is_json():
 
 @pytest.mark.parametrize("content_type", ["text/plain", "application/xml", "application/json; charset=latin-1"])
 def test_other_bodies_are_refused(content_type):
-    with pytest.raises(UnsupportedMediaType):
+    with pytest.raises(UnsupportedMediaTypeProblem):
         negotiation.body_type(content_type)
 
 
 def test_compressed_bodies_are_refused():
-    with pytest.raises(UnsupportedMediaType):
+    with pytest.raises(UnsupportedMediaTypeProblem):
         negotiation.require_plain_encoding("gzip")
 
 
@@ -59,5 +59,5 @@ def test_only_bearer_tokens_are_credentials():
     assert negotiation.bearer_token("bearer abc") == "abc"
     assert negotiation.bearer_token(None) is None
     for header in ("Basic dXNlcjpwdw==", "Bearer", "Bearer  ", "token"):
-        with pytest.raises(Unauthenticated):
+        with pytest.raises(UnauthenticatedProblem):
             negotiation.bearer_token(header)

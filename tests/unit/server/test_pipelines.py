@@ -8,7 +8,7 @@ from tests.support.queue_desk import Desk
 from marey_schemas.jobs import Job
 from marey_schemas.kinds import Kind
 from marey_schemas.pipelines import PipelineCreate
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 from marey_server.store import blobs, items
 from marey_server.store.jobs import reading
 from marey_server.store.jobs.submission import submit_pipeline
@@ -93,7 +93,7 @@ def test_one_bad_step_lets_none_in(desk: Desk, changes: dict[str, Any], pointer:
     steps = chain()
     for name, change in changes.items():
         steps[name] |= change
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         submit(desk, steps)
     assert [(error.pointer, error.code) for error in refused.value.errors] == [(pointer, code)]
     assert desk.database.read(desk.user, reading.list_jobs, "lab").items == ()
@@ -131,7 +131,7 @@ def test_a_step_that_asks_for_a_place_its_result_cannot_go_to_is_refused(desk: D
         "takes": {"kind": "import", "params": {"files": files}},
         "tree": {"kind": "tree", "inputs": {"model": {"step": "takes"}}, "into": "trees"},
     }
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         submit(desk, steps)
     assert [(error.pointer, error.code) for error in refused.value.errors] == [("/steps/tree/into", "ambiguous-place")]
 

@@ -8,7 +8,7 @@ from tests.support import predecessor_models as models
 from tests.support.predecessor_models import FILE, TREE_FILE
 
 from marey_schemas.kinds import Kind
-from marey_server.errors import Invalid, NotFound
+from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.predecessor_exports import PredecessorOptions, unchanged_original, write_predecessor
 
 
@@ -55,7 +55,7 @@ def test_a_tree_is_written_with_the_spatial_part_of_its_samples(stored):
     assert name == "walk_cluster_tree.json"
     assert np.shape(document["data"]) == (40, models.SPATIAL + models.TEMPORAL)
     assert np.shape(document["features"]) == (40, models.SPATIAL)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         write_predecessor(Kind.MODEL, "walk", {"model": parts["model"]}, hierarchy, PredecessorOptions(part="tree"))
 
 
@@ -74,7 +74,7 @@ def test_the_time_function_beside_an_aligned_clip_is_written_in_whole_frames():
 
 
 def test_other_kinds_have_no_file_of_the_predecessor():
-    with pytest.raises(Invalid, match="exported as json"):
+    with pytest.raises(InvalidProblem, match="exported as json"):
         write_predecessor(Kind.STUDY, "s", {"study": {}}, None, PredecessorOptions())
 
 
@@ -104,7 +104,7 @@ def test_a_model_that_an_older_server_took_with_odd_notes_is_written_anew(stored
 def test_a_tree_whose_nodes_are_none_is_refused(stored):
     parts, hierarchy = stored
     parts = {**parts, "tree": {**parts["tree"], "children": np.ones_like(parts["tree"]["children"])}}
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         write_predecessor(Kind.MODEL, "walk", parts, hierarchy, PredecessorOptions(part="tree"))
     assert refused.value.error_code == "cannot-be-exported"
 
@@ -114,7 +114,7 @@ def test_a_tree_whose_nodes_are_none_is_refused(stored):
     [(Kind.MODEL, "alignment"), (Kind.PROCESSED, "tree"), (Kind.CLIP, "model"), (Kind.ANNOTATION, "alignment")],
 )
 def test_a_part_that_items_of_a_kind_do_not_have_is_refused(kind, part):
-    with pytest.raises(Invalid, match=f"{kind} has no part '{part}'") as refused:
+    with pytest.raises(InvalidProblem, match=f"{kind} has no part '{part}'") as refused:
         PredecessorOptions(part=part).require_part_of(kind)
     assert refused.value.error_code == "no-part"
     PredecessorOptions().require_part_of(kind)

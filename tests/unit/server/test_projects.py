@@ -6,7 +6,13 @@ from tests.support.store_fixtures import declared, requiring
 from marey_schemas.access import MemberChange, ProjectChange, ProjectCreate, Role, Visibility
 from marey_server.access.principal import Principal
 from marey_server.access.roles import RequiredRole
-from marey_server.errors import Conflict, Forbidden, NotFound, PreconditionFailed, Unauthenticated
+from marey_server.errors import (
+    ConflictProblem,
+    ForbiddenProblem,
+    NotFoundProblem,
+    PreconditionFailedProblem,
+    UnauthenticatedProblem,
+)
 from marey_server.store import members, projects
 
 ROLES = list(Role)
@@ -20,7 +26,7 @@ def allowed(lab, who, need, scope="read", *, public=True):
     required = RequiredRole(need, scope, guests=public)
     try:
         lab.database.read(who, requiring(required, projects.require), "lab")
-    except (NotFound, Forbidden, Unauthenticated) as error:
+    except (NotFoundProblem, ForbiddenProblem, UnauthenticatedProblem) as error:
         return error.status
     return 200
 
@@ -36,9 +42,9 @@ def test_a_private_project_does_not_exist_for_those_who_are_not_in_it(lab):
     for who in (lab.stranger, lab.anonymous):
         for need in ROLES:
             assert allowed(lab, who, need) == 404
-    with pytest.raises(NotFound) as hidden:
+    with pytest.raises(NotFoundProblem) as hidden:
         lab.read(projects.read_project, "lab", who=lab.stranger)
-    with pytest.raises(NotFound) as absent:
+    with pytest.raises(NotFoundProblem) as absent:
         lab.read(projects.read_project, "nope", who=lab.stranger)
     assert hidden.value.detail.replace("lab", "nope") == absent.value.detail
 
@@ -107,12 +113,12 @@ def test_lists_of_projects_come_in_pages(lab):
 
 
 def test_names_are_unique_among_living_projects(lab):
-    with pytest.raises(Conflict) as taken:
+    with pytest.raises(ConflictProblem) as taken:
         lab.write(projects.create_project, ProjectCreate(name="lab"), who=lab.stranger)
     assert taken.value.error_code == "name-taken"
     lab.write(projects.delete_project, "lab", expected_rev=None)
     again = lab.write(projects.create_project, ProjectCreate(name="lab"), who=lab.stranger)
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         lab.write(projects.restore_project, "lab")
     lab.write(projects.delete_project, "lab", expected_rev=None, who=lab.stranger)
     assert lab.write(projects.restore_project, "lab", who=lab.stranger).id == again.id
@@ -122,9 +128,9 @@ def test_a_deleted_project_is_gone_until_an_owner_restores_it(lab):
     before = lab.read(projects.read_project, "lab")
     lab.write(projects.delete_project, "lab", expected_rev=before.rev)
     assert allowed(lab, lab.owner, Role.READER) == 404
-    with pytest.raises(Forbidden):
+    with pytest.raises(ForbiddenProblem):
         lab.write(projects.restore_project, "lab", who=lab.reader, required=OWNERS)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         lab.write(projects.restore_project, "lab", who=lab.stranger)
     assert lab.write(projects.restore_project, "lab").id == before.id
     assert allowed(lab, lab.reader, Role.READER) == 200
@@ -133,7 +139,7 @@ def test_a_deleted_project_is_gone_until_an_owner_restores_it(lab):
 def test_a_change_of_a_state_that_has_passed_is_refused_and_changes_nothing(lab):
     before = lab.read(projects.read_project, "lab")
     lab.write(projects.change_project, "lab", ProjectChange(title="First"), expected_rev=before.rev)
-    with pytest.raises(PreconditionFailed) as failed:
+    with pytest.raises(PreconditionFailedProblem) as failed:
         lab.write(projects.change_project, "lab", ProjectChange(title="Second"), expected_rev=before.rev)
     assert failed.value.context == {"rev": before.rev + 1}
     assert lab.read(projects.read_project, "lab").title == "First"
@@ -151,13 +157,13 @@ def test_members_are_known_to_members_only(lab):
     names = [one.user for one in lab.read(members.list_members, "lab", who=lab.reader).items]
     assert names == sorted(who.user_name for who in (lab.owner, lab.maintainer, lab.contributor, lab.reader))
     for who in (lab.stranger, lab.anonymous):
-        with pytest.raises((Forbidden, Unauthenticated)):
+        with pytest.raises((ForbiddenProblem, UnauthenticatedProblem)):
             lab.read(members.list_members, "lab", who=who, required=MEMBERS_ONLY)
 
 
 def test_only_owners_change_members(lab):
     for who in (lab.reader, lab.contributor, lab.maintainer):
-        with pytest.raises(Forbidden):
+        with pytest.raises(ForbiddenProblem):
             lab.write(
                 members.put_member,
                 "lab",
@@ -170,10 +176,10 @@ def test_only_owners_change_members(lab):
 
 def test_a_project_keeps_an_owner(lab):
     owner = lab.owner.user_name
-    with pytest.raises(Conflict) as refused:
+    with pytest.raises(ConflictProblem) as refused:
         lab.write(members.put_member, "lab", owner, MemberChange(role=Role.READER))
     assert refused.value.error_code == "last-owner"
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         lab.write(members.remove_member, "lab", owner, expected_rev=None)
     assert lab.read(members.read_member, "lab", owner).role is Role.OWNER
     lab.write(members.put_member, "lab", lab.reader.user_name, MemberChange(role=Role.OWNER))
@@ -184,13 +190,13 @@ def test_a_project_keeps_an_owner(lab):
 def test_membership_changes_honour_their_preconditions(lab):
     name = lab.reader.user_name
     before = lab.read(members.read_member, "lab", name)
-    with pytest.raises(PreconditionFailed):
+    with pytest.raises(PreconditionFailedProblem):
         lab.write(members.put_member, "lab", name, MemberChange(role=Role.OWNER), absent=True)
     changed = lab.write(members.put_member, "lab", name, MemberChange(role=Role.OWNER), expected_rev=before.rev)
-    with pytest.raises(PreconditionFailed):
+    with pytest.raises(PreconditionFailedProblem):
         lab.write(members.remove_member, "lab", name, expected_rev=before.rev)
     lab.write(members.remove_member, "lab", name, expected_rev=changed.rev)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         lab.read(members.read_member, "lab", name)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         lab.write(members.put_member, "lab", "nobody", MemberChange(role=Role.READER))

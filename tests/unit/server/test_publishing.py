@@ -9,7 +9,7 @@ from tests.support.predecessor_models import imported
 from tests.support.store_fixtures import motion_tree, skeleton_tree
 
 from marey_schemas.kinds import Kind
-from marey_server.errors import Conflict, Invalid
+from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import documents, items, projects
 from marey_server.store.items import Draft, StoredDocument, references
 
@@ -77,13 +77,13 @@ def test_other_content_under_a_taken_name_is_numbered(lab):
 
 def test_a_new_item_refuses_a_taken_name_and_nothing_is_published(lab):
     publish(lab, rig_draft())
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         publish(lab, clip_draft(), rig_draft(reuse="new"))
     assert listed(lab, Kind.CLIP) == ()
 
 
 def test_one_bad_draft_and_nothing_is_published(lab):
-    with pytest.raises(Invalid):
+    with pytest.raises(InvalidProblem):
         publish(lab, rig_draft(), clip_draft("good"), clip_draft("bad", joints=2))
     assert listed(lab, Kind.SKELETON) == listed(lab, Kind.CLIP) == ()
     with lab.database.engine.connect() as connection:
@@ -92,7 +92,7 @@ def test_one_bad_draft_and_nothing_is_published(lab):
 
 
 def test_names_within_a_batch_are_unique(lab):
-    with pytest.raises(Invalid):
+    with pytest.raises(InvalidProblem):
         publish(lab, rig_draft(), rig_draft())
 
 
@@ -206,7 +206,7 @@ names = st.sampled_from("abcdef")
 def test_references_are_followed_before_what_refers(refers):
     try:
         order = references.in_order(refers)
-    except Invalid:
+    except InvalidProblem:
         # There is a cycle: walking backwards over members of `refers` never ends.
         left = {name: {one for one in refers[name] if one in refers} for name in refers}
         while done := [name for name, others in left.items() if not others]:
@@ -245,5 +245,5 @@ def test_nothing_but_the_model_of_a_tree_is_replaced_by_a_digest(lab, notes):
 
 def test_a_tree_of_another_part_than_the_model_is_refused(lab):
     parts, _ = imported()
-    with pytest.raises(Invalid, match="model_digest"):
+    with pytest.raises(InvalidProblem, match="model_digest"):
         publish(lab, Draft("walk", Kind.MODEL, "walk", {"tree": {**parts["tree"], "model_digest": {"digest_of": "x"}}}))

@@ -9,7 +9,7 @@ from marey_schemas.access import ProjectCreate
 from marey_schemas.jobs import JobCreate, Progress
 from marey_schemas.worker_protocol import BatchCompletion, ClaimRequest, CompleteRequest
 from marey_server.access.principal import SYSTEM, Principal
-from marey_server.errors import Forbidden, Invalid, LeaseLost, NotFound
+from marey_server.errors import ForbiddenProblem, InvalidProblem, LeaseLostProblem, NotFoundProblem
 from marey_server.store import projects
 from marey_server.store.jobs import completion, queue
 from marey_server.store.jobs.endings import Ended
@@ -58,11 +58,11 @@ def test_a_worker_that_lost_its_lease_cannot_publish(desk: Desk) -> None:
         lambda: desk.complete(slept),
         lambda: desk.fail(slept),
     ):
-        with pytest.raises(LeaseLost):
+        with pytest.raises(LeaseLostProblem):
             act()
     desk.stage(awake, "fresh")
     desk.complete(awake)
-    with pytest.raises(LeaseLost):
+    with pytest.raises(LeaseLostProblem):
         desk.complete(slept)
     assert [one.name for one in desk.outputs(job)] == ["fresh"]
 
@@ -86,7 +86,7 @@ def test_a_worker_gets_only_kinds_and_labels_that_it_names(desk: Desk) -> None:
 
 
 def test_too_many_labels_are_refused(desk: Desk) -> None:
-    with pytest.raises(Invalid, match="labels"):
+    with pytest.raises(InvalidProblem, match="labels"):
         desk.claim_many(labels={f"label{n}": "x" for n in range(7)})
 
 
@@ -130,10 +130,10 @@ def test_the_token_of_an_attempt_ends_when_another_takes_its_place(desk: Desk) -
     desk.clock.advance(slept.lease_ttl_s + 1)
     assert desk.attempt(slept).project_id is not None
     desk.reap()
-    with pytest.raises(LeaseLost):
+    with pytest.raises(LeaseLostProblem):
         desk.attempt(slept)
     awake = desk.claim()
-    with pytest.raises(LeaseLost):
+    with pytest.raises(LeaseLostProblem):
         desk.attempt(slept)
     assert desk.attempt(awake).fence == awake.fence
 
@@ -144,13 +144,13 @@ def test_a_job_reads_nothing_of_another_project(desk: Desk) -> None:
     (theirs,) = elsewhere.things(1)
     made = elsewhere.submit("sum")
     for choice, code in (({"item": theirs}, "unknown-item"), ({"job": made}, "unknown-job")):
-        with pytest.raises(Invalid) as refused:
+        with pytest.raises(InvalidProblem) as refused:
             desk.submit("square", inputs={"things": [choice]})
         assert [error.code for error in refused.value.errors] == [code]
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         desk.submit(after=[made])
     assert [error.code for error in refused.value.errors] == ["unknown-job"]
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         desk.submit("square", inputs={"things": {"collection": "raw"}})
     assert [error.code for error in refused.value.errors] == ["empty-collection"]
     assert elsewhere.submit("square", inputs={"things": [{"item": theirs}, {"job": made}]})
@@ -212,7 +212,7 @@ def test_a_lease_cannot_be_kept_beyond_the_time_limit_and_its_grace(desk: Desk) 
     failure = desk.job(job).failure
     assert failure is not None
     assert failure.reason == "timeout"
-    with pytest.raises(LeaseLost):
+    with pytest.raises(LeaseLostProblem):
         desk.complete(lease)
 
 
@@ -230,9 +230,9 @@ def test_the_same_write_gets_the_same_answer_and_another_one_none(desk: Desk) ->
     desk.stage(lease, "a")
     first = desk.complete(lease, write_id="write-one")
     assert desk.complete(lease, write_id="write-one") == first
-    with pytest.raises(LeaseLost):
+    with pytest.raises(LeaseLostProblem):
         desk.complete(lease, write_id="write-two")
-    with pytest.raises(LeaseLost):
+    with pytest.raises(LeaseLostProblem):
         desk.fail(lease, write_id="write-one")
 
 
@@ -246,7 +246,7 @@ def test_a_failure_said_twice_counts_once(desk: Desk) -> None:
     again = desk.claim()
     assert desk.fail(lease, write_id="write-one") == first
     assert desk.state(job) == "running"
-    with pytest.raises(LeaseLost):
+    with pytest.raises(LeaseLostProblem):
         desk.complete(lease, write_id="write-one")
     desk.complete(again)
 
@@ -331,7 +331,7 @@ def test_a_worker_that_does_not_stop_loses_a_cancelled_job_after_a_grace(desk: D
     desk.clock.advance(10)
     assert desk.reap() == 1
     assert desk.state(job) == "cancelled"
-    with pytest.raises(LeaseLost):
+    with pytest.raises(LeaseLostProblem):
         desk.complete(lease)
 
 
@@ -388,14 +388,14 @@ def test_an_attempts_token_works_for_its_own_attempt_only(desk: Desk) -> None:
     mine, other = desk.claim_many()
     me = desk.attempt(mine)
     assert (me.kind, me.job_id, me.fence) == ("attempt", mine.job, mine.fence)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         desk.database.write(me, completion.complete, other.job, other.fence, CompleteRequest(write_id="12345678"))
 
 
 def test_only_a_token_with_the_scope_work_may_claim(desk: Desk) -> None:
     desk.submit()
     idle = Principal("user", desk.user.user_id, "ann", scopes=("read", "jobs"))
-    with pytest.raises(Forbidden):
+    with pytest.raises(ForbiddenProblem):
         desk.database.write(idle, queue.claim, ClaimRequest(worker="w", kinds=("errand",)))
     elsewhere = Principal("user", desk.user.user_id, "ann", scopes=("work!project=other",))
     assert desk.database.write(elsewhere, queue.claim, ClaimRequest(worker="w", kinds=("errand",))) == []
@@ -406,5 +406,5 @@ def test_only_a_token_with_the_scope_work_may_claim(desk: Desk) -> None:
 
 
 def test_another_version_of_the_protocol_is_refused(desk: Desk) -> None:
-    with pytest.raises(Invalid, match="protocol"):
+    with pytest.raises(InvalidProblem, match="protocol"):
         desk.claim_many(protocol=99)

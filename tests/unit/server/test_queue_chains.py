@@ -13,7 +13,7 @@ from marey_schemas.access import MemberChange, Role, UserCreate
 from marey_schemas.jobs import JobCreate, Progress
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM, Principal
-from marey_server.errors import Conflict, Forbidden, Invalid, LeaseLost, NotFound
+from marey_server.errors import ConflictProblem, ForbiddenProblem, InvalidProblem, LeaseLostProblem, NotFoundProblem
 from marey_server.store import blobs, garbage, items, members, users
 from marey_server.store.items.drafts import Draft
 from marey_server.store.jobs import reading, retrying
@@ -71,7 +71,7 @@ def test_what_depends_on_a_cancelled_job_fails(desk: Desk) -> None:
 
 
 def test_a_job_can_only_come_after_jobs_of_its_project(desk: Desk) -> None:
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         desk.submit(after=["job_nowhere"])
     assert refused.value.errors[0].pointer == "/after/0"
 
@@ -116,7 +116,7 @@ def test_inputs_that_make_no_sense_are_refused_with_their_place(
     desk: Desk, inputs: dict[str, Any], pointer: str, code: str
 ) -> None:
     desk.things(3)
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         desk.submit("square", inputs=inputs)
     assert [(error.pointer, error.code) for error in refused.value.errors] == [(pointer, code)]
 
@@ -132,7 +132,7 @@ def test_inputs_that_make_no_sense_are_refused_with_their_place(
 def test_a_job_whose_results_have_no_clear_place_is_refused(desk: Desk, kind: str, fields: dict[str, Any]) -> None:
     maker = desk.submit()
     fields["inputs"] = {name: {"job": maker} for name in fields["inputs"]}
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         desk.submit(kind, **fields)
     assert [(error.pointer, error.code) for error in refused.value.errors] == [("/into", "ambiguous-place")]
 
@@ -144,7 +144,7 @@ def test_results_that_would_lie_too_deep_are_refused_before_they_are_made(desk: 
     desk.submit("square", inputs=inputs, into=deepest)
     many_bytes = "/".join(["\U0001f9a6" * 255] * 3)
     for kind, given, into in (("square", inputs, f"{deepest}dd"), ("sum", {}, many_bytes)):
-        with pytest.raises(Invalid) as refused:
+        with pytest.raises(InvalidProblem) as refused:
             desk.submit_many(JobCreate(kind="sum"), JobCreate(kind=kind, inputs=given, into=into))
         assert [(error.pointer, error.code) for error in refused.value.errors] == [("/jobs/1/into", "long-path")]
     desk.submit("sum", into=f"{deepest}dd")  # whose results keep no places below it
@@ -152,23 +152,23 @@ def test_results_that_would_lie_too_deep_are_refused_before_they_are_made(desk: 
 
 def test_a_revision_that_does_not_exist_is_refused(desk: Desk) -> None:
     (thing,) = desk.things(1)
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         desk.submit("square", inputs={"things": [{"item": thing, "revision": 2}]})
     assert refused.value.errors[0].pointer == "/inputs/things/0/revision"
 
 
 def test_one_bad_job_of_a_batch_lets_none_in(desk: Desk) -> None:
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         desk.submit_many(JobCreate(kind="errand"), JobCreate(kind="errand", params={"numbre": 3}))
     assert refused.value.errors[0].pointer == "/jobs/1/params/numbre"
     assert desk.database.read(desk.user, reading.list_jobs, "lab").items == ()
-    with pytest.raises(Invalid) as refused:
+    with pytest.raises(InvalidProblem) as refused:
         desk.submit("unheard-of")
     assert refused.value.errors[0].pointer == "/kind"
 
 
 def test_parameters_that_name_bytes_nobody_sent_are_refused(desk: Desk) -> None:
-    with pytest.raises(Conflict) as refused:
+    with pytest.raises(ConflictProblem) as refused:
         desk.submit("import", params={"files": [{"name": "walk.bvh", "blob": f"sha256:{'0' * 64}"}]})
     assert refused.value.error_code == "missing-blobs"
 
@@ -344,7 +344,7 @@ def test_one_task_alone_is_no_task(desk: Desk) -> None:
 
 def test_more_tasks_than_can_be_or_none_are_refused(desk: Desk) -> None:
     for number in (0, job_kinds.MOST_TASKS + 1):
-        with pytest.raises(Invalid) as refused:
+        with pytest.raises(InvalidProblem) as refused:
             a_survey(desk, tasks=number)
         assert refused.value.errors[0].code == "too-many-tasks"
 
@@ -400,7 +400,7 @@ def test_a_gathering_that_is_lost_or_fails_is_done_again_without_the_tasks(desk:
     desk.clock.advance(61)
     assert desk.reap() == 1
     failing = desk.claim()
-    with pytest.raises(LeaseLost):
+    with pytest.raises(LeaseLostProblem):
         desk.complete(lost)
     assert failing.job == job
     desk.fail(failing)
@@ -575,9 +575,9 @@ def test_results_know_exactly_which_revisions_they_were_made_from(desk: Desk) ->
     both: Any = {"things": [{"item": thing, "revision": 1}, {"item": thing, "revision": 2}]}
     desk.submit("square", inputs=both)
     lease = desk.claim()
-    with pytest.raises(Invalid, match="at 1, 2"):
+    with pytest.raises(InvalidProblem, match="at 1, 2"):
         desk.stage(lease, "vague", sources={"things": [{"item": thing}]})
-    with pytest.raises(Invalid, match="revision 3"):
+    with pytest.raises(InvalidProblem, match="revision 3"):
         desk.stage(lease, "wrong", sources={"things": [{"item": thing, "revision": 3}]})
     desk.stage(lease, "first", sources={"things": [{"item": thing, "revision": 1}]})
     desk.stage(lease, "second", sources={"things": [{"item": thing, "revision": 2}]})
@@ -722,7 +722,7 @@ def test_tasks_find_the_results_of_earlier_tasks(desk: Desk) -> None:
 
 def test_only_what_failed_or_was_cancelled_can_be_tried_again(desk: Desk) -> None:
     job = desk.submit(params={"number": 7}, priority=3, concurrency_key="k", labels={"gpu": "x"}, max_attempts=1)
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         desk.database.write(desk.user, retrying.retry_job, job)
     desk.cancel(job)
     again = desk.database.write(desk.user, retrying.retry_job, job)
@@ -737,11 +737,11 @@ def test_others_jobs_are_cancelled_by_maintainers_only_and_hidden_from_strangers
     job = desk.submit()
     made = desk.database.write(SYSTEM, users.create_user, UserCreate(name="bob"))
     bob = Principal("user", made.id, "bob", scopes=("read", "write", "jobs"))
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         desk.database.read(bob, read, job)
     desk.database.write(SYSTEM, members.put_member, "lab", "bob", MemberChange(role=Role.CONTRIBUTOR))
     assert desk.database.read(bob, read, job).id == job
-    with pytest.raises(Forbidden):
+    with pytest.raises(ForbiddenProblem):
         desk.database.write(bob, cancel, job)
     desk.database.write(SYSTEM, members.put_member, "lab", "bob", MemberChange(role=Role.MAINTAINER))
     assert desk.database.write(bob, cancel, job).state == "cancelled"

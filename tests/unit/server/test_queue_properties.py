@@ -15,7 +15,7 @@ from tests.support.queue_model import TERMINAL, ModelJob, ModelQueue
 
 from marey_schemas.worker_protocol import Lease
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import Conflict, LeaseLost
+from marey_server.errors import ConflictProblem, LeaseLostProblem
 from marey_server.store import tables
 from marey_server.store.jobs import layout, retrying
 from marey_server.store.jobs.reaper import share_waiting
@@ -161,7 +161,7 @@ class QueueMachine(RuleBasedStateMachine):
             if lease.kind in ERRANDS:
                 self.model.heartbeat(lease.job, self.clock.us)
         else:
-            with pytest.raises(LeaseLost):
+            with pytest.raises(LeaseLostProblem):
                 self.desk.heartbeat(lease)
 
     @precondition(lambda self: self.leases)
@@ -171,7 +171,7 @@ class QueueMachine(RuleBasedStateMachine):
         if self._holds(lease):
             self.desk.stage(lease, name)
         else:
-            with pytest.raises(LeaseLost):
+            with pytest.raises(LeaseLostProblem):
                 self.desk.stage(lease, name)
 
     @precondition(lambda self: self.leases)
@@ -184,7 +184,7 @@ class QueueMachine(RuleBasedStateMachine):
             if lease.kind in ERRANDS:
                 self.model.complete(lease.job, lease.fence, write_id)
         else:
-            with pytest.raises(LeaseLost):
+            with pytest.raises(LeaseLostProblem):
                 self.desk.complete(lease, write_id=write_id)
 
     @precondition(lambda self: self.leases)
@@ -204,7 +204,7 @@ class QueueMachine(RuleBasedStateMachine):
                 self.model.fail(lease.job, lease.fence, write_id, self.clock.us, **how)
                 assert answer.state == self.model.jobs[lease.job].answers[lease.fence, write_id]
         else:
-            with pytest.raises(LeaseLost):
+            with pytest.raises(LeaseLostProblem):
                 self.desk.fail(lease, write_id=write_id, **how)
 
     @precondition(lambda self: self.said)
@@ -238,7 +238,7 @@ class QueueMachine(RuleBasedStateMachine):
     def cancel(self, data: st.DataObject) -> None:
         job_id = data.draw(st.sampled_from(sorted(self.model.jobs)))
         if self.model.jobs[job_id].state in ("succeeded", "failed"):
-            with pytest.raises(Conflict):
+            with pytest.raises(ConflictProblem):
                 self.desk.cancel(job_id)
         else:
             self.desk.cancel(job_id)

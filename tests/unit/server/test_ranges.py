@@ -2,7 +2,7 @@
 
 import pytest
 
-from marey_server.errors import RangeNotSatisfiable
+from marey_server.errors import RangeNotSatisfiableProblem
 from marey_server.http.streaming import parse_range
 
 ETAG = '"abc.bytes"'
@@ -38,6 +38,6 @@ def test_a_range_of_another_state_is_answered_with_the_whole():
 def test_a_range_outside_says_how_long_the_whole_is(header, size):
     wanted = parse_range(header, None, ETAG)
     assert wanted is not None
-    with pytest.raises(RangeNotSatisfiable) as refusal:
+    with pytest.raises(RangeNotSatisfiableProblem) as refusal:
         wanted.within(size)
     assert refusal.value.headers["Content-Range"] == f"bytes */{size}"

@@ -4,7 +4,13 @@ import os
 
 import pytest
 
-from marey_server.errors import Conflict, Invalid, NotFound, TooLarge, Unauthenticated
+from marey_server.errors import (
+    ConflictProblem,
+    InvalidProblem,
+    NotFoundProblem,
+    TooLargeProblem,
+    UnauthenticatedProblem,
+)
 from marey_server.store import blobs, garbage, uploads
 from marey_server.store.blobs import digest_of
 
@@ -36,10 +42,10 @@ def test_a_piece_at_the_wrong_place_is_told_the_right_one(lab):
     upload = lab.write(uploads.create_upload, len(DATA))
     send(lab, upload.id, (1000,))
     for offset in (0, 999, 1001):
-        with pytest.raises(Conflict) as refused:
+        with pytest.raises(ConflictProblem) as refused:
             lab.write(uploads.append, upload.id, offset, b"x")
         assert refused.value.context == {"offset": 1000}
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         lab.write(uploads.finish, upload.id)
 
 
@@ -54,28 +60,28 @@ def test_the_same_piece_sent_twice_at_once_counts_once(lab):
 
 def test_more_than_was_announced_is_refused(lab):
     upload = lab.write(uploads.create_upload, 10)
-    with pytest.raises(TooLarge):
+    with pytest.raises(TooLargeProblem):
         lab.write(uploads.append, upload.id, 0, b"x" * 11)
     for length in (0, -1, uploads.MAX_UPLOAD_BYTES + 1):
-        with pytest.raises(TooLarge):
+        with pytest.raises(TooLargeProblem):
             lab.write(uploads.create_upload, length)
 
 
 def test_other_bytes_than_announced_become_no_blob(lab):
     upload = lab.write(uploads.create_upload, 5, digest=digest_of(b"right"))
     lab.write(uploads.append, upload.id, 0, b"wrong")
-    with pytest.raises(Invalid):
+    with pytest.raises(InvalidProblem):
         lab.write(uploads.finish, upload.id)
     assert lab.read(blobs.readable, [digest_of(b"wrong"), digest_of(b"right")]) == set()
 
 
 def test_an_upload_is_its_senders_alone(lab):
     upload = lab.write(uploads.create_upload, 5)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         lab.read(uploads.read_upload, upload.id, who=lab.reader)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         lab.write(uploads.append, upload.id, 0, b"x", who=lab.reader)
-    with pytest.raises(Unauthenticated):
+    with pytest.raises(UnauthenticatedProblem):
         lab.read(uploads.read_upload, upload.id, who=lab.anonymous)
 
 
@@ -86,9 +92,9 @@ def test_uploads_that_nobody_continues_are_dropped(lab, clock):
     alive = lab.write(uploads.create_upload, 5)
     clock.advance(20)
     assert garbage.collect_garbage(lab.database).uploads == 1
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         lab.read(uploads.read_upload, forgotten.id)
     assert lab.read(uploads.read_upload, alive.id).offset == 0
     lab.write(uploads.abandon, alive.id)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         lab.read(uploads.read_upload, alive.id)

@@ -8,7 +8,14 @@ from marey_schemas.jobs import JobState
 from marey_server.access import passwords
 from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
 from marey_server.access.secret_tokens import issue_attempt_token
-from marey_server.errors import Conflict, Forbidden, LeaseLost, NotFound, PreconditionFailed, Unauthenticated
+from marey_server.errors import (
+    ConflictProblem,
+    ForbiddenProblem,
+    LeaseLostProblem,
+    NotFoundProblem,
+    PreconditionFailedProblem,
+    UnauthenticatedProblem,
+)
 from marey_server.store import projects, tokens, users
 from marey_server.store.tables import attempt, job
 
@@ -40,25 +47,25 @@ def test_only_administrators_make_and_list_users(database, chief):
     ann = sign_up(database, chief, "ann")
     weak_chief = Principal("user", chief.user_id, "admin", administrator=True, scopes=("read", "write"))
     for who in (ann, weak_chief):
-        with pytest.raises(Forbidden):
+        with pytest.raises(ForbiddenProblem):
             database.write(who, users.create_user, UserCreate(name="ben"))
-        with pytest.raises(Forbidden):
+        with pytest.raises(ForbiddenProblem):
             database.read(who, users.list_users)
-    with pytest.raises(Unauthenticated):
+    with pytest.raises(UnauthenticatedProblem):
         database.read(ANONYMOUS, users.list_users)
     assert [found.name for found in database.read(chief, users.list_users).items] == ["admin", "ann"]
 
 
 def test_names_of_users_are_unique(database, chief):
     sign_up(database, chief, "ann")
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         sign_up(database, chief, "ann")
 
 
 def test_users_see_themselves_and_nobody_else(database, chief):
     ann, ben = sign_up(database, chief, "ann"), sign_up(database, chief, "ben")
     assert database.read(ann, users.find_user, "ann").name == "ann"
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         database.read(ben, users.find_user, "ann")
 
 
@@ -69,7 +76,7 @@ def test_signing_in_needs_the_password(database, chief):
     assert (principal.user_name, principal.administrator) == ("ann", False)
     assert "admin" not in principal.scopes
     for name, password in (("ann", "wrong horse"), ("nobody", "correct horse"), ("silent", ""), ("admin", "")):
-        with pytest.raises(Unauthenticated) as refused:
+        with pytest.raises(UnauthenticatedProblem) as refused:
             database.read(ANONYMOUS, users.verify_password, name, password)
         assert refused.value.detail == "Name or password is wrong."
 
@@ -78,26 +85,26 @@ def test_a_user_changes_the_password_with_the_current_one(database, chief):
     ann = sign_up(database, chief, "ann", "correct horse")
     change = UserChange(password="battery staple", current_password="correct horse")
     new = passwords.hash_password("battery staple")
-    with pytest.raises(Forbidden):
+    with pytest.raises(ForbiddenProblem):
         database.write(ann, users.change_user, "ann", change, expected_rev=None, password_hash=new)
     old = database.read(ann, users.stored_hash, "ann")
     database.write(ann, users.change_user, "ann", change, expected_rev=None, password_hash=new, verified_hash=old)
     assert database.read(ANONYMOUS, users.verify_password, "ann", "battery staple").user_name == "ann"
-    with pytest.raises(PreconditionFailed):
+    with pytest.raises(PreconditionFailedProblem):
         database.write(ann, users.change_user, "ann", change, expected_rev=None, password_hash=new, verified_hash=old)
 
 
 def test_users_cannot_raise_themselves(database, chief):
     ann = sign_up(database, chief, "ann")
-    with pytest.raises(Forbidden):
+    with pytest.raises(ForbiddenProblem):
         database.write(ann, users.change_user, "ann", UserChange(administrator=True), expected_rev=None)
     assert not database.read(ann, users.find_user, "ann").administrator
 
 
 def test_somebody_stays_administrator(database, chief):
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         database.write(chief, users.delete_user, "admin", expected_rev=None)
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictProblem):
         database.write(chief, users.change_user, "admin", UserChange(administrator=False), expected_rev=None)
     assert database.read(chief, users.find_user, "admin").administrator
 
@@ -112,10 +119,10 @@ def test_a_token_stands_for_its_user_until_it_is_revoked(database, chief):
     found = database.read(ANONYMOUS, tokens.resolve_token, made.secret)
     assert (found.user_id, found.scopes, found.token_id) == (ann.user_id, ("read",), made.id)
     assert [one.id for one in database.read(ann, tokens.list_tokens).items] == [made.id]
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         database.write(ben, tokens.revoke_token, made.id)
     database.write(ann, tokens.revoke_token, made.id)
-    with pytest.raises(Unauthenticated):
+    with pytest.raises(UnauthenticatedProblem):
         database.read(ANONYMOUS, tokens.resolve_token, made.secret)
 
 
@@ -124,7 +131,7 @@ def test_a_token_expires(database, chief, clock):
     clock.advance(59)
     assert database.read(ANONYMOUS, tokens.resolve_token, made.secret).user_name == "admin"
     clock.advance(2)
-    with pytest.raises(Unauthenticated):
+    with pytest.raises(UnauthenticatedProblem):
         database.read(ANONYMOUS, tokens.resolve_token, made.secret)
 
 
@@ -132,9 +139,9 @@ def test_tokens_of_a_disabled_user_are_worth_nothing(database, chief):
     ann = sign_up(database, chief, "ann", "correct horse")
     made = make_token(database, ann)
     database.write(chief, users.delete_user, "ann", expected_rev=None)
-    with pytest.raises(Unauthenticated):
+    with pytest.raises(UnauthenticatedProblem):
         database.read(ANONYMOUS, tokens.resolve_token, made.secret)
-    with pytest.raises(Unauthenticated):
+    with pytest.raises(UnauthenticatedProblem):
         database.read(ANONYMOUS, users.verify_password, "ann", "correct horse")
 
 
@@ -143,13 +150,13 @@ def test_tokens_of_a_disabled_user_are_worth_nothing(database, chief):
     ["", "marey_", "marey_abc", "marey__x", "mareyjob_", "mareyjob_0", "Bearer x", "marey_\ud800_\x00", "x" * 5000],
 )
 def test_what_is_no_token_is_refused(database, text):
-    with pytest.raises(Unauthenticated):
+    with pytest.raises(UnauthenticatedProblem):
         database.read(ANONYMOUS, tokens.resolve_token, text)
 
 
 def test_a_wrong_secret_behind_a_right_prefix_is_refused(database, chief):
     made = make_token(database, chief)
-    with pytest.raises(Unauthenticated):
+    with pytest.raises(UnauthenticatedProblem):
         database.read(ANONYMOUS, tokens.resolve_token, made.secret[:-1] + ("0" if made.secret[-1] != "0" else "1"))
 
 
@@ -167,10 +174,10 @@ def test_a_token_never_makes_a_stronger_one(database, chief):
     ann = sign_up(database, chief, "ann")
     weak = Principal("user", ann.user_id, "ann", scopes=("read", "write", "jobs!project=walk"))
     for scope in ("admin", "work", "jobs", "jobs!project=run"):
-        with pytest.raises(Forbidden):
+        with pytest.raises(ForbiddenProblem):
             make_token(database, weak, scopes=(scope,))
     assert make_token(database, weak, scopes=("write!project=run", "jobs!project=walk")).scopes
-    with pytest.raises(Forbidden):
+    with pytest.raises(ForbiddenProblem):
         make_token(database, Principal("user", ann.user_id, "ann", scopes=("read",)), scopes=("read",))
 
 
@@ -227,7 +234,7 @@ def test_the_token_of_an_attempt_reads_its_project(lab, running):
 
 def test_the_token_of_an_attempt_dies_when_the_fence_moves(lab, running):
     change_job(lab, fence=4)
-    with pytest.raises(LeaseLost):
+    with pytest.raises(LeaseLostProblem):
         lab.read(tokens.resolve_token, running)
 
 
@@ -235,5 +242,5 @@ def test_the_token_of_an_attempt_dies_when_the_fence_moves(lab, running):
 def test_the_token_of_an_attempt_that_is_over_reads_nothing(lab, running, state):
     change_job(lab, state=state)
     found = lab.read(tokens.resolve_token, running)
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundProblem):
         lab.read(projects.read_project, "lab", who=found)

@@ -9,7 +9,7 @@ from pydantic import Field
 from marey_schemas.access import ProjectCreate
 from marey_schemas.items import ItemCreate, UploadCreate
 from marey_schemas.jobs import JobCreate
-from marey_server.errors import BadRequest, Invalid
+from marey_server.errors import BadRequestProblem, InvalidProblem
 from marey_server.http.queries import CommaSeparated, PageQuery
 from marey_server.http.validation import decode_body, parse_query, validate_body
 
@@ -42,35 +42,35 @@ def test_parameters_are_read_by_the_names_they_have_in_addresses():
     ],
 )
 def test_each_wrong_parameter_is_named(arguments, wrong):
-    with pytest.raises(BadRequest) as refusal:
+    with pytest.raises(BadRequestProblem) as refusal:
         parse_query(Query, arguments)
     assert pointers(refusal) == wrong
 
 
 def test_where_nothing_can_be_asked_every_parameter_is_unknown():
     assert parse_query(None, {}) is None
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequestProblem):
         parse_query(None, {"limit": [b"1"]})
 
 
 def test_a_body_that_is_no_document_is_a_bad_request_and_one_that_may_not_travel_is_invalid():
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequestProblem):
         decode_body(b"{", "application/json")
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequestProblem):
         decode_body(b"\xff", "application/bson")
-    with pytest.raises((BadRequest, Invalid)):
+    with pytest.raises((BadRequestProblem, InvalidProblem)):
         decode_body(b'{"a": NaN}', "application/json")
 
 
 def test_a_whole_number_is_an_integer_however_it_is_spelt():
     assert validate_body(UploadCreate, json.loads('{"length": 5.0}')).length == 5
     for spelling in ("5", True, 5.5, None):
-        with pytest.raises(Invalid):
+        with pytest.raises(InvalidProblem):
             validate_body(UploadCreate, {"length": spelling})
 
 
 def test_faults_point_into_the_body_even_inside_alternatives():
-    with pytest.raises(Invalid) as refusal:
+    with pytest.raises(InvalidProblem) as refusal:
         validate_body(JobCreate, {"kind": "x", "inputs": {"clips": [{"item": "a", "revision": 0}]}, "priority": 1000})
     assert "/priority" in pointers(refusal)
     assert any(pointer.startswith("/inputs/clips") for pointer in pointers(refusal))
@@ -78,7 +78,7 @@ def test_faults_point_into_the_body_even_inside_alternatives():
 
 
 def test_a_missing_field_is_pointed_at_where_it_should_be():
-    with pytest.raises(Invalid) as refusal:
+    with pytest.raises(InvalidProblem) as refusal:
         validate_body(ProjectCreate, {})
     assert pointers(refusal) == {"/name"}
 
@@ -90,6 +90,6 @@ def test_arrays_pass_through_untouched():
 
 
 def test_nul_is_found_however_deep():
-    with pytest.raises(Invalid) as refusal:
+    with pytest.raises(InvalidProblem) as refusal:
         validate_body(ItemCreate, {"name": "n", "parts": {"a/b": {"c": ["ok", "no\0"]}}})
     assert pointers(refusal) == {"/parts/a~1b/c/1"}

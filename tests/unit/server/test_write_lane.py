@@ -7,7 +7,7 @@ import pytest
 import sqlalchemy
 
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import Conflict
+from marey_server.errors import ConflictProblem
 from marey_server.store.tables import user
 
 pytestmark = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
@@ -51,11 +51,11 @@ def test_writes_that_waited_all_happen_and_each_hears_its_own_answer(database, s
 def test_a_refused_write_leaves_nothing_and_disturbs_no_other(database, submit_all):
     def refused(tx):
         add_user(tx, "refused")
-        raise Conflict("not you")
+        raise ConflictProblem("not you")
 
     first, second, third = submit_all(adding("a"), refused, adding("b"))
     assert (first.result(30), third.result(30)) == ("a", "b")
-    with pytest.raises(Conflict, match="not you"):
+    with pytest.raises(ConflictProblem, match="not you"):
         second.result(30)
     assert user_names(database) == ["a", "b"]
 
@@ -80,7 +80,7 @@ def test_what_follows_a_commit_sees_it_and_follows_no_refusal(database, submit_a
             tx.after_commit(lambda: heard.append((name, user_names(database))))
             add_user(tx, name)
             if refuse:
-                raise Conflict("not you")
+                raise ConflictProblem("not you")
 
         return write
 

@@ -23,7 +23,7 @@ import sqlalchemy
 from sqlalchemy import URL, Connection, Engine, event, exc, make_url
 
 from marey_server.access.principal import Principal
-from marey_server.errors import Invalid, StorageFull, Unavailable
+from marey_server.errors import InvalidProblem, StorageFullProblem, UnavailableProblem
 from marey_server.store import tables
 from marey_server.store.blob_backings import BlobBacking, DatabaseBlobs
 from marey_server.store.database.clock import Clock, DatabaseClock, save_high_water
@@ -288,20 +288,20 @@ def _translated(error: Exception) -> Exception:
     """The same failure in the server's own terms, where the caller can do something about it."""
     if isinstance(error, OSError):
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        return StorageFull("The disk has no room left; nothing was written.") if full else error
+        return StorageFullProblem("The disk has no room left; nothing was written.") if full else error
     if isinstance(error, exc.TimeoutError):
         return _no_answer("All connections to the database are in use; nothing was written.")
     if isinstance(error, OverflowError | UnicodeEncodeError | exc.DataError):
-        return Invalid("A number or text of the request is beyond what can be stored.", code="bad-value")
+        return InvalidProblem("A number or text of the request is beyond what can be stored.", code="bad-value")
     if not isinstance(error, exc.DBAPIError):
         return error
     message = str(error.orig)
     if "disk is full" in message or getattr(error.orig, "sqlstate", None) == "53100":
-        return StorageFull("The database's disk has no room left; nothing was written.")
+        return StorageFullProblem("The database's disk has no room left; nothing was written.")
     if isinstance(error, exc.OperationalError) and not message.startswith(("no such", "near ")):  # those are our faults
         return _no_answer("The database does not answer; nothing was written. Try again.")
     return error
 
 
-def _no_answer(detail: str) -> Unavailable:
-    return Unavailable(detail, headers={"Retry-After": "2"})
+def _no_answer(detail: str) -> UnavailableProblem:
+    return UnavailableProblem(detail, headers={"Retry-After": "2"})

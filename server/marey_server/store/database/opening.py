@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from alembic.util import CommandError
 from sqlalchemy import exc, make_url
 
-from marey_server.errors import StorageFull, Unavailable
+from marey_server.errors import StorageFullProblem, UnavailableProblem
 
 
 class DatabaseUnusable(Exception):
@@ -25,9 +25,9 @@ def opening(url: str) -> Iterator[None]:
             "the database_url names no database that Marey knows; write sqlite:////folder/file.db, "
             "or postgresql://user@host/name with the extra `postgres` installed"
         ) from None
-    except Unavailable as error:
+    except UnavailableProblem as error:
         raise DatabaseUnusable(f"the database {_shown(url)} does not answer: {_reason(error.__cause__)}") from error
-    except StorageFull as error:
+    except StorageFullProblem as error:
         raise DatabaseUnusable(f"the database {_shown(url)} cannot be opened for writing: {error.detail}") from error
     except exc.DBAPIError as error:
         raise DatabaseUnusable(f"the database {_shown(url)} cannot be used: {_reason(error)}") from error

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from sqlalchemy import exc
 
-from marey_server.errors import MareyError
+from marey_server.errors import ApiProblem
 
 _POSTGRES_UNIQUE = "23505"
 
@@ -19,7 +19,7 @@ def is_unique_violation(error: exc.IntegrityError) -> bool:
 
 
 @contextmanager
-def taken(error: MareyError) -> Iterator[None]:
+def taken(error: ApiProblem) -> Iterator[None]:
     """Raise `error` where a statement inside fails because a unique name is taken. The transaction is then over."""
     try:
         yield

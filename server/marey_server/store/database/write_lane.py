@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from marey_server.access.principal import SYSTEM, Principal
-from marey_server.errors import MareyError
+from marey_server.errors import ApiProblem
 from marey_server.store.database.prepared import run_text
 from marey_server.store.transaction import Transaction
 
@@ -100,7 +100,7 @@ def _run(tx: Transaction, one: _Write) -> Callable[[], Any]:
     run_text(tx.connection, "SAVEPOINT this_write")
     try:
         answer = one.function(own)
-    except MareyError as refusal:
+    except ApiProblem as refusal:
         run_text(tx.connection, "ROLLBACK TO this_write")
         run_text(tx.connection, "RELEASE this_write")
         return _raiser(refusal)
@@ -113,7 +113,7 @@ def _run(tx: Transaction, one: _Write) -> Callable[[], Any]:
     return finish
 
 
-def _raiser(refusal: MareyError) -> Callable[[], Any]:
+def _raiser(refusal: ApiProblem) -> Callable[[], Any]:
     def finish() -> Any:
         raise refusal
 

@@ -8,7 +8,7 @@ from typing import Any
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
-from marey_server.errors import Invalid, MareyError, NotFound
+from marey_server.errors import ApiProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import projects
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.items.changing import put_part
@@ -30,11 +30,11 @@ class ChangedAnnotation:
     """Result of commands on an annotation that was at `rev`: the new document, or the error that refused them."""
 
     rev: int
-    made: PreparedDocument | MareyError
+    made: PreparedDocument | ApiProblem
 
 
 def find_annotation(tx: Transaction, project: str, item_id: str) -> FoundAnnotation:
-    """Read the annotation to change. Raises `NotFound`, and `Invalid` if its clip is gone."""
+    """Read the annotation to change. Raises `NotFoundProblem`, and `InvalidProblem` if its clip is gone."""
     projects.require(tx, project)
     found = read_part(tx, project, Kind.ANNOTATION, item_id, "annotation")
     return FoundAnnotation(found.tree, found.rev, _frame_count(tx, project, found.tree["clip"]))
@@ -43,9 +43,9 @@ def find_annotation(tx: Transaction, project: str, item_id: str) -> FoundAnnotat
 def put_changed(tx: Transaction, project: str, item_id: str, changed: ChangedAnnotation, message: str) -> Item:
     """Store the new revision of the annotation.
 
-    Raises the error that refused the commands, and `PreconditionFailed` if the annotation was changed meanwhile.
+    Raises the error that refused the commands, and `PreconditionFailedProblem` if the annotation was changed meanwhile.
     """
-    if isinstance(changed.made, MareyError):
+    if isinstance(changed.made, ApiProblem):
         raise changed.made
     return put_part(
         tx, project, Kind.ANNOTATION, item_id, "annotation", changed.made, expected_rev=changed.rev, message=message
@@ -61,16 +61,19 @@ class AnnotatedClip:
 
 
 def find_annotated_clip(tx: Transaction, project: str, item_id: str) -> AnnotatedClip:
-    """Read the clip to annotate. Raises `NotFound`."""
+    """Read the clip to annotate. Raises `NotFoundProblem`."""
     item = read_item(tx, project, Kind.CLIP, item_id)
     return AnnotatedClip(item, int(item.summary["frames"]))
 
 
 def _frame_count(tx: Transaction, project: str, annotated: dict[str, Any]) -> int:
-    """Count the frames of the clip's revision that an annotation belongs to. Raises `Invalid` if the clip is gone."""
+    """Count the frames of the clip's revision that an annotation belongs to.
+
+    Raises `InvalidProblem` if the clip is gone.
+    """
     clip = RevisionRef.model_validate(annotated)
     try:
         motion = read_part(tx, project, Kind.CLIP, clip.item, "motion", revision=clip.revision, arrays="none").tree
-    except NotFound as error:
-        raise Invalid(f"Its clip is not there any more: {error.detail}", code="no-clip") from error
+    except NotFoundProblem as error:
+        raise InvalidProblem(f"Its clip is not there any more: {error.detail}", code="no-clip") from error
     return int(motion["poses"]["shape"][0])

@@ -9,7 +9,7 @@ from sqlalchemy import delete, insert
 from marey_schemas.items import Item, ItemChange, ItemCreate
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import FieldError
-from marey_server.errors import Conflict, Invalid
+from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import collections, documents, projects
 from marey_server.store.database.violations import taken
 from marey_server.store.documents import PreparedDocument
@@ -27,7 +27,7 @@ from marey_server.store.transaction import Transaction
 def prepare_parts(kind: Kind, parts: dict[str, Any]) -> dict[str, PreparedDocument]:
     """Check and encode the documents of a request; give them to `create_item` or `put_part` in place of the trees.
 
-    Needs no database and much of the time. Raises `Invalid` with pointers that start with the part.
+    Needs no database and much of the time. Raises `InvalidProblem` with pointers that start with the part.
     """
     return {part: prepare_part(kind, part, tree) for part, tree in parts.items()}
 
@@ -37,16 +37,18 @@ def prepare_part(kind: Kind, part: str, tree: Any) -> PreparedDocument:
     spec = PARTS[kind].get(part)
     if spec is None:
         detail = f"A {kind} has no part {part!r}; it has {', '.join(PARTS[kind])}."
-        raise Invalid(detail, code="no-part", errors=[FieldError(pointer=f"/{part}", code="no-part", detail=detail)])
+        raise InvalidProblem(
+            detail, code="no-part", errors=[FieldError(pointer=f"/{part}", code="no-part", detail=detail)]
+        )
     try:
         return documents.prepared(tree, schema=spec.schema)
-    except Invalid as error:
+    except InvalidProblem as error:
         moved = [found.model_copy(update={"pointer": f"/{part}{found.pointer}"}) for found in error.errors]
-        raise Invalid(error.detail, code=error.error_code, errors=moved, context=error.context) from error
+        raise InvalidProblem(error.detail, code=error.error_code, errors=moved, context=error.context) from error
 
 
 def create_item(tx: Transaction, project: str, kind: Kind, request: ItemCreate) -> Item:
-    """A new item. Raises `Conflict` where the name is taken in its collection."""
+    """A new item. Raises `ConflictProblem` where the name is taken in its collection."""
     project_row = projects.require(tx, project)
     draft = Draft(
         name_in_batch="", kind=kind, item_name=request.name, parts=request.parts, collection=request.collection,
@@ -69,7 +71,7 @@ def put_part(
 ) -> Item:
     """A new revision in which one part is replaced; the same content makes none.
 
-    Raises `PreconditionFailed` where the item is not at `expected_rev` any more.
+    Raises `PreconditionFailedProblem` where the item is not at `expected_rev` any more.
     """
     project_row = projects.require(tx, project)
     found = find_item(tx, project_row, kind, item_id)
@@ -93,7 +95,7 @@ def put_part(
 def change_item(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: ItemChange, *, expected_rev: ExpectedRev
 ) -> Item:
-    """Rename, move or tag an item. Raises `Conflict` where the name is taken at its new place."""
+    """Rename, move or tag an item. Raises `ConflictProblem` where the name is taken at its new place."""
     project_row = projects.require(tx, project)
     values: dict[str, Any] = {"updated_us": tx.now_us}
     if request.name is not None:
@@ -101,7 +103,7 @@ def change_item(
     if request.collection is not None:
         values["collection_id"] = collections.ensure(tx, project_row, request.collection)
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_(None))
-    with taken(Conflict(f"There is a {kind} of that name there already.", code="name-taken")):
+    with taken(ConflictProblem(f"There is a {kind} of that name there already.", code="name-taken")):
         change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))
     if request.tags is not None:
         tx.execute(delete(item_tag).where(item_tag.c.item_id == item_id))
@@ -123,13 +125,16 @@ def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expe
 
 
 def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev = None) -> Item:
-    """Bring back a deleted item, and its collection if that is gone. Raises `Conflict` where its name is taken."""
+    """Bring back a deleted item, and its collection if that is gone.
+
+    Raises `ConflictProblem` where its name is taken.
+    """
     project_row = projects.require(tx, project)
     gone = find_item(tx, project_row, kind, item_id, deleted=True)
     collection_id = collections.ensure(tx, project_row, gone.path)
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_not(None))
     values = {"deleted_us": None, "updated_us": tx.now_us, "collection_id": collection_id}
-    with taken(Conflict(f"There is another {kind} {gone.name!r} in its place now.", code="name-taken")):
+    with taken(ConflictProblem(f"There is another {kind} {gone.name!r} in its place now.", code="name-taken")):
         change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))
     shown = _shown(tx, project_row, kind, item_id)
     emit_item(tx, "item.restored", project_row, shown)

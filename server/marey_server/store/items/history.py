@@ -9,7 +9,7 @@ from sqlalchemy import Row, Select, and_, select, tuple_
 
 from marey_schemas.items import Lineage, LineageEdge, Page, Revision, Staleness
 from marey_schemas.kinds import Kind
-from marey_server.errors import NotFound
+from marey_server.errors import NotFoundProblem
 from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.items.reading import find_item, read_parts
@@ -49,7 +49,7 @@ def _revision_rows() -> Select[Any]:
 def _find_revision(tx: Transaction, item_id: str, number: int) -> Row[Any]:
     row = tx.execute(_revision_rows().where(revision.c.item_id == item_id, revision.c.number == number)).first()
     if row is None:
-        raise NotFound(f"{item_id!r} has no revision {number}.", code="no-revision")
+        raise NotFoundProblem(f"{item_id!r} has no revision {number}.", code="no-revision")
     return row
 
 

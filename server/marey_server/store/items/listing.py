@@ -11,7 +11,7 @@ from sqlalchemy import ColumnElement, func, select
 from marey_schemas.access import Role
 from marey_schemas.items import Item, Page
 from marey_schemas.kinds import Kind
-from marey_server.errors import BadRequest
+from marey_server.errors import BadRequestProblem
 from marey_server.store import collections, listing, projects
 from marey_server.store.items.reading import item_rows, shown_items
 from marey_server.store.tables import collection, item, item_tag
@@ -80,7 +80,7 @@ def _shown(tx: Transaction, rows: Any, fields: Collection[str] | None) -> list[A
     if fields is None:
         return shown_items(tx, rows)
     if unknown := sorted(set(fields) - set(Item.model_fields)):
-        raise BadRequest(f"An item has no field {unknown[0]!r}.", code="bad-fields")
+        raise BadRequestProblem(f"An item has no field {unknown[0]!r}.", code="bad-fields")
     shown = shown_items(tx, rows, tags="tags" in fields, parts="parts" in fields)
     return [found.model_dump(mode="json", include=set(fields)) for found in shown]
 

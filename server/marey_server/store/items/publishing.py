@@ -11,7 +11,7 @@ from sqlalchemy import and_, insert, select
 
 from marey_schemas.kinds import PARTS, Kind
 from marey_server import faults
-from marey_server.errors import Conflict, Invalid
+from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import collections, documents
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.ids import new_id
@@ -43,11 +43,11 @@ def publish(
     tree may name the model of its own draft. Content that stands there already makes no new revision. The caller has
     authorised the write.
 
-    Raises `Invalid` where a draft makes no sense, `Conflict` where a name is taken.
+    Raises `InvalidProblem` where a draft makes no sense, `ConflictProblem` where a name is taken.
     """
     by_name = {draft.name_in_batch: draft for draft in drafts}
     if len(by_name) != len(drafts):
-        raise Invalid("Two results of one write have the same name.", code="duplicate-output")
+        raise InvalidProblem("Two results of one write have the same name.", code="duplicate-output")
     loaded = {name: _load_parts(tx, draft) for name, draft in by_name.items()}
     refers = {
         name: [found for part in parts.values() for found in references.outputs_in(part.body)]
@@ -74,7 +74,7 @@ def _load_parts(tx: Transaction, draft: Draft) -> dict[str, _Part]:
     loaded = {}
     for part, content in draft.parts.items():
         if part not in specs:
-            raise Invalid(f"A {draft.kind} has no part {part!r}; it has {', '.join(specs)}.", code="no-part")
+            raise InvalidProblem(f"A {draft.kind} has no part {part!r}; it has {', '.join(specs)}.", code="no-part")
         if isinstance(content, StoredDocument):
             loaded[part] = _Part(documents.load_body(tx, content.digest), content)
         else:
@@ -128,7 +128,9 @@ class _Publication:
             if published is not None:
                 self.done[draft.name_in_batch] = published
                 return
-        raise Conflict(f"{draft.item_name!r} is being changed by others at this moment; try again.", code="contended")
+        raise ConflictProblem(
+            f"{draft.item_name!r} is being changed by others at this moment; try again.", code="contended"
+        )
 
     def _store(self, held: _Part, body: Tree) -> str:
         changed = body != held.body
@@ -170,7 +172,7 @@ class _Publication:
     def _create(self, draft: Draft, digests: Mapping[str, str], bodies: Mapping[str, Tree]) -> Published | None:
         lacking = [part for part, spec in PARTS[draft.kind].items() if spec.required and part not in digests]
         if lacking:
-            raise Invalid(f"A {draft.kind} needs the part {lacking[0]!r}.", code="part-required")
+            raise InvalidProblem(f"A {draft.kind} needs the part {lacking[0]!r}.", code="part-required")
         summary = summarise(draft.kind, bodies)
         row = {
             "id": new_id(draft.kind.value), "project_id": self.project.id, "kind": draft.kind.value, "head": 1,
@@ -187,7 +189,7 @@ class _Publication:
                 return Published(draft.name_in_batch, made, draft.kind, 1, True)
         if draft.reuse == "new":
             place = f"{draft.collection}/{draft.item_name}" if draft.collection else draft.item_name
-            raise Conflict(f"There is a {draft.kind} {place!r} already.", code="name-taken")
+            raise ConflictProblem(f"There is a {draft.kind} {place!r} already.", code="name-taken")
         return None
 
     def _revise(

@@ -10,7 +10,7 @@ from sqlalchemy import Row, Select, bindparam, select
 
 from marey_schemas.items import Item, PartSummary
 from marey_schemas.kinds import Kind
-from marey_server.errors import Invalid, NotFound
+from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.store import documents, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
@@ -21,7 +21,7 @@ from marey_server.store.transaction import Transaction
 
 
 def read_item(tx: Transaction, project: str, kind: Kind, item_id: str) -> Item:
-    """An item at its newest revision. Raises `NotFound`."""
+    """An item at its newest revision. Raises `NotFoundProblem`."""
     project_row = projects.require(tx, project)
     return shown_items(tx, [find_item(tx, project_row, kind, item_id)])[0]
 
@@ -63,7 +63,7 @@ _PART_OF_REVISION = Prepared(_PART.where(revision_part.c.number == bindparam("nu
 
 
 def find_item(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, *, deleted: bool = False) -> Any:
-    """Row of an item. Raises `NotFound`."""
+    """Row of an item. Raises `NotFoundProblem`."""
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value}
     row = tx.first(_DELETED_ITEM if deleted else _ITEM, which)
     if row is None:
@@ -71,9 +71,9 @@ def find_item(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str
     return row
 
 
-def no_item(kind: Kind, item_id: str) -> NotFound:
+def no_item(kind: Kind, item_id: str) -> NotFoundProblem:
     """There is no such item."""
-    return NotFound(f"There is no {kind} {item_id!r} here.", code="no-item")
+    return NotFoundProblem(f"There is no {kind} {item_id!r} here.", code="no-item")
 
 
 def shown_items(tx: Transaction, rows: Sequence[Row[Any]], *, tags: bool = True, parts: bool = True) -> list[Item]:
@@ -124,7 +124,7 @@ class FoundPart:
 def find_part(
     tx: Transaction, project: str, kind: Kind, item_id: str, part: str, *, revision: int | None = None
 ) -> FoundPart:
-    """The part of the newest revision, or of `revision`. Raises `NotFound` where there is none."""
+    """The part of the newest revision, or of `revision`. Raises `NotFoundProblem` where there is none."""
     project_row = projects.require(tx, project)
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value, "part": part}
     if revision is None:
@@ -132,7 +132,7 @@ def find_part(
     else:
         row = tx.first(_PART_OF_REVISION, {**which, "number": revision})
     if row is None:
-        raise NotFound(f"There is no part {part!r} of {kind} {item_id!r} at that revision.", code="no-part")
+        raise NotFoundProblem(f"There is no part {part!r} of {kind} {item_id!r} at that revision.", code="no-part")
     return FoundPart(row.document_digest, row.number, row.rev)
 
 
@@ -147,13 +147,13 @@ def load_part(
     """The document of a part, its arrays as `arrays` says.
 
     `frames` (half-open, clipped to what is there) and `joints` (names, in the order wanted) cut a motion. Raises
-    `Invalid` where they do not fit it.
+    `InvalidProblem` where they do not fit it.
     """
     if frames is None and joints is None:
         return documents.load_document(tx, found.digest, arrays=arrays)
     tree = documents.load_document(tx, found.digest)
     if tree["schema"] != "marey/motion@1":
-        raise Invalid("Only motions are cut by frames and joints.", code="not-a-motion")
+        raise InvalidProblem("Only motions are cut by frames and joints.", code="not-a-motion")
     if arrays == "none":
         raise ValueError("references name whole arrays, which a cut has not")
     return slice_motion(tree, frames, joints, encoded=arrays == "encoded")

@@ -10,7 +10,7 @@ from sqlalchemy import select
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
 from marey_schemas.wording import counted
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 from marey_server.store.items.drafts import Published
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import document, item, revision_part
@@ -42,7 +42,7 @@ def with_model_digest(tree: Tree, digest: str | None) -> Tree:
 def in_order(names: Mapping[str, Sequence[str]]) -> list[str]:
     """Names, each after those it refers to; names that stand for nothing here are left out.
 
-    Raises `Invalid` where some refer to each other.
+    Raises `InvalidProblem` where some refer to each other.
     """
     ordered: dict[str, None] = {}
     for start in names:
@@ -52,7 +52,9 @@ def in_order(names: Mapping[str, Sequence[str]]) -> list[str]:
             if not waiting:
                 ordered[path.pop()] = None
             elif waiting[0] in path:
-                raise Invalid(f"Results refer to each other: {' -> '.join([*path, waiting[0]])}.", code="output-cycle")
+                raise InvalidProblem(
+                    f"Results refer to each other: {' -> '.join([*path, waiting[0]])}.", code="output-cycle"
+                )
             else:
                 path.append(waiting[0])
     return list(ordered)
@@ -79,7 +81,7 @@ class ReferenceCheck:
         self._seen: dict[tuple[str, int, Kind, str], Tree] = {}
 
     def require(self, kind: Kind, bodies: Mapping[str, Tree]) -> None:
-        """Raise `Invalid` where something the new parts of an item refer to is not there or does not fit."""
+        """Raise `InvalidProblem` where something the new parts of an item refer to is not there or does not fit."""
         if kind in (Kind.CLIP, Kind.PROCESSED) and "motion" in bodies:
             self._require_joints(bodies["motion"], "/motion")
         elif kind is Kind.MODEL:
@@ -155,5 +157,5 @@ def _escaped(name: str) -> str:
     return name.replace("~", "~0").replace("/", "~1")
 
 
-def _invalid(pointer: str, code: str, detail: str) -> Invalid:
-    return Invalid(detail, code=code, errors=[FieldError(pointer=pointer, code=code, detail=detail)])
+def _invalid(pointer: str, code: str, detail: str) -> InvalidProblem:
+    return InvalidProblem(detail, code=code, errors=[FieldError(pointer=pointer, code=code, detail=detail)])

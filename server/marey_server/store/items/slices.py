@@ -12,7 +12,7 @@ from marey_schemas.encoding import blocks
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.problems import FieldError
 from marey_schemas.wording import counted
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 
 Tree = dict[str, Any]
 
@@ -73,5 +73,5 @@ def _cut(
     return EncodedArray.of(array, predict=False) if encoded else array
 
 
-def _invalid(pointer: str, code: str, detail: str) -> Invalid:
-    return Invalid(detail, code=code, errors=[FieldError(pointer=pointer, code=code, detail=detail)])
+def _invalid(pointer: str, code: str, detail: str) -> InvalidProblem:
+    return InvalidProblem(detail, code=code, errors=[FieldError(pointer=pointer, code=code, detail=detail)])

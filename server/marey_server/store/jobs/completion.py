@@ -17,7 +17,7 @@ from marey_schemas.worker_protocol import (
     FailRequest,
 )
 from marey_server import faults
-from marey_server.errors import MareyError, NotFound
+from marey_server.errors import ApiProblem, NotFoundProblem
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs import staging
 from marey_server.store.jobs.endings import ENDED_COLUMNS, AttemptEnd, Ended, as_ended, end_attempts
@@ -44,7 +44,7 @@ _Place = tuple[str, int]
 def complete(tx: Transaction, job_id: str, fence: int, request: CompleteRequest) -> CompleteAnswer:
     """End the job with success and publish what the attempt staged. The same `write_id` again: the same answer.
 
-    Raises `LeaseLost` if the attempt does not hold the job, or has ended it with another `write_id`.
+    Raises `LeaseLostProblem` if the attempt does not hold the job, or has ended it with another `write_id`.
     """
     require_attempt(tx.principal, job_id, fence)
     place = (job_id, fence)
@@ -62,12 +62,12 @@ def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> li
     own = _claimed_by_caller(tx, requests)
     publishing = {place for place in own if any(staging.named_blobs(requests[place].result))} | _staged(tx, own)
     ended = _complete(tx, {place: requests[place] for place in own - publishing})
-    refused: dict[_Place, MareyError] = {}
+    refused: dict[_Place, ApiProblem] = {}
     for place in sorted(publishing):  # what one of them may not publish must not keep the others from it
         try:
             with tx.connection.begin_nested():
                 ended |= _complete(tx, {place: requests[place]})
-        except MareyError as error:
+        except ApiProblem as error:
             refused[place] = error
     settle(tx, [end for end, _ in ended.values()])
     _pass_fault_points(tx)
@@ -194,17 +194,17 @@ def _result(
     tx: Transaction,
     one: BatchCompletion,
     answers: Mapping[_Place, CompleteAnswer],
-    refused: Mapping[_Place, MareyError],
+    refused: Mapping[_Place, ApiProblem],
     own: Collection[_Place],
 ) -> BatchCompletionResult:
     place = (one.job, one.fence)
     try:
         if place not in own:
-            raise NotFound(f"There is no attempt {one.fence} of {one.job} that you claimed.")
+            raise NotFoundProblem(f"There is no attempt {one.fence} of {one.job} that you claimed.")
         if place in refused:
             raise refused[place]
         answer = answers.get(place) or _same_answer(tx, place, one.write_id)
-    except MareyError as error:
+    except ApiProblem as error:
         return BatchCompletionResult(job=one.job, fence=one.fence, code=error.error_code, detail=error.detail)
     return BatchCompletionResult(job=one.job, fence=one.fence, answer=answer)
 
@@ -217,7 +217,7 @@ def fail(
 ) -> FailAnswer:
     """End the attempt without success. The same `write_id` again: the same answer.
 
-    Raises `LeaseLost` if the attempt does not hold the job, or has ended with another `write_id`.
+    Raises `LeaseLostProblem` if the attempt does not hold the job, or has ended with another `write_id`.
     """
     require_attempt(tx.principal, job_id, fence)
     earlier = earlier_answer(tx, job_id, fence, request.write_id)

@@ -103,7 +103,7 @@ def carry_out(
 ) -> None:
     """Bring the job where the verdict says, if `condition` still holds, and let what follows follow.
 
-    Raises `LeaseLost` if it does not.
+    Raises `LeaseLostProblem` if it does not.
     """
     if verdict.rest_us is None:
         failure = {} if verdict.failure is None else {"failure": verdict.failure}

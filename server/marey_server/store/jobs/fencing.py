@@ -12,7 +12,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Row, and_, bindparam, case, literal_column, select, tuple_
 
 from marey_server.access.principal import Principal
-from marey_server.errors import LeaseLost, NotFound
+from marey_server.errors import LeaseLostProblem, NotFoundProblem
 from marey_server.store.tables import attempt, job
 from marey_server.store.transaction import Transaction
 
@@ -48,12 +48,13 @@ def held_parameters(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
 def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
     """The credential must be that of this very attempt.
 
-    Raises `NotFound` for a credential that is no attempt's of this job, `LeaseLost` for another attempt of it.
+    Raises `NotFoundProblem` for a credential that is no attempt's of this job, `LeaseLostProblem` for another attempt
+    of it.
     """
     if principal.kind == "system":
         return
     if principal.kind != "attempt" or principal.job_id != job_id:
-        raise NotFound(f"There is no attempt {fence} of {job_id} that this credential may write to.")
+        raise NotFoundProblem(f"There is no attempt {fence} of {job_id} that this credential may write to.")
     if principal.fence != fence:
         raise lease_lost(job_id, fence)
 
@@ -61,7 +62,7 @@ def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
 def hold(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any]) -> Row[Any]:
     """Keep the job from changing hands until the transaction ends, and read `columns` of it.
 
-    Raises `LeaseLost` if the attempt does not hold it any more.
+    Raises `LeaseLostProblem` if the attempt does not hold it any more.
     """
     statement = select(job.c.project_id, *columns).where(held(job_id, fence)).with_for_update()
     row = tx.execute(statement).one_or_none()
@@ -70,9 +71,9 @@ def hold(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any])
     return row
 
 
-def lease_lost(job_id: str, fence: int) -> LeaseLost:
+def lease_lost(job_id: str, fence: int) -> LeaseLostProblem:
     """The error that tells a worker to stop."""
-    return LeaseLost(f"Attempt {fence} does not hold {job_id} any more. Stop working on it.")
+    return LeaseLostProblem(f"Attempt {fence} does not hold {job_id} any more. Stop working on it.")
 
 
 def earlier_answer(tx: Transaction, job_id: str, fence: int, write_id: str) -> dict[str, Any] | None:

@@ -10,7 +10,7 @@ from sqlalchemy import ColumnElement, bindparam, func, or_, select
 from marey_schemas.job_kinds import KindDeclaration
 from marey_schemas.jobs import CollectionInput, InputSpec, ItemInput, JobCreate, JobInput, JobOutputsInput
 from marey_schemas.problems import FieldError
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import collection, item
@@ -72,8 +72,8 @@ def pin_inputs(
     jobs make stays to be bound.
 
     `known` holds what `find_items` found of the request's items.
-    Raises `Invalid`, with a pointer below `at` for each thing that is wrong: an input the kind does not have or lacks,
-    nothing for one that is required, an item or revision that is not in the project, an item of another kind, a
+    Raises `InvalidProblem`, with a pointer below `at` for each thing that is wrong: an input the kind does not have or
+    lacks, nothing for one that is required, an item or revision that is not in the project, an item of another kind, a
     collection that holds none.
     """
     errors = _misnamed(kind, request, at)
@@ -90,7 +90,7 @@ def pin_inputs(
             _error(f"{at}/inputs", "too-many", f"{total} inputs are named; at most {MOST_INPUTS} are possible.")
         )
     if errors:
-        raise Invalid(f"{errors[0].pointer}: {errors[0].detail}", errors=errors[:100])
+        raise InvalidProblem(f"{errors[0].pointer}: {errors[0].detail}", errors=errors[:100])
     return pins
 
 

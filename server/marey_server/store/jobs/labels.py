@@ -7,7 +7,7 @@ from itertools import combinations
 from urllib.parse import quote
 
 from marey_schemas.problems import FieldError
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 
 MOST_LABELS = 6
 """A worker matches 2 to the power of its labels many sets of labels, so there is a limit."""
@@ -16,7 +16,7 @@ LONGEST_KEY = 512
 
 
 def labels_key(labels: Mapping[str, str]) -> str:
-    """The labels in a fixed order, such as `gpu=a100,site=lyon`; raises `Invalid` if there are too many."""
+    """The labels in a fixed order, such as `gpu=a100,site=lyon`; raises `InvalidProblem` if there are too many."""
     pairs = _checked_pairs(labels)
     key = ",".join(pairs)
     if len(key) > LONGEST_KEY:
@@ -36,5 +36,5 @@ def _checked_pairs(labels: Mapping[str, str]) -> list[str]:
     return [f"{quote(name, safe='')}={quote(value, safe='')}" for name, value in sorted(labels.items())]
 
 
-def _refusal(detail: str) -> Invalid:
-    return Invalid(detail, errors=[FieldError(pointer="/labels", code="too-long", detail=detail)])
+def _refusal(detail: str) -> InvalidProblem:
+    return InvalidProblem(detail, errors=[FieldError(pointer="/labels", code="too-long", detail=detail)])

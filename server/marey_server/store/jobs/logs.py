@@ -9,7 +9,7 @@ from sqlalchemy import Row, insert, select, update
 
 from marey_schemas.jobs import JobState
 from marey_schemas.worker_protocol import LogAnswer
-from marey_server.errors import Conflict
+from marey_server.errors import ConflictProblem
 from marey_server.store.jobs.fencing import hold, require_attempt
 from marey_server.store.jobs.policy import DEFAULT_POLICY, QueuePolicy
 from marey_server.store.tables import attempt, job_log
@@ -19,7 +19,7 @@ CAPPED = b"\n[the log is full; what follows is not kept]\n"
 MOST_READ_BYTES = 2**20
 
 
-class LogOffset(Conflict):
+class LogOffset(ConflictProblem):
     """The log goes on at another offset."""
 
     code = "log-offset"
@@ -30,7 +30,7 @@ def append_log(
 ) -> LogAnswer:
     """Add `data` to the attempt's log, which must be `offset` bytes long. The same piece again is taken as said.
 
-    Raises `LogOffset` with the true offset, `LeaseLost` if the attempt does not hold the job any more.
+    Raises `LogOffset` with the true offset, `LeaseLostProblem` if the attempt does not hold the job any more.
     """
     require_attempt(tx.principal, job_id, fence)
     hold(tx, job_id, fence)

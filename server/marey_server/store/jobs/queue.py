@@ -37,7 +37,7 @@ from marey_schemas.worker_protocol import (
 )
 from marey_server import faults
 from marey_server.access.secret_tokens import IssuedToken, issue_attempt_token
-from marey_server.errors import Forbidden, Invalid
+from marey_server.errors import ForbiddenProblem, InvalidProblem
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs.events import emit_job_events
 from marey_server.store.jobs.fencing import QUEUED, RUNNING, earlier, held, lease_lost, require_attempt
@@ -50,11 +50,11 @@ from marey_server.store.transaction import Transaction
 def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_POLICY) -> list[Lease]:
     """Give the caller up to `request.max` queued jobs, best first, each under a new fence.
 
-    Raises `Forbidden` for a caller that may not work, `Invalid` for another version of the protocol.
+    Raises `ForbiddenProblem` for a caller that may not work, `InvalidProblem` for another version of the protocol.
     """
     if request.protocol != PROTOCOL_VERSION:
         detail = f"The worker speaks version {request.protocol} of the protocol, the server {PROTOCOL_VERSION}."
-        raise Invalid(detail, errors=[FieldError(pointer="/protocol", code="protocol", detail=detail)])
+        raise InvalidProblem(detail, errors=[FieldError(pointer="/protocol", code="protocol", detail=detail)])
     rows = _claim_rows(tx, request, policy)
     if not rows:
         return []
@@ -89,7 +89,7 @@ def heartbeat(
 ) -> HeartbeatAnswer:
     """Extend the lease, even a late one that nobody has taken; never past the grace of a cancel or of the time limit.
 
-    Raises `LeaseLost` if the attempt does not hold the job any more.
+    Raises `LeaseLostProblem` if the attempt does not hold the job any more.
     """
     require_attempt(tx.principal, job_id, fence)
     values: dict[str, Any] = {
@@ -223,7 +223,7 @@ def _claim_rows(tx: Transaction, request: ClaimRequest, policy: QueuePolicy) -> 
     caller = tx.principal
     scopes = [scope for scope in caller.scopes if scope.partition("!")[0] == "work"]
     if not scopes or caller.kind not in ("user", "system"):
-        raise Forbidden("Claiming jobs needs a user's token with the scope `work`.", code="insufficient-scope")
+        raise ForbiddenProblem("Claiming jobs needs a user's token with the scope `work`.", code="insufficient-scope")
     restriction = _Restriction(request.job is not None, "work" not in scopes, not caller.administrator)
     parameters: dict[str, Any] = {
         "now_us": tx.now_us,

@@ -12,7 +12,7 @@ from marey_schemas.access import Role
 from marey_schemas.items import Page
 from marey_schemas.jobs import Attempt, Job, JobOutput, JobState, TaskResult
 from marey_server.access import roles
-from marey_server.errors import Conflict, Forbidden, NotFound
+from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem
 from marey_server.store import events, listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.jobs.documents import as_documents, job_documents, select_jobs
@@ -50,7 +50,7 @@ class JobFilters:
 
 
 def read_job(tx: Transaction, job_id: str) -> Job:
-    """A job and how it stands. Raises `NotFound`."""
+    """A job and how it stands. Raises `NotFoundProblem`."""
     row, _ = find_job(tx, job_id)
     return as_documents(tx, [row])[0]
 
@@ -153,7 +153,7 @@ def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLIC
     """Cancel a job, at once where nobody works on it, else as soon as the worker stops or its grace is over.
 
     A gathering job is cancelled with its tasks. Cancelling twice is cancelling once.
-    Raises `Conflict` for a job that has succeeded or failed, `Forbidden` for somebody else's job.
+    Raises `ConflictProblem` for a job that has succeeded or failed, `ForbiddenProblem` for somebody else's job.
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "cancel")
@@ -165,7 +165,7 @@ def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLIC
     settle(tx, [as_ended(one) for one in (*tasks, *whole) if one.state != "running"])
     document = job_documents(tx, [job_id])[0]
     if not whole and document.state != JobState.CANCELLED:
-        raise Conflict(f"The job has {document.state} already; nothing can be cancelled.", code="job-ended")
+        raise ConflictProblem(f"The job has {document.state} already; nothing can be cancelled.", code="job-ended")
     return document
 
 
@@ -201,14 +201,14 @@ def _cancel(tx: Transaction, which: ColumnElement[bool], policy: QueuePolicy) ->
 
 
 def find_job(tx: Transaction, job_id: str) -> tuple[Row[Any], ProjectRow]:
-    """Return the job and its project; raise `NotFound` if the caller may not know the project."""
+    """Return the job and its project; raise `NotFoundProblem` if the caller may not know the project."""
     row = tx.execute(select_jobs().where(job.c.id == job_id)).one_or_none()
     if row is not None:
         try:
             return row, projects.require(tx, row.project_name)
-        except NotFound:
+        except NotFoundProblem:
             pass
-    raise NotFound(f"There is no job {job_id!r} that you may see.", code="no-job")
+    raise NotFoundProblem(f"There is no job {job_id!r} that you may see.", code="no-job")
 
 
 def require_own(tx: Transaction, row: Row[Any], project: ProjectRow, what: str) -> None:
@@ -216,4 +216,4 @@ def require_own(tx: Transaction, row: Row[Any], project: ProjectRow, what: str) 
     if roles.includes(project.role, Role.MAINTAINER):
         return
     if not roles.includes(project.role, Role.CONTRIBUTOR) or row.author_id != tx.principal.user_id:
-        raise Forbidden(f"To {what} somebody else's job needs the role maintainer.", code="insufficient-role")
+        raise ForbiddenProblem(f"To {what} somebody else's job needs the role maintainer.", code="insufficient-role")

@@ -18,7 +18,7 @@ from sqlalchemy import and_, delete, insert, or_, select, update
 
 from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.job_kinds import KindDeclaration
-from marey_server.errors import MareyError
+from marey_server.errors import ApiProblem
 from marey_server.store import blobs
 from marey_server.store.jobs import staging
 from marey_server.store.jobs.endings import Ended, end_jobs
@@ -213,7 +213,7 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     try:
         with tx.connection.begin_nested():
             ended = _publish_anew(tx, job_id)
-    except MareyError:
+    except ApiProblem:
         ended = []
     if not ended:
         _compute_again(tx, job_id)

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from marey_schemas.job_kinds import KindDeclaration
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 from marey_server.store import collections
 from marey_server.store.jobs.inputs import Pin, PinnedInputs
 
@@ -44,7 +44,7 @@ def _too_long(kind: KindDeclaration, pins: PinnedInputs, into: str) -> tuple[str
     for folder in sorted({"", *map(_folder, kept)}) if into else ():
         try:
             collections.check_length(_path(into, folder))
-        except Invalid as error:
+        except InvalidProblem as error:
             return error.error_code, f"The results would go to {_path(into, folder)}. {error.detail}"
     return None
 

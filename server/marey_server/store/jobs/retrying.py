@@ -11,7 +11,7 @@ from marey_schemas.access import Role
 from marey_schemas.job_kinds import UnknownKindError, find_kind
 from marey_schemas.jobs import FailureReason, Job, JobState
 from marey_server.access import roles
-from marey_server.errors import Conflict
+from marey_server.errors import ConflictProblem
 from marey_server.store.ids import new_id
 from marey_server.store.jobs.inputs import PinnedInputs
 from marey_server.store.jobs.layout import Submission, request_of
@@ -32,16 +32,16 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
 
     Jobs it needs that did not succeed are tried again before it, and those that ended only because it did not succeed
     after it, as far as the caller may: the rest of a pipeline goes on. The answer is the job that takes its place.
-    Raises `Conflict` for a job that has not ended or has succeeded, and for a task.
+    Raises `ConflictProblem` for a job that has not ended or has succeeded, and for a task.
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "retry")
     if row.state not in UNSUCCESSFUL:
-        raise Conflict(
+        raise ConflictProblem(
             f"Only a failed or cancelled job can be tried again; this one is {row.state}.", code="not-failed"
         )
     if row.parent_id is not None:
-        raise Conflict(f"This is a task; try {row.parent_id} again, which it belongs to.", code="is-task")
+        raise ConflictProblem(f"This is a task; try {row.parent_id} again, which it belongs to.", code="is-task")
     family = _Family(tx, project)
     family.add_with_needed([job_id])
     family.add_dependants()
@@ -99,7 +99,7 @@ class _Family:
         self._needs |= needs
         if len(self._rows) > MOST_AT_ONCE:
             detail = f"More than {MOST_AT_ONCE} jobs hang together here; try those again that the others need."
-            raise Conflict(detail, code="too-many")
+            raise ConflictProblem(detail, code="too-many")
 
     def _doomed_after(self, ids: Collection[str]) -> Iterable[Row[Any]]:
         """Jobs the caller may try again that came after one of these, ended for it, and have not been tried again."""
@@ -132,7 +132,7 @@ def _again(tx: Transaction, row: Row[Any], new: str, stand_ins: Mapping[str, str
     try:
         kind = find_kind(row.kind)
     except UnknownKindError as error:
-        raise Conflict(f"This server does not know the kind any more: {error}.", code="unknown-kind") from error
+        raise ConflictProblem(f"This server does not know the kind any more: {error}.", code="unknown-kind") from error
     return Submission(
         kind,
         request_of(row).model_copy(update={"concurrency_key": _concurrency_key(tx, row)}),

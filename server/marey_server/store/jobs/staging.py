@@ -14,7 +14,7 @@ from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import FieldError
 from marey_schemas.worker_protocol import StagedOutput
 from marey_server import faults
-from marey_server.errors import Conflict, Invalid
+from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import blobs, documents
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.documents import PreparedDocument
@@ -43,12 +43,12 @@ class PreparedOutput:
 
 
 def prepare_output(output: StagedOutput) -> PreparedOutput:
-    """Check and encode the documents of an output; raises `Invalid`."""
+    """Check and encode the documents of an output; raises `InvalidProblem`."""
     specs = PARTS[output.kind]
     unknown = [part for part in output.parts if part not in specs]
     if unknown:
         detail = f"A {output.kind} has no part {unknown[0]!r}; it has {', '.join(specs)}."
-        raise Invalid(
+        raise InvalidProblem(
             detail, code="no-part", errors=[FieldError(pointer=f"/{unknown[0]}", code="no-part", detail=detail)]
         )
     parts = {part: documents.prepare_document(tree, schema=specs[part].schema) for part, tree in output.parts.items()}
@@ -58,13 +58,14 @@ def prepare_output(output: StagedOutput) -> PreparedOutput:
 def stage(tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOutput]) -> int:
     """Keep results until the attempt completes; one of the same name replaces the earlier. How many there are now.
 
-    Raises `LeaseLost` if the attempt does not hold the job, `Invalid` for sources that are no inputs of the job.
+    Raises `LeaseLostProblem` if the attempt does not hold the job, `InvalidProblem` for sources that are no inputs of
+    the job.
     """
     require_attempt(tx.principal, job_id, fence)
     pins: PinnedInputs = hold(tx, job_id, fence, job.c.inputs).inputs
     names = [one.output.name for one in outputs]
     if len(set(names)) != len(names):
-        raise Invalid("Two results have the same name.", code="duplicate-output")
+        raise InvalidProblem("Two results have the same name.", code="duplicate-output")
     of_attempt = (staged_output.c.job_id == job_id) & (staged_output.c.fence == fence)
     last = tx.execute(select(func.max(staged_output.c.position)).where(of_attempt)).scalar()
     replaced = tx.execute(
@@ -89,7 +90,7 @@ def stage(tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOu
             }
         )
     if position >= MOST_STAGED:
-        raise Invalid(f"An attempt can stage at most {MOST_STAGED} results.", code="too-many")
+        raise InvalidProblem(f"An attempt can stage at most {MOST_STAGED} results.", code="too-many")
     tx.execute(insert(staged_output), rows)
     faults.point("stage.before_commit")
     return position + 1
@@ -123,7 +124,7 @@ def _pinned_source(role: str, source: ItemInput, pins: PinnedInputs) -> list[Any
         return [source.item, source.revision]
     asked = "" if source.revision is None else f" at revision {source.revision}"
     known = f"; it is there at {', '.join(map(str, given))}" if given else ""
-    raise Invalid(f"{source.item}{asked} is not among the job's inputs {role!r}{known}.", code="no-input")
+    raise InvalidProblem(f"{source.item}{asked} is not among the job's inputs {role!r}{known}.", code="no-input")
 
 
 # -- publishing -------------------------------------------------------------------------------------------------------
@@ -234,12 +235,12 @@ def named_blobs(tree: Any) -> Iterator[str]:
 def keep_named_blobs(tx: Transaction, job_id: str, digests: set[str]) -> None:
     """Keep the blobs a job names, which the caller must be allowed to read.
 
-    Raises `Conflict` (`missing-blobs`) for those he has not sent and may not read.
+    Raises `ConflictProblem` (`missing-blobs`) for those he has not sent and may not read.
     """
     if not digests:
         return
     lacking = digests - blobs.readable(tx, digests)
     if lacking:
         detail = "The job names blobs that are not here; send them first."
-        raise Conflict(detail, code="missing-blobs", context={"missing": sorted(lacking)})
+        raise ConflictProblem(detail, code="missing-blobs", context={"missing": sorted(lacking)})
     blobs.keep_for_job(tx, job_id, digests)

@@ -15,7 +15,7 @@ from marey_schemas.jobs import Job, JobCreate, JobState
 from marey_schemas.pipelines import Pipeline, PipelineCreate, PipelineError, PipelineStep, job_of_step, order_steps
 from marey_schemas.problems import FieldError
 from marey_server import faults
-from marey_server.errors import Invalid
+from marey_server.errors import InvalidProblem
 from marey_server.field_errors import field_errors, json_pointer
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.ids import new_id
@@ -47,7 +47,7 @@ class Upstream(NamedTuple):
 def submit(tx: Transaction, project: str, requests: Sequence[JobCreate]) -> list[Job]:
     """Submit jobs to a project, all or none; the answer is in the order asked.
 
-    Raises `Invalid` with a pointer for each thing that makes no sense, and what `require` raises.
+    Raises `InvalidProblem` with a pointer for each thing that makes no sense, and what `require` raises.
     """
     row = require(tx, project)
     many = len(requests) > 1
@@ -121,7 +121,7 @@ def _check(
     except ValidationError as error:
         found = field_errors(error, request.params, lambda steps: f"{at}/params{json_pointer(steps)}")
         detail = f"These are no parameters of {kind.name}: {found[0].pointer}: {found[0].detail}"
-        raise Invalid(detail, errors=found) from error
+        raise InvalidProblem(detail, errors=found) from error
     pins = pin_inputs(tx, project, kind, request, known, at)
     if (clash := find_clash(kind, params, pins, request.into)) is not None:
         raise _invalid(f"{at}{clash.place}", clash.code, clash.detail)
@@ -148,8 +148,8 @@ def _count_tasks(kind: KindDeclaration, params: Any, at: str) -> int:
     return count
 
 
-def _invalid(pointer: str, code: str, detail: str) -> Invalid:
-    return Invalid(detail, errors=[FieldError(pointer=pointer, code=code, detail=detail)])
+def _invalid(pointer: str, code: str, detail: str) -> InvalidProblem:
+    return InvalidProblem(detail, errors=[FieldError(pointer=pointer, code=code, detail=detail)])
 
 
 def _lock_upstream(
@@ -234,14 +234,16 @@ def _insert_dependencies(tx: Transaction, submissions: Sequence[Submission], ups
 def submit_pipeline(tx: Transaction, project: str, pipeline: PipelineCreate) -> Pipeline:
     """Submit a job for each step. Those that work on what others make get their inputs when these have succeeded.
 
-    Raises `Invalid` with a pointer for each thing that makes no sense, and what `require` raises.
+    Raises `InvalidProblem` with a pointer for each thing that makes no sense, and what `require` raises.
     """
     row = require(tx, project)
     try:
         order = order_steps(pipeline)
     except PipelineError as error:
         detail = str(error)
-        raise Invalid(detail, errors=[FieldError(pointer=error.pointer, code=error.code, detail=detail)]) from error
+        raise InvalidProblem(
+            detail, errors=[FieldError(pointer=error.pointer, code=error.code, detail=detail)]
+        ) from error
     ids = {name: new_id("job") for name in order}
     places = {name: f"/steps/{name}" for name in order}
     requests = {places[name]: _placed(job_of_step(pipeline, name, ids), pipeline.steps[name]) for name in order}
