@@ -40,7 +40,7 @@ def skeleton_to_document(skeleton: Skeleton) -> skeletons.SkeletonHierarchy:
         )
     )
     sites = tuple(
-        skeletons.EndSite(joint=site.joint, offset=tuple(site.offset.tolist())) for site in skeleton.end_sites
+        skeletons.EndSiteDocument(joint=site.joint, offset=tuple(site.offset.tolist())) for site in skeleton.end_sites
     )
     return skeletons.SkeletonHierarchy(joints=joints, end_sites=sites)
 
@@ -57,10 +57,10 @@ def skeleton_from_document(document: skeletons.SkeletonHierarchy) -> Skeleton:
     )
 
 
-def clip_to_document(clip: Clip, skeleton: RevisionRef | OutputRef) -> clips.Motion:
+def clip_to_document(clip: Clip, skeleton: RevisionRef | OutputRef) -> clips.MotionDocument:
     """Part `motion` of a clip whose skeleton is stored as `skeleton`."""
     names = clip.skeleton.joint_names
-    return clips.Motion(
+    return clips.MotionDocument(
         skeleton=skeleton,
         frame_rate_hz=clip.frame_rate_hz,
         joints=names,
@@ -70,7 +70,7 @@ def clip_to_document(clip: Clip, skeleton: RevisionRef | OutputRef) -> clips.Mot
     )
 
 
-def clip_from_document(document: clips.Motion, skeleton: Skeleton) -> Clip:
+def clip_from_document(document: clips.MotionDocument, skeleton: Skeleton) -> Clip:
     """The clip of a `motion` part, with its rotations in the skeleton's order.
 
     `ClipError` where the document is not of this skeleton or its numbers are no motion.
@@ -105,8 +105,8 @@ def layer_to_document(
         clip=clip,
         layer=name,
         made_by=made_by,
-        segments=tuple(annotation_documents.Segment(**segment._asdict()) for segment in layer.segments),
-        keyframes=tuple(annotation_documents.Keyframe(**keyframe._asdict()) for keyframe in layer.keyframes),
+        segments=tuple(annotation_documents.SegmentDocument(**segment._asdict()) for segment in layer.segments),
+        keyframes=tuple(annotation_documents.KeyframeDocument(**keyframe._asdict()) for keyframe in layer.keyframes),
     )
 
 
@@ -126,7 +126,7 @@ def mapping_to_document(mapping: JointMapping, axes: Mapping[str, JointAxes]) ->
         method=mapping.method,
         confidence=mapping.confidence,
         joints=dict(mapping.joints),
-        axes={joint: skeletons.JointAxes(twist=one.twist, swing=one.swing) for joint, one in axes.items()},
+        axes={joint: skeletons.JointAxesDocument(twist=one.twist, swing=one.swing) for joint, one in axes.items()},
         notes=mapping.notes,
     )
 
@@ -175,7 +175,7 @@ def _angle_in_radians(name: str, value: Any) -> tuple[str, Any]:
     return f"{name.removesuffix('_deg')}_rad", math.radians(angles) if isinstance(angles, float | int) else angles
 
 
-def _orthonormal(joint: str, axes: skeletons.JointAxes) -> JointAxes:
+def _orthonormal(joint: str, axes: skeletons.JointAxesDocument) -> JointAxes:
     twist, swing = np.array(axes.twist), np.array(axes.swing)
     length = float(np.linalg.norm(twist))
     if not 0.0 < length < np.inf:

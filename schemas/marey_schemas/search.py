@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, StringConstraints, model_validator
 
 from marey_schemas.base import Answer, Request
-from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 
 MOST_CONSTRAINTS = 64
@@ -33,12 +33,12 @@ ItemId = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 # --- constraints -----------------------------------------------------------------------------------------------------
 
 
-class _Constraint(Request):
+class _SearchConstraint(Request):
     at: Moment = Field(description="Label of a keyframe of the model, start, end, or a canonical frame.")
     weight: Positive = Field(1.0, description="How much it counts.")
 
 
-class JointPositionConstraint(_Constraint):
+class JointPositionConstraint(_SearchConstraint):
     """A joint is at a place."""
 
     type: Literal["joint_position"]
@@ -49,7 +49,7 @@ class JointPositionConstraint(_Constraint):
     tolerance_cm: Tolerance = Field(1.0, description="The error that counts as 1.")
 
 
-class JointOrientationConstraint(_Constraint):
+class JointOrientationConstraint(_SearchConstraint):
     """A joint is turned so."""
 
     type: Literal["joint_orientation"]
@@ -58,7 +58,7 @@ class JointOrientationConstraint(_Constraint):
     tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1.")
 
 
-class LookDirectionConstraint(_Constraint):
+class LookDirectionConstraint(_SearchConstraint):
     """An axis of a joint points in a direction, or at a point."""
 
     type: Literal["look_direction"]
@@ -69,7 +69,7 @@ class LookDirectionConstraint(_Constraint):
     tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1.")
 
 
-class RootPositionConstraint(_Constraint):
+class RootPositionConstraint(_SearchConstraint):
     """The body stands over a place on the ground."""
 
     type: Literal["root_position"]
@@ -77,7 +77,7 @@ class RootPositionConstraint(_Constraint):
     tolerance_cm: Tolerance = Field(1.0, description="The error that counts as 1.")
 
 
-class RootHeadingConstraint(_Constraint):
+class RootHeadingConstraint(_SearchConstraint):
     """The body faces a heading on the ground."""
 
     type: Literal["root_heading"]
@@ -85,7 +85,7 @@ class RootHeadingConstraint(_Constraint):
     tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1.")
 
 
-class KeyframeTimeConstraint(_Constraint):
+class KeyframeTimeConstraint(_SearchConstraint):
     """A moment comes so long after the motion's beginning."""
 
     type: Literal["keyframe_time"]
@@ -211,4 +211,4 @@ class SearchAnswer(Answer):
         (), description="Places in `errors` that are off by more than 5 cm before inverse kinematics."
     )
     iterations: int = Field(description="Of the optimisation.")
-    motion: Motion | None = None
+    motion: MotionDocument | None = None

@@ -18,7 +18,7 @@ from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
 from marey_motion.documents import clip_from_document, skeleton_from_document
 from marey_motion.kinematics import global_positions
-from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree
 
 pytestmark = pytest.mark.timeout(600)
@@ -92,6 +92,6 @@ def motion_in(uploaded: Uploaded, clip: ClipHandle, form: str) -> dict[str, obje
 
 def positions_of(lab: ProjectHandle, clip: ClipHandle) -> NDArray[np.float32]:
     """(F, J, 3) metres, by the clip's own documents."""
-    motion = Motion.model_validate(clip.part("motion"))
+    motion = MotionDocument.model_validate(clip.part("motion"))
     skeleton = lab.skeletons.get(motion.skeleton.model_dump()["item"])
     return global_positions(clip_from_document(motion, skeleton_from_document(skeleton.hierarchy())))

@@ -27,6 +27,7 @@ from marey_worker.child_process import ChildProcess
 from marey_worker.heartbeats import LeaseKeeper
 from marey_worker.job_io.input_cache import InputCache
 from marey_worker.messages import (
+    ChildReply,
     Done,
     Failed,
     Made,
@@ -35,7 +36,6 @@ from marey_worker.messages import (
     ReadItem,
     ReadPart,
     ReadResults,
-    Reply,
     Request,
     Run,
     Stage,
@@ -52,7 +52,7 @@ LOG_LIMIT_BYTES = 64 * MIB
 TRANSFERS_AT_ONCE = 4
 
 
-class JobLog:
+class LogUploader:
     """The file a job prints to, and how much of it the server has.
 
     The log of the attempt is this file from its start, so that the server's word how long it is tells where to go on,
@@ -114,7 +114,7 @@ class Watch:
     lease: Lease
     keeper: LeaseKeeper
     stopping: threading.Event
-    job_log: JobLog
+    job_log: LogUploader
     started: float
     weighed: float = 0.0
 
@@ -149,7 +149,7 @@ class Watch:
         }[stop]
 
 
-class Attempt:
+class RunningAttempt:
     """Runs one lease to its end."""
 
     def __init__(
@@ -168,7 +168,7 @@ class Attempt:
         self._server = server
         self._threads = threads
         self._scratch = Path(tempfile.mkdtemp(prefix="marey-job-"))
-        self._job_log = JobLog(api, self._scratch / "log")
+        self._job_log = LogUploader(api, self._scratch / "log")
         self._keeper = LeaseKeeper(api, lease)
         self._watch = Watch(lease, self._keeper, stopping, self._job_log, time.monotonic())
         self._transfers = ThreadPoolExecutor(TRANSFERS_AT_ONCE, thread_name_prefix="marey-transfer")
@@ -225,11 +225,11 @@ class Attempt:
     def _serve(self, request: Request, child: ChildProcess) -> None:
         """Do one thing the child asked for, and answer."""
         try:
-            child.send(Reply(request.request, self._carried_out(request)))
+            child.send(ChildReply(request.request, self._carried_out(request)))
         except LeaseLost:
             self._keeper.lost.set()
         except Exception as error:  # noqa: BLE001 - whatever happened, the child waits for an answer
-            child.send(Reply(request.request, refusal=str(error), missing=isinstance(error, NotFound)))
+            child.send(ChildReply(request.request, refusal=str(error), missing=isinstance(error, NotFound)))
 
     def _carried_out(self, request: Request) -> Any:
         match request:

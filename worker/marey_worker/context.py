@@ -14,7 +14,18 @@ from marey_schemas.items import Item
 from marey_schemas.jobs import Progress
 from marey_schemas.kinds import Kind
 from marey_schemas.worker_protocol import PinnedInput, StagedOutput, StageRequest
-from marey_worker.messages import Made, PutFile, ReadBlob, ReadItem, ReadPart, ReadResults, Reply, Request, Run, Stage
+from marey_worker.messages import (
+    ChildReply,
+    Made,
+    PutFile,
+    ReadBlob,
+    ReadItem,
+    ReadPart,
+    ReadResults,
+    Request,
+    Run,
+    Stage,
+)
 
 T = TypeVar("T")
 
@@ -67,7 +78,7 @@ class Context:
         self.threads = run.threads
         self.scratch: Path = run.scratch
         self._pipe = pipe
-        self._replies: dict[int, Reply] = {}
+        self._replies: dict[int, ChildReply] = {}
         self._staging: deque[int] = deque()
 
     # -- reading --
@@ -159,7 +170,7 @@ class Context:
     def _value(self, request: int, missing: str = "not-found") -> Any:
         """What was answered. Raises `NoSuchThing` with the code `missing`, and `RequestRefused`."""
         while request not in self._replies:
-            reply: Reply = self._pipe.recv()
+            reply: ChildReply = self._pipe.recv()
             self._replies[reply.request] = reply
         reply = self._replies.pop(request)
         if reply.refusal is not None:

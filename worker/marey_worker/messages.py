@@ -33,7 +33,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Reply:
+class ChildReply:
     """The answer to a request: bytes, a digest or nothing; or why it was not carried out."""
 
     request: int

@@ -19,7 +19,7 @@ from marey_client.transport import Transport
 from marey_schemas.job_kinds import job_kinds
 from marey_schemas.worker_protocol import ClaimRequest, Lease
 from marey_worker import faults
-from marey_worker.attempt import Attempt, Stop
+from marey_worker.attempt import RunningAttempt, Stop
 from marey_worker.attempt_api import AttemptApi, claim
 from marey_worker.child_process import ChildBroken, ChildProcess
 from marey_worker.job_io.input_cache import InputCache
@@ -138,7 +138,7 @@ class Supervisor:
             faults.point("worker.after_claim")
             log.info("%s: %s, attempt %d", lease.job, lease.kind, lease.attempt)
             api = AttemptApi(self._transport, lease)
-            end = Attempt(
+            end = RunningAttempt(
                 api, lease, self._cache, self._transport.url, self._stopping, threads=self._options.threads_of_a_slot
             ).run(child)
             self._interrupted |= end is Stop.INTERRUPTED

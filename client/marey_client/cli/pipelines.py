@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address, require_item
+from marey_client.cli.annotating import Method
 from marey_client.cli.failures import Refused, WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.jobs import clips_at, json_or_text
@@ -29,14 +30,6 @@ COUNTED = ("clips", "annotations", "frames", "samples", "nodes")
 REFUSED_SHOWN = 3
 
 STEPS = ("import", "annotate", "cut", "align", "model", "tree")
-
-
-class Method(StrEnum):
-    """How annotations are proposed."""
-
-    STEPS = "steps"
-    VELOCITY_MINIMA = "velocity_minima"
-    WRIST_CONTACT = "wrist_contact"
 
 
 class Cache(StrEnum):

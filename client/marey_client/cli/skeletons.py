@@ -61,7 +61,7 @@ def joint_axes(
     as_json: AsJson = False,
 ) -> None:
     """Show the twist and swing axes of joints, or change those of one."""
-    from marey_schemas.documents.skeletons import JointAxes
+    from marey_schemas.documents.skeletons import JointAxesDocument
     from marey_schemas.kinds import Kind
 
     with connect(context) as marey:
@@ -71,7 +71,7 @@ def joint_axes(
             if joint not in mapping.axes:
                 raise WrongUsage(f"{joint!r} has no axes; marey skeleton axes {place} shows the joints that have")
             old = mapping.axes[joint]
-            new = JointAxes(twist=_vector(twist) or old.twist, swing=_vector(swing) or old.swing)
+            new = JointAxesDocument(twist=_vector(twist) or old.twist, swing=_vector(swing) or old.swing)
             mapping = mapping.model_copy(update={"axes": {**mapping.axes, joint: new}, "method": "manual"})
             item = found.put_mapping(mapping)
             tell(f"{place}: revision {item.revision}")

@@ -14,14 +14,14 @@ from marey_client.handles.edits import Commands, preview_edit
 from marey_client.items import ItemHandle, Items
 from marey_client.one_or_several import several
 from marey_schemas.documents.annotations import Annotation
-from marey_schemas.documents.clips import ClipInfo, Motion
+from marey_schemas.documents.clips import ClipInfo, MotionDocument
 from marey_schemas.editing.annotation_commands import AnnotationImport
 from marey_schemas.editing.previews import EditPreview
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 
 
-class MotionArrays(Motion):
+class MotionArrays(MotionDocument):
     """The poses of a clip, or of some of its frames and joints.
 
     Metres, right-handed with Y up; quaternions w, x, y, z. Members a newer server adds are ignored.
@@ -62,7 +62,7 @@ class ClipHandle(ItemHandle):
         """Make a revision with another description; the poses are shared."""
         return self.put_part("info", info.model_dump(mode="json", by_alias=True))
 
-    def put_motion(self, motion: Motion, *, message: str | None = None) -> Item:
+    def put_motion(self, motion: MotionDocument, *, message: str | None = None) -> Item:
         """Make a revision with other poses; `PreconditionFailed` if the clip was changed since it was read."""
         return self.put_part("motion", motion.model_dump(by_alias=True, exclude_none=True), message=message)
 

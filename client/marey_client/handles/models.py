@@ -16,7 +16,7 @@ from marey_client.downloads import download, safe_file_name, saved_atomically
 from marey_client.handles.clips import ClipHandle, MotionArrays
 from marey_client.handles.searches import SearchableHandle
 from marey_client.items import Items
-from marey_schemas.documents.clips import ClipInfo, Source
+from marey_schemas.documents.clips import ClipInfo, ClipSource
 from marey_schemas.encoding.codecs import JSON, encode_tree
 from marey_schemas.kinds import Kind
 
@@ -98,7 +98,7 @@ class ModelHandle(SearchableHandle):
         made = []
         for place, motion in enumerate(tree["motions"], start=1):
             details = {"model": tree["model"], "seed": seed, "place": place}
-            info = ClipInfo(action=self.name, source=Source(format="sampled", details=details))
+            info = ClipInfo(action=self.name, source=ClipSource(format="sampled", details=details))
             parts = {"motion": motion, "info": info.model_dump(mode="json", by_alias=True, exclude_none=True)}
             name = f"{names or self.name}_{seed}_{place:04d}"
             made.append(clips.create(name, parts, collection=into, tags=tags))

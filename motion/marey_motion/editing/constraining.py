@@ -15,7 +15,7 @@ from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Floats, Ints
 from marey_motion.editing.allowance import PER_MEETING, PER_MET_NUMBER, Allowance
 from marey_motion.editing.displacement import displace, windows_around
-from marey_motion.editing.inverse_kinematics.solving import Limb, Solver, limb_targets, measure_residuals, solve
+from marey_motion.editing.inverse_kinematics.solving import Solver, TwoBoneLimb, limb_targets, measure_residuals, solve
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     LookAtTarget,
@@ -52,7 +52,7 @@ class Constraint:
     start: int
     stop: int
     joints: tuple[int, ...]
-    limb: Limb | None = None
+    limb: TwoBoneLimb | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +210,7 @@ class _Cluster:
         ).motion
 
     def _work(
-        self, frames: int, constraints: Sequence[Constraint], limb: Limb | None, joints: tuple[int, ...]
+        self, frames: int, constraints: Sequence[Constraint], limb: TwoBoneLimb | None, joints: tuple[int, ...]
     ) -> float:
         """Of solving these frames, where nothing can be reached."""
         limited, asked = bool(self.freedom.limits), limb_targets([one.target for one in constraints], limb)

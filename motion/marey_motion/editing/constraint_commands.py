@@ -23,7 +23,7 @@ from marey_motion.editing.inverse_kinematics.targets import (
     Target,
     chain_of,
 )
-from marey_motion.editing.take import Finding, Take
+from marey_motion.editing.take import EditFinding, Take
 from marey_motion.errors import EditError, MappingError, MotionError
 from marey_motion.rigs import JointAxes, guess_axes
 
@@ -74,7 +74,7 @@ def constrain(
             constraints, wanted, made.residuals_before, made.residuals_after, strict=True
         )
     ]
-    return take.moved(made.motion).with_finding(Finding("constrain", {"constraints": found}))
+    return take.moved(made.motion).with_finding(EditFinding("constrain", {"constraints": found}))
 
 
 def plant_feet(
@@ -104,7 +104,7 @@ def plant_feet(
         "slide_after_m": made.slide_after_m,
         "lowered_m": made.lowered_m,
     }
-    return take.moved(made.motion).with_finding(Finding("plant_feet", values))
+    return take.moved(made.motion).with_finding(EditFinding("plant_feet", values))
 
 
 class _Rig:

@@ -21,7 +21,7 @@ from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Flags, Floats
 from marey_motion.editing.annotations.contacts import runs, without_short
 from marey_motion.editing.displacement import spread_displacements, windows_around
-from marey_motion.editing.inverse_kinematics.solving import Limb, solve_two_bone
+from marey_motion.editing.inverse_kinematics.solving import TwoBoneLimb, solve_two_bone
 from marey_motion.editing.inverse_kinematics.targets import OrientationTarget, PositionTarget
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion
@@ -36,7 +36,7 @@ SHORTEST_LOWERING_M = 1e-9
 class Foot:
     """One foot: its leg and its toe joint, which is the ankle where there is none."""
 
-    leg: Limb
+    leg: TwoBoneLimb
     toe: int
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from marey_motion.arrays import Floats
 from marey_motion.editing.annotations.contacts import ContactOptions, Stance, find_stances
 from marey_motion.editing.placement import translate
-from marey_motion.editing.take import Finding, Take
+from marey_motion.editing.take import EditFinding, Take
 from marey_motion.importing.checks import sole_points
 from marey_motion.kinematics import forward_kinematics
 
@@ -38,12 +38,12 @@ def move_to_ground(take: Take, *, height_m: float | None = None) -> Take:
     """
     ground = estimate_ground(take) if height_m is None else Ground(height_m, 0)
     moved = translate(take, shift_m=(0.0, -ground.height_m, 0.0))
-    return moved if height_m is not None else moved.with_finding(Finding("move_to_ground", ground._asdict()))
+    return moved if height_m is not None else moved.with_finding(EditFinding("move_to_ground", ground._asdict()))
 
 
 def find_ground(take: Take) -> Take:
     """Note the height of the ground. Raises `MappingError` where the feet are not known."""
-    return take.with_finding(Finding("find_ground", estimate_ground(take)._asdict()))
+    return take.with_finding(EditFinding("find_ground", estimate_ground(take)._asdict()))
 
 
 def find_contacts(
@@ -80,7 +80,7 @@ def find_contacts(
     ]
     segments.sort(key=lambda one: (one["start"], one["label"]))
     values = {"frame_count": take.frame_count, "frame_rate_hz": take.frame_rate_hz, "segments": segments}
-    return take.with_finding(Finding("find_contacts", values))
+    return take.with_finding(EditFinding("find_contacts", values))
 
 
 def estimate_ground(take: Take) -> Ground:

@@ -25,7 +25,7 @@ from marey_motion.editing.joints import paste, rotate_joint
 from marey_motion.editing.loops import close_loop
 from marey_motion.editing.placement import face, fix_drift, flip_axes, mirror, move_to_origin, rotate, scale, translate
 from marey_motion.editing.smoothing import smooth
-from marey_motion.editing.take import MOST_NUMBERS, EditedBody, Finding, Take, motion_of, require_finite, settled
+from marey_motion.editing.take import MOST_NUMBERS, EditedBody, EditFinding, Take, motion_of, require_finite, settled
 from marey_motion.errors import EditError, MotionError
 from marey_motion.motion import Motion
 
@@ -75,7 +75,7 @@ class EditedClip:
 
     clip: Clip
     pieces: tuple[int, ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[EditFinding, ...]
 
 
 def edit_clip(

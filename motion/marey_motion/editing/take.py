@@ -71,7 +71,7 @@ class EditedBody:
 
 
 @dataclass(frozen=True)
-class Finding:
+class EditFinding:
     """What a command found out about the motion as it was when its turn came.
 
     Parameters
@@ -104,7 +104,7 @@ class Take:
     frame_rate_hz: float
     body: EditedBody
     sources: Mapping[str, Clip] = field(default_factory=lambda: MappingProxyType({}))
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[EditFinding, ...] = ()
     pieces: tuple[int, ...] = ()
     most_numbers: int = MOST_NUMBERS
     allowance: Allowance = field(default_factory=Allowance)
@@ -129,7 +129,7 @@ class Take:
         """With another motion of the same body and frame rate."""
         return replace(self, motion=motion)
 
-    def with_finding(self, finding: Finding) -> Take:
+    def with_finding(self, finding: EditFinding) -> Take:
         """With one finding more."""
         return replace(self, findings=(*self.findings, finding))
 

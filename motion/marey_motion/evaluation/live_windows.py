@@ -29,7 +29,7 @@ from marey_motion.matching.simulation_root import (
 LEAST_RATE_HZ, MOST_RATE_HZ = 10.0, 240.0
 
 
-class Take(NamedTuple):
+class LiveTake(NamedTuple):
     """What is remembered of the take under way: rings in which frame f of the take is at f modulo their length.
 
     Parameters
@@ -134,8 +134,8 @@ class LiveWindows:
     def _duration_s(self) -> float:
         return self._span / self.rate_hz
 
-    def _empty_take(self) -> Take:
-        return Take(
+    def _empty_take(self) -> LiveTake:
+        return LiveTake(
             raw=np.zeros((len(self._filters.directions), 4)),
             steps=np.zeros((self._span, 3)),
             headings=np.zeros(self._span + 1),

@@ -41,7 +41,7 @@ AWAY_DECIMALS = 1
 
 
 @dataclass(frozen=True)
-class Performer:
+class PerformerState:
     """Where the performer is in the newest frame, and how he moves by the newest window, which is None at first.
 
     Ground position in metres, heading in radians, strafe positive to the left.
@@ -159,13 +159,13 @@ class OnlineCoverage:
         return float(np.mean(self.deficit_s == 0.0))
 
     @property
-    def performer(self) -> Performer | None:
+    def performer(self) -> PerformerState | None:
         """Where he is and how he moves; None where no take is under way."""
         newest = self._live.newest_frame
         if newest is None:
             return None
         x, z, facing_x, facing_z = newest.tolist()
-        return Performer(x, z, float(np.arctan2(facing_x, facing_z)), self._live.newest_window)
+        return PerformerState(x, z, float(np.arctan2(facing_x, facing_z)), self._live.newest_window)
 
     def targets(self, count: int, *, path_s: float = 4.0) -> tuple[Target, ...]:
         """The cells that lack data and are nearest to how the performer moves, or to standing still, nearest first.

@@ -16,7 +16,7 @@ from marey_motion.formats.bvh_writer import write_bvh
 from marey_motion.formats.euler import NO_COLUMN, rotations_from_euler
 from marey_motion.formats.frame_times import frame_rate_of
 from marey_motion.formats.joint_names import unique_names
-from marey_motion.formats.numeric_text import BadToken, scan_numbers
+from marey_motion.formats.numeric_text import BadNumber, scan_numbers
 from marey_motion.formats.text_lines import TextLines, number_problem
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.importing.source import SourceMotion
@@ -106,7 +106,7 @@ def _read_frames(
     text = np.frombuffer(lines.data, np.uint8, offset=min(header.data_start, len(lines.data)))
     try:
         table = scan_numbers(text, width, header.data_line)
-    except BadToken as bad:
+    except BadNumber as bad:
         lines.number = bad.line
         joint, channel = columns.labels[bad.index % width] if width else (0, "value")
         raise lines.error(

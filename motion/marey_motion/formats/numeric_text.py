@@ -40,7 +40,7 @@ class NumberTable:
     last_line: int
 
 
-class BadToken(ValueError):
+class BadNumber(ValueError):
     """A token that is no finite decimal number: its text, its line and which value of the block it stands for."""
 
     def __init__(self, token: str, line: int, index: int, in_line: int) -> None:
@@ -201,14 +201,14 @@ def _read_long_tokens(text: NDArray[np.uint8], tokens: NDArray[np.int64], values
         token = text[start:stop].tobytes()
         value = float(token)
         if value in (float("inf"), float("-inf")):
-            raise BadToken(excerpt(token), line, index, in_line)
+            raise BadNumber(excerpt(token), line, index, in_line)
         values[index] = value
 
 
-def _bad_token_at(text: NDArray[np.uint8], state: NDArray[np.int64]) -> BadToken:
+def _bad_token_at(text: NDArray[np.uint8], state: NDArray[np.int64]) -> BadNumber:
     start = int(state[_POSITION])
     words = text[start : start + 64].tobytes().split(maxsplit=1)
-    return BadToken(excerpt(words[0]), int(state[_LINE]), int(state[_VALUES]), int(state[_IN_LINE]))
+    return BadNumber(excerpt(words[0]), int(state[_LINE]), int(state[_VALUES]), int(state[_IN_LINE]))
 
 
 def excerpt(token: bytes) -> str:

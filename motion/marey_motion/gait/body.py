@@ -29,7 +29,7 @@ SIDES = {"Left": 1, "Right": -1}
 
 
 @dataclass(frozen=True)
-class Moments:
+class GaitMoments:
     """What drives the pose at n evenly spaced moments.
 
     Parameters
@@ -69,7 +69,7 @@ def padding_frames(frame_rate_hz: float) -> int:
 
 
 def pose_body(
-    skeleton: Skeleton, style: GaitStyle, moments: Moments, feet: Mapping[str, FootMotion]
+    skeleton: Skeleton, style: GaitStyle, moments: GaitMoments, feet: Mapping[str, FootMotion]
 ) -> tuple[AnyFloats, AnyFloats]:
     """Root positions (n, 3) in metres and global rotations (n, J, 4) of the studio skeleton's joints.
 
@@ -105,7 +105,7 @@ def _shank_m(skeleton: Skeleton) -> float:
     return -float(_offset(skeleton, "LeftFoot")[1])
 
 
-def _pelvis(style: GaitStyle, moments: Moments) -> AnyFloats:
+def _pelvis(style: GaitStyle, moments: GaitMoments) -> AnyFloats:
     """The heading, exactly, and a tilt that drops the side of the swinging leg; it leaves forward and left in place."""
     speeds = moments.settled(moments.root.speeds)
     tilts = style.bounce * 0.06 * eased(speeds / 1.4) * np.cos(2.0 * np.pi * moments.phases)
@@ -123,7 +123,7 @@ def _ankle(skeleton: Skeleton, side: str, foot: FootMotion, rotations: dict[str,
 def _pelvis_heights(
     skeleton: Skeleton,
     style: GaitStyle,
-    moments: Moments,
+    moments: GaitMoments,
     pelvis: AnyFloats,
     ankles: Mapping[str, AnyFloats],
     loaded: Mapping[str, NDArray[np.bool_]],
@@ -180,7 +180,7 @@ def _bend_leg(
         rotations[joint] = quaternions.from_matrix(np.stack((hinge, y, np.cross(hinge, y)), axis=-1))
 
 
-def _pose_trunk(style: GaitStyle, moments: Moments, rotations: dict[str, AnyFloats]) -> None:
+def _pose_trunk(style: GaitStyle, moments: GaitMoments, rotations: dict[str, AnyFloats]) -> None:
     """Lean into speed and turns, shoulders against the legs, a head that looks ahead."""
     root = moments.root
     forward = moments.settled(root.speeds * np.cos(root.travel_angles))
@@ -200,7 +200,7 @@ def _pose_trunk(style: GaitStyle, moments: Moments, rotations: dict[str, AnyFloa
     rotations["Head"] = _turned("yzx", root.headings + 0.15 * slow[0], -0.3 * bank, 0.2 * lean + 0.06 * slow[2])
 
 
-def _pose_arm(style: GaitStyle, moments: Moments, side: str, sign: int, rotations: dict[str, AnyFloats]) -> None:
+def _pose_arm(style: GaitStyle, moments: GaitMoments, side: str, sign: int, rotations: dict[str, AnyFloats]) -> None:
     """Arms that swing against the legs from hanging shoulders; elbows bend with speed."""
     speeds = moments.settled(moments.root.speeds)
     swing = style.arm_swing * sign * np.sin(2.0 * np.pi * moments.phases)
@@ -218,13 +218,13 @@ def _pose_arm(style: GaitStyle, moments: Moments, side: str, sign: int, rotation
     rotations[side + "HandMiddle1"] = quaternions.multiply(rotations[side + "Hand"], _turned("z", curl))
 
 
-def _shoulder_twist(style: GaitStyle, moments: Moments) -> AnyFloats:
+def _shoulder_twist(style: GaitStyle, moments: GaitMoments) -> AnyFloats:
     speeds = moments.settled(moments.root.speeds)
     size = styles.blended(0.10 * eased(speeds / 1.4), 0.14, speeds)
     return np.asarray(-style.sway * size * np.sin(2.0 * np.pi * moments.phases))
 
 
-def _drift(style: GaitStyle, moments: Moments, which: int) -> AnyFloats:
+def _drift(style: GaitStyle, moments: GaitMoments, which: int) -> AnyFloats:
     """A slow wave (n,) between -1 and 1, each with its own period and phase."""
     period_s = (9.1, 6.7, 4.9)[which]
     return np.asarray(np.sin(2.0 * np.pi * moments.times_s / period_s + style.wander_phases_rad[which]))

@@ -13,7 +13,7 @@ from marey_motion import kinematics, quaternions
 from marey_motion.arrays import AnyFloats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
-from marey_motion.gait.body import SIDES, Moments, padding_frames, pose_body
+from marey_motion.gait.body import SIDES, GaitMoments, padding_frames, pose_body
 from marey_motion.gait.footfalls import Cadence, Footfalls, FootMotion, FootShape
 from marey_motion.gait.path import PathSegment, RootPath, start_and_stop, straight_or_arc
 from marey_motion.gait.skeletons import STUDIO_STATURE_M, studio_skeleton
@@ -85,7 +85,7 @@ def generate_along(
     padding = padding_frames(frame_rate_hz)
     size = stature_m / STUDIO_STATURE_M
     path, times = _at_studio_size(path, np.arange(-padding, frames + padding) / frame_rate_hz, size)
-    moments = Moments(times, Cadence(path, style).phase_at(times), path.at(times))
+    moments = GaitMoments(times, Cadence(path, style).phase_at(times), path.at(times))
     positions, rotations = pose_body(studio_skeleton(), style, moments, _feet(path, style, times))
     wanted = slice(padding, padding + frames)
     local = quaternions.unroll(kinematics.as_local_rotations(skeleton, rotations[wanted]))

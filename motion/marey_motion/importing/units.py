@@ -57,7 +57,7 @@ class Conversion:
 
 
 @dataclass
-class _Body:
+class _Measurements:
     """What is measured on the file, in its own unit and axes.
 
     `positions` (F, J, 3) of sampled frames and `rest` (J, 3); `leg` is None without two feet.
@@ -91,7 +91,7 @@ def infer_conversion(source: SourceMotion, landmarks: Landmarks, file: str, opti
     return Conversion(unit_scale_m, up_axis, options.handedness, tuple(body.evidence), tuple(body.warnings))
 
 
-def _measure(source: SourceMotion, landmarks: Landmarks, file: str) -> _Body:
+def _measure(source: SourceMotion, landmarks: Landmarks, file: str) -> _Measurements:
     skeleton = source.skeleton
     rest = skeleton.rest_global_positions
     positions: NDArray[np.floating[Any]] = rest[None]
@@ -108,13 +108,13 @@ def _measure(source: SourceMotion, landmarks: Landmarks, file: str) -> _Body:
     leg = None
     if landmarks.feet and landmarks.hips is not None:
         leg = float(np.mean([path_length(skeleton, landmarks.hips, foot) for foot in landmarks.feet]))
-    return _Body(file, landmarks, positions.astype(np.float64), rest, leg or None)
+    return _Measurements(file, landmarks, positions.astype(np.float64), rest, leg or None)
 
 
 # Up axis
 
 
-def _choose_up_axis(source: SourceMotion, body: _Body, options: ImportOptions) -> UpAxis:
+def _choose_up_axis(source: SourceMotion, body: _Measurements, options: ImportOptions) -> UpAxis:
     if options.up_axis is not None:
         body.evidence.append(f"up axis {options.up_axis}: given by the user")
         return options.up_axis
@@ -137,7 +137,7 @@ def _choose_up_axis(source: SourceMotion, body: _Body, options: ImportOptions) -
     return _settle_up_axis(body, *standing, flat)
 
 
-def _settle_up_axis(body: _Body, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
+def _settle_up_axis(body: _Measurements, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
     """Decide where the body does not simply stand along y: it may lie or climb, or the file may have another axis."""
     rest_axis, rest_cosine = _body_axis(body.rest[None], body.landmarks)
     standing, resting = f"mean direction from feet to head is {axis} with cosine {cosine:.2f}", _FOLDED
@@ -196,7 +196,7 @@ def _mean_direction(ways: NDArray[np.float64]) -> NDArray[np.float64]:
     return mean
 
 
-def _flat_axis(body: _Body) -> tuple[UpAxis, str] | None:
+def _flat_axis(body: _Measurements) -> tuple[UpAxis, str] | None:
     """The axis along which the lowest of feet and hands hardly moves while along the others it does."""
     limbs = [*body.landmarks.ground_joints, *(body.landmarks.hands or ())]
     assert body.leg is not None
@@ -213,7 +213,7 @@ def _flat_axis(body: _Body) -> tuple[UpAxis, str] | None:
     return name, f"heights of the lowest limb spread by {x:.2f}, {y:.2f}, {z:.2f} leg lengths along x, y, z"
 
 
-def _stands_on_origin(body: _Body, axis: UpAxis) -> bool:
+def _stands_on_origin(body: _Measurements, axis: UpAxis) -> bool:
     """Whether a ground through the origin, orthogonal to the axis, passes just under the body."""
     assert body.leg is not None
     lowest = _heights(body.positions, axis).min(axis=1)
@@ -233,7 +233,7 @@ def _heights(positions: NDArray[np.float64], up_axis: UpAxis) -> NDArray[np.floa
 # Unit
 
 
-def _choose_unit(source: SourceMotion, body: _Body, options: ImportOptions, up_axis: UpAxis) -> float:
+def _choose_unit(source: SourceMotion, body: _Measurements, options: ImportOptions, up_axis: UpAxis) -> float:
     hip_height = _hip_height(body, up_axis)
     if options.unit_scale_m is not None:
         body.evidence.append(
@@ -255,7 +255,7 @@ def _choose_unit(source: SourceMotion, body: _Body, options: ImportOptions, up_a
     return _unit_of_leg(body, hip_height, up_axis)
 
 
-def _unit_of_leg(body: _Body, hip_height: float, up_axis: UpAxis) -> float:
+def _unit_of_leg(body: _Measurements, hip_height: float, up_axis: UpAxis) -> float:
     assert body.leg is not None
     (low, high), known, reason = LEG_LENGTH_M, tuple(UNITS_M), "legs"
     if _walks_on_hands(body, up_axis):
@@ -279,7 +279,7 @@ def _unit_of_leg(body: _Body, hip_height: float, up_axis: UpAxis) -> float:
     return scale
 
 
-def _ambiguous_unit(body: _Body, hip_height: float) -> AmbiguousUnits:
+def _ambiguous_unit(body: _Measurements, hip_height: float) -> AmbiguousUnits:
     assert body.leg is not None
     by_fit = sorted(UNITS_M, key=lambda name: abs(np.log((body.leg or 1.0) * UNITS_M[name] / 0.9)))
     listed = [
@@ -299,7 +299,7 @@ def _is_leg(length_m: float) -> bool:
     return LEG_LENGTH_M[0] <= length_m <= LEG_LENGTH_M[1]
 
 
-def _hip_height(body: _Body, up_axis: UpAxis) -> float:
+def _hip_height(body: _Measurements, up_axis: UpAxis) -> float:
     """How high the hips mostly are above the ground, in the file's unit; 0 without feet."""
     if body.leg is None:
         return 0.0
@@ -317,7 +317,7 @@ def _as_hips(hip_height: float, scale: float) -> str:
     return f", hips {hip_height * scale:.2f} m above the ground" if hip_height > 0 else ""
 
 
-def _walks_on_hands(body: _Body, up_axis: UpAxis) -> bool:
+def _walks_on_hands(body: _Measurements, up_axis: UpAxis) -> bool:
     if body.landmarks.hands is None or body.leg is None:
         return False
     heights = _heights(body.positions, up_axis)
@@ -326,7 +326,7 @@ def _walks_on_hands(body: _Body, up_axis: UpAxis) -> bool:
     return bool(np.median(hands - feet) < 0.25 * body.leg)
 
 
-def _stands_on_all_fours(body: _Body, up_axis: UpAxis) -> bool:
+def _stands_on_all_fours(body: _Measurements, up_axis: UpAxis) -> bool:
     """Whether hands and feet stand on one ground well below the hips, as a body's sides never do."""
     assert body.leg is not None
     return _walks_on_hands(body, up_axis) and _hip_height(body, up_axis) > 0.5 * body.leg
@@ -335,7 +335,7 @@ def _stands_on_all_fours(body: _Body, up_axis: UpAxis) -> bool:
 # Handedness
 
 
-def _look_for_mirroring(source: SourceMotion, body: _Body, options: ImportOptions, up_axis: UpAxis) -> None:
+def _look_for_mirroring(source: SourceMotion, body: _Measurements, options: ImportOptions, up_axis: UpAxis) -> None:
     """Warn where left is on the right: with up and the way the feet point, the left foot must be to the left."""
     landmarks = body.landmarks
     if landmarks.feet is None or landmarks.toes is None or options.handedness == "left":

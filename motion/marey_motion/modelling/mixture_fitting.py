@@ -49,7 +49,7 @@ class MixtureOptions:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class MixtureCandidate:
     """A mixture of so many components, as the criterion sees it.
 
     Parameters
@@ -83,7 +83,7 @@ class FittedMixture:
 
     mixture: LatentMixture
     method: Literal["em", "shrunk", "point"]
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[MixtureCandidate, ...]
     held_out: Floats | None
 
 
@@ -135,7 +135,7 @@ class _Fitting:
     options: MixtureOptions
     seed: int
 
-    def choose(self) -> tuple[LatentMixture, list[Candidate], Floats | None]:
+    def choose(self) -> tuple[LatentMixture, list[MixtureCandidate], Floats | None]:
         """The mixture, what was tried, and the held-out likelihood of the examples."""
         examples, dimensions = self.latents.shape
         if examples <= dimensions + 1:
@@ -148,13 +148,13 @@ class _Fitting:
         chosen, held_out = self._best(candidates)
         return fits[chosen][0], list(candidates.values()), held_out
 
-    def _judged(self, count: int, mixture: LatentMixture, converged: bool) -> Candidate:
+    def _judged(self, count: int, mixture: LatentMixture, converged: bool) -> MixtureCandidate:
         examples, dimensions = self.latents.shape
         likelihood = float(mixture.log_density(self.latents).sum())
         numbers = count * (1 + dimensions + dimensions * (dimensions + 1) // 2) - 1
         smallest = float(mixture.weights.min())
         least = max(dimensions + 1, LEAST_EXAMPLES_PER_COMPONENT) / examples
-        return Candidate(
+        return MixtureCandidate(
             components=count,
             bic=numbers * float(np.log(examples)) - 2.0 * likelihood,
             aic=2.0 * numbers - 2.0 * likelihood,
@@ -164,7 +164,7 @@ class _Fitting:
             refusal="small-component" if count > 1 and smallest < least else "",
         )
 
-    def _best(self, candidates: dict[int, Candidate]) -> tuple[int, Floats | None]:
+    def _best(self, candidates: dict[int, MixtureCandidate]) -> tuple[int, Floats | None]:
         """The number of components with the best criterion that nothing speaks against; refusals are noted."""
         single = self._held_out(1)
         falling = sorted(candidates.values(), key=lambda one: getattr(one, self.options.criterion))
@@ -242,7 +242,7 @@ def _ordered(weights: Floats, means: Floats, covariances: Floats) -> LatentMixtu
     return LatentMixture(weights[order] / weights.sum(), means[order], symmetric[order])
 
 
-def _rescaled(candidate: Candidate, shift: float) -> Candidate:
+def _rescaled(candidate: MixtureCandidate, shift: float) -> MixtureCandidate:
     """In the units of the data; `shift` is the logarithm of the volume that all examples gain."""
     return replace(
         candidate,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from marey_motion.arrays import Floats
 from marey_motion.errors import ModelError
 from marey_motion.modelling.mixture import LatentMixture
-from marey_motion.modelling.mixture_fitting import Candidate
+from marey_motion.modelling.mixture_fitting import MixtureCandidate
 from marey_motion.modelling.primitive import FunctionalComponents, MotionPrimitive
 from marey_motion.modelling.reconstruction import ReconstructionErrors
 from marey_motion.modelling.sample_quality import FootQuality
@@ -103,7 +103,7 @@ def report_from_tree(tree: Mapping[str, Any]) -> TrainingReport | None:
         spatial_energy=training["spatial_energy"],
         temporal_energy=training["temporal_energy"],
         mixture_method=training["mixture_method"],
-        candidates=tuple(Candidate(**one) for one in training["candidates"]),
+        candidates=tuple(MixtureCandidate(**one) for one in training["candidates"]),
         log_likelihood=training["log_likelihood"],
         held_out_log_likelihood=training["held_out_log_likelihood"],
         examples=tuple(ExampleReport(**one) for one in training["examples"]),

@@ -11,7 +11,7 @@ from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.arrays import Floats
 from marey_motion.importing.landmarks import find_landmarks
 from marey_motion.modelling.fpca import PrincipalExamples
-from marey_motion.modelling.mixture_fitting import Candidate, FittedMixture
+from marey_motion.modelling.mixture_fitting import FittedMixture, MixtureCandidate
 from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.reconstruction import ReconstructionErrors, reconstruction_errors
@@ -77,7 +77,7 @@ class TrainingReport:
     spatial_energy: Floats
     temporal_energy: Floats
     mixture_method: str
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[MixtureCandidate, ...]
     log_likelihood: float
     held_out_log_likelihood: float | None
     examples: tuple[ExampleReport, ...]

@@ -112,14 +112,14 @@ def rest_pose_doubts(skeleton: Skeleton, mapping: JointMapping) -> tuple[str, ..
     return tuple(part for part in parts if part not in rest.readable_parts)
 
 
-def _resting_body(skeleton: Skeleton, mapping: JointMapping) -> _Body:
+def _resting_body(skeleton: Skeleton, mapping: JointMapping) -> _PosedBody:
     joints = {standard: skeleton.index_of(name) for standard, name in mapping.joints.items()}
     if not any({f"{side}_{joint}" for side in SIDES} <= joints.keys() for joint in ("hip", "shoulder")):
         raise MappingError("axes need both hips or both shoulders in the mapping", where="left_hip")
-    return _Body(skeleton, joints, skeleton.rest_global_positions[None], skeleton.rest_global_rotations[None])
+    return _PosedBody(skeleton, joints, skeleton.rest_global_positions[None], skeleton.rest_global_rotations[None])
 
 
-def _moving_body(skeleton: Skeleton, motion: Clip, joints: Mapping[str, int]) -> _Body:
+def _moving_body(skeleton: Skeleton, motion: Clip, joints: Mapping[str, int]) -> _PosedBody:
     if not same_hierarchy(skeleton, motion.skeleton):
         raise ClipError("the motion to read axes from is of another skeleton", where="motion")
     count = min(motion.frame_count, FRAMES_READ)
@@ -130,11 +130,11 @@ def _moving_body(skeleton: Skeleton, motion: Clip, joints: Mapping[str, int]) ->
         translations=None if motion.translations is None else motion.translations[frames],
     )
     positions = kinematics.global_positions(seen).astype(np.float64)
-    return _Body(skeleton, joints, positions, kinematics.global_rotations(seen).astype(np.float64))
+    return _PosedBody(skeleton, joints, positions, kinematics.global_rotations(seen).astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)
-class _Body:
+class _PosedBody:
     """A body over K frames: global positions (K, J, 3) and rotations (K, J, 4)."""
 
     skeleton: Skeleton
@@ -236,7 +236,7 @@ def _part(standard: str) -> str:
     return f"{side} leg" if joint in _LEG else f"{side} arm"
 
 
-def _twist(standard: str, body: _Body) -> Floats:
+def _twist(standard: str, body: _PosedBody) -> Floats:
     """Unit direction (3,) of a joint's bone in its frame."""
     side, _, joint = standard.partition("_")
     prefix, joint = (f"{side}_", joint) if side in SIDES else ("", standard)
@@ -266,7 +266,7 @@ def _tip(skeleton: Skeleton, joint: int) -> Floats | None:
     return max(ends, key=lambda end: float(np.linalg.norm(end))) if ends else None
 
 
-def _swing(standard: str, body: _Body) -> Floats:
+def _swing(standard: str, body: _PosedBody) -> Floats:
     """Global directions (K, 3) whose mean in the joint's frame is its swing axis."""
     side, _, joint = standard.partition("_")
     if side not in SIDES:
@@ -288,7 +288,7 @@ def _swing(standard: str, body: _Body) -> Floats:
     return _arm_hinge(side, joint, body)
 
 
-def _leg_hinge(side: str, body: _Body) -> Floats:
+def _leg_hinge(side: str, body: _PosedBody) -> Floats:
     """The axis a knee bends about, which turns the shank backwards; the body's left where it does not bend."""
     thigh, shank = body.way(f"{side}_hip", f"{side}_knee"), body.way(f"{side}_knee", f"{side}_ankle")
     if len(body.positions) > 1 and thigh is not None and shank is not None:
@@ -298,7 +298,7 @@ def _leg_hinge(side: str, body: _Body) -> Floats:
     return body.hips_left
 
 
-def _arm_hinge(side: str, joint: str, body: _Body) -> Floats:
+def _arm_hinge(side: str, joint: str, body: _PosedBody) -> Floats:
     """The axis an elbow stretches about; where it does not bend, left, carried along as the arm is raised."""
     upper, fore = body.way(f"{side}_shoulder", f"{side}_elbow"), body.way(f"{side}_elbow", f"{side}_wrist")
     if len(body.positions) > 1 and upper is not None and fore is not None:

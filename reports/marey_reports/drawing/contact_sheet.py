@@ -16,7 +16,7 @@ import numpy as np
 from marey_motion.arrays import AnyFloats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
-from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Body, Camera, Stances, body_of, stances_at
+from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, Stances, StickFigure, body_of, stances_at
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -91,12 +91,12 @@ def contact_sheet(takes: Sequence[TakePair], *, heading: str = "Retargeting", mo
 
 
 @dataclass(frozen=True)
-class _Row:
+class _SheetRow:
     """A take made ready for the page: bodies and stances of source and result, and from where they are seen."""
 
     take: TakePair
     times_s: AnyFloats
-    actors: tuple[tuple[Body, Stances], tuple[Body, Stances]]
+    actors: tuple[tuple[StickFigure, Stances], tuple[StickFigure, Stances]]
     camera: Camera
 
     @property
@@ -108,7 +108,7 @@ class _Row:
         return min(float(heights.min()), 0.0), max(float(heights.max()), 0.0)
 
 
-def _staged(take: TakePair, moments: int) -> _Row:
+def _staged(take: TakePair, moments: int) -> _SheetRow:
     clips = (take.source, take.result)
     last_s = min((clip.frame_count - 1) / clip.frame_rate_hz for clip in clips)
     times = np.linspace(0.0, last_s, min(moments, *(clip.frame_count for clip in clips)))
@@ -118,11 +118,11 @@ def _staged(take: TakePair, moments: int) -> _Row:
         actors.append((body, stances_at(clip, body, np.rint(times * clip.frame_rate_hz).astype(np.intp))))
     facing = next((stances.facing[0] for _, stances in actors if stances.facing is not None), (0.0, 1.0))
     camera = Camera(float(np.arctan2(*facing)) + CAMERA_TURN_RAD, CAMERA_TILT_RAD)
-    return _Row(take, times, (actors[0], actors[1]), camera)
+    return _SheetRow(take, times, (actors[0], actors[1]), camera)
 
 
 @dataclass(frozen=True)
-class _Stage:
+class _SheetCell:
     """The place of one figure on the page.
 
     Parameters
@@ -159,7 +159,7 @@ def _draw_header(axes: Axes, top: float, heading: str, count: int) -> None:
     _write(axes, (right - 0.65, middle), "facing", 10.5, QUIET, va="center")
 
 
-def _draw_row(axes: Axes, row: _Row, top: float, cell: float) -> None:
+def _draw_row(axes: Axes, row: _SheetRow, top: float, cell: float) -> None:
     """Title, then one cell per moment with both figures over their floor; places in inches."""
     _draw_titles(axes, row, top)
     low, high = row.extent_m
@@ -172,14 +172,14 @@ def _draw_row(axes: Axes, row: _Row, top: float, cell: float) -> None:
         for side, ground in enumerate(("white", TINT)):
             start = left + side * width
             centre = (start + 0.5 * width, bottom + 0.12 * STAGE - low * scale)
-            stage = _Stage(start, bottom, width, centre, scale, ground)
+            stage = _SheetCell(start, bottom, width, centre, scale, ground)
             body, stances = row.actors[side]
             facing = None if stances.facing is None else stances.facing[moment]
             _draw_floor(axes, stage, row.camera, facing, FLOOR_SHARE * (high - low))
             _draw_body(axes, stage, body, row.camera.seen(stances.points[moment]), HEAD_SHARE * (high - low))
 
 
-def _draw_titles(axes: Axes, row: _Row, top: float) -> None:
+def _draw_titles(axes: Axes, row: _SheetRow, top: float) -> None:
     clips = (row.take.source, row.take.result)
     title = row.take.title if len(row.take.title) <= LONGEST_TITLE else f"{row.take.title[: LONGEST_TITLE - 1]}…"
     _write(axes, (MARGIN, top - 0.2), title, 12.5, weight="bold")
@@ -188,7 +188,7 @@ def _draw_titles(axes: Axes, row: _Row, top: float) -> None:
     _write(axes, (PAGE_WIDTH - MARGIN, top - 0.2), about, 9.5, QUIET, ha="right")
 
 
-def _draw_floor(axes: Axes, stage: _Stage, camera: Camera, facing: AnyFloats | None, radius_m: float) -> None:
+def _draw_floor(axes: Axes, stage: _SheetCell, camera: Camera, facing: AnyFloats | None, radius_m: float) -> None:
     """The stage's ground, the floor line, the spot of floor under the figure and an arrow where it faces."""
     from matplotlib.patches import Ellipse, Rectangle
 
@@ -203,7 +203,7 @@ def _draw_floor(axes: Axes, stage: _Stage, camera: Camera, facing: AnyFloats | N
         axes.annotate("", tuple(tip), stage.centre, arrowprops=ARROW)
 
 
-def _draw_body(axes: Axes, stage: _Stage, body: Body, seen: AnyFloats, head_m: float) -> None:
+def _draw_body(axes: Axes, stage: _SheetCell, body: StickFigure, seen: AnyFloats, head_m: float) -> None:
     """Bones from back to front, each with an edge in the colour of the ground that sets it off from those behind."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Circle

@@ -36,7 +36,7 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class Body:
+class StickFigure:
     """What to draw of a skeleton.
 
     Parameters
@@ -70,14 +70,14 @@ class Stances:
     facing: AnyFloats | None
 
 
-def body_of(skeleton: Skeleton) -> Body:
+def body_of(skeleton: Skeleton) -> StickFigure:
     """The bones of a body, without roots on the floor, props and helpers; all bones where no pelvis is known."""
     mapping = map_joints(skeleton)
     standard = {skeleton.index_of(name): key for key, name in mapping.joints.items() if key != "root"}
     pelvis = next((joint for joint, key in standard.items() if key == "pelvis"), None)
     if pelvis is None:
         bones = [(joint, int(parent)) for joint, parent in enumerate(skeleton.parents) if parent >= 0]
-        return Body(_pairs(bones), np.zeros(len(bones), dtype=np.intp), 0, None, ((), ()))
+        return StickFigure(_pairs(bones), np.zeros(len(bones), dtype=np.intp), 0, None, ((), ()))
     sides: dict[int, int] = {}
     for joint, key in standard.items():
         path = skeleton.path_to_root(joint)
@@ -90,7 +90,7 @@ def body_of(skeleton: Skeleton) -> Body:
     ends = [skeleton.end_sites[number - skeleton.joint_count].joint for number, _ in tips]
     heads = [(len(bones) + place, 0.5) for place, joint in enumerate(ends) if standard.get(joint) == "head"]
     heads += [(place, 1.0) for place, (joint, _) in enumerate(bones) if standard.get(joint) == "head"]
-    return Body(
+    return StickFigure(
         _pairs(bones + tips),
         np.array([*sides.values(), *(sides[joint] for joint in ends)], dtype=np.intp),
         pelvis,
@@ -113,7 +113,7 @@ def runs_of(bones: Indices) -> list[Indices]:
     return runs
 
 
-def stances_at(clip: Clip, body: Body, frames: Indices) -> Stances:
+def stances_at(clip: Clip, body: StickFigure, frames: Indices) -> Stances:
     """The body in these frames (K,); only they are computed, however long the clip is."""
     points = kinematics.forward_kinematics(
         clip.skeleton,

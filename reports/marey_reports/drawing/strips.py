@@ -14,7 +14,7 @@ import numpy as np
 
 from marey_motion.arrays import Floats, Indices
 from marey_reports.drawing.paper import COLOURS, HAIRLINE, INK, PAPER, QUIET, REFERENCE, TEXT, new_figure, write
-from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Body, Camera, runs_of
+from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, StickFigure, runs_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,7 +54,7 @@ class StripRow:
     ghost: Floats | None = None
 
 
-class Moments(NamedTuple):
+class StripMoments(NamedTuple):
     """The columns of a strip: where each looks at, (T, 2) x and z of its middle in metres, and what it is called."""
 
     middles: Floats
@@ -63,9 +63,9 @@ class Moments(NamedTuple):
 
 
 def draw_strips(
-    body: Body,
+    body: StickFigure,
     rows: Sequence[StripRow],
-    moments: Moments,
+    moments: StripMoments,
     direction_rad: float,
     *,
     cell_in: tuple[float, float],
@@ -93,7 +93,7 @@ def draw_strips(
         bottom = page[1] - HEADER - (number + 1) * (height + GAP) + GAP
         _draw_label(axes, row, bottom + 0.5 * height)
         for column in range(columns):
-            stage = _Stage((labels + column * width, bottom), cell_in, moments.middles[column], camera, scale)
+            stage = _StripCell((labels + column * width, bottom), cell_in, moments.middles[column], camera, scale)
             _draw_cell(axes, stage, shapes, row, column)
     for column, (name, label) in enumerate(zip(moments.names, moments.labels, strict=True)):
         middle = labels + (column + 0.5) * width
@@ -103,7 +103,7 @@ def draw_strips(
 
 
 @dataclass(frozen=True)
-class _Stage:
+class _StripCell:
     """A cell: its lower left corner and its size in inches, and what it looks at, `scale` inches per metre."""
 
     corner: tuple[float, float]
@@ -120,7 +120,7 @@ class _Stage:
 
 
 def _scale(
-    body: Body, rows: Sequence[StripRow], moments: Moments, camera: Camera, cell_in: tuple[float, float]
+    body: StickFigure, rows: Sequence[StripRow], moments: StripMoments, camera: Camera, cell_in: tuple[float, float]
 ) -> float:
     """Inches per metre: the highest point fits, and most figures fit from side to side."""
     middles = np.stack((moments.middles[:, 0], np.zeros(len(moments.middles)), moments.middles[:, 1]), axis=1)
@@ -164,7 +164,7 @@ class _Look(NamedTuple):
 GHOST = _Look(LINE_POINTS, 0.55, REFERENCE)
 
 
-def _draw_cell(axes: Axes, stage: _Stage, shapes: _Shapes, row: StripRow, column: int) -> None:
+def _draw_cell(axes: Axes, stage: _StripCell, shapes: _Shapes, row: StripRow, column: int) -> None:
     """The floor, the ways on it, the ghost, then the bodies; nothing leaves the cell to its sides."""
     from matplotlib.patches import Rectangle
 
@@ -198,7 +198,7 @@ class _Shapes(NamedTuple):
     head_m: float
 
 
-def _shapes(body: Body, rows: Sequence[StripRow]) -> _Shapes:
+def _shapes(body: StickFigure, rows: Sequence[StripRow]) -> _Shapes:
     shown = np.ones(len(body.bones), dtype=bool)
     if body.head is not None and body.head[1] < 1.0:
         shown[body.head[0]] = False  # the circle stands for it
@@ -213,7 +213,7 @@ def _shapes(body: Body, rows: Sequence[StripRow]) -> _Shapes:
     )
 
 
-def _draw_body(axes: Axes, shapes: _Shapes, stage: _Stage, points: Floats, look: _Look, frame: Rectangle) -> None:
+def _draw_body(axes: Axes, shapes: _Shapes, stage: _StripCell, points: Floats, look: _Look, frame: Rectangle) -> None:
     """Bones at points (P, 3), each side as one shape, from the far side to the near one."""
     from matplotlib.patches import Circle, PathPatch
 

@@ -13,7 +13,7 @@ from marey_motion.evaluation.scenario import STRAIGHT_DEG_S
 from marey_reports.drawing.words import span
 
 
-class Hole(NamedTuple):
+class CoverageGap(NamedTuple):
     """Neighbouring cells of one speed that lack data: what to record there, and how much.
 
     Parameters
@@ -32,7 +32,7 @@ class Hole(NamedTuple):
         return f"{turning(*self.turn_rates_deg_s)} at {span(*self.speeds_m_s)} m/s"
 
 
-def find_holes(coverage: Coverage) -> list[Hole]:
+def find_holes(coverage: Coverage) -> list[CoverageGap]:
     """What is missing as few rectangles of cells, the largest deficit first.
 
     Cells are joined along the turn rate within one side (left, straight on, right), then runs that are alike along the
@@ -50,7 +50,7 @@ def find_holes(coverage: Coverage) -> list[Hole]:
             else:
                 done.append((first, last, row, row))
     holes = [
-        Hole(
+        CoverageGap(
             (float(turns[first]), float(turns[last])),
             (float(speeds[low]), float(speeds[high])),
             float(coverage.deficit_s[low : high + 1, first : last + 1].sum()),

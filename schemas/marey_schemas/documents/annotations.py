@@ -12,7 +12,7 @@ from marey_schemas.documents.references import OutputRef as OutputRef
 from marey_schemas.documents.references import RevisionRef as RevisionRef
 
 
-class Segment(Request):
+class SegmentDocument(Request):
     """A labelled half-open range of frames."""
 
     label: Annotated[str, StringConstraints(min_length=1, max_length=255)]
@@ -26,7 +26,7 @@ class Segment(Request):
         return self
 
 
-class Keyframe(Request):
+class KeyframeDocument(Request):
     """A labelled frame."""
 
     label: Annotated[str, StringConstraints(min_length=1, max_length=255)]
@@ -40,8 +40,8 @@ class Annotation(Request):
     clip: RevisionRef | OutputRef
     layer: str = "default"
     made_by: Literal["person", "algorithm"] = "person"
-    segments: tuple[Segment, ...] = Field((), description="In the order of time.")
-    keyframes: tuple[Keyframe, ...] = Field((), description="In the order of time.")
+    segments: tuple[SegmentDocument, ...] = Field((), description="In the order of time.")
+    keyframes: tuple[KeyframeDocument, ...] = Field((), description="In the order of time.")
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:

@@ -22,7 +22,7 @@ from marey_schemas.names import Digest, JointName, Tag
 MAX_FRAME_RATE_HZ = 100_000.0
 
 
-class Motion(Request):
+class MotionDocument(Request):
     """Part `motion` of a clip: the poses."""
 
     schema_: Literal["marey/motion@1"] = Field("marey/motion@1", alias="schema")
@@ -65,7 +65,7 @@ class Check(Request):
     values: dict[str, Any] = Field(default_factory=dict)
 
 
-class Source(Request):
+class ClipSource(Request):
     """Where a clip came from and what the importer did to it."""
 
     file: Digest | None = Field(None, description="The file exactly as it came.")
@@ -89,5 +89,5 @@ class ClipInfo(Request):
     capture_system: str | None = None
     licence: str | None = None
     comment: str | None = None
-    source: Source | None = None
+    source: ClipSource | None = None
     checks: tuple[Check, ...] = ()

@@ -9,7 +9,7 @@ from pydantic import ConfigDict, Field, StringConstraints
 from marey_schemas.base import Request
 from marey_schemas.documents.alignments import AlignmentInfo
 from marey_schemas.documents.annotations import Annotation
-from marey_schemas.documents.clips import ClipInfo, Motion
+from marey_schemas.documents.clips import ClipInfo, MotionDocument
 from marey_schemas.documents.evaluations import EvaluationDocument, EvaluationRecords
 from marey_schemas.documents.graphs import ModelGraph
 from marey_schemas.documents.models import MotionPrimitiveDocument
@@ -34,7 +34,7 @@ class OpenDocument(Request):
 SCHEMAS: dict[str, type[Request]] = {
     "marey/skeleton@1": SkeletonHierarchy,
     "marey/skeleton-mapping@1": SkeletonMapping,
-    "marey/motion@1": Motion,
+    "marey/motion@1": MotionDocument,
     "marey/clip-info@1": ClipInfo,
     "marey/annotation@1": Annotation,
     "marey/evaluation@1": EvaluationDocument,

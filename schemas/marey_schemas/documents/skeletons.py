@@ -29,7 +29,7 @@ class Joint(Request):
     display_name: str | None = Field(None, description="Name in the source, where it differs from `name`.")
 
 
-class EndSite(Request):
+class EndSiteDocument(Request):
     """A point at the end of a chain that has no rotation of its own."""
 
     joint: int = Field(ge=0)
@@ -41,7 +41,7 @@ class SkeletonHierarchy(Request):
 
     schema_: Literal["marey/skeleton@1"] = Field("marey/skeleton@1", alias="schema")
     joints: tuple[Joint, ...] = Field(min_length=1, max_length=MAX_JOINTS)
-    end_sites: tuple[EndSite, ...] = Field((), max_length=4 * MAX_JOINTS)
+    end_sites: tuple[EndSiteDocument, ...] = Field((), max_length=4 * MAX_JOINTS)
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -59,7 +59,7 @@ class SkeletonHierarchy(Request):
         return self
 
 
-class JointAxes(Request):
+class JointAxesDocument(Request):
     """Anatomical axes of a joint in its own local frame: `twist` along the bone, `swing` orthogonal to it."""
 
     twist: Vector3
@@ -74,5 +74,5 @@ class SkeletonMapping(Request):
     method: Literal["names", "geometry", "manual"] = "manual"
     confidence: float = Field(1.0, ge=0.0, le=1.0)
     joints: dict[str, JointName] = Field(default_factory=dict, description="Standard joint name to joint name.")
-    axes: dict[JointName, JointAxes] = Field(default_factory=dict)
+    axes: dict[JointName, JointAxesDocument] = Field(default_factory=dict)
     notes: tuple[str, ...] = ()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from marey_schemas.base import Answer, Request
-from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.editing.commands import Frames
 from marey_schemas.editing.edits import MOST_COMMANDS, EditCommand
 from marey_schemas.encoding.arrays import ArrayOf
@@ -42,7 +42,7 @@ class EditPreview(Answer):
     frame_count: int = Field(description="Frames of the whole result.")
     frame_rate_hz: float
     frames: tuple[int, int] = Field(description="Which of them these are: half-open.")
-    motion: Motion | None = Field(None, description="The motion of these frames.")
+    motion: MotionDocument | None = Field(None, description="The motion of these frames.")
     positions: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=3, columns=3)] | None = Field(
         None, description="[frames, joints, 3]: where the joints are, metres."
     )

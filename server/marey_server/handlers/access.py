@@ -77,7 +77,7 @@ class LogoutResource(Resource):
         return await self.answer(sign_out)
 
 
-class Tokens(Resource):
+class OwnTokens(Resource):
     """The caller's tokens."""
 
     path = "/tokens"
@@ -109,7 +109,7 @@ class TokenResource(Resource):
         return await self.answer(tokens.revoke_token, token)
 
 
-class Users(Resource):
+class AllUsers(Resource):
     """Everybody who can sign in."""
 
     path = "/users"
@@ -197,8 +197,8 @@ RESOURCES: tuple[type[Resource], ...] = (
     MeResource,
     LoginResource,
     LogoutResource,
-    Tokens,
+    OwnTokens,
     TokenResource,
-    Users,
+    AllUsers,
     UserResource,
 )

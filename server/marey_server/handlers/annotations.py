@@ -7,7 +7,7 @@ from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_server.errors import ConflictProblem, NotFoundProblem, PreconditionFailedProblem
 from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
-from marey_server.http.declarations import Access, Body, writes
+from marey_server.http.declarations import Access, RequestBody, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.motions.annotating import apply_commands, prepare_annotation
@@ -59,7 +59,7 @@ class ClipAnnotations(Resource):
 
     @writes(
         access=Access.CONTRIBUTOR,
-        body=Body(AnnotationImport, max_bytes=MAX_DOCUMENT_BYTES),
+        body=RequestBody(AnnotationImport, max_bytes=MAX_DOCUMENT_BYTES),
         answer=Item,
         status=201,
         etag=True,

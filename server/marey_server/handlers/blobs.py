@@ -7,7 +7,7 @@ import re
 from marey_schemas.items import BlobsMissing, BlobsQuery
 from marey_server.errors import NotFoundProblem
 from marey_server.http.calls import only_identify
-from marey_server.http.declarations import MIB, Access, Body, Bytes, reads, writes
+from marey_server.http.declarations import MIB, Access, Bytes, RequestBody, reads, writes
 from marey_server.http.receiving import Receiver
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
@@ -42,7 +42,7 @@ class Blob(BlobSender):
         """Take the next bytes."""
         await self.receiver.write(chunk)
 
-    @writes(access=Access.SIGNED_IN, body=Body(Bytes, max_bytes=MAX_BLOB_BYTES, streamed=True, required=False))
+    @writes(access=Access.SIGNED_IN, body=RequestBody(Bytes, max_bytes=MAX_BLOB_BYTES, streamed=True, required=False))
     async def put(self, digest: str) -> Rendered:
         """Send bytes by their digest.
 

@@ -19,11 +19,11 @@ class CollectionsQuery(PageQuery):
     deleted: bool = Field(False, description="Among the deleted ones.")
 
 
-class Collections(Resource):
+class ProjectCollections(Resource):
     """All folders."""
 
     path = "/projects/{project}/collections"
-    tag = "Collections"
+    tag = "ProjectCollections"
 
     @reads(access=Access.READER, query=CollectionsQuery, answer=Collection, paged=True)
     async def get(self, project: str, query: CollectionsQuery) -> Rendered:
@@ -59,7 +59,7 @@ class CollectionResource(Resource):
     """One folder."""
 
     path = "/projects/{project}/collections/{collection}"
-    tag = "Collections"
+    tag = "ProjectCollections"
 
     @reads(access=Access.READER, answer=Collection, etag=True)
     async def get(self, project: str, collection: str) -> Rendered:
@@ -83,7 +83,7 @@ class CollectionRestoration(Resource):
     """Bringing a deleted folder back."""
 
     path = "/projects/{project}/collections/{collection}/restore"
-    tag = "Collections"
+    tag = "ProjectCollections"
 
     @writes(access=Access.MAINTAINER, answer=Collection, etag=True)
     async def post(self, project: str, collection: str) -> Rendered:
@@ -91,4 +91,4 @@ class CollectionRestoration(Resource):
         return await self.answer(collections.restore_collection, project, collection)
 
 
-RESOURCES: tuple[type[Resource], ...] = (Collections, CollectionResource, CollectionRestoration)
+RESOURCES: tuple[type[Resource], ...] = (ProjectCollections, CollectionResource, CollectionRestoration)

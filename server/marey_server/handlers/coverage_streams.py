@@ -14,18 +14,18 @@ from marey_schemas.coverage_streams import (
     CoverageStreamCreate,
     CoverageStreamState,
 )
-from marey_server.http.declarations import MIB, Access, Body, reads, writes
+from marey_server.http.declarations import MIB, Access, RequestBody, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.motions import coverage
 from marey_server.store import coverage_streams
-from marey_server.store.coverage_streams import Step, Stream
+from marey_server.store.coverage_streams import Stream, StreamStep
 
 MOST_FRAMES_BYTES = 16 * MIB
 
 
-class CoverageStreams(Resource):
+class ProjectCoverageStreams(Resource):
     """The performances that are being measured."""
 
     path = "/projects/{project}/coverage-streams"
@@ -84,7 +84,11 @@ class CoverageStreamFrames(Resource):
     path = "/projects/{project}/coverage-streams/{stream}/frames"
     tag = "Evaluations"
 
-    @writes(access=Access.CONTRIBUTOR, body=Body(CoverageFrames, max_bytes=MOST_FRAMES_BYTES), answer=CoverageProgress)
+    @writes(
+        access=Access.CONTRIBUTOR,
+        body=RequestBody(CoverageFrames, max_bytes=MOST_FRAMES_BYTES),
+        answer=CoverageProgress,
+    )
     async def post(self, project: str, stream: str, body: CoverageFrames) -> Rendered | Reply:
         """Send the next frames, as poses of the stream's skeleton or as roots; hear what is still missing.
 
@@ -93,7 +97,7 @@ class CoverageStreamFrames(Resource):
         """
         held = await self.look_up(coverage_streams.read_to_advance, project, stream)
         step = await self.compute(coverage.advance, held, body)
-        if not isinstance(step, Step):
+        if not isinstance(step, StreamStep):
             return _progress(step)
         return await self.answer_with(_progress, coverage_streams.advance_stream, project, held, step)
 
@@ -102,4 +106,4 @@ def _progress(answer: dict[str, Any]) -> Reply:
     return Reply(CoverageProgress.model_validate(answer))
 
 
-RESOURCES: tuple[type[Resource], ...] = (CoverageStreams, CoverageStreamResource, CoverageStreamFrames)
+RESOURCES: tuple[type[Resource], ...] = (ProjectCoverageStreams, CoverageStreamResource, CoverageStreamFrames)

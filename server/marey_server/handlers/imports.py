@@ -14,7 +14,7 @@ from marey_schemas.jobs import Job, JobCreate
 from marey_schemas.options.imports import ImportOptions
 from marey_server.errors import ApiProblem, BadRequestProblem, InvalidProblem, TooLargeProblem
 from marey_server.field_errors import field_errors
-from marey_server.http.declarations import MIB, Access, Body, Files, writes
+from marey_server.http.declarations import MIB, Access, Files, RequestBody, writes
 from marey_server.http.multipart import MultipartReader, PartHead, Piece, boundary_of
 from marey_server.http.negotiation import body_type
 from marey_server.http.receiving import Receiver
@@ -39,11 +39,11 @@ REFUSED_ALTOGETHER = (401, 403, 404, 503, 507)
 """Refusals that concern the request, not one of its files."""
 
 
-class Imports(Resource):
+class ProjectImports(Resource):
     """Bringing motion files into a project."""
 
     path = "/projects/{project}/imports"
-    tag = "Imports"
+    tag = "ProjectImports"
 
     async def begin(self, project: str) -> None:
         """Check that the caller may import, before the files come."""
@@ -105,7 +105,7 @@ class Imports(Resource):
 
     @writes(
         access=Access.CONTRIBUTOR,
-        body=Body(Files, max_bytes=MAX_UPLOAD_BYTES, alternative=ImportRequest, streamed=True),
+        body=RequestBody(Files, max_bytes=MAX_UPLOAD_BYTES, alternative=ImportRequest, streamed=True),
         answer=ImportAnswer,
         also=((202, Job),),
     )
@@ -231,4 +231,4 @@ def _stored_files(tx: Transaction, request: ImportRequest) -> list[SourceFile]:
     return [SourceFile(file.name, file.blob, blobs.require_readable(tx, file.blob), None) for file in request.files]
 
 
-RESOURCES: tuple[type[Resource], ...] = (Imports,)
+RESOURCES: tuple[type[Resource], ...] = (ProjectImports,)

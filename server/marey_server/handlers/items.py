@@ -8,7 +8,7 @@ from marey_schemas.base import Request
 from marey_schemas.items import Item, ItemChange, ItemCreate, Lineage, Revision, Staleness
 from marey_schemas.kinds import Kind
 from marey_server.errors import NotFoundProblem
-from marey_server.http.declarations import MIB, Access, Body, reads, writes
+from marey_server.http.declarations import MIB, Access, RequestBody, reads, writes
 from marey_server.http.queries import MAX_INTEGER, CommaSeparated, CountedPageQuery, PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
@@ -62,11 +62,11 @@ def kind_of(plural: str) -> Kind:
         raise NotFoundProblem(f"There is no kind of item called {plural!r}.", code="no-kind") from None
 
 
-class Items(Resource):
+class ItemsOfKind(Resource):
     """The items of a kind in a project."""
 
     path = "/projects/{project}/{kind}"
-    tag = "Items"
+    tag = "ItemsOfKind"
 
     @reads(access=Access.READER, query=ItemsQuery, answer=Item, paged=True)
     async def get(self, project: str, kind: str, query: ItemsQuery) -> Rendered:
@@ -85,7 +85,7 @@ class Items(Resource):
 
     @writes(
         access=Access.CONTRIBUTOR,
-        body=Body(ItemCreate, max_bytes=MAX_DOCUMENT_BYTES),
+        body=RequestBody(ItemCreate, max_bytes=MAX_DOCUMENT_BYTES),
         answer=Item,
         status=201,
         etag=True,
@@ -107,7 +107,7 @@ class ItemResource(Resource):
     """One item."""
 
     path = "/projects/{project}/{kind}/{item}"
-    tag = "Items"
+    tag = "ItemsOfKind"
 
     @reads(access=Access.READER, answer=Item, etag=True)
     async def get(self, project: str, kind: str, item: str) -> Rendered:
@@ -131,7 +131,7 @@ class ItemRestoration(Resource):
     """Bringing a deleted item back."""
 
     path = "/projects/{project}/{kind}/{item}/restore"
-    tag = "Items"
+    tag = "ItemsOfKind"
 
     @writes(access=Access.MAINTAINER, answer=Item, etag=True)
     async def post(self, project: str, kind: str, item: str) -> Rendered:
@@ -143,7 +143,7 @@ class Revisions(Resource):
     """The history of an item."""
 
     path = "/projects/{project}/{kind}/{item}/revisions"
-    tag = "Items"
+    tag = "ItemsOfKind"
 
     @reads(access=Access.READER, query=PageQuery, answer=Revision, paged=True)
     async def get(self, project: str, kind: str, item: str, query: PageQuery) -> Rendered:
@@ -157,7 +157,7 @@ class RevisionResource(Resource):
     """One revision."""
 
     path = "/projects/{project}/{kind}/{item}/revisions/{revision:int}"
-    tag = "Items"
+    tag = "ItemsOfKind"
 
     @reads(access=Access.READER, answer=Revision)
     async def get(self, project: str, kind: str, item: str, revision: int) -> Rendered:
@@ -175,7 +175,7 @@ class LineageResource(Resource):
     """Where a revision comes from."""
 
     path = "/projects/{project}/{kind}/{item}/lineage"
-    tag = "Items"
+    tag = "ItemsOfKind"
 
     @reads(access=Access.READER, query=LineageQuery, answer=Lineage)
     async def get(self, project: str, kind: str, item: str, query: LineageQuery) -> Rendered:
@@ -187,7 +187,7 @@ class StalenessResource(Resource):
     """Whether an item is outdated."""
 
     path = "/projects/{project}/{kind}/{item}/stale"
-    tag = "Items"
+    tag = "ItemsOfKind"
 
     @reads(access=Access.READER, answer=Staleness)
     async def get(self, project: str, kind: str, item: str) -> Rendered:
@@ -196,7 +196,7 @@ class StalenessResource(Resource):
 
 
 RESOURCES: tuple[type[Resource], ...] = (
-    Items,
+    ItemsOfKind,
     ItemResource,
     ItemRestoration,
     Revisions,

@@ -12,7 +12,7 @@ from marey_schemas.items import Event, Page
 from marey_schemas.job_kinds import UnknownKindError, find_kind, job_kinds
 from marey_schemas.jobs import Attempt, Job, JobBatch, JobCreate, JobKind, JobList, JobOutput, JobState, TaskResult
 from marey_server.errors import NotFoundProblem
-from marey_server.http.declarations import MIB, Access, Body, Bytes, reads, writes
+from marey_server.http.declarations import MIB, Access, Bytes, RequestBody, reads, writes
 from marey_server.http.queries import CommaSeparated, CommaSeparatedOf, CountedPageQuery, PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
@@ -93,7 +93,7 @@ class ProjectJobs(Resource):
     @writes(
         access=Access.CONTRIBUTOR,
         scope="jobs",
-        body=Body(JobCreate, max_bytes=MAX_SUBMISSION_BYTES),
+        body=RequestBody(JobCreate, max_bytes=MAX_SUBMISSION_BYTES),
         answer=Job,
         status=202,
         idempotency="key",
@@ -127,7 +127,7 @@ class ProjectJobBatch(Resource):
     @writes(
         access=Access.CONTRIBUTOR,
         scope="jobs",
-        body=Body(JobBatch, max_bytes=MAX_SUBMISSION_BYTES),
+        body=RequestBody(JobBatch, max_bytes=MAX_SUBMISSION_BYTES),
         answer=JobList,
         status=202,
         idempotency="key",

@@ -21,7 +21,7 @@ from marey_schemas.worker_protocol import (
     StageRequest,
 )
 from marey_server.errors import BadRequestProblem
-from marey_server.http.declarations import KIB, MIB, Access, Body, Bytes, writes
+from marey_server.http.declarations import KIB, MIB, Access, Bytes, RequestBody, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store.jobs import completion, logs, queue, reaper, staging
@@ -69,7 +69,7 @@ class Completions(Resource):
     @writes(
         access=Access.WORKER,
         scope="work",
-        body=Body(BatchCompleteRequest, max_bytes=16 * MIB),
+        body=RequestBody(BatchCompleteRequest, max_bytes=16 * MIB),
         answer=BatchCompleteAnswer,
     )
     async def post(self, body: BatchCompleteRequest) -> Rendered:
@@ -87,7 +87,7 @@ class AttemptHeartbeat(Resource):
     path = "/jobs/{job}/attempts/{fence:int}/heartbeat"
     tag = "Work"
 
-    @writes(access=Access.ATTEMPT, scope=None, body=Body(Heartbeat, max_bytes=64 * KIB), answer=HeartbeatAnswer)
+    @writes(access=Access.ATTEMPT, scope=None, body=RequestBody(Heartbeat, max_bytes=64 * KIB), answer=HeartbeatAnswer)
     async def post(self, job: str, fence: int, body: Heartbeat) -> Rendered:
         """Keep the lease; hear whether to stop."""
         return await self.answer(queue.heartbeat, job, fence, body, self.services.queue_policy)
@@ -102,7 +102,7 @@ class AttemptLog(Resource):
     @writes(
         access=Access.ATTEMPT,
         scope=None,
-        body=Body(Bytes, max_bytes=MAX_LOG_BYTES, required=False),
+        body=RequestBody(Bytes, max_bytes=MAX_LOG_BYTES, required=False),
         answer=LogAnswer,
         headers=("Upload-Offset",),
     )
@@ -121,7 +121,12 @@ class AttemptOutputs(Resource):
     path = "/jobs/{job}/attempts/{fence:int}/outputs"
     tag = "Work"
 
-    @writes(access=Access.ATTEMPT, scope=None, body=Body(StageRequest, max_bytes=MAX_STAGED_BYTES), answer=StageAnswer)
+    @writes(
+        access=Access.ATTEMPT,
+        scope=None,
+        body=RequestBody(StageRequest, max_bytes=MAX_STAGED_BYTES),
+        answer=StageAnswer,
+    )
     async def post(self, job: str, fence: int, body: StageRequest) -> Rendered:
         """Stage results: they become visible when the attempt completes. One of the same name replaces the earlier."""
         prepared = await self.compute(partial(_prepare, body))
@@ -140,7 +145,9 @@ class AttemptCompletion(Resource):
     path = "/jobs/{job}/attempts/{fence:int}/complete"
     tag = "Work"
 
-    @writes(access=Access.ATTEMPT, scope=None, body=Body(CompleteRequest, max_bytes=16 * MIB), answer=CompleteAnswer)
+    @writes(
+        access=Access.ATTEMPT, scope=None, body=RequestBody(CompleteRequest, max_bytes=16 * MIB), answer=CompleteAnswer
+    )
     async def post(self, job: str, fence: int, body: CompleteRequest) -> Rendered:
         """Publish what is staged and end the job. The same `write_id` again gives the same answer."""
         return await self.answer(completion.complete, job, fence, body)

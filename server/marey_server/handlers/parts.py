@@ -13,7 +13,7 @@ from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_schemas.names import Message
 from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
-from marey_server.http.declarations import Access, Body, Document, reads, writes
+from marey_server.http.declarations import Access, Document, RequestBody, reads, writes
 from marey_server.http.queries import MAX_INTEGER, CommaSeparated
 from marey_server.http.reply import Lasting, Rendered, Reply
 from marey_server.http.resource import Resource
@@ -79,7 +79,7 @@ class PartResource(Resource):
     @writes(
         access=Access.CONTRIBUTOR,
         query=PartChange,
-        body=Body(Document, max_bytes=MAX_DOCUMENT_BYTES),
+        body=RequestBody(Document, max_bytes=MAX_DOCUMENT_BYTES),
         answer=Item,
         precondition="required",
         etag=True,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from marey_schemas.pipelines import Pipeline, PipelineCreate
 from marey_server.handlers.jobs import MAX_SUBMISSION_BYTES
-from marey_server.http.declarations import Access, Body, writes
+from marey_server.http.declarations import Access, RequestBody, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store.jobs.submission import submit_pipeline
@@ -19,7 +19,7 @@ class ProjectPipelines(Resource):
     @writes(
         access=Access.CONTRIBUTOR,
         scope="jobs",
-        body=Body(PipelineCreate, max_bytes=MAX_SUBMISSION_BYTES),
+        body=RequestBody(PipelineCreate, max_bytes=MAX_SUBMISSION_BYTES),
         answer=Pipeline,
         status=202,
         idempotency="key",

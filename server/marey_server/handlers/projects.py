@@ -72,7 +72,7 @@ class ProjectRestoration(Resource):
         return await self.answer(projects.restore_project, project)
 
 
-class Members(Resource):
+class ProjectMembers(Resource):
     """Who belongs to a project."""
 
     path = "/projects/{project}/members"
@@ -114,6 +114,6 @@ RESOURCES: tuple[type[Resource], ...] = (
     Projects,
     ProjectResource,
     ProjectRestoration,
-    Members,
+    ProjectMembers,
     MemberResource,
 )

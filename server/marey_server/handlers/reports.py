@@ -58,7 +58,7 @@ class StoredFileSender(BlobSender):
         )
 
 
-class Report(StoredFileSender):
+class ItemReport(StoredFileSender):
     """The report of an evaluation or a model."""
 
     path = "/projects/{project}/{kind}/{item}/report"
@@ -142,4 +142,4 @@ def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:
     return figure.csv[table]
 
 
-RESOURCES: tuple[type[Resource], ...] = (Report, Figure)
+RESOURCES: tuple[type[Resource], ...] = (ItemReport, Figure)

@@ -48,7 +48,7 @@ class ModelUser(Resource):
         return found, known
 
 
-class Samples(ModelUser):
+class ModelSamples(ModelUser):
     """Samples of a model as a document."""
 
     path = "/projects/{project}/{kind}/{item}/samples"
@@ -100,5 +100,5 @@ def _caching(query: SampleQuery) -> dict[str, str]:
     return {"Cache-Control": IMMUTABLE if query.revision is not None else "private, no-cache"}
 
 
-RESOURCES: tuple[type[Resource], ...] = (Samples, SampleFiles)
+RESOURCES: tuple[type[Resource], ...] = (ModelSamples, SampleFiles)
 """Samples of models."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from marey_schemas.items import Upload, UploadCreate
 from marey_server.errors import BadRequestProblem, ConflictProblem
-from marey_server.http.declarations import MIB, Access, Body, Bytes, reads, writes
+from marey_server.http.declarations import MIB, Access, Bytes, RequestBody, reads, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store import uploads
@@ -14,14 +14,14 @@ PIECE_BYTES = MIB
 """Of a piece that is cut off, less than this is lost."""
 
 
-def upload_reply(upload: uploads.Upload) -> Reply:
+def upload_reply(upload: uploads.StoredUpload) -> Reply:
     """How far an upload is, in the body and in headers."""
     shown = Upload(id=upload.id, length=upload.length, offset=upload.offset, digest=upload.digest)
     headers = {"Upload-Offset": str(upload.offset), "Upload-Length": str(upload.length), "Cache-Control": "no-store"}
     return Reply(shown, headers=headers)
 
 
-def finish_upload(tx: Transaction, upload_id: str) -> uploads.Upload:
+def finish_upload(tx: Transaction, upload_id: str) -> uploads.StoredUpload:
     """Make a blob of an upload whose last byte has come; leave any other as it is."""
     upload = uploads.read_upload(tx, upload_id)
     if upload.offset == upload.length:
@@ -39,7 +39,7 @@ class Uploads(Resource):
     async def post(self, body: UploadCreate) -> Rendered:
         """Announce bytes that come in pieces."""
 
-        def created(upload: uploads.Upload) -> Reply:
+        def created(upload: uploads.StoredUpload) -> Reply:
             reply = upload_reply(upload)
             return Reply(reply.content, location=f"/uploads/{upload.id}", headers=reply.headers)
 
@@ -83,7 +83,7 @@ class UploadResource(Resource):
 
     @writes(
         access=Access.SIGNED_IN,
-        body=Body(Bytes, max_bytes=uploads.MAX_UPLOAD_BYTES, streamed=True, required=False),
+        body=RequestBody(Bytes, max_bytes=uploads.MAX_UPLOAD_BYTES, streamed=True, required=False),
         answer=Upload,
         headers=("Upload-Offset",),
     )

@@ -13,7 +13,7 @@ from marey_server.access import scopes
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.errors import ForbiddenProblem, UnauthenticatedProblem
 from marey_server.http.declarations import Access, Operation
-from marey_server.http.reply import AnswerCache, Form, Rendered, Reply, render
+from marey_server.http.reply import AnswerCache, AnswerForm, Rendered, Reply, render
 from marey_server.store import idempotency, projects, tokens
 from marey_server.store.transaction import Transaction
 
@@ -69,7 +69,7 @@ class Call:
     """What to do in the transaction, and how to answer."""
 
     caller: Caller
-    form: Form
+    form: AnswerForm
     answers: AnswerCache
     to_reply: Callable[[Any], Reply]
     function: Callable[..., Any]

@@ -63,7 +63,7 @@ Content = type[BaseModel] | type[Document] | type[Bytes]
 
 
 @dataclass(frozen=True, slots=True)
-class Body:
+class RequestBody:
     """A body that a method takes: a model, a document, bytes or files.
 
     `streamed` bodies are given to the resource piece by piece, as they come.
@@ -86,7 +86,7 @@ class Operation:
     access: Access
     scope: str | None
     query: type[Request] | None
-    body: Body | None
+    body: RequestBody | None
     answer: Content | None
     status: int
     paged: bool
@@ -115,7 +115,7 @@ def reads(
     *,
     access: Access,
     query: type[Request] | None = None,
-    body: Content | Body | None = None,
+    body: Content | RequestBody | None = None,
     answer: Content | None = None,
     paged: bool = False,
     etag: bool = False,
@@ -143,7 +143,7 @@ def reads(
 def writes(
     *,
     access: Access,
-    body: Content | Body | None = None,
+    body: Content | RequestBody | None = None,
     answer: Content | None = None,
     status: int | None = None,
     query: type[Request] | None = None,
@@ -178,7 +178,7 @@ def _declare(
     status: int,
     etag: bool,
     also: tuple[tuple[int, type[Answer] | None], ...],
-    body: Content | Body | None = None,
+    body: Content | RequestBody | None = None,
     paged: bool = False,
     precondition: Literal["none", "required", "create", "optional"] = "none",
     idempotency: Literal["key", "nature"] = "nature",
@@ -193,7 +193,7 @@ def _declare(
             await self.perform(method)
 
         summary, _, description = (inspect.getdoc(method) or "").partition("\n")
-        taken = body if body is None or isinstance(body, Body) else Body(body)
+        taken = body if body is None or isinstance(body, RequestBody) else RequestBody(body)
         perform.operation = Operation(  # type: ignore[attr-defined]
             method.__name__.upper(), summary.rstrip("."), description.strip(), access, scope, query, taken, answer,
             status, paged, etag, precondition, idempotency, answer_types, also, public, headers, stream,

@@ -15,7 +15,7 @@ from marey_schemas.encoding.codecs import MEDIA_TYPES
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import MEDIA_TYPE as PROBLEM_TYPE
 from marey_schemas.problems import Problem
-from marey_server.http.declarations import Access, Body, Bytes, Document, Files, Operation
+from marey_server.http.declarations import Access, Bytes, Document, Files, Operation, RequestBody
 from marey_server.http.negotiation import DOCUMENT_FORMS
 from marey_server.http.routes import Route
 
@@ -207,7 +207,7 @@ def _header_parameters(operation: Operation) -> list[Schema]:
     ]  # fmt: skip
 
 
-def _request_body(body: Body, models: _Models) -> Schema:
+def _request_body(body: RequestBody, models: _Models) -> Schema:
     content: Schema = {}
     if body.content is Bytes:
         content["application/octet-stream"] = {}

@@ -61,7 +61,7 @@ class Rendered:
 
 
 @dataclass(frozen=True, slots=True)
-class Form:
+class AnswerForm:
     """How the caller wants the answer: media type, what it holds already, and the status of success."""
 
     media: MediaType
@@ -69,7 +69,7 @@ class Form:
     status: int
 
 
-def render(reply: Reply, form: Form, answers: AnswerCache) -> Rendered:
+def render(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Rendered:
     """The bytes of a reply; 304 without any where the caller holds this state in this form."""
     headers = {"Vary": "Accept, Accept-Encoding", **reply.headers}
     if reply.location is not None:

@@ -36,7 +36,7 @@ from marey_server.http.calls import Call, Caller, only_identify, require_access,
 from marey_server.http.declarations import Bytes, Declared, Document, Operation
 from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.http.exchange import Exchange
-from marey_server.http.reply import Form, Rendered, Reply, render
+from marey_server.http.reply import AnswerForm, Rendered, Reply, render
 from marey_server.http.validation import decode_body, parse_query, validate_body
 from marey_server.store.transaction import Transaction
 
@@ -144,10 +144,12 @@ class Resource(Exchange):
         return True
 
     @property
-    def answer_form(self) -> Form:
+    def answer_form(self) -> AnswerForm:
         """How the caller wants the answer."""
         reading = self.request.method in ("GET", "HEAD")
-        return Form(self.media, self.request.headers.get("If-None-Match") if reading else None, self.operation.status)
+        return AnswerForm(
+            self.media, self.request.headers.get("If-None-Match") if reading else None, self.operation.status
+        )
 
     async def _begin(self, **_path: Any) -> None:
         pass

@@ -24,14 +24,14 @@ from marey_schemas.coverage_streams import (
     MeasuredCoverage,
     Performer,
 )
-from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.store import items, projects
-from marey_server.store.coverage_streams import NewStream, Step, Stream, answered_before, require_offset
+from marey_server.store.coverage_streams import NewStream, Stream, StreamStep, answered_before, require_offset
 from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:  # numeric modules take a second to load: only who measures coverage pays for them
@@ -113,7 +113,7 @@ def look(stream: Stream) -> CoverageStreamState:
     return CoverageStreamState(**stream.shown(), **_state(online, stream.settings))
 
 
-def advance(held: Stream, frames: CoverageFrames) -> Step | Tree:
+def advance(held: Stream, frames: CoverageFrames) -> StreamStep | Tree:
     """Where frames take a stream, or the answer to the same request before.
 
     Raises `CoverageOffset` where they do not go on where the stream is, `InvalidProblem` where they are no frames of
@@ -142,7 +142,7 @@ def advance(held: Stream, frames: CoverageFrames) -> Step | Tree:
         changed=_cells(online, np.argwhere(online.counts != before)),
         **_now(online, held.settings),
     )
-    return Step(said, progress.model_dump(mode="json"), online.frame_count, _packed(online))
+    return StreamStep(said, progress.model_dump(mode="json"), online.frame_count, _packed(online))
 
 
 def _add_poses(online: OnlineCoverage, held: Stream, frames: CoverageFrames) -> int:
@@ -166,7 +166,7 @@ def _add_poses(online: OnlineCoverage, held: Stream, frames: CoverageFrames) -> 
             "translations": _single(frames.translations),
             "translated_joints": frames.translated_joints,
         }
-        clip = clip_from_document(Motion.model_validate(motion), body.skeleton)
+        clip = clip_from_document(MotionDocument.model_validate(motion), body.skeleton)
         return len(online.add_frames(body, clip).speed_m_s)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from marey_schemas.documents.alignments import AlignmentInfo
-from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.encoding import codecs
 from marey_schemas.formats import ExportFormat
@@ -126,7 +126,7 @@ def write_file(
     from marey_motion.exporting import write_clip_file
 
     skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(source.hierarchy))
-    clip = clip_from_document(Motion.model_validate(source.parts["motion"]), skeleton)
+    clip = clip_from_document(MotionDocument.model_validate(source.parts["motion"]), skeleton)
     try:
         if time == "source":
             clip = restored_clip(clip, AlignmentInfo.model_validate(source.parts["info"]).model_dump())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import ValidationError
 
-from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.editing.edits import EditDocument
 from marey_schemas.editing.previews import EditPreview, EditPreviewRequest
@@ -101,7 +101,7 @@ def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
         raise TooLargeProblem(
             f"{stop - start} frames are too many for one preview; ask for some of them.", code="preview-too-large"
         )
-    skeleton = Motion.model_validate(source.motion).skeleton
+    skeleton = MotionDocument.model_validate(source.motion).skeleton
     return EditPreview(
         pieces=len(made),
         frame_count=wanted.clip.frame_count,
@@ -149,7 +149,7 @@ def _clip_of(source: PreviewSource, tree: Tree) -> tuple[Clip, EditedBody]:
         return require_trust(mapping_from_document(SkeletonMapping.model_validate(stored), skeleton)[0])
 
     skeleton = skeleton_from_document(hierarchy)
-    return clip_from_document(Motion.model_validate(tree), skeleton), EditedBody(skeleton, find_mapping)
+    return clip_from_document(MotionDocument.model_validate(tree), skeleton), EditedBody(skeleton, find_mapping)
 
 
 def _invalid(pointer: str, code: str, detail: str) -> InvalidProblem:

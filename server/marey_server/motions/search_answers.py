@@ -111,7 +111,7 @@ def _require_room(steps: Sequence[Step], sequel: Sequel) -> None:
 
 def _steps_of(searchables: Sequence[Searchable], request: SearchRequest) -> tuple[Step, ...]:
     from marey_motion.errors import MotionError
-    from marey_motion.modelling.search.constraints import ConstraintError as BadConstraint
+    from marey_motion.modelling.search.constraints import InvalidConstraint as BadConstraint
     from marey_motion.modelling.search.steps import Step
 
     steps = []

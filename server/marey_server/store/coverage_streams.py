@@ -76,7 +76,7 @@ class Stream:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class StreamStep:
     """Where a request takes a stream: the digest of what it said, its answer, and what is kept from then on."""
 
     said: str
@@ -122,7 +122,7 @@ def read_to_advance(tx: Transaction, project: str, stream_id: str) -> Stream:
     return _find(tx, projects.require(tx, project).id, stream_id)
 
 
-def advance_stream(tx: Transaction, project: str, held: Stream, step: Step) -> Tree:
+def advance_stream(tx: Transaction, project: str, held: Stream, step: StreamStep) -> Tree:
     """Move a stream on from where `held` was, and return the answer.
 
     Raises `CoverageOffset` with the true offset where somebody else moved it in between, `NotFoundProblem` where it is

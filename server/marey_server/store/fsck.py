@@ -38,7 +38,7 @@ PAGE = 100
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class StoreDefect:
     """One thing that is wrong: a stable code, what it is about, and a sentence."""
 
     code: str
@@ -46,10 +46,10 @@ class Finding:
     detail: str
 
 
-def check_store(database: Database, *, progress: Callable[[str, int], None] | None = None) -> Iterator[Finding]:
+def check_store(database: Database, *, progress: Callable[[str, int], None] | None = None) -> Iterator[StoreDefect]:
     """Everything that is wrong, as it is found. `progress(what, count)` is called after each page."""
     yield from database.read(SYSTEM, _check_file)
-    passes: tuple[tuple[str, Table, Callable[[Transaction, Row[Any]], list[Finding]]], ...] = (
+    passes: tuple[tuple[str, Table, Callable[[Transaction, Row[Any]], list[StoreDefect]]], ...] = (
         ("blobs", blob, _check_blob),
         ("documents", document, _check_document),
         ("items", item, _check_item),
@@ -67,42 +67,44 @@ def check_store(database: Database, *, progress: Callable[[str, int], None] | No
 
 
 def _check_page(
-    tx: Transaction, table: Table, check: Callable[[Transaction, Row[Any]], list[Finding]], behind: str
-) -> list[tuple[str, list[Finding]]]:
+    tx: Transaction, table: Table, check: Callable[[Transaction, Row[Any]], list[StoreDefect]], behind: str
+) -> list[tuple[str, list[StoreDefect]]]:
     key = table.primary_key.columns[0]
     rows = tx.execute(select(table).where(key > behind).order_by(key).limit(PAGE)).all()
     return [(row._mapping[key], check(tx, row)) for row in rows]
 
 
-def _check_file(tx: Transaction) -> list[Finding]:
+def _check_file(tx: Transaction) -> list[StoreDefect]:
     """What the database can tell of itself: Postgres holds its foreign keys; SQLite is asked."""
     if tx.is_postgres:
         return []
     pages = [row[0] for row in tx.execute(text("PRAGMA integrity_check(100)")) if row[0] != "ok"]
-    findings = [Finding("broken-database", "database", line) for line in pages]
+    findings = [StoreDefect("broken-database", "database", line) for line in pages]
     dangling = tx.execute(text("PRAGMA foreign_key_check")).mappings()
     return findings + [
-        Finding("dangling-reference", f"{row['table']}/{row['rowid']}", f"refers to what {row['parent']} does not hold")
+        StoreDefect(
+            "dangling-reference", f"{row['table']}/{row['rowid']}", f"refers to what {row['parent']} does not hold"
+        )
         for row in dangling
     ]
 
 
-def _check_blob(tx: Transaction, row: Row[Any]) -> list[Finding]:
+def _check_blob(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     hashed, size = hashlib.sha256(), 0
     for piece in tx.blobs.read(tx.connection, row.digest, 0, row.size_bytes):
         hashed.update(piece)
         size += len(piece)
     if size != row.size_bytes:
-        return [Finding("blob-incomplete", row.digest, f"{size} of {row.size_bytes} bytes are there")]
+        return [StoreDefect("blob-incomplete", row.digest, f"{size} of {row.size_bytes} bytes are there")]
     if f"sha256:{hashed.hexdigest()}" != row.digest:
-        return [Finding("blob-corrupt", row.digest, "the bytes have another digest")]
+        return [StoreDefect("blob-corrupt", row.digest, "the bytes have another digest")]
     return []
 
 
-def _check_document(tx: Transaction, row: Row[Any]) -> list[Finding]:
+def _check_document(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     findings = []
     if digest_of(canonical_json(row.body)) != row.digest:
-        findings.append(Finding("document-corrupt", row.digest, "the text has another digest"))
+        findings.append(StoreDefect("document-corrupt", row.digest, "the text has another digest"))
     arrays, files = documents.references_of(row.schema, row.body)
     statement = select(document_blob.c.pointer, document_blob.c.blob_digest, blob.c.size_bytes)
     statement = statement.outerjoin(blob, blob.c.digest == document_blob.c.blob_digest)
@@ -111,33 +113,35 @@ def _check_document(tx: Transaction, row: Row[Any]) -> list[Finding]:
     }
     for pointer in sorted(held.keys() ^ (arrays.keys() | files.keys())):
         what = "has no blob" if pointer not in held else "is no reference"
-        findings.append(Finding("document-reference", row.digest, f"{pointer} {what}"))
+        findings.append(StoreDefect("document-reference", row.digest, f"{pointer} {what}"))
     for pointer, named in files.items():
         if pointer in held and held[pointer].blob_digest != named:
-            findings.append(Finding("document-reference", row.digest, f"{pointer} is held by another blob"))
+            findings.append(StoreDefect("document-reference", row.digest, f"{pointer} is held by another blob"))
     for pointer, leaf in arrays.items():
         if pointer in held and held[pointer].size_bytes is not None:
             findings += _check_array(tx, row.digest, pointer, leaf, held[pointer])
     return findings
 
 
-def _check_array(tx: Transaction, digest: str, pointer: str, leaf: dict[str, Any], held: Row[Any]) -> list[Finding]:
+def _check_array(tx: Transaction, digest: str, pointer: str, leaf: dict[str, Any], held: Row[Any]) -> list[StoreDefect]:
     data = read_blob(tx, held.blob_digest, 0, held.size_bytes)
     try:
         content = array_digest(EncodedArray(leaf["dtype"], tuple(leaf["shape"]), data))
     except ArrayError as error:
-        return [Finding("array-corrupt", digest, f"{pointer}: {error}")]
+        return [StoreDefect("array-corrupt", digest, f"{pointer}: {error}")]
     if content != leaf["content"]:
-        return [Finding("array-corrupt", digest, f"{pointer}: the array has another digest")]
+        return [StoreDefect("array-corrupt", digest, f"{pointer}: the array has another digest")]
     return []
 
 
-def _check_item(tx: Transaction, row: Row[Any]) -> list[Finding]:
+def _check_item(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     kind = Kind(row.kind)
     counts = select(func.count(), func.max(revision.c.number)).where(revision.c.item_id == row.id)
     count, newest = tuple(tx.execute(counts).one())
     if (count, newest) != (row.head, row.head):
-        return [Finding("revisions-lost", row.id, f"{count} revisions up to {newest}; the newest should be {row.head}")]
+        return [
+            StoreDefect("revisions-lost", row.id, f"{count} revisions up to {newest}; the newest should be {row.head}")
+        ]
     findings = []
     bodies, complete = {}, True
     for found in tx.execute(_head_parts(row)):
@@ -145,17 +149,17 @@ def _check_item(tx: Transaction, row: Row[Any]) -> list[Finding]:
         bodies[found.part] = found.body
         if found.body is None:
             detail = f"{found.part} of revision {row.head}: {found.document_digest}"
-            findings.append(Finding("document-lost", row.id, detail))
+            findings.append(StoreDefect("document-lost", row.id, detail))
     lacking = [part for part, spec in PARTS[kind].items() if spec.required and part not in bodies]
-    findings += [Finding("part-lost", row.id, f"revision {row.head} has no {part}") for part in lacking]
+    findings += [StoreDefect("part-lost", row.id, f"revision {row.head} has no {part}") for part in lacking]
     if complete and not lacking:
         summary = summarise(kind, bodies)
         if (summary.shown, summary.frames, summary.skeleton_id) != (row.summary, row.frames, row.skeleton_id):
-            findings.append(Finding("summary-wrong", row.id, "the summary is not that of the newest revision"))
+            findings.append(StoreDefect("summary-wrong", row.id, "the summary is not that of the newest revision"))
         findings += _check_named_items(tx, row, bodies)
     place = tx.execute(select(collection).where(collection.c.id == row.collection_id)).first()
     if place is None or place.project_id != row.project_id or (row.deleted_us is None) > (place.deleted_us is None):
-        findings.append(Finding("misplaced-item", row.id, "its collection is deleted, gone or of another project"))
+        findings.append(StoreDefect("misplaced-item", row.id, "its collection is deleted, gone or of another project"))
     return findings
 
 
@@ -167,7 +171,7 @@ def _head_parts(row: Row[Any]) -> Select[Any]:
     )
 
 
-def _check_named_items(tx: Transaction, row: Row[Any], bodies: dict[str, dict[str, Any]]) -> list[Finding]:
+def _check_named_items(tx: Transaction, row: Row[Any], bodies: dict[str, dict[str, Any]]) -> list[StoreDefect]:
     named = {"motion": ("motion", "skeleton"), "annotation": ("annotation", "clip")}
     if row.kind not in (Kind.CLIP, Kind.ANNOTATION):
         return []
@@ -176,10 +180,10 @@ def _check_named_items(tx: Transaction, row: Row[Any], bodies: dict[str, dict[st
     there = exists().where(and_(revision.c.item_id == ref["item"], revision.c.number == ref["revision"]))
     if tx.execute(select(there)).scalar():
         return []
-    return [Finding("dangling-reference", row.id, f"{member} {ref['item']} has no revision {ref['revision']}")]
+    return [StoreDefect("dangling-reference", row.id, f"{member} {ref['item']} has no revision {ref['revision']}")]
 
 
-def _check_collection(tx: Transaction, row: Row[Any]) -> list[Finding]:
+def _check_collection(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     if not row.path or row.deleted_us is not None:
         return []
     parent = row.path.rpartition("/")[0]
@@ -188,10 +192,10 @@ def _check_collection(tx: Transaction, row: Row[Any]) -> list[Finding]:
     )
     if tx.execute(select(above)).scalar():
         return []
-    return [Finding("orphan-collection", row.id, f"{row.path!r} lies in {parent!r}, which is not there")]
+    return [StoreDefect("orphan-collection", row.id, f"{row.path!r} lies in {parent!r}, which is not there")]
 
 
-def _check_upload(tx: Transaction, row: Row[Any]) -> list[Finding]:
+def _check_upload(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     if row.finished_digest is not None:
         return []
     held = select(func.coalesce(func.sum(func.length(upload_chunk.c.data)), 0)).where(
@@ -199,7 +203,9 @@ def _check_upload(tx: Transaction, row: Row[Any]) -> list[Finding]:
     )
     size = tx.execute(held).scalar_one()
     return (
-        [] if size == row.offset else [Finding("upload-incomplete", row.id, f"{size} of {row.offset} bytes are there")]
+        []
+        if size == row.offset
+        else [StoreDefect("upload-incomplete", row.id, f"{size} of {row.offset} bytes are there")]
     )
 
 

@@ -32,7 +32,7 @@ LIFETIME_US = 7 * 86400 * 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Upload:
+class StoredUpload:
     """How far an upload is; `digest` once it is complete."""
 
     id: str
@@ -41,7 +41,7 @@ class Upload:
     digest: str | None
 
 
-def create_upload(tx: Transaction, length: int, *, digest: str | None = None) -> Upload:
+def create_upload(tx: Transaction, length: int, *, digest: str | None = None) -> StoredUpload:
     """Announce `length` bytes; with `digest`, they must turn out to be these."""
     user_id = _sender(tx)
     if not 0 < length <= MAX_UPLOAD_BYTES:
@@ -52,15 +52,15 @@ def create_upload(tx: Transaction, length: int, *, digest: str | None = None) ->
         "created_us": tx.now_us, "updated_us": tx.now_us,
     }  # fmt: skip
     tx.execute(insert(upload), row)
-    return Upload(upload_id, length, 0, None)
+    return StoredUpload(upload_id, length, 0, None)
 
 
-def read_upload(tx: Transaction, upload_id: str) -> Upload:
+def read_upload(tx: Transaction, upload_id: str) -> StoredUpload:
     """How far an upload of the caller is. Raises `NotFoundProblem`."""
     return _shown(_find(tx, upload_id))
 
 
-def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> Upload:
+def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> StoredUpload:
     """Append a piece of at most a few MiB that starts at `offset`.
 
     Raises `ConflictProblem` with the true offset in `context.offset` where the upload is elsewhere.
@@ -84,7 +84,7 @@ def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> Upload:
     for start in range(0, len(data), CHUNK_BYTES):
         piece = {"upload_id": upload_id, "offset": offset + start, "data": data[start : start + CHUNK_BYTES]}
         tx.execute(insert(upload_chunk), piece)
-    return Upload(upload_id, found.length, offset + len(data), None)
+    return StoredUpload(upload_id, found.length, offset + len(data), None)
 
 
 def finish(tx: Transaction, upload_id: str) -> str:
@@ -172,5 +172,5 @@ def _elsewhere(offset: int) -> ConflictProblem:
     )
 
 
-def _shown(row: Row[Any]) -> Upload:
-    return Upload(row.id, row.length, row.offset, row.finished_digest)
+def _shown(row: Row[Any]) -> StoredUpload:
+    return StoredUpload(row.id, row.length, row.offset, row.finished_digest)

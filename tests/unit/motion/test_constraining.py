@@ -9,7 +9,7 @@ from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
 from marey_motion.editing.constraining import Constraint, constrain_motion
 from marey_motion.editing.finish import finish
-from marey_motion.editing.inverse_kinematics.solving import Limb, limb_ending_at
+from marey_motion.editing.inverse_kinematics.solving import TwoBoneLimb, limb_ending_at
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     JointLimit,
@@ -33,7 +33,7 @@ def walk() -> Clip:
 
 
 @pytest.fixture(scope="module")
-def arm(walk: Clip) -> Limb:
+def arm(walk: Clip) -> TwoBoneLimb:
     mapping = map_joints(walk.skeleton)
     wrist = mapping.indices(walk.skeleton, ("left_wrist",))[0]
     limb = limb_ending_at(walk.skeleton, mapping, wrist, guess_axes(walk.skeleton, mapping))
@@ -48,7 +48,7 @@ def _jolt(skeleton: Skeleton, motion: Motion) -> float:
 
 @pytest.mark.parametrize("whole_body", [False, True])
 def test_a_held_wrist_stays_within_a_millimetre_and_nothing_changes_outside(
-    walk: Clip, arm: Limb, whole_body: bool
+    walk: Clip, arm: TwoBoneLimb, whole_body: bool
 ) -> None:
     motion, skeleton = Motion.of(walk), walk.skeleton
     place = motion.positions(skeleton)[50, arm.end] + (0.0, 0.15, 0.1)
@@ -65,7 +65,7 @@ def test_a_held_wrist_stays_within_a_millimetre_and_nothing_changes_outside(
     assert _jolt(skeleton, made.motion) < 1.6 * _jolt(skeleton, motion)
 
 
-def test_a_single_frame_is_met_in_the_middle_of_its_window(walk: Clip, arm: Limb) -> None:
+def test_a_single_frame_is_met_in_the_middle_of_its_window(walk: Clip, arm: TwoBoneLimb) -> None:
     motion, skeleton = Motion.of(walk), walk.skeleton
     place = motion.positions(skeleton)[60, arm.end] + (0.05, 0.2, 0.1)
     once = Constraint(PositionTarget(arm.end, place), 60, 61, arm.joints, arm)
@@ -77,7 +77,7 @@ def test_a_single_frame_is_met_in_the_middle_of_its_window(walk: Clip, arm: Limb
     assert moved[45] < moved[50] < moved[55]
 
 
-def test_constraints_that_overlap_in_part_come_and_go_smoothly(walk: Clip, arm: Limb) -> None:
+def test_constraints_that_overlap_in_part_come_and_go_smoothly(walk: Clip, arm: TwoBoneLimb) -> None:
     motion, skeleton = Motion.of(walk), walk.skeleton
     head = skeleton.index_of("Head")
     place = motion.positions(skeleton)[50, arm.end] + (0.0, 0.2, 0.1)
@@ -93,7 +93,7 @@ def test_constraints_that_overlap_in_part_come_and_go_smoothly(walk: Clip, arm: 
     assert _jolt(skeleton, made.motion) < 1.5 * _jolt(skeleton, motion)
 
 
-def test_constraints_of_different_limbs_do_not_disturb_each_other(walk: Clip, arm: Limb) -> None:
+def test_constraints_of_different_limbs_do_not_disturb_each_other(walk: Clip, arm: TwoBoneLimb) -> None:
     motion, skeleton = Motion.of(walk), walk.skeleton
     mapping = map_joints(skeleton)
     other = limb_ending_at(skeleton, mapping, mapping.indices(skeleton, ("right_wrist",))[0])
@@ -120,7 +120,7 @@ def test_an_orientation_over_a_range_is_met_about_all_axes(walk: Clip) -> None:
     assert quaternions.angle_between(spins, wanted).max() < 1.01e-3
 
 
-def test_limits_hold_in_the_constrained_frames(walk: Clip, arm: Limb) -> None:
+def test_limits_hold_in_the_constrained_frames(walk: Clip, arm: TwoBoneLimb) -> None:
     motion, skeleton = Motion.of(walk), walk.skeleton
     axes = guess_axes(skeleton, map_joints(skeleton))[skeleton.joint_names[arm.middle]]
     hinge = JointLimit.hinge(JointAxes(axes.twist, axes.swing), -1.0, 0.0, skeleton.rest_rotations[arm.middle])
@@ -136,14 +136,14 @@ def test_limits_hold_in_the_constrained_frames(walk: Clip, arm: Limb) -> None:
     assert made.residuals_after[0].min() > 0.01
 
 
-def test_the_same_constraints_give_the_same_bytes(walk: Clip, arm: Limb) -> None:
+def test_the_same_constraints_give_the_same_bytes(walk: Clip, arm: TwoBoneLimb) -> None:
     motion, skeleton = Motion.of(walk), walk.skeleton
     held = [Constraint(PositionTarget(arm.end, (0.3, 1.2, 1.0)), 50, 60, chain_of(skeleton, arm.end, 1))]
     first, second = (constrain_motion(skeleton, motion, held, blend_frames=BLEND).motion for _ in range(2))
     assert first.rotations.tobytes() == second.rotations.tobytes()
 
 
-def test_ranges_that_are_not_there_are_refused_by_number(walk: Clip, arm: Limb) -> None:
+def test_ranges_that_are_not_there_are_refused_by_number(walk: Clip, arm: TwoBoneLimb) -> None:
     motion = Motion.of(walk)
     good = Constraint(PositionTarget(arm.end, (0, 0, 0)), 0, 1, arm.joints, arm)
     for start, stop in ((110, 130), (5, 5), (-1, 3)):
@@ -155,7 +155,7 @@ def test_ranges_that_are_not_there_are_refused_by_number(walk: Clip, arm: Limb) 
         constrain_motion(walk.skeleton, motion, [bad], blend_frames=3)
 
 
-def test_a_finish_meets_what_a_model_left_and_flags_what_it_could_not_reach(walk: Clip, arm: Limb) -> None:
+def test_a_finish_meets_what_a_model_left_and_flags_what_it_could_not_reach(walk: Clip, arm: TwoBoneLimb) -> None:
     motion, skeleton = Motion.of(walk), walk.skeleton
     places = motion.positions(skeleton)
     near = Constraint(PositionTarget(arm.end, places[40, arm.end] + (0.0, 0.01, 0.0)), 40, 41, arm.joints, arm)

@@ -9,7 +9,7 @@ from marey_motion import kinematics
 from marey_motion.gait import generate_gait
 from marey_reports.drawing.paper import COLOURS, INK, REFERENCE
 from marey_reports.drawing.stick_figures import body_of, runs_of
-from marey_reports.drawing.strips import Moments, StripRow, draw_strips
+from marey_reports.drawing.strips import StripMoments, StripRow, draw_strips
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,9 @@ def strip(walk, *, shift=(0.0, 0.0, 0.0), ghost=False, copies=1):
     row = StripRow(
         "a walk", "", np.stack([shown + shift] * copies), points[None, :, body.pelvis], shown if ghost else None
     )
-    return draw_strips(body, [row], Moments(middles, ["0 %", "50 %", "100 %"], ["", "", ""]), 0.0, cell_in=(1.2, 1.5))
+    return draw_strips(
+        body, [row], StripMoments(middles, ["0 %", "50 %", "100 %"], ["", "", ""]), 0.0, cell_in=(1.2, 1.5)
+    )
 
 
 def coloured(figure, colour):

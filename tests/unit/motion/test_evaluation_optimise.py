@@ -9,7 +9,7 @@ from tests.support.made_databases import arc_track, made_database
 from tests.support.suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.improvement.objective import Objective, headline_means
+from marey_motion.evaluation.improvement.objective import DataSetObjective, headline_means
 from marey_motion.evaluation.improvement.optimise import OptimisationOptions, optimise
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.selection import without_sources
@@ -17,7 +17,7 @@ from marey_motion.evaluation.improvement.suggestion_documents import optimisatio
 from marey_motion.evaluation.suite import EvaluationCancelled
 
 TURNS = ("turn_left", "turn_right")
-AIM = OptimisationOptions(objective=Objective(seconds=0.002), max_steps=6)
+AIM = OptimisationOptions(objective=DataSetObjective(seconds=0.002), max_steps=6)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_no_candidate_would_have_been_better_at_any_step(pool):
 
 def test_a_clip_that_helps_is_added_where_the_budget_of_data_allows(pool):
     straight = made_database(named([arc_track(1.0, 0.0, 6.0), arc_track(2.0, 0.0, 6.0), arc_track(2.0, 50.0, 6.0)]))
-    aim = OptimisationOptions(objective=Objective(seconds=0.0))
+    aim = OptimisationOptions(objective=DataSetObjective(seconds=0.0))
     free = optimise(Resimulation(straight, OPTIONS), aim, absent=["clip_002"])
     assert ("add", ("clip_002",)) in [(step.action, step.sources) for step in free.steps]
     tight = optimise(Resimulation(straight, OPTIONS), replace(aim, max_data_s=15.0), absent=["clip_002"])

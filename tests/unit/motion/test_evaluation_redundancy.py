@@ -5,7 +5,7 @@ from tests.support.made_databases import made_database
 from tests.support.suggestion_cases import OPTIONS, evaluated, named, wandering_tracks, with_mirrored
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.improvement.objective import HEADLINES, Objective, headline_means
+from marey_motion.evaluation.improvement.objective import HEADLINES, DataSetObjective, headline_means
 from marey_motion.evaluation.improvement.redundancy import leave_one_out, plan_removals
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.selection import without_sources
@@ -51,7 +51,7 @@ def test_trials_that_do_not_need_a_clip_are_not_run_again(database, simulation):
 
 
 def test_every_removal_is_told_with_the_change_that_an_evaluation_finds(database, result, simulation):
-    objective = Objective()
+    objective = DataSetObjective()
     removals = leave_one_out(simulation, objective)
     assert {removal.source for removal in removals} == simulation.needed()
     before = headline_means(result.trials)
@@ -64,7 +64,7 @@ def test_every_removal_is_told_with_the_change_that_an_evaluation_finds(database
 
 
 def test_a_plan_predicts_every_step_exactly(database, simulation):
-    plan = plan_removals(simulation, 4, Objective(), removed=["fast_000", "fast_001"])
+    plan = plan_removals(simulation, 4, DataSetObjective(), removed=["fast_000", "fast_001"])
     gone = ["fast_000", "fast_001"]
     for step in plan:
         gone.append(step.removal.source)
@@ -75,16 +75,16 @@ def test_a_plan_predicts_every_step_exactly(database, simulation):
 
 
 def test_a_plan_takes_the_least_harmful_removal_at_each_step(simulation):
-    plan = plan_removals(simulation, 3, Objective())
+    plan = plan_removals(simulation, 3, DataSetObjective())
     gone = []
     for step in plan:
-        assert step.removal == leave_one_out(simulation, Objective(), removed=gone)[0]
+        assert step.removal == leave_one_out(simulation, DataSetObjective(), removed=gone)[0]
         gone.append(step.removal.source)
 
 
 def test_only_as_many_clips_are_tried_as_asked_for_those_first_that_few_trials_need(simulation):
-    few = leave_one_out(simulation, Objective(), consider=2)
-    everything = leave_one_out(simulation, Objective())
+    few = leave_one_out(simulation, DataSetObjective(), consider=2)
+    everything = leave_one_out(simulation, DataSetObjective())
     assert len(few) == 2
     assert max(removal.trials for removal in few) <= sorted(removal.trials for removal in everything)[1]
 
@@ -99,7 +99,7 @@ def test_a_clip_and_its_mirrored_twin_go_together():
 
 def test_the_last_clip_is_never_taken():
     simulation = Resimulation(made_database(named(wandering_tracks(2)[:2])), OPTIONS)
-    assert len(plan_removals(simulation, 5, Objective())) <= 1
+    assert len(plan_removals(simulation, 5, DataSetObjective())) <= 1
 
 
 def test_a_clip_that_is_not_there_cannot_be_left_out(simulation):
@@ -110,16 +110,16 @@ def test_a_clip_that_is_not_there_cannot_be_left_out(simulation):
 def test_the_work_can_be_stopped(database):
     stopped = Resimulation(database, OPTIONS, cancelled=lambda: True)
     with pytest.raises(EvaluationCancelled):
-        leave_one_out(stopped, Objective())
+        leave_one_out(stopped, DataSetObjective())
 
 
 def test_progress_is_told_clip_by_clip(simulation):
     told = []
-    leave_one_out(simulation, Objective(), progress=lambda *step: told.append(step))
+    leave_one_out(simulation, DataSetObjective(), progress=lambda *step: told.append(step))
     assert [step[0] for step in told] == list(range(1, len(told) + 1))
     assert {step[1] for step in told} == {len(told)}
 
 
 def test_weights_that_make_no_sense_are_refused():
     with pytest.raises(MotionError, match="pose_cost"):
-        Objective(pose_cost=-1.0)
+        DataSetObjective(pose_cost=-1.0)

@@ -8,7 +8,7 @@ import pytest
 from tests.support.suggestion_cases import OPTIONS, evaluated
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.improvement.objective import Objective
+from marey_motion.evaluation.improvement.objective import DataSetObjective
 from marey_motion.evaluation.improvement.sweep import (
     GROUPS,
     SweepRow,
@@ -66,7 +66,7 @@ def test_each_row_of_a_sweep_is_an_evaluation_with_these_weights(database):
     for row in rows:
         result = evaluated(reweighted(database, row.weights))
         assert row.metrics == pooled_metrics(result.trials)
-        assert row.objective == Objective().value(result.trials, 0.0)
+        assert row.objective == DataSetObjective().value(result.trials, 0.0)
     assert rows[0].objective != rows[1].objective
 
 

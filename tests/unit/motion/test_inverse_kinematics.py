@@ -11,8 +11,8 @@ from scipy.optimize import least_squares
 from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
 from marey_motion.editing.inverse_kinematics.solving import (
-    Limb,
     SolvedPoses,
+    TwoBoneLimb,
     constraint_jacobian,
     limb_ending_at,
     measure_residuals,
@@ -378,7 +378,7 @@ def test_two_bones_meet_every_place_they_can_reach(skeleton: Skeleton, standard:
 
 def test_two_bones_stay_in_the_plane_of_the_limb(body: Skeleton) -> None:
     motion = _moved(body, frames=50)
-    limb = Limb(*(body.index_of(name) for name in ("LeftUpLeg", "LeftLeg", "LeftFoot")))
+    limb = TwoBoneLimb(*(body.index_of(name) for name in ("LeftUpLeg", "LeftLeg", "LeftFoot")))
     places = motion.positions(body)
     nearer = places[:, limb.start] + 0.8 * (places[:, limb.end] - places[:, limb.start])
     after = solve_two_bone(body, motion, limb, PositionTarget(limb.end, nearer)).motion.positions(body)
@@ -393,7 +393,7 @@ def test_two_bones_stay_in_the_plane_of_the_limb(body: Skeleton) -> None:
 @pytest.mark.parametrize("far", [0.9, 100.0])
 def test_two_bones_stretch_towards_what_they_cannot_reach(body: Skeleton, far: float) -> None:
     motion = _moved(body, frames=20)
-    limb = Limb(*(body.index_of(name) for name in ("LeftArm", "LeftForeArm", "LeftHand")))
+    limb = TwoBoneLimb(*(body.index_of(name) for name in ("LeftArm", "LeftForeArm", "LeftHand")))
     way = np.array([2.0, 1.0, -2.0]) / 3.0
     start = motion.positions(body)[:, limb.start]
     solved = solve_two_bone(body, motion, limb, PositionTarget(limb.end, start + far * way))
@@ -418,7 +418,7 @@ def test_a_limb_that_is_straight_or_folded_bends_about_its_hinge(body: Skeleton)
         assert np.isfinite(folded.motion.rotations).all()
 
 
-def _bending_leg(body: Skeleton, bends_rad: np.ndarray, aside_rad: float) -> tuple[Motion, Limb]:
+def _bending_leg(body: Skeleton, bends_rad: np.ndarray, aside_rad: float) -> tuple[Motion, TwoBoneLimb]:
     """A hanging left leg whose knee goes through these bends, forwards, each with so much of it aside."""
     frames = len(bends_rad)
     rotations = np.repeat(body.rest_rotations[None], frames, axis=0)
@@ -458,7 +458,7 @@ def test_a_limb_that_is_where_it_shall_be_stays_as_it_is(body: Skeleton, bend_de
 
 def test_the_end_of_a_limb_keeps_or_gets_an_orientation(body: Skeleton) -> None:
     motion = _moved(body, frames=30)
-    limb = Limb(*(body.index_of(name) for name in ("LeftArm", "LeftForeArm", "LeftHand")))
+    limb = TwoBoneLimb(*(body.index_of(name) for name in ("LeftArm", "LeftForeArm", "LeftHand")))
     places, spins = motion.positions(body), _spins(body, motion, limb.end)
     near = places[:, limb.start] + 0.7 * (places[:, limb.end] - places[:, limb.start])
     held = solve_two_bone(body, motion, limb, PositionTarget(limb.end, near), ending="held")
@@ -481,7 +481,7 @@ def test_damping_keeps_a_stretching_limb_from_snapping_straight(body: Skeleton) 
         np.zeros((frames, 0, 3)),
         (),
     )
-    limb = Limb(*(body.index_of(name) for name in ("LeftUpLeg", "LeftLeg", "LeftFoot")))
+    limb = TwoBoneLimb(*(body.index_of(name) for name in ("LeftUpLeg", "LeftLeg", "LeftFoot")))
     rest.rotations[:, limb.middle] = quaternions.from_axis_angle((1.0, 0.0, 0.0), 0.8)
     hip = rest.positions(body)[:, limb.start]
     target = hip - np.linspace(0.75, 0.86, frames)[:, None] * (0.0, 1.0, 0.0)
@@ -537,7 +537,7 @@ def test_joints_with_translations_of_their_own_are_reckoned_with(body: Skeleton,
 
 def test_the_solver_that_fits_is_chosen(body: Skeleton) -> None:
     motion = _moved(body, frames=1)
-    limb = Limb(*(body.index_of(name) for name in ("LeftArm", "LeftForeArm", "LeftHand")))
+    limb = TwoBoneLimb(*(body.index_of(name) for name in ("LeftArm", "LeftForeArm", "LeftHand")))
     near = motion.positions(body)[0, limb.start] + (0.3, 0.1, 0.1)
     exact = solve(body, motion, [PositionTarget(limb.end, near)], limb=limb)
     assert exact.residual_after[0, 0] < 1e-12

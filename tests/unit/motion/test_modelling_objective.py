@@ -11,7 +11,7 @@ from marey_motion.alignment.aligned import Placement
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import as_global_rotations, forward_directions, forward_kinematics, headings
 from marey_motion.modelling.search.constraints import (
-    ConstraintError,
+    InvalidConstraint,
     JointOrientation,
     JointPosition,
     KeyframeTime,
@@ -119,7 +119,7 @@ def test_times_are_those_of_motions_that_are_kept_within_their_range():
             column, plain_error(primitive, standard_joints(), latents, constraint), atol=1e-9, err_msg=str(constraint)
         )
     for seconds in (0.85, 1.15):
-        with pytest.raises(ConstraintError, match=r"0\.90 to 1\.10 s"):
+        with pytest.raises(InvalidConstraint, match=r"0\.90 to 1\.10 s"):
             build_objective(primitive, [KeyframeTime("end", seconds)], standard_joints())
 
 
@@ -242,7 +242,7 @@ def assert_derivatives(problem, stacked):
     ],
 )
 def test_a_constraint_that_makes_no_sense_is_refused_by_its_field(make, where):
-    with pytest.raises(ConstraintError) as caught:
+    with pytest.raises(InvalidConstraint) as caught:
         make()
     assert caught.value.where == where
 
@@ -269,7 +269,7 @@ def test_a_heading_needs_hips_and_shoulders():
 
 
 def test_too_many_constraints_are_refused():
-    with pytest.raises(ConstraintError, match="more than"):
+    with pytest.raises(InvalidConstraint, match="more than"):
         build_objective(sliding(), [RootPosition(0, (0.0, 0.0))] * (MOST_CONSTRAINTS + 1), {})
 
 

@@ -7,7 +7,7 @@ import pytest
 from tests.support.search_primitives import walking
 
 from marey_motion.errors import MotionError
-from marey_motion.modelling.search.constraints import ConstraintError, KeyframeTime
+from marey_motion.modelling.search.constraints import InvalidConstraint, KeyframeTime
 from marey_motion.modelling.search.objective import build_objective
 
 FAR = 1e3
@@ -45,5 +45,5 @@ def _moved(primitive, amount):
 
 def test_a_time_that_no_motion_of_the_model_reaches_is_refused():
     primitive, joints = bounded()
-    with pytest.raises(ConstraintError, match="last"):
+    with pytest.raises(InvalidConstraint, match="last"):
         build_objective(primitive, [KeyframeTime("end", 3.0 * primitive.duration_range_s[1])], joints)

@@ -10,7 +10,7 @@ from marey_motion.alignment.aligned import Placement
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_directions, headings
 from marey_motion.modelling.search.constraints import (
-    ConstraintError,
+    InvalidConstraint,
     JointOrientation,
     JointPosition,
     LookDirection,
@@ -139,14 +139,14 @@ def test_one_step_needs_no_hips_and_shoulders():
 
 def test_a_constraint_that_is_wrong_is_told_by_step_and_place():
     steps = [THREE[0], Step(walking()[0], (RootHeading("end", 0.0), RootHeading("never", 0.0)), standard_joints())]
-    with pytest.raises(ConstraintError, match="no keyframe 'never'") as caught:
+    with pytest.raises(InvalidConstraint, match="no keyframe 'never'") as caught:
         search_steps(steps, [tree()] * 2)
     assert caught.value.where == "steps[1].constraints[1].at"
 
 
 @pytest.mark.parametrize("count", [0, MOST_STEPS + 1])
 def test_the_number_of_steps_is_limited(count):
-    with pytest.raises(ConstraintError, match="steps"):
+    with pytest.raises(InvalidConstraint, match="steps"):
         search_steps(THREE[:1] * count, [tree()] * count)
 
 
@@ -155,7 +155,7 @@ def test_steps_of_different_skeletons_make_no_motion():
     primitive = sliding(2)
     other = Step(primitive, (), {})
     wrong = search_steps([other], [build_tree(primitive, 0, TreeOptions(10, features="latent"))])
-    with pytest.raises(ConstraintError, match="different skeletons") as caught:
+    with pytest.raises(InvalidConstraint, match="different skeletons") as caught:
         found_motion([THREE[0], other], joined(sequel, wrong))
     assert caught.value.where == "steps[1]"
 

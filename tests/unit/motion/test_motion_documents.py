@@ -20,7 +20,7 @@ STORED = RevisionRef(item="skeleton-1", revision=3)
 def test_a_clip_comes_back_to_the_bit_in_every_media_type(body, tumbling, media_type):
     clip = tumbling(body, translated=(3, 9))
     sent = codecs.encode_tree(documents.clip_to_document(clip, STORED).model_dump(by_alias=True), media_type)
-    document = clips.Motion.model_validate(codecs.decode_tree(sent, media_type))
+    document = clips.MotionDocument.model_validate(codecs.decode_tree(sent, media_type))
     back = documents.clip_from_document(document, body)
 
     assert document.skeleton == STORED

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marey_motion.formats.numeric_text import BadToken, scan_numbers
+from marey_motion.formats.numeric_text import BadNumber, scan_numbers
 
 
 def scan(text: bytes, width: int = 1, first_line: int = 1) -> np.ndarray:
@@ -30,7 +30,7 @@ def test_any_decimal_numeral_is_read_as_python_reads_it(numerals: list[str]) -> 
 
 @pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
 def test_lines_are_counted_whatever_ends_them(ending: str) -> None:
-    with pytest.raises(BadToken) as bad:
+    with pytest.raises(BadNumber) as bad:
         scan(ending.join(["1 2", "", "3 x"]).encode(), first_line=10)
     assert (bad.value.line, bad.value.index, bad.value.in_line, bad.value.token) == (12, 3, 1, "x")
 
@@ -39,7 +39,7 @@ def test_lines_are_counted_whatever_ends_them(ending: str) -> None:
     "token", ["nan", "inf", "1e999", "1,5", "1_0", "0x1p3", ".", "-", "1e", "--1", "1.2.3", "\x00"]
 )
 def test_what_is_no_finite_decimal_number_is_refused(token: str) -> None:
-    with pytest.raises(BadToken):
+    with pytest.raises(BadNumber):
         scan(f"1 {token} 2".encode())
 
 

@@ -7,7 +7,7 @@ from tests.support.store_fixtures import WRITE, requiring
 
 from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem
 from marey_server.store import coverage_streams, garbage
-from marey_server.store.coverage_streams import LIFETIME_US, MOST_STREAMS, CoverageOffset, NewStream, Step
+from marey_server.store.coverage_streams import LIFETIME_US, MOST_STREAMS, CoverageOffset, NewStream, StreamStep
 
 SETTINGS = {
     "frame_rate_hz": 60.0, "skeleton": None, "evaluation": None, "speeds_m_s": [1.0], "turn_rates_deg_s": [0.0],
@@ -18,7 +18,7 @@ DAY_S = LIFETIME_US / 1e6
 
 
 def step(offset, said="a"):
-    return Step(f"sha256:{said * 64}", {"offset": offset, "said": said}, offset, f"state {said}".encode())
+    return StreamStep(f"sha256:{said * 64}", {"offset": offset, "said": said}, offset, f"state {said}".encode())
 
 
 @pytest.fixture

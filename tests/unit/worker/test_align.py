@@ -9,7 +9,7 @@ from marey_motion.alignment.aligned_documents import StoredExample, set_from_exa
 from marey_motion.gait import generate_gait
 from marey_schemas.documents.alignments import AlignmentInfo
 from marey_schemas.documents.annotations import Annotation
-from marey_schemas.documents.clips import Motion as MotionDocument
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.job_params import AlignParams
 from marey_schemas.kinds import Kind

@@ -5,7 +5,7 @@ import pytest
 from marey_client.errors import Unreachable
 from marey_schemas.worker_protocol import LogAnswer
 from marey_worker import attempt
-from marey_worker.attempt import JobLog
+from marey_worker.attempt import LogUploader
 
 ARRIVES, NEVER_ARRIVES, ANSWER_IS_LOST = "arrives", "never arrives", "answer is lost"
 
@@ -39,7 +39,7 @@ def api(monkeypatch):
 
 @pytest.fixture
 def printed(api, tmp_path):
-    return JobLog(api, tmp_path / "log")
+    return LogUploader(api, tmp_path / "log")
 
 
 @pytest.mark.parametrize("fate", [NEVER_ARRIVES, ANSWER_IS_LOST])

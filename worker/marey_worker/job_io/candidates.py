@@ -13,7 +13,7 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.preparing import SAME_OFFSET_M
 from marey_motion.skeleton import same_hierarchy
-from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted
@@ -43,7 +43,7 @@ class Candidates:
 
 class _Group(NamedTuple):
     pins: list[PinnedInput]
-    motions: list[tuple[str, Motion]]
+    motions: list[tuple[str, MotionDocument]]
 
 
 def read_candidates(context: Context, evaluated: EvaluatedSet) -> Candidates:
@@ -83,5 +83,5 @@ def _build(context: Context, group: _Group, database: MatchingDatabase) -> Match
     return build_clips(context, ClipSet(tuple(group.pins)), group.motions, body, database.options, database.normaliser)
 
 
-def _skeleton_of(motion: tuple[str, Motion]) -> RevisionRef:
+def _skeleton_of(motion: tuple[str, MotionDocument]) -> RevisionRef:
     return RevisionRef.model_validate(motion[1].skeleton.model_dump())

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from marey_motion.evaluation.improvement.objective import Objective
+from marey_motion.evaluation.improvement.objective import DataSetObjective
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import records_from_tree, result_from_tree
 from marey_motion.evaluation.scenario import Trial
@@ -47,9 +47,9 @@ def read_evaluated_set(context: Context) -> EvaluatedSet:
     return EvaluatedSet(result, read_evaluated_clips(context, pin, document, result.options.database))
 
 
-def objective_of(params: ObjectiveParams) -> Objective:
+def objective_of(params: ObjectiveParams) -> DataSetObjective:
     """The objective that was asked for."""
-    return Objective(**params.model_dump())
+    return DataSetObjective(**params.model_dump())
 
 
 def store_document(context: Context, tree: Mapping[str, Any]) -> dict[str, Any]:

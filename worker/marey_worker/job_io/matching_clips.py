@@ -17,7 +17,7 @@ from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.normaliser import Normaliser
 from marey_motion.matching.options import DatabaseOptions
 from marey_motion.matching.search import SearchIndex, build_index
-from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.canonical import canonical_json, document_digest
 from marey_schemas.job_params import EvaluateParams
@@ -138,7 +138,7 @@ def build_set(
 def build_clips(
     context: Context,
     wanted: ClipSet,
-    motions: Sequence[tuple[str, Motion]],
+    motions: Sequence[tuple[str, MotionDocument]],
     body: MatchingBody,
     options: DatabaseOptions,
     normaliser: Normaliser | None,
@@ -166,14 +166,14 @@ def uid_of(pin: PinnedInput) -> str:
     return f"{pin.item}@{pin.revision}"
 
 
-def read_motions(context: Context, pins: Sequence[PinnedInput]) -> Iterator[tuple[str, Motion]]:
+def read_motions(context: Context, pins: Sequence[PinnedInput]) -> Iterator[tuple[str, MotionDocument]]:
     """Each clip's motion and its digest."""
     for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
         context.progress(0, None, f"reading clip {done + 1} of {len(pins)}, {pin.name}")
-        yield document_digest(tree), Motion.model_validate(tree)
+        yield document_digest(tree), MotionDocument.model_validate(tree)
 
 
-def _common_rig(context: Context, wanted: ClipSet, motions: Sequence[tuple[str, Motion]]) -> Rig:
+def _common_rig(context: Context, wanted: ClipSet, motions: Sequence[tuple[str, MotionDocument]]) -> Rig:
     """The skeleton of all clips, at the newest revision in use. Raises `JobRefused` where there are several."""
     used = [RevisionRef.model_validate(motion.skeleton.model_dump()) for _, motion in motions]
     (most, count), *others = Counter(ref.item for ref in used).most_common()
@@ -194,7 +194,7 @@ def _common_rig(context: Context, wanted: ClipSet, motions: Sequence[tuple[str, 
     return Rig(skeleton, mapping)
 
 
-def _trim(pin: PinnedInput, motion: Motion, trims: Mapping[str, tuple[int, int]]) -> tuple[int, int] | None:
+def _trim(pin: PinnedInput, motion: MotionDocument, trims: Mapping[str, tuple[int, int]]) -> tuple[int, int] | None:
     trim = trims.get(pin.item)
     if trim is not None and trim[1] > len(motion.poses):
         frames = len(motion.poses)

@@ -26,7 +26,7 @@ from marey_motion.alignment.segments import Cut, cuts_of
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
 from marey_schemas.documents.annotations import Annotation
-from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.job_params import MOST_EXAMPLES, AlignParams
@@ -47,12 +47,12 @@ class _Clip(NamedTuple):
     """A clip that may become an example."""
 
     pin: PinnedInput
-    motion: Motion
+    motion: MotionDocument
     content: str
     skeleton: RevisionRef
 
 
-class _Annotated(NamedTuple):
+class _ClipAnnotation(NamedTuple):
     """An annotation of a revision of a clip."""
 
     pin: PinnedInput
@@ -120,7 +120,7 @@ class _Job:
         for done, (pin, tree) in enumerate(self._context.documents(pins, "motion", required=False)):
             self._context.progress(done, len(pins), f"reading {pin.name}")
             try:
-                motion = Motion.model_validate(present(pin, tree))
+                motion = MotionDocument.model_validate(present(pin, tree))
             except UNUSABLE as error:
                 self._refusals.add(pin, error)
                 continue
@@ -179,22 +179,22 @@ class _Job:
 
     # -- annotations --
 
-    def _read_annotations(self) -> dict[str, list[_Annotated]] | None:
+    def _read_annotations(self) -> dict[str, list[_ClipAnnotation]] | None:
         """Annotations by clip, of the layer that is asked for; None where the job has none."""
         pins = self._context.inputs.get("annotations", ())
         if not pins:
             if self._params.layer is not None or self._params.labels:
                 raise JobRefused("no-annotations", "a layer or labels are named, but no annotations are given")
             return None
-        found: dict[str, list[_Annotated]] = {}
+        found: dict[str, list[_ClipAnnotation]] = {}
         for pin, tree in self._context.documents(pins, "annotation"):
             annotation = Annotation.model_validate(tree)
             clip = RevisionRef.model_validate(annotation.clip.model_dump())
             if self._params.layer in (None, annotation.layer):
-                found.setdefault(clip.item, []).append(_Annotated(pin, annotation, clip))
+                found.setdefault(clip.item, []).append(_ClipAnnotation(pin, annotation, clip))
         return found
 
-    def _cuts(self, clip: _Clip, annotations: Mapping[str, Sequence[_Annotated]]) -> tuple[Cut, ...]:
+    def _cuts(self, clip: _Clip, annotations: Mapping[str, Sequence[_ClipAnnotation]]) -> tuple[Cut, ...]:
         """Where an annotation cuts a clip; one of the clip's own revision goes before those of others."""
         known = annotations.get(clip.pin.item, ())
         known = [one for one in known if one.clip.revision == clip.pin.revision] or known

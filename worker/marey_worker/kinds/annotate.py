@@ -14,7 +14,7 @@ from marey_motion.editing.annotations.speed_proposals import PauseOptions, Reach
 from marey_motion.editing.annotations.step_proposals import StepOptions, propose_steps
 from marey_motion.errors import AnnotationError, MotionError, UnknownJoint
 from marey_motion.matching.body import MatchingBody
-from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.job_params import AnnotateParams
 from marey_schemas.jobs import ItemInput
@@ -50,7 +50,7 @@ def run(context: Context, params: AnnotateParams) -> dict[str, Any]:
     for done, (pin, tree) in enumerate(context.documents(pins, "motion", required=False)):
         context.progress(done, len(pins), f"annotating {pin.name}")
         try:
-            motion = Motion.model_validate(present(pin, tree))
+            motion = MotionDocument.model_validate(present(pin, tree))
             used = RevisionRef.model_validate(motion.skeleton.model_dump())
             edited = rigs.get(used.item)
             rigged = read_rigged(context, Rig(used, edited.ref if edited else used))

@@ -12,7 +12,7 @@ from marey_motion import documents
 from marey_motion.editing.annotations.layers import Segment, piece_of
 from marey_motion.errors import MotionError
 from marey_schemas.documents.annotations import Annotation
-from marey_schemas.documents.clips import ClipInfo, Motion, Source
+from marey_schemas.documents.clips import ClipInfo, ClipSource, MotionDocument
 from marey_schemas.documents.references import OutputRef, RevisionRef
 from marey_schemas.items import Item
 from marey_schemas.job_params import CutParams
@@ -34,7 +34,7 @@ def run(context: Context, params: CutParams) -> dict[str, Any]:
     return _Cutting(context, params).run()
 
 
-class _Annotated(NamedTuple):
+class _AnnotatedClip(NamedTuple):
     """An annotation, the clip it is of, and the segments to cut out with the names that the pieces get."""
 
     pin: PinnedInput
@@ -77,7 +77,7 @@ class _Cutting:
 
     # -- what there is to cut --
 
-    def _read(self) -> list[_Annotated]:
+    def _read(self) -> list[_AnnotatedClip]:
         pins = self._context.inputs["annotations"]
         found = []
         for pin, tree in self._context.documents(pins, "annotation", required=False):
@@ -90,7 +90,7 @@ class _Cutting:
             except UNUSABLE as error:
                 self._refusals.add(pin, error)
                 continue
-            found.append(_Annotated(pin, annotation, clip, item, tuple(self._named(annotation, item))))
+            found.append(_AnnotatedClip(pin, annotation, clip, item, tuple(self._named(annotation, item))))
         return found
 
     def _clip_of(self, clip: RevisionRef) -> Item | PinnedInput:
@@ -118,7 +118,7 @@ class _Cutting:
                 name = self._params.piece_name(clip.name, one.label, numbers[one.label])
                 yield Segment(one.label, one.start, one.end), name
 
-    def _require_pieces(self, todo: Sequence[_Annotated]) -> None:
+    def _require_pieces(self, todo: Sequence[_AnnotatedClip]) -> None:
         places = Counter((self._folder(one, segment), name) for one in todo for segment, name in one.pieces)
         if not places:
             labels = sorted({segment.label for one in todo for segment in one.annotation.segments})
@@ -137,15 +137,17 @@ class _Cutting:
         if long:
             raise JobRefused("name-too-long", f"{long[0]!r} has {len(long[0])} of {MAX_NAME_LENGTH} characters")
 
-    def _folder(self, one: _Annotated, segment: Segment) -> str:
+    def _folder(self, one: _AnnotatedClip, segment: Segment) -> str:
         folder = one.item.folder if isinstance(one.item, PinnedInput) else one.item.collection
         below = (folder, segment.label.replace("/", "-") if self._params.by_label else "")
         return "/".join(filter(None, below))
 
     # -- pieces --
 
-    def _pieces(self, one: _Annotated) -> Iterator[tuple[StagedOutput, str | None]]:
-        motion = Motion.model_validate(self._context.document(Kind.CLIP, one.clip.item, one.clip.revision, "motion"))
+    def _pieces(self, one: _AnnotatedClip) -> Iterator[tuple[StagedOutput, str | None]]:
+        motion = MotionDocument.model_validate(
+            self._context.document(Kind.CLIP, one.clip.item, one.clip.revision, "motion")
+        )
         info = self._info(one.clip)
         layer = documents.layer_from_document(one.annotation, len(motion.poses))
         for segment, name in one.pieces:
@@ -171,7 +173,7 @@ class _Cutting:
                 parts = {"annotation": document.model_dump(mode="json", by_alias=True)}
                 yield StagedOutput(name=f"{place} (annotation)", kind=Kind.ANNOTATION, parts=parts, **common), None
 
-    def _with_margins(self, segment: Segment, motion: Motion) -> tuple[int, int]:
+    def _with_margins(self, segment: Segment, motion: MotionDocument) -> tuple[int, int]:
         before, after = (
             round(margin_s * motion.frame_rate_hz)
             for margin_s in (self._params.margin_before_s, self._params.margin_after_s)
@@ -186,14 +188,14 @@ class _Cutting:
             return ClipInfo()
         return ClipInfo.model_validate(stored).model_copy(update={"checks": ()})
 
-    def _sources(self, one: _Annotated) -> dict[str, tuple[ItemInput, ...]]:
+    def _sources(self, one: _AnnotatedClip) -> dict[str, tuple[ItemInput, ...]]:
         sources: dict[str, tuple[ItemInput, ...]] = {"annotations": (one.pin.as_input(),)}
         if clip := self._clip_pins.get((one.clip.item, one.clip.revision)):
             sources["clips"] = (clip.as_input(),)
         return sources
 
 
-def _sliced(motion: Motion, frames: tuple[int, int]) -> dict[str, Any]:
+def _sliced(motion: MotionDocument, frames: tuple[int, int]) -> dict[str, Any]:
     """The `motion` part of the frames [start, end), bit for bit."""
     kept = slice(*frames)
     translations = None if motion.translations is None else np.ascontiguousarray(motion.translations[kept])
@@ -201,12 +203,12 @@ def _sliced(motion: Motion, frames: tuple[int, int]) -> dict[str, Any]:
     return motion.model_copy(update={"poses": poses, "translations": translations}).model_dump(by_alias=True)
 
 
-def _piece_info(info: ClipInfo, one: _Annotated, segment: Segment, frames: tuple[int, int]) -> dict[str, Any]:
+def _piece_info(info: ClipInfo, one: _AnnotatedClip, segment: Segment, frames: tuple[int, int]) -> dict[str, Any]:
     details = {
         "clip": one.clip.model_dump(),
         "annotation": one.pin.as_input().model_dump(),
         "label": segment.label,
         "frames": list(frames),
     }
-    cut = info.model_copy(update={"source": Source(format="cut", details=details)})
+    cut = info.model_copy(update={"source": ClipSource(format="cut", details=details)})
     return cut.model_dump(mode="json", by_alias=True, exclude_none=True)

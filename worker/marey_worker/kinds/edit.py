@@ -14,7 +14,7 @@ from marey_motion.editing.registry import EditedClip, NamedCommand, edit_clip
 from marey_motion.editing.take import EditedBody
 from marey_motion.errors import EditError, MotionError
 from marey_motion.skeleton import Skeleton
-from marey_schemas.documents.clips import ClipInfo, Motion, Source
+from marey_schemas.documents.clips import ClipInfo, ClipSource, MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.editing.edits import EditDocument
@@ -64,7 +64,7 @@ class _Editing:
         for done, (pin, motion) in enumerate(self._context.documents(pins, "motion", required=False)):
             self._context.progress(done, len(pins), f"editing {pin.name}")
             try:
-                outputs = list(self._edited(pin, Motion.model_validate(present(pin, motion)), sources))
+                outputs = list(self._edited(pin, MotionDocument.model_validate(present(pin, motion)), sources))
             except UNUSABLE as error:
                 self._refusals.add(pin, error)
                 continue
@@ -83,14 +83,14 @@ class _Editing:
         pins = tuple(self._source_pins.values())
         sources = {}
         for pin, tree in self._context.documents(pins, "motion"):
-            motion = Motion.model_validate(tree)
+            motion = MotionDocument.model_validate(tree)
             try:
                 sources[pin.item] = documents.clip_from_document(motion, self._body(motion).skeleton)
             except MotionError as error:
                 raise JobRefused(error.code, f"the source {pin.path}: {error}") from error
         return sources
 
-    def _edited(self, pin: PinnedInput, motion: Motion, sources: Mapping[str, Clip]) -> Iterator[StagedOutput]:
+    def _edited(self, pin: PinnedInput, motion: MotionDocument, sources: Mapping[str, Clip]) -> Iterator[StagedOutput]:
         """The results of one clip. Raises `MotionError`, `NoSuchThing`."""
         if self._params.in_place:
             self._require_newest(pin)
@@ -109,7 +109,7 @@ class _Editing:
             self._note(pin, name, one)
             yield self._output(pin, name, one.clip, motion, info)
 
-    def _output(self, pin: PinnedInput, name: str, clip: Clip, motion: Motion, info: ClipInfo) -> StagedOutput:
+    def _output(self, pin: PinnedInput, name: str, clip: Clip, motion: MotionDocument, info: ClipInfo) -> StagedOutput:
         rig = self._rigs.get(_skeleton_of(motion).item)
         pins: dict[str, list[PinnedInput | None]] = {
             "clips": [pin],
@@ -131,7 +131,7 @@ class _Editing:
             sources={role: many for role, many in sources.items() if many},
         )
 
-    def _body(self, motion: Motion) -> EditedBody:
+    def _body(self, motion: MotionDocument) -> EditedBody:
         """The skeleton of a motion; its mapping is looked for when a command asks. Raises `MotionError`."""
         used = _skeleton_of(motion)
         if used not in self._bodies:
@@ -154,9 +154,9 @@ class _Editing:
         try:
             stored = self._context.document(Kind.CLIP, pin.item, pin.revision, "info")
         except NoSuchThing:
-            return ClipInfo(source=Source(format="edited", details=done))
+            return ClipInfo(source=ClipSource(format="edited", details=done))
         known = ClipInfo.model_validate(stored)
-        source = Source(format="edited", details=done)
+        source = ClipSource(format="edited", details=done)
         if self._params.in_place and known.source is not None:
             # It is still the clip of that file; only its motion is another.
             source = known.source.model_copy(update={"details": {**known.source.details, "edited": done}})
@@ -211,5 +211,5 @@ def _wanted_sources(context: Context, edit: EditDocument) -> dict[str, PinnedInp
     return found
 
 
-def _skeleton_of(motion: Motion) -> RevisionRef:
+def _skeleton_of(motion: MotionDocument) -> RevisionRef:
     return RevisionRef.model_validate(motion.skeleton.model_dump())

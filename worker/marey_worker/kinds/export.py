@@ -11,7 +11,7 @@ from marey_motion import documents
 from marey_motion.errors import MotionError
 from marey_motion.exporting import write_clip_file
 from marey_motion.skeleton import Skeleton
-from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.reports import StoredFile
 from marey_schemas.documents.skeletons import SkeletonHierarchy
@@ -81,7 +81,7 @@ class _Exporting:
             return self._original(pin, info)
         tree = self._context.document(pin.kind, pin.item, pin.revision, "motion")
         try:
-            motion = Motion.model_validate(tree)
+            motion = MotionDocument.model_validate(tree)
         except ValidationError as error:
             raise _Unwritable("bad-document", str(error)) from error
         skeleton, hierarchy = self._skeleton(RevisionRef.model_validate(motion.skeleton.model_dump()))

@@ -19,7 +19,7 @@ from marey_motion.rigs import map_joints
 from marey_reports.models.figures import ModelSubject, draw_alignment_figures, draw_model_figures
 from marey_reports.models.page import render_model_report
 from marey_schemas.documents.alignments import AlignmentInfo
-from marey_schemas.documents.clips import Motion
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.reports import ModelReport
 from marey_schemas.documents.skeletons import SkeletonHierarchy
@@ -69,12 +69,12 @@ def run(context: Context, params: ModelParams) -> dict[str, Any]:
     }
 
 
-def _read(context: Context, pins: Sequence[PinnedInput]) -> tuple[list[Motion], list[dict[str, Any]]]:
+def _read(context: Context, pins: Sequence[PinnedInput]) -> tuple[list[MotionDocument], list[dict[str, Any]]]:
     """Motion and info of each aligned clip."""
     motions, infos = [], []
     for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
         context.progress(done, len(pins), f"reading {pin.name}")
-        motions.append(Motion.model_validate(tree))
+        motions.append(MotionDocument.model_validate(tree))
     for pin, tree in context.documents(pins, "info"):
         try:
             AlignmentInfo.model_validate(tree)
@@ -84,7 +84,7 @@ def _read(context: Context, pins: Sequence[PinnedInput]) -> tuple[list[Motion], 
     return motions, infos
 
 
-def _common_skeleton(pins: Sequence[PinnedInput], motions: Sequence[Motion]) -> RevisionRef:
+def _common_skeleton(pins: Sequence[PinnedInput], motions: Sequence[MotionDocument]) -> RevisionRef:
     """The skeleton of all clips, at the newest revision in use. Raises `JobRefused` where there are several."""
     used = [RevisionRef.model_validate(motion.skeleton.model_dump()) for motion in motions]
     for pin, ref in zip(pins, used, strict=True):
@@ -100,7 +100,7 @@ def _aligned(
     context: Context,
     pins: Sequence[PinnedInput],
     ref: RevisionRef,
-    motions: Sequence[Motion],
+    motions: Sequence[MotionDocument],
     infos: Sequence[dict[str, Any]],
 ) -> AlignedSet:
     hierarchy = context.document(Kind.SKELETON, ref.item, ref.revision, "hierarchy")

@@ -8,7 +8,7 @@ from typing import Any
 from marey_motion import documents
 from marey_motion.errors import MotionError
 from marey_motion.retargeting import RetargetPlan, moved_bones, retarget
-from marey_schemas.documents.clips import Check, ClipInfo, Motion, Source
+from marey_schemas.documents.clips import Check, ClipInfo, ClipSource, MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.job_params import RetargetParams
 from marey_schemas.kinds import Kind
@@ -54,7 +54,7 @@ class _Retargeting:
         for done, (pin, motion) in enumerate(self._context.documents(pins, "motion", required=False)):
             self._context.progress(done, len(pins), f"retargeting {pin.name}")
             try:
-                self._results.add(self._retargeted(pin, Motion.model_validate(present(pin, motion))))
+                self._results.add(self._retargeted(pin, MotionDocument.model_validate(present(pin, motion))))
             except UNUSABLE as error:
                 self._refusals.add(pin, error)
         self._results.flush()
@@ -65,7 +65,7 @@ class _Retargeting:
             "refused": self._refusals.entries,
         }
 
-    def _retargeted(self, pin: PinnedInput, motion: Motion) -> StagedOutput:
+    def _retargeted(self, pin: PinnedInput, motion: MotionDocument) -> StagedOutput:
         name = f"{pin.name}{self._params.suffix}"
         self._places.take(Kind.CLIP, pin.folder, name)
         used = RevisionRef.model_validate(motion.skeleton.model_dump())
@@ -103,7 +103,7 @@ class _Retargeting:
             "at_rest": list(plan.at_rest),
             "carried": list(plan.carried),
         }
-        made = Source(format="retargeted", details=details)
+        made = ClipSource(format="retargeted", details=details)
         try:
             stored = self._context.document(Kind.CLIP, pin.item, pin.revision, "info")
         except NoSuchThing:

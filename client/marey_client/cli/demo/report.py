@@ -25,7 +25,7 @@ REASONS_SHOWN = 12
 
 
 @dataclass
-class Report:
+class DemoReport:
     """Figures and places. `seconds` is by step: import, retarget, files, evaluate."""
 
     entries: Sequence[ImportEntry]
@@ -89,7 +89,7 @@ class Report:
         return {step: count / self.seconds[step] for step, count in frames.items()}
 
 
-def print_report(report: Report) -> None:
+def print_report(report: DemoReport) -> None:
     """How good the motion is, a table of figures, the reasons of refusals, and where everything is."""
     typer.echo(f"{report.evaluation.sentence}\n")
     print_rows(_rows(report))
@@ -114,7 +114,7 @@ def _command() -> str:
     return "marey" if shutil.which("marey") else shlex.quote(sys.argv[0])
 
 
-def _rows(report: Report) -> Iterator[tuple[str, str, str]]:
+def _rows(report: DemoReport) -> Iterator[tuple[str, str, str]]:
     figures = report.as_dict()
     rates, seconds, sizes = figures["poses_per_second"], figures["seconds"], figures["bytes_per_pose"]
     taken = {status: count for status, count in figures["statuses"].items() if status != "failed"}
@@ -142,7 +142,7 @@ def _rows(report: Report) -> Iterator[tuple[str, str, str]]:
     yield from _evaluation_rows(report)
 
 
-def _evaluation_rows(report: Report) -> Iterator[tuple[str, str, str]]:
+def _evaluation_rows(report: DemoReport) -> Iterator[tuple[str, str, str]]:
     yield "evaluated", f"{report.evaluation.chosen}", report.evaluation.selection
     if (found := report.evaluation.summary) is not None:
         yield (

@@ -15,7 +15,7 @@ from typing import Any
 
 from marey_client import embedded
 from marey_client.cli.demo.evaluation import evaluate_locomotion
-from marey_client.cli.demo.report import Report, print_report
+from marey_client.cli.demo.report import DemoReport, print_report
 from marey_client.cli.output import Advance, print_json, progress, tell
 from marey_client.credentials import ADMIN_TOKEN, read_secret
 from marey_client.errors import NotFound
@@ -62,7 +62,7 @@ class Story:
     advance: Advance
     seconds: dict[str, float] = field(default_factory=dict)
 
-    def tell(self) -> Report:
+    def tell(self) -> DemoReport:
         """All steps; what came of them."""
         with self._timed("import"):
             entries = self._import()
@@ -80,7 +80,7 @@ class Story:
         with self._timed("evaluate"):
             root = target.hierarchy().joints[0].name
             evaluation = evaluate_locomotion(self.project, results, root, self.data, self.advance)
-        return Report(
+        return DemoReport(
             entries=entries,
             left_out=len(self.files.left_out),
             job=job,

@@ -26,7 +26,7 @@ from marey_motion.skeleton import Skeleton
 _KINDS: dict[type, int] = {PositionTarget: 0, OrientationTarget: 1, LookAtTarget: 2}
 
 
-class Body(NamedTuple):
+class JointChains(NamedTuple):
     """K joints: parents (K,), offsets (F or 1, K, 3) metres, and what each may do; `carries` (K, C) its targets."""
 
     parents: Ints
@@ -51,7 +51,7 @@ class Targets(NamedTuple):
     scales: Floats
 
 
-class Found(NamedTuple):
+class SolverResult(NamedTuple):
     """What a solver tells: residuals (F, C), iterations and whether all targets are reached (F,)."""
 
     before: Floats
@@ -99,7 +99,7 @@ class Stepping(NamedTuple):
     outward: Floats
 
 
-class Problem(NamedTuple):
+class IkProblem(NamedTuple):
     """Everything that stays the same while a solver runs, and the poses it changes.
 
     Parameters
@@ -109,16 +109,16 @@ class Problem(NamedTuple):
     """
 
     joints: Ints
-    body: Body
+    body: JointChains
     targets: Targets
     roots: Floats
     rotations: Floats
 
     @property
-    def found(self) -> Found:
+    def found(self) -> SolverResult:
         """Empty room for what the solver tells."""
         frames, count = len(self.roots), len(self.targets.kinds)
-        return Found(
+        return SolverResult(
             np.zeros((frames, count)), np.zeros((frames, count)), np.zeros(frames, np.int64), np.zeros(frames, np.bool_)
         )
 
@@ -166,7 +166,7 @@ class Problem(NamedTuple):
         return motion._replace(root_translations=self.roots, rotations=rotations)
 
 
-def pose_problem(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], freedom: Freedom) -> Problem:
+def pose_problem(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], freedom: Freedom) -> IkProblem:
     """Pack targets for the frames of a motion.
 
     Raises
@@ -186,10 +186,10 @@ def pose_problem(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], 
     roots, rotations = (
         np.array(one, dtype=np.float64, order="C") for one in (motion.root_translations, motion.rotations[:, joints])
     )
-    return Problem(np.array(joints, dtype=np.int64), body, packed, roots, rotations)
+    return IkProblem(np.array(joints, dtype=np.int64), body, packed, roots, rotations)
 
 
-def _body(skeleton: Skeleton, motion: Motion, joints: list[int], carries: Flags, freedom: Freedom) -> Body:
+def _body(skeleton: Skeleton, motion: Motion, joints: list[int], carries: Flags, freedom: Freedom) -> JointChains:
     count = len(joints)
     may_turn = set(joints if freedom.joints is None else freedom.joints)
     movable = np.array([joint in may_turn for joint in joints], dtype=np.bool_)
@@ -207,7 +207,7 @@ def _body(skeleton: Skeleton, motion: Motion, joints: list[int], carries: Flags,
     if moving:
         offsets = np.repeat(offsets, motion.frame_count, axis=0)
         offsets[:, [places[motion.translated_joints[number]] for number in moving]] = motion.translations[:, moving]
-    return Body(parents, offsets, movable, stiffness, limited, limits, carries, bool(freedom.root_moves))
+    return JointChains(parents, offsets, movable, stiffness, limited, limits, carries, bool(freedom.root_moves))
 
 
 def _targets(joints: list[int], targets: Sequence[Target], frames: int) -> Targets:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.arrays import Floats
-from marey_motion.editing.inverse_kinematics.problem import Found, Problem, pose_problem
+from marey_motion.editing.inverse_kinematics.problem import IkProblem, SolverResult, pose_problem
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     OrientationTarget,
@@ -56,7 +56,7 @@ class SolvedPoses:
 
 
 @dataclass(frozen=True)
-class Limb:
+class TwoBoneLimb:
     """A chain of two bones; joints between its own are carried along as they are.
 
     Parameters
@@ -91,7 +91,7 @@ class _LimbKernel(NamedTuple):
 
 def limb_ending_at(
     skeleton: Skeleton, mapping: JointMapping, joint: int, axes: Mapping[str, JointAxes] | None = None
-) -> Limb | None:
+) -> TwoBoneLimb | None:
     """The arm or leg whose wrist or ankle the joint is, None for other joints.
 
     Parameters
@@ -107,7 +107,7 @@ def limb_ending_at(
             swing = None if axes is None else axes[str(names[1])].swing
             # Knees bend about their swing axis, elbows stretch about it.
             hinge = swing if swing is None or middle == "elbow" else (-swing[0], -swing[1], -swing[2])
-            return Limb(top, mid, joint, hinge)
+            return TwoBoneLimb(top, mid, joint, hinge)
     return None
 
 
@@ -117,7 +117,7 @@ def solve(
     targets: Sequence[Target],
     *,
     freedom: Freedom = _ANYWHERE,
-    limb: Limb | None = None,
+    limb: TwoBoneLimb | None = None,
     solver: Solver = "auto",
     options: SolverOptions = _OPTIONS,
 ) -> SolvedPoses:
@@ -212,7 +212,7 @@ def solve_least_squares(
 def solve_two_bone(
     skeleton: Skeleton,
     motion: Motion,
-    limb: Limb,
+    limb: TwoBoneLimb,
     position: PositionTarget,
     *,
     orientation: OrientationTarget | None = None,
@@ -261,7 +261,7 @@ def solve_two_bone(
 
 
 def _kernel_limb(
-    problem: Problem, limb: Limb, ending: Literal["carried", "held", "given"], damping_zone_rad: float
+    problem: IkProblem, limb: TwoBoneLimb, ending: Literal["carried", "held", "given"], damping_zone_rad: float
 ) -> _LimbKernel:
     from marey_motion.editing.inverse_kinematics import two_bone_kernels
 
@@ -276,7 +276,7 @@ def _kernel_limb(
     return _LimbKernel(start, middle, end, offset, hinge, float(damping_zone_rad), endings[ending])
 
 
-def _keep_better(problem: Problem, before: Floats, found: Found) -> None:
+def _keep_better(problem: IkProblem, before: Floats, found: SolverResult) -> None:
     """Frames that the closed form made worse, such as for an orientation that pulls a tool out of reach, stay."""
     squares = problem.targets.scales**2
     worse = (found.after**2) @ squares > (found.before**2) @ squares + 1e-18
@@ -285,7 +285,7 @@ def _keep_better(problem: Problem, before: Floats, found: Found) -> None:
     found.iterations[~worse] = 1
 
 
-def _measure(problem: Problem, options: SolverOptions, residuals: Floats, found: Found) -> None:
+def _measure(problem: IkProblem, options: SolverOptions, residuals: Floats, found: SolverResult) -> None:
     from marey_motion.editing.inverse_kinematics import pose_kernels
 
     pose_kernels.measure_frames(
@@ -325,7 +325,7 @@ def constraint_jacobian(
 
 
 def limb_targets(
-    targets: Sequence[Target], limb: Limb | None
+    targets: Sequence[Target], limb: TwoBoneLimb | None
 ) -> tuple[PositionTarget, OrientationTarget | None] | None:
     """The position and the orientation asked of a limb's end, None where something else is asked."""
     positions = [target for target in targets if isinstance(target, PositionTarget)]
@@ -336,5 +336,5 @@ def limb_targets(
     return positions[0], orientations[0] if orientations else None
 
 
-def _solved(motion: Motion, problem: Problem, found: Found) -> SolvedPoses:
+def _solved(motion: Motion, problem: IkProblem, found: SolverResult) -> SolvedPoses:
     return SolvedPoses(problem.put_back(motion), found.before, found.after, found.iterations, found.reached)

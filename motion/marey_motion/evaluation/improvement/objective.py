@@ -15,7 +15,7 @@ HEADLINES = ("offset_mean", "abs_se_v", "abs_se_omega_deg", "pose_cost_mean", "t
 
 
 @dataclass(frozen=True)
-class Objective:
+class DataSetObjective:
     """mean offset + a · speed error + a' · turn rate error + b · pose cost + c · seconds of data, in metres.
 
     Parameters

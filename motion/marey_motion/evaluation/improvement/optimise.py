@@ -14,7 +14,7 @@ import numpy as np
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.filling import source_seconds
-from marey_motion.evaluation.improvement.objective import Objective, headline_means
+from marey_motion.evaluation.improvement.objective import DataSetObjective, headline_means
 from marey_motion.evaluation.improvement.resimulation import NONE, Resimulation, Sources
 
 Action = Literal["start", "remove", "add"]
@@ -35,7 +35,7 @@ class OptimisationOptions:
         clips that fill most of what the set lacks) are tried; None for all
     """
 
-    objective: Objective = field(default_factory=Objective)
+    objective: DataSetObjective = field(default_factory=DataSetObjective)
     least_gain: float = 1e-4
     max_steps: int = 50
     max_evaluations: int | None = None

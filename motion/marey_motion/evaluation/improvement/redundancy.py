@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
-from marey_motion.evaluation.improvement.objective import Objective, headline_changes, headline_means
+from marey_motion.evaluation.improvement.objective import DataSetObjective, headline_changes, headline_means
 from marey_motion.evaluation.improvement.resimulation import NONE, Resimulation
 
 ProgressCallback = Callable[[int, int, str], None]
@@ -52,7 +52,7 @@ class PlannedRemoval:
 
 def leave_one_out(
     simulation: Resimulation,
-    objective: Objective,
+    objective: DataSetObjective,
     *,
     removed: Collection[str] = NONE,
     consider: int | None = None,
@@ -89,7 +89,7 @@ def leave_one_out(
 def plan_removals(
     simulation: Resimulation,
     count: int,
-    objective: Objective,
+    objective: DataSetObjective,
     *,
     removed: Collection[str] = NONE,
     consider: int | None = None,

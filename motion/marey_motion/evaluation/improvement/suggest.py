@@ -18,7 +18,7 @@ from marey_motion.evaluation.improvement.duplicates import (
     spared_sources,
 )
 from marey_motion.evaluation.improvement.filling import Addition, Filling, plan_fillings, rank_fillings
-from marey_motion.evaluation.improvement.objective import Objective
+from marey_motion.evaluation.improvement.objective import DataSetObjective
 from marey_motion.evaluation.improvement.redundancy import PlannedRemoval, Removal, leave_one_out, plan_removals
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.unused import Unused, find_unused
@@ -49,7 +49,7 @@ class SuggestionOptions:
         when None
     """
 
-    objective: Objective = field(default_factory=Objective)
+    objective: DataSetObjective = field(default_factory=DataSetObjective)
     removals: int = 10
     consider: int | None = 50
     duplicate_cm: float = THRESHOLD_CM

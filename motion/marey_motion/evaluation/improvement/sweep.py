@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, fields, replace
 import numpy as np
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.improvement.objective import Objective, headline_means
+from marey_motion.evaluation.improvement.objective import DataSetObjective, headline_means
 from marey_motion.evaluation.metrics import measure_trial, pooled_metrics
 from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.result import Metrics
@@ -66,7 +66,7 @@ def sweep_weights(
     options: EvaluationOptions,
     settings: Sequence[FeatureWeights],
     *,
-    objective: Objective | None = None,
+    objective: DataSetObjective | None = None,
     trials: Sequence[Trial] | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
@@ -77,7 +77,7 @@ def sweep_weights(
     Progress counts trials over all settings.
     """
     wanted = suite_trials(options) if trials is None else tuple(trials)
-    aim = objective or Objective()
+    aim = objective or DataSetObjective()
     tell = progress or (lambda _done, _total, _note: None)
     rows = []
     for number, weights in enumerate(settings):

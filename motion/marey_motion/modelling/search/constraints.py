@@ -25,7 +25,7 @@ TOLERANCE_RAD = radians(5.0)
 TOLERANCE_S = 0.05
 
 
-class ConstraintError(MotionError):
+class InvalidConstraint(MotionError):
     """The constraint makes no sense, or the model has not what it names."""
 
     default_code = "constraint-invalid"
@@ -179,16 +179,16 @@ def tolerance_of(constraint: Constraint) -> float:
 
 
 def frame_at(primitive: MotionPrimitive, at: Moment) -> float:
-    """The canonical frame of a moment. Raises `ConstraintError`, naming the keyframes that there are."""
+    """The canonical frame of a moment. Raises `InvalidConstraint`, naming the keyframes that there are."""
     last = primitive.frame_count - 1
     if isinstance(at, str):
         moments: Mapping[str, int] = {START: 0, END: last, **primitive.keyframes}
         if at not in moments:
             known = ", ".join(moments)
-            raise ConstraintError(f"{primitive.name} has no keyframe {at!r}; it has {known}", where="at")
+            raise InvalidConstraint(f"{primitive.name} has no keyframe {at!r}; it has {known}", where="at")
         return float(moments[at])
     if not 0 <= at <= last:
-        raise ConstraintError(f"canonical frame {at:g} is not within 0 to {last}", where="at")
+        raise InvalidConstraint(f"canonical frame {at:g} is not within 0 to {last}", where="at")
     return float(at)
 
 
@@ -201,7 +201,7 @@ def joint_index(primitive: MotionPrimitive, name: str, standard_joints: Mapping[
 
 def _require(holds: bool, message: str, where: str) -> None:
     if not holds:
-        raise ConstraintError(message, where=where)
+        raise InvalidConstraint(message, where=where)
 
 
 def _require_positive(**values: float) -> None:

@@ -11,7 +11,7 @@ from marey_motion import quaternions
 from marey_motion.alignment.aligned import Placement
 from marey_motion.arrays import Floats
 from marey_motion.modelling.primitive import MotionPrimitive
-from marey_motion.modelling.search.constraints import ConstraintError, Moment, frame_at
+from marey_motion.modelling.search.constraints import InvalidConstraint, Moment, frame_at
 from marey_motion.modelling.search.step_search import Sequel
 from marey_motion.modelling.search.steps import Step
 from marey_motion.motion import Motion
@@ -54,15 +54,15 @@ class FoundMotion:
 def found_motion(steps: Sequence[Step], sequel: Sequel) -> FoundMotion:
     """The motions of all steps, one after the other.
 
-    Raises `ConstraintError` where steps move different skeletons, or have different frame rates.
+    Raises `InvalidConstraint` where steps move different skeletons, or have different frame rates.
     """
     first = steps[0].primitive
     for number, step in enumerate(steps):
         if not same_hierarchy(step.primitive.skeleton, first.skeleton, tolerance_m=SAME_OFFSET_M):
-            raise ConstraintError("the models of the steps move different skeletons", where=f"steps[{number}]")
+            raise InvalidConstraint("the models of the steps move different skeletons", where=f"steps[{number}]")
         if step.primitive.frame_rate_hz != first.frame_rate_hz:
             rates = f"{first.frame_rate_hz:g} and {step.primitive.frame_rate_hz:g} Hz"
-            raise ConstraintError(f"the models of the steps have frame rates of {rates}", where=f"steps[{number}]")
+            raise InvalidConstraint(f"the models of the steps have frame rates of {rates}", where=f"steps[{number}]")
     placed = [
         _placed(step.primitive.motions(latent[None])[0], placement)
         for step, latent, placement in zip(steps, sequel.latents, sequel.measured.placements, strict=True)

@@ -17,7 +17,7 @@ from marey_motion.modelling.search import objective_kernels as kernels
 from marey_motion.modelling.search import slope_kernels
 from marey_motion.modelling.search.constraints import (
     Constraint,
-    ConstraintError,
+    InvalidConstraint,
     JointOrientation,
     JointPosition,
     KeyframeTime,
@@ -156,7 +156,7 @@ def build_objective(
     ConstraintError    naming the constraint and what is wrong with it
     """
     if len(constraints) > MOST_CONSTRAINTS:
-        raise ConstraintError(f"{len(constraints)} constraints are more than {MOST_CONSTRAINTS}", where="constraints")
+        raise InvalidConstraint(f"{len(constraints)} constraints are more than {MOST_CONSTRAINTS}", where="constraints")
     tracked = {one: place for place, one in enumerate(also)}
     moments: dict[float, int] = {}
     rows = []
@@ -165,7 +165,7 @@ def build_objective(
             rows.append(_row(primitive, constraint, standard_joints, tracked, moments))
         except MotionError as error:
             place = ".".join(part for part in (f"constraints[{number}]", error.where) if part)
-            raise ConstraintError(error.message, code=error.code, where=place) from None
+            raise InvalidConstraint(error.message, code=error.code, where=place) from None
     return Objective(
         primitive=primitive,
         constraints=tuple(constraints),
@@ -181,7 +181,7 @@ def as_row(placement: Placement) -> Floats:
     return np.array((placement.heading_rad, placement.x, placement.z))
 
 
-class _Row(NamedTuple):
+class _ResidualRow(NamedTuple):
     kind: int
     item: int
     target: tuple[float, ...]
@@ -194,7 +194,7 @@ def _row(
     standard_joints: Mapping[str, int],
     tracked: dict[Tracked, int],
     moments: dict[float, int],
-) -> _Row:
+) -> _ResidualRow:
     """A constraint in numbers; what it looks at is added to what is tracked, each thing once."""
     frame = frame_at(primitive, constraint.at)
 
@@ -204,9 +204,9 @@ def _row(
     match constraint:
         case KeyframeTime():
             _require_possible(primitive, constraint, frame)
-            return _Row(kernels.TIME, moments.setdefault(frame, len(moments)), (constraint.seconds,))
+            return _ResidualRow(kernels.TIME, moments.setdefault(frame, len(moments)), (constraint.seconds,))
         case RootHeading():
-            return _Row(kernels.HEADING, place(facing(frame, standard_joints)), (constraint.heading_rad,))
+            return _ResidualRow(kernels.HEADING, place(facing(frame, standard_joints)), (constraint.heading_rad,))
         case RootPosition():
             x, z = constraint.target_m
             return _position_row(place(standing(frame, standard_joints)), (x, None, z))
@@ -216,28 +216,28 @@ def _row(
         case JointPosition():
             return _position_row(joint, constraint.target_m)
         case JointOrientation():
-            return _Row(kernels.ORIENTATION, joint, _unit(constraint.rotation))
+            return _ResidualRow(kernels.ORIENTATION, joint, _unit(constraint.rotation))
         case LookDirection(point_m=None, direction=direction):
             assert direction is not None  # one of the two is there
-            return _Row(kernels.DIRECTION, joint, _unit(direction), _unit(constraint.axis))
+            return _ResidualRow(kernels.DIRECTION, joint, _unit(direction), _unit(constraint.axis))
         case LookDirection(point_m=point):
             assert point is not None
-            return _Row(kernels.POINT, joint, point, _unit(constraint.axis))
+            return _ResidualRow(kernels.POINT, joint, point, _unit(constraint.axis))
 
 
 def _require_possible(primitive: MotionPrimitive, constraint: KeyframeTime, frame: float) -> None:
-    """Raise `ConstraintError` for a time that no motion of the primitive reaches, at a canonical frame."""
+    """Raise `InvalidConstraint` for a time that no motion of the primitive reaches, at a canonical frame."""
     if primitive.duration_range_s is None:
         return
     least, most = primitive.duration_range_s
     ends = frame == primitive.frame_count - 1
     if constraint.seconds > most or (ends and constraint.seconds < least):
-        raise ConstraintError(f"motions of {primitive.name} last {least:.2f} to {most:.2f} s", where="seconds")
+        raise InvalidConstraint(f"motions of {primitive.name} last {least:.2f} to {most:.2f} s", where="seconds")
 
 
-def _position_row(item: int, target: tuple[float | None, ...]) -> _Row:
+def _position_row(item: int, target: tuple[float | None, ...]) -> _ResidualRow:
     counted = tuple(float(value is not None) for value in target)
-    return _Row(kernels.POSITION, item, tuple(value or 0.0 for value in target), counted)
+    return _ResidualRow(kernels.POSITION, item, tuple(value or 0.0 for value in target), counted)
 
 
 def _unit(values: tuple[float, ...]) -> tuple[float, ...]:
@@ -245,7 +245,7 @@ def _unit(values: tuple[float, ...]) -> tuple[float, ...]:
     return tuple((array / np.linalg.norm(array)).tolist())
 
 
-def _as_rows(rows: Sequence[_Row]) -> Rows:
+def _as_rows(rows: Sequence[_ResidualRow]) -> Rows:
     targets, axes = np.zeros((len(rows), 4)), np.zeros((len(rows), 3))
     for number, row in enumerate(rows):
         targets[number, : len(row.target)] = row.target

@@ -67,7 +67,7 @@ class Refined:
     evaluations: int
 
 
-class Problem(Protocol):
+class LeastSquares(Protocol):
     """Sums of squares with a prior."""
 
     @property
@@ -78,7 +78,7 @@ class Problem(Protocol):
         """Residuals (r,) and their derivatives (r, W)."""
 
 
-def refine(problem: Problem, start: Floats, options: RefineOptions = DEFAULT_REFINING) -> Refined:
+def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAULT_REFINING) -> Refined:
     """Improve latent vectors; the result is never worse than the start, by what is minimised.
 
     Parameters

@@ -22,7 +22,7 @@ NARROWING = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class FoundSamples:
     """The best samples that a search came upon, the best first.
 
     Parameters
@@ -39,7 +39,7 @@ class Found:
     evaluations: int
 
 
-def search_tree(objective: Objective, tree: SampleTree, *, candidates: int = CANDIDATES, top: int = 1) -> Found:
+def search_tree(objective: Objective, tree: SampleTree, *, candidates: int = CANDIDATES, top: int = 1) -> FoundSamples:
     """Go down a tree with the best nodes of each level, and keep the best samples on the way.
 
     All children of all candidates of a level are evaluated at once, nodes by the mean of their samples, nodes of one
@@ -57,7 +57,7 @@ def search_tree(objective: Objective, tree: SampleTree, *, candidates: int = CAN
 
 def search_closely(
     objective: Objective, tree: SampleTree, *, candidates: int = CANDIDATES, passes: int = PASSES
-) -> Found:
+) -> FoundSamples:
     """The best sample, and then what is better close to it: as `search_tree`, several times.
 
     Each further pass goes down the same tree once more, with all samples drawn together about the best motion so far,
@@ -76,7 +76,7 @@ def search_closely(
 
 def _descend(
     objective: Objective, tree: SampleTree, candidates: int, top: int, drawn: Callable[[Floats], Floats]
-) -> Found:
+) -> FoundSamples:
     """Go down a tree whose latent vectors are where `drawn` puts them."""
     frontier = np.zeros(1, dtype=np.intp)
     seen, costs, evaluations = [], [], 0
@@ -95,7 +95,7 @@ def _descend(
     return replace(best, latents=drawn(best.latents))
 
 
-def search_all(objective: Objective, tree: SampleTree, *, top: int = 1) -> Found:
+def search_all(objective: Objective, tree: SampleTree, *, top: int = 1) -> FoundSamples:
     """Evaluate every sample."""
     _check(objective, tree, 1, top)
     costs = objective.costs(tree.samples.astype(np.float64))
@@ -110,9 +110,9 @@ def _check(objective: Objective, tree: SampleTree, candidates: int, top: int) ->
         raise MotionError("a search follows at least one candidate and returns at least one sample", where="candidates")
 
 
-def _best(tree: SampleTree, samples: Indices, costs: Floats, top: int, evaluations: int) -> Found:
+def _best(tree: SampleTree, samples: Indices, costs: Floats, top: int, evaluations: int) -> FoundSamples:
     chosen = _smallest(costs, samples, top)
-    return Found(samples[chosen], tree.samples[samples[chosen]].astype(np.float64), costs[chosen], evaluations)
+    return FoundSamples(samples[chosen], tree.samples[samples[chosen]].astype(np.float64), costs[chosen], evaluations)
 
 
 def _smallest(costs: Floats, places: Indices, count: int) -> Indices:

@@ -13,7 +13,7 @@ from marey_motion.errors import MotionError
 from marey_motion.modelling.search.constraints import START, JointPosition
 from marey_motion.modelling.search.objective import AT_ORIGIN, build_objective
 from marey_motion.modelling.search.optimise import DEFAULT_REFINING, Refined, RefineOptions, refine
-from marey_motion.modelling.search.samples import CANDIDATES, PASSES, Found, search_closely
+from marey_motion.modelling.search.samples import CANDIDATES, PASSES, FoundSamples, search_closely
 from marey_motion.modelling.search.steps import (
     DEFAULT_TRANSITIONS,
     CarriedOn,
@@ -42,7 +42,7 @@ class Sequel:
     latents: tuple[Floats, ...]
     measured: Measured
     joints: tuple[str, ...]
-    searched: tuple[Found, ...]
+    searched: tuple[FoundSamples, ...]
     sampled: Measured
     refined: Refined | None
 
@@ -72,7 +72,7 @@ def search_steps(
     MotionError    where numbers become too large to compute with
     """
     problem = SeveralSteps.of(steps, start, transitions)
-    searched: list[Found] = []
+    searched: list[FoundSamples] = []
     for step, tree in zip(steps, trees, strict=True):
         begun = problem.carried_on([one.latents[0] for one in searched])
         searched.append(_search_step(step, tree, begun, candidates, passes, transitions))
@@ -96,7 +96,7 @@ def _require_finite(*found: Floats) -> None:
 
 def _search_step(
     step: Step, tree: SampleTree, begun: CarriedOn, candidates: int, passes: int, transitions: TransitionOptions
-) -> Found:
+) -> FoundSamples:
     """The best motion of a tree for a step that goes on where another ended."""
     going_on = tuple(
         JointPosition(name, START, (x, y, z), transitions.tolerance_m, transitions.weight)

@@ -19,7 +19,7 @@ from marey_motion.errors import MotionError
 from marey_motion.modelling.mixture import LatentMixture
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search import slope_kernels
-from marey_motion.modelling.search.constraints import Constraint, ConstraintError
+from marey_motion.modelling.search.constraints import Constraint, InvalidConstraint
 from marey_motion.modelling.search.objective import AT_ORIGIN, Linearised, Objective, as_row, build_objective
 from marey_motion.modelling.search.tracking import Chains, Tracked, facing, standing, track_points
 
@@ -128,9 +128,9 @@ class SeveralSteps:
     def of(
         cls, steps: Sequence[Step], start: Placement = AT_ORIGIN, transitions: TransitionOptions = DEFAULT_TRANSITIONS
     ) -> SeveralSteps:
-        """Prepare steps. Raises `ConstraintError`, naming step and constraint."""
+        """Prepare steps. Raises `InvalidConstraint`, naming step and constraint."""
         if not 1 <= len(steps) <= MOST_STEPS:
-            raise ConstraintError(f"{len(steps)} steps are not within 1 to {MOST_STEPS}", where="steps")
+            raise InvalidConstraint(f"{len(steps)} steps are not within 1 to {MOST_STEPS}", where="steps")
         joints = tuple(name for name in transitions.joints if all(name in step.standard_joints for step in steps))
         alone = len(steps) == 1
         links: list[_Link] = []
@@ -140,7 +140,7 @@ class SeveralSteps:
                 links.append(_link(step, () if alone else _ends(step, joints), first))
             except MotionError as error:
                 place = ".".join(part for part in (f"steps[{number}]", error.where) if part)
-                raise ConstraintError(error.message, code=error.code, where=place) from None
+                raise InvalidConstraint(error.message, code=error.code, where=place) from None
             first += step.primitive.dimensions
         return cls(tuple(links), joints, start, transitions)
 

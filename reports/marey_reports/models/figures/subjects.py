@@ -18,8 +18,8 @@ from marey_motion.modelling.search.check import SearchCheck
 from marey_motion.modelling.training_report import TrainingReport
 from marey_motion.skeleton import Skeleton
 from marey_reports.drawing.paper import shortened, told_apart
-from marey_reports.drawing.stick_figures import Body, body_of
-from marey_reports.drawing.strips import Moments
+from marey_reports.drawing.stick_figures import StickFigure, body_of
+from marey_reports.drawing.strips import StripMoments
 
 MOMENTS = 7
 SAMPLES = 16
@@ -51,7 +51,7 @@ class ModelSubject:
     seed: int = 0
 
     @cached_property
-    def body(self) -> Body:
+    def body(self) -> StickFigure:
         """What to draw of the skeleton."""
         return body_of(self.primitive.skeleton)
 
@@ -90,7 +90,7 @@ class ModelSubject:
         """(..., P, 3) where joints, then end sites, of poses (..., 3 + 4·J) are, metres."""
         return points_of(self.primitive.skeleton, poses)
 
-    def moments(self, count: int = MOMENTS) -> tuple[NDArray[np.int64], Moments]:
+    def moments(self, count: int = MOMENTS) -> tuple[NDArray[np.int64], StripMoments]:
         """The canonical frames that strips show, and their columns; all look at where the mean motion is."""
         return choose_moments(self, count)
 
@@ -107,7 +107,7 @@ def points_of(skeleton: Skeleton, poses: Floats) -> Floats:
     return np.asarray(points.reshape(*poses.shape[:-1], -1, 3), dtype=np.float64)
 
 
-def choose_moments(subject: ModelSubject, count: int) -> tuple[NDArray[np.int64], Moments]:
+def choose_moments(subject: ModelSubject, count: int) -> tuple[NDArray[np.int64], StripMoments]:
     """Evenly spaced canonical frames; a keyframe takes the place of the one that is nearest to it."""
     last = subject.primitive.frame_count - 1
     frames = np.unique(np.rint(np.linspace(0, last, count)).astype(np.int64))
@@ -123,7 +123,7 @@ def choose_moments(subject: ModelSubject, count: int) -> tuple[NDArray[np.int64]
     frames, labels = frames[order], [labels[place] for place in order]
     middles = subject.points(subject.mean_poses[frames])[:, subject.body.pelvis][:, [0, 2]]
     names = [f"{100 * frame / max(last, 1):.0f} %" for frame in frames]
-    return frames, Moments(middles, names, labels)
+    return frames, StripMoments(middles, names, labels)
 
 
 def position_table(

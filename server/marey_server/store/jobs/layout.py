@@ -85,7 +85,7 @@ def request_of(row: Row[Any]) -> JobCreate:
     )
 
 
-def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dict[str, result_cache.Source]]:
+def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dict[str, result_cache.SharedResult]]:
     """Spread jobs whose inputs are known over tasks and give them their cache keys.
 
     Returns the tasks, and for each job whose result is there or under way, whose that is; such jobs wait for it.
@@ -97,7 +97,7 @@ def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dic
     return tasks, sources | _find_results(tx, single)
 
 
-def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_cache.Source]:
+def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_cache.SharedResult]:
     """Give jobs their cache keys; those whose result is there or under way wait for it instead of being queued."""
     _set_cache_keys(tx, jobs)
     sources = result_cache.decide(tx, [one for one in jobs if one.state == "queued"])

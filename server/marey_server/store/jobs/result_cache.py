@@ -37,7 +37,7 @@ MOST_SHARED_OUTPUTS = 256
 IN_LIST = 1000
 
 
-class Source(NamedTuple):
+class SharedResult(NamedTuple):
     """The job whose result another one shares."""
 
     id: str
@@ -110,7 +110,7 @@ def _content(pin: Pin, read: Collection[str], parts: Mapping[str, str]) -> list[
 # -- deciding ---------------------------------------------------------------------------------------------------------
 
 
-def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, Source]:
+def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult]:
     """For each of `candidates` (`id, project_id, cache_key, cache_mode`) whose result is there or under way: whose.
 
     Of several identical candidates the first computes and the others share. Submissions to one project that use the
@@ -122,24 +122,24 @@ def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, Source]:
     for project_id in sorted({one.project_id for one in asking}):
         tx.lock(f"job-cache:{project_id}")
     known = _known_sources(tx, asking)
-    sources: dict[str, Source] = {}
+    sources: dict[str, SharedResult] = {}
     for one in asking:
         place = (one.project_id, one.cache_key)
         source = known.get(place)
         if one.cache_mode == "use" and source is not None:
             sources[one.id] = source
         else:
-            known[place] = Source(one.id, finished=False)
+            known[place] = SharedResult(one.id, finished=False)
     return sources
 
 
-def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, str], Source]:
+def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, str], SharedResult]:
     """The newest finished job of each key, else the oldest that is under way."""
     keys = sorted({one.cache_key for one in asking if one.cache_mode == "use"})
     projects = sorted({one.project_id for one in asking})
     active = or_(job.c.state == QUEUED, job.c.state == RUNNING)
-    finished: dict[tuple[str, str], Source] = {}
-    under_way: dict[tuple[str, str], Source] = {}
+    finished: dict[tuple[str, str], SharedResult] = {}
+    under_way: dict[tuple[str, str], SharedResult] = {}
     for start in range(0, len(keys), IN_LIST):
         rows = tx.execute(
             select(job.c.id, job.c.project_id, job.c.cache_key, job.c.state)
@@ -155,16 +155,16 @@ def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, st
         for row in rows:
             place = (row.project_id, row.cache_key)
             if row.state == "succeeded":
-                finished[place] = Source(row.id, finished=True)
+                finished[place] = SharedResult(row.id, finished=True)
             else:
-                under_way.setdefault(place, Source(row.id, finished=False))
+                under_way.setdefault(place, SharedResult(row.id, finished=False))
     return under_way | finished
 
 
 # -- sharing ----------------------------------------------------------------------------------------------------------
 
 
-def join(tx: Transaction, joining: Sequence[tuple[Any, Source]]) -> list[Ended]:
+def join(tx: Transaction, joining: Sequence[tuple[Any, SharedResult]]) -> list[Ended]:
     """Let waiting jobs (`id`) share the result of their sources: now where it is there, else when it comes."""
     if not joining:
         return []
