@@ -1,4 +1,4 @@
-"""A recorded or made motion of one skeleton, sampled at a constant rate."""
+"""A motion of one skeleton, sampled at a constant rate."""
 
 from __future__ import annotations
 
@@ -16,21 +16,35 @@ from marey_motion.skeleton import UNIT_TOLERANCE, Skeleton
 class Clip:
     """Poses of a skeleton over time.
 
-    Arrays are taken over without a copy where their type fits, and are read-only afterwards.
+    Arrays are used without a copy where their type fits, and are read-only afterwards.
 
     Parameters
     ----------
-    skeleton : the joints the poses are of
-    frame_rate_hz : frames per second
+    skeleton : Skeleton    the joints that the poses belong to
+    frame_rate_hz : float    frames per second
     poses : (F, 3 + 4·J) float32    absolute root translation in metres, which replaces the root's offset, then one
         unit local rotation (w, x, y, z) per joint in the skeleton's order
-    translations : (F, k, 3) float32    metres in the parent's frame; replace the offsets of `translated_joints`.
-        None where only the root moves.
-    translated_joints : increasing indices of those k joints, never the root
+    translations : (F, k, 3) float32, optional    metres in the parent's frame; replace the offsets of
+        `translated_joints`. None where only the root moves.
+    translated_joints : tuple of int    increasing indices of those k joints, never the root
 
     Raises
     ------
     ClipError    naming the field, frame and joint that is wrong
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from marey_motion import Clip, studio_skeleton
+    >>> skeleton = studio_skeleton()
+    >>> poses = np.zeros((60, 3 + 4 * skeleton.joint_count))
+    >>> poses[:, 1] = 0.95
+    >>> poses[:, 3::4] = 1.0
+    >>> clip = Clip(skeleton, 30.0, poses)
+    >>> clip.frame_count, clip.duration_s
+    (60, 2.0)
+    >>> clip.rotations.shape
+    (60, 26, 4)
     """
 
     skeleton: Skeleton
@@ -92,21 +106,34 @@ class Clip:
 
     @property
     def duration_s(self) -> float:
-        """Seconds the clip lasts when each frame is held for one period, so that consecutive slices add up."""
+        """Duration in seconds when each frame lasts one period, so that consecutive slices add up."""
         return self.frame_count / self.frame_rate_hz
 
     @property
     def root_translations(self) -> NDArray[np.float32]:
-        """(F, 3) read-only view of the root's absolute positions, metres."""
+        """Absolute positions (F, 3) of the root in metres, a read-only view."""
         return self.poses[:, :3]
 
     @property
     def rotations(self) -> NDArray[np.float32]:
-        """(F, J, 4) read-only view of the local rotations (w, x, y, z)."""
+        """Local rotations (F, J, 4) as (w, x, y, z), a read-only view."""
         return self.poses[:, 3:].reshape(self.frame_count, -1, 4)
 
     def sliced(self, start: int, stop: int) -> Clip:
-        """Frames [start, stop) as a clip that shares this one's memory; `ClipError` unless 0 <= start < stop <= F."""
+        """Take a range of frames, sharing memory with this clip.
+
+        Parameters
+        ----------
+        start, stop : int    first frame, and the one after the last
+
+        Returns
+        -------
+        Clip    the frames [start, stop)
+
+        Raises
+        ------
+        ClipError    unless 0 <= start < stop <= F
+        """
         if not 0 <= start < stop <= self.frame_count:
             raise ClipError(
                 f"frames {start}:{stop} are not a part of 0:{self.frame_count}; start must come before stop",

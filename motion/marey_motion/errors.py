@@ -1,4 +1,4 @@
-"""Everything that can be wrong with motion data, in one tree.
+"""Errors in motion data, in one tree.
 
 Each error has a stable `code` (a slug that clients may switch on) and says `where` in the input it was found.
 """
@@ -13,9 +13,18 @@ class MotionError(ValueError):
 
     Parameters
     ----------
-    message : what is wrong and what to do about it, for a person
-    code : stable slug; each class has its own default
-    where : the place in the input (joint, field, frame), or None when it concerns the whole
+    message : str    the problem and its remedy, for a person
+    code : str, optional    stable slug; each class has its own default
+    where : str, optional    place in the input (joint, field, frame); None when the error concerns the whole
+
+    Examples
+    --------
+    >>> from marey_motion import MotionError, generate_gait
+    >>> try:
+    ...     generate_gait(1.2, 0.0, duration_s=-1.0)
+    ... except MotionError as error:
+    ...     print(error.where)
+    duration_s
     """
 
     default_code: ClassVar[str] = "motion-invalid"
@@ -45,31 +54,82 @@ def _restore(error_type: type[MotionError], message: str, state: dict[str, objec
 
 
 class SkeletonError(MotionError):
-    """The skeleton is not a valid joint hierarchy."""
+    """The skeleton is not a valid joint hierarchy.
+
+    Examples
+    --------
+    >>> from marey_motion import SkeletonError, studio_skeleton
+    >>> try:
+    ...     studio_skeleton(stature_m=0.0)
+    ... except SkeletonError as error:
+    ...     print(error.code)
+    skeleton-invalid
+    """
 
     default_code = "skeleton-invalid"
 
 
 class UnknownJoint(SkeletonError):
-    """The skeleton has no joint of this name."""
+    """The skeleton has no joint of this name.
+
+    Examples
+    --------
+    >>> from marey_motion import UnknownJoint, studio_skeleton
+    >>> try:
+    ...     studio_skeleton().index_of("LeftKnee")
+    ... except UnknownJoint as error:
+    ...     print(error)
+    LeftKnee: no joint is called 'LeftKnee'; did you mean LeftLeg or LeftToeBase or LeftHand?
+    """
 
     default_code = "unknown-joint"
 
 
 class ClipError(MotionError):
-    """The clip's arrays do not describe a motion of its skeleton."""
+    """The clip's arrays do not describe a motion of its skeleton.
+
+    Examples
+    --------
+    >>> from marey_motion import ClipError, generate_gait
+    >>> try:
+    ...     generate_gait(1.2, 0.0, 2.0).sliced(5, 5)
+    ... except ClipError as error:
+    ...     print(error)
+    slice: frames 5:5 are not a part of 0:120; start must come before stop
+    """
 
     default_code = "clip-invalid"
 
 
 class RotationError(MotionError):
-    """The numbers do not describe rotations."""
+    """The numbers do not describe rotations.
+
+    Examples
+    --------
+    >>> from marey_motion import RotationError, quaternions
+    >>> try:
+    ...     quaternions.normalise([0.0, 0.0, 0.0, 0.0])
+    ... except RotationError as error:
+    ...     print(error)
+    a quaternion of length zero has no direction
+    """
 
     default_code = "rotation-invalid"
 
 
 class MappingError(MotionError):
-    """The skeleton's joints could not be given the standard names that the operation needs."""
+    """The joint mapping lacks standard names that the operation needs.
+
+    Examples
+    --------
+    >>> from marey_motion import MappingError, map_joints, studio_skeleton
+    >>> skeleton = studio_skeleton()
+    >>> try:
+    ...     map_joints(skeleton).indices(skeleton, ["left_wing"])
+    ... except MappingError as error:
+    ...     print(error)
+    left_wing: the mapping names no joint for left_wing; add them to it
+    """
 
     default_code = "mapping-invalid"
 
@@ -87,7 +147,7 @@ class EditError(MotionError):
 
 
 class ModelError(MotionError):
-    """No model can be made of these examples, or the numbers describe none."""
+    """The examples allow no model, or the numbers describe none."""
 
     default_code = "model-invalid"
 
@@ -96,13 +156,24 @@ class ModelError(MotionError):
 
 
 class FormatError(MotionError):
-    """The file is not what its format says it should be.
+    """The file does not follow its format.
 
     Parameters
     ----------
-    file : name of the file as the user knows it
-    line : 1-based line number, for text formats
-    joint : name of the joint that was being read
+    message : str    the problem and its remedy, for a person
+    code : str, optional    stable slug; each class has its own default
+    file : str, optional    name of the file as the user knows it
+    line : int, optional    1-based line number, for text formats
+    joint : str, optional    name of the joint that was being read
+
+    Examples
+    --------
+    >>> from marey_motion import FormatError, read_motion
+    >>> try:
+    ...     read_motion(b"HIERARCHY", "walk.bvh")
+    ... except FormatError as error:
+    ...     print(error.code, error.file)
+    file-truncated walk.bvh
     """
 
     default_code = "format-invalid"
@@ -125,18 +196,52 @@ class FormatError(MotionError):
 
 
 class UnknownFormat(FormatError):
-    """No reader recognises the file."""
+    """No reader recognises the file.
+
+    Examples
+    --------
+    >>> from marey_motion import UnknownFormat, read_motion
+    >>> try:
+    ...     read_motion(b"hello", "hello.txt")
+    ... except UnknownFormat as error:
+    ...     print(error.code)
+    format-unknown
+    """
 
     default_code = "format-unknown"
 
 
 class AmbiguousUnits(FormatError):
-    """The file does not say its unit of length and its sizes fit more than one."""
+    """The file does not state its unit of length, and its sizes fit more than one.
+
+    Examples
+    --------
+    >>> from marey_motion import AmbiguousUnits, ImportOptions, generate_gait, read_motion, write_motion
+    >>> data = write_motion(generate_gait(1.2, 0.0, 2.0), "bvh", unit=0.00137)
+    >>> try:
+    ...     read_motion(data, "walk.bvh")
+    ... except AmbiguousUnits as error:
+    ...     print(error.code)
+    units-ambiguous
+    >>> read_motion(data, "walk.bvh", options=ImportOptions(unit_scale_m=0.00137)).source.unit_scale_m
+    0.00137
+    """
 
     default_code = "units-ambiguous"
 
 
 class FormatLimit(FormatError):
-    """The file asks for more joints, frames or bytes than a reader accepts."""
+    r"""The file has more joints, frames or bytes than a reader accepts.
+
+    Examples
+    --------
+    >>> from marey_motion import FormatLimit, read_motion
+    >>> joints = "".join(f"JOINT {n}\n{{\nOFFSET 0 1 0\nCHANNELS 0\n" for n in range(20_000))
+    >>> try:
+    ...     read_motion(f"HIERARCHY\nROOT root\n{{\nOFFSET 0 0 0\nCHANNELS 0\n{joints}".encode(), "deep.bvh")
+    ... except FormatLimit as error:
+    ...     print(error.code)
+    format-limit
+    """
 
     default_code = "format-limit"

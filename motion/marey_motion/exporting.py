@@ -1,4 +1,4 @@
-"""Clips as files for other programs."""
+"""Clips written as files for other programs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,14 @@ from marey_schemas.formats import format_named
 
 @dataclass(frozen=True)
 class ExportedFile:
-    """The bytes of a file, the ending of its name, and its media type."""
+    """A written file.
+
+    Parameters
+    ----------
+    data : bytes    the content
+    suffix : str    ending of its name, with the dot
+    media_type : str    media type for HTTP
+    """
 
     data: bytes
     suffix: str
@@ -28,8 +35,15 @@ def write_clip_file(
 
     Parameters
     ----------
-    unit : unit of length by name or in metres, where the format leaves it open
-    info : the clip's `info` document; Euler angles keep the rotation orders of the file it came from
+    clip : Clip    the motion
+    file_format : str    name of the format
+    unit : str or float    unit of length by name or in metres, where the format leaves it open
+    info : mapping, optional    the clip's `info` document; Euler angles keep the rotation orders of the file it came
+        from
+
+    Returns
+    -------
+    ExportedFile    the file with its suffix and media type
 
     Raises
     ------

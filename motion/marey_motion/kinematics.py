@@ -1,4 +1,4 @@
-"""Where joints are and how they move: forward kinematics, velocities, heading, contacts.
+"""Joint positions and their motion: forward kinematics, velocities, heading, contacts.
 
 Right-handed, Y up, metres, seconds, radians. Heading theta is about +Y: a body that faces +z has heading 0 and its left
 at +x, forward(theta) = (sin theta, cos theta) in (x, z), and a growing heading is a left turn.
@@ -25,7 +25,26 @@ SHORTEST_LATERAL_M = 1e-3
 
 
 def global_positions(clip: Clip, *, end_sites: bool = False) -> NDArray[np.float32]:
-    """Positions (F, J, 3) of all joints of a clip in metres; `end_sites` appends them: (F, J + E, 3)."""
+    """Compute the positions of all joints of a clip in the world.
+
+    Parameters
+    ----------
+    clip : Clip    F frames of J joints
+    end_sites : bool    append the skeleton's E end sites
+
+    Returns
+    -------
+    (F, J, 3) float32    metres, Y up; (F, J + E, 3) with end sites
+
+    Examples
+    --------
+    >>> from marey_motion import generate_gait, global_positions
+    >>> clip = generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.0, duration_s=2.0)
+    >>> global_positions(clip).shape
+    (120, 26, 3)
+    >>> global_positions(clip, end_sites=True).shape
+    (120, 33, 3)
+    """
     return forward_kinematics(
         clip.skeleton,
         clip.poses,
@@ -36,7 +55,22 @@ def global_positions(clip: Clip, *, end_sites: bool = False) -> NDArray[np.float
 
 
 def global_rotations(clip: Clip) -> NDArray[np.float32]:
-    """Rotations (F, J, 4) of all joints of a clip in the world."""
+    """Compute the rotations of all joints of a clip in the world.
+
+    Parameters
+    ----------
+    clip : Clip    F frames of J joints
+
+    Returns
+    -------
+    (F, J, 4) float32    unit quaternions (w, x, y, z)
+
+    Examples
+    --------
+    >>> from marey_motion import generate_gait, global_rotations
+    >>> global_rotations(generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.0, duration_s=2.0)).shape
+    (120, 26, 4)
+    """
     return as_global_rotations(clip.skeleton, clip.rotations)
 
 
@@ -48,13 +82,32 @@ def forward_kinematics(
     translated_joints: Sequence[int] = (),
     end_sites: bool = False,
 ) -> AnyFloats:
-    """Global joint positions (F, J, 3), in metres and the type of `poses`, of poses that need not belong to a clip.
+    """Compute joint positions in the world for poses that need not belong to a clip.
 
     Parameters
     ----------
-    poses : (F, 3 + 4·J) float32 or float64    root translation, then unit local rotations
-    translations : (F, k, 3)    metres, in place of the offsets of the k `translated_joints`
-    end_sites : append the skeleton's E end sites as points J to J + E - 1
+    skeleton : Skeleton    J joints
+    poses : (F, 3 + 4·J) float32 or float64    root translation in metres, then unit local rotations (w, x, y, z)
+    translations : (F, k, 3), optional    metres in the parent's frame, in place of the offsets of `translated_joints`
+    translated_joints : sequence of int    indices of those k joints
+    end_sites : bool    append the skeleton's E end sites as points J to J + E - 1
+
+    Returns
+    -------
+    (F, J, 3) or (F, J + E, 3)    metres, in the type of `poses`
+
+    Raises
+    ------
+    MotionError    where `poses` has another shape
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from marey_motion import forward_kinematics, studio_skeleton
+    >>> skeleton = studio_skeleton()
+    >>> rest = np.concatenate((skeleton.offsets[0], skeleton.rest_rotations.ravel()))[None]
+    >>> np.allclose(forward_kinematics(skeleton, rest)[0], skeleton.rest_global_positions)
+    True
     """
     from marey_motion import kinematics_kernels
 
@@ -85,7 +138,21 @@ def forward_kinematics(
 
 
 def as_global_rotations(skeleton: Skeleton, rotations: AnyFloats) -> AnyFloats:
-    """Global rotations (F, J, 4) of local ones (F, J, 4)."""
+    """Convert local rotations to rotations in the world.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    rotations : (F, J, 4)    unit quaternions in the parent's frame
+
+    Returns
+    -------
+    (F, J, 4)    unit quaternions in the world, in the same type
+
+    Raises
+    ------
+    MotionError    where the shape is another one
+    """
     from marey_motion import kinematics_kernels
 
     if rotations.ndim != 3 or rotations.shape[1:] != (skeleton.joint_count, 4):
@@ -99,40 +166,101 @@ def as_global_rotations(skeleton: Skeleton, rotations: AnyFloats) -> AnyFloats:
 
 
 def as_kernel_input(array: NDArray[Any]) -> NDArray[Any]:
-    """The array contiguous and read-only, so that each kernel is compiled for one layout only."""
+    """Make an array contiguous and read-only, so that each kernel is compiled for one layout only.
+
+    Parameters
+    ----------
+    array : ndarray    any shape and type
+
+    Returns
+    -------
+    ndarray    a view where the layout fits, else a copy
+    """
     view = np.ascontiguousarray(array).view()
     view.setflags(write=False)
     return view
 
 
 def as_local_rotations(skeleton: Skeleton, rotations: AnyFloats) -> AnyFloats:
-    """Local rotations (..., J, 4) of global ones (..., J, 4)."""
+    """Convert rotations in the world to local ones.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    rotations : (..., J, 4)    unit quaternions in the world
+
+    Returns
+    -------
+    (..., J, 4)    unit quaternions in the parent's frame
+    """
     parents = rotations[..., skeleton.parents[1:], :]
     inner = quaternions.multiply(quaternions.conjugate(parents), rotations[..., 1:, :])
     return np.concatenate((rotations[..., :1, :], inner), axis=-2)
 
 
 def velocities(positions: AnyFloats, frame_rate_hz: float) -> AnyFloats:
-    """Velocities (F, ...) in m/s of positions (F, ...): central differences, linearly extrapolated at both ends."""
+    """Differentiate over time by central differences, linearly extrapolated at both ends.
+
+    Parameters
+    ----------
+    positions : (F, ...)    metres, or any other unit
+    frame_rate_hz : float    frames per second
+
+    Returns
+    -------
+    (F, ...)    metres per second, in the type of `positions`
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from marey_motion import velocities
+    >>> velocities(np.array([0.0, 1.0, 4.0, 9.0]), frame_rate_hz=1.0)
+    array([0., 2., 4., 6.])
+    """
     steps = np.diff(np.asarray(positions, dtype=np.float64), axis=0) * frame_rate_hz
     return quaternions.rate_from_steps(steps, len(positions)).astype(positions.dtype, copy=False)
 
 
 def ground_projection(positions: AnyFloats) -> AnyFloats:
-    """The (x, z) part (..., 2) of positions (..., 3)."""
+    """Project positions to the ground.
+
+    Parameters
+    ----------
+    positions : (..., 3)    metres, Y up
+
+    Returns
+    -------
+    (..., 2)    (x, z) in metres
+    """
     return positions[..., (0, 2)]
 
 
 def forward_directions(positions: AnyFloats, left: Sequence[int], right: Sequence[int]) -> NDArray[np.float64]:
-    """Where the body faces on the ground: unit (x, z) directions (F, 2).
+    """Compute the direction that the body faces on the ground.
+
+    The sum of the left-minus-right vectors is crossed with up. Frames in which that axis is vertical take the direction
+    of the frame before them; the first ones, of the first frame that has one.
 
     Parameters
     ----------
-    positions : (F, J, 3)    metres
-    left, right : matching joints of both sides, best the hips and the shoulders
+    positions : (F, J, 3)    metres, Y up
+    left, right : sequence of int    matching joints of both sides, best the hips and the shoulders
 
-    The sum of the left-minus-right vectors crossed with up. Frames in which that axis is vertical take the direction of
-    the frame before them (the first ones, of the first frame that has one); `MotionError` when no frame has one.
+    Returns
+    -------
+    (F, 2) float64    unit (x, z)
+
+    Raises
+    ------
+    MotionError    when no frame has a direction
+
+    Examples
+    --------
+    >>> from marey_motion import forward_directions, generate_gait, global_positions
+    >>> clip = generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.0, duration_s=2.0)
+    >>> left, right = clip.skeleton.index_of("LeftUpLeg"), clip.skeleton.index_of("RightUpLeg")
+    >>> forward_directions(global_positions(clip), [left], [right])[0].round(1) + 0.0
+    array([0., 1.])
     """
     forward = forward_vectors(positions, left, right)
     length = np.linalg.norm(forward, axis=1)
@@ -146,7 +274,21 @@ def forward_directions(positions: AnyFloats, left: Sequence[int], right: Sequenc
 
 
 def forward_vectors(positions: AnyFloats, left: Sequence[int], right: Sequence[int]) -> NDArray[np.float64]:
-    """As `forward_directions`, not brought to length 1 (F, 2): one under `SHORTEST_LATERAL_M` tells no direction."""
+    """Compute `forward_directions` before they are scaled to length 1.
+
+    Parameters
+    ----------
+    positions : (F, J, 3)    metres, Y up
+    left, right : sequence of int    matching joints of both sides
+
+    Returns
+    -------
+    (F, 2) float64    (x, z) in metres; a length below `SHORTEST_LATERAL_M` gives no reliable direction
+
+    Raises
+    ------
+    MotionError    without a pair of joints
+    """
     if not left or len(left) != len(right):
         raise MotionError("a heading needs at least one pair of left and right joints", code="heading-undefined")
     lateral = np.sum(positions[:, list(left)].astype(np.float64) - positions[:, list(right)], axis=1)
@@ -154,12 +296,45 @@ def forward_vectors(positions: AnyFloats, left: Sequence[int], right: Sequence[i
 
 
 def headings(directions: AnyFloats) -> NDArray[np.float64]:
-    """Heading theta (F,) in radians, continuous in time, of directions (F, 2) on the ground."""
+    """Compute headings from directions on the ground.
+
+    Parameters
+    ----------
+    directions : (F, 2)    (x, z)
+
+    Returns
+    -------
+    (F,) float64    radians about +Y, 0 along +z, continuous in time
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from marey_motion import headings
+    >>> np.degrees(headings(np.array([[0.0, 1.0], [1.0, 0.0], [0.0, -1.0]])))
+    array([  0.,  90., 180.])
+    """
     return np.unwrap(np.arctan2(directions[:, 0], directions[:, 1]).astype(np.float64))
 
 
 def turn_rates(heading: AnyFloats, frame_rate_hz: float) -> NDArray[np.float64]:
-    """Turning speed omega (F,) in rad/s, positive to the left, of continuous headings (F,)."""
+    """Compute the turning speed from headings.
+
+    Parameters
+    ----------
+    heading : (F,)    radians, continuous in time
+    frame_rate_hz : float    frames per second
+
+    Returns
+    -------
+    (F,) float64    radians per second, positive to the left
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from marey_motion import turn_rates
+    >>> turn_rates(np.array([0.0, 0.1, 0.2]), frame_rate_hz=10.0).round(6)
+    array([1., 1., 1.])
+    """
     return np.asarray(velocities(heading, frame_rate_hz), dtype=np.float64)
 
 
@@ -170,10 +345,29 @@ def foot_contacts(
     speed_limit_m_s: float = CONTACT_SPEED_M_S,
     window_s: float = CONTACT_WINDOW_S,
 ) -> NDArray[np.bool_]:
-    """Whether feet stand (F, k), from toe positions (F, k, 3) in metres.
+    """Detect which feet touch the ground.
 
     A toe slower than the limit touches the ground; then each frame follows the majority of the frames around it, within
     the largest odd number that fits in the window, so that single frames cannot flicker.
+
+    Parameters
+    ----------
+    toes : (F, k, 3)    positions of k toes in metres
+    frame_rate_hz : float    frames per second
+    speed_limit_m_s : float    metres per second
+    window_s : float    seconds
+
+    Returns
+    -------
+    (F, k) bool    True where the foot touches the ground
+
+    Examples
+    --------
+    >>> from marey_motion import foot_contacts, generate_gait, global_positions
+    >>> clip = generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.0, duration_s=2.0)
+    >>> toes = [clip.skeleton.index_of(name) for name in ("LeftToeBase", "RightToeBase")]
+    >>> foot_contacts(global_positions(clip)[:, toes], clip.frame_rate_hz).shape
+    (120, 2)
     """
     slow = np.linalg.norm(velocities(toes, frame_rate_hz), axis=-1) < speed_limit_m_s
     reach = max(0, (int(window_s * frame_rate_hz + 1e-9) - 1) // 2)

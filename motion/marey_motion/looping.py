@@ -1,4 +1,4 @@
-"""Clips whose last frame leads into their first one, elsewhere on the ground: where a round ends the next one begins.
+"""Loops: clips whose last frame leads into their first one, elsewhere on the ground.
 
 Ground positions are (x, z) in metres, headings radians that grow to the left.
 """
@@ -15,22 +15,32 @@ from marey_motion.motion import Motion
 
 
 class LoopSeam(NamedTuple):
-    """The move on the ground that takes each round of a loop to the next one: a turn about the origin, then a shift."""
+    """The move on the ground from each round of a loop to the next: a turn about the origin, then a shift.
+
+    Parameters
+    ----------
+    turn_rad : float    radians, positive to the left
+    shift_m : (2,) float64    (x, z) in metres
+    """
 
     turn_rad: float
     shift_m: Floats
 
 
 def loop_seam(positions: Floats, headings: Floats) -> LoopSeam:
-    """The seam of a loop that moves on the ground.
+    """Compute the seam of a loop that moves on the ground.
 
     The step from the last frame to the first one of the next round is not in the data: it is taken as the mean of its
-    neighbours, each as its own frame sees it, so that velocities go on through the seam.
+    neighbours, each seen from its own frame, so that velocities are continuous through the seam.
 
     Parameters
     ----------
-    positions : (F, 2) metres
-    headings : (F,) continuous
+    positions : (F, 2) float64    (x, z) in metres
+    headings : (F,) float64    radians, continuous in time
+
+    Returns
+    -------
+    LoopSeam    identity for fewer than two frames
     """
     if len(headings) < 2:
         return LoopSeam(0.0, np.zeros(2))
@@ -43,14 +53,35 @@ def loop_seam(positions: Floats, headings: Floats) -> LoopSeam:
 
 
 def rotated(vectors: Floats, angles_rad: Floats | float) -> Floats:
-    """Ground vectors (..., 2) turned to the left by angles (...)."""
+    """Rotate ground vectors to the left.
+
+    Parameters
+    ----------
+    vectors : (..., 2) float64    (x, z)
+    angles_rad : (...) float64    radians
+
+    Returns
+    -------
+    (..., 2) float64    (x, z), in the unit of `vectors`
+    """
     sine, cosine = np.sin(angles_rad), np.cos(angles_rad)
     x, z = vectors[..., 0], vectors[..., 1]
     return np.stack((x * cosine + z * sine, z * cosine - x * sine), axis=-1)
 
 
 def moves_of_rounds(seam: LoopSeam, rounds: Ints) -> tuple[Floats, Floats]:
-    """Turns (n,) and shifts (n, 2) from the recorded round to each of `rounds` (n,): 1 is the next."""
+    """Compute the moves from the recorded round of a loop to other rounds.
+
+    Parameters
+    ----------
+    seam : LoopSeam    the move to the next round
+    rounds : (n,) int64    numbers of rounds; 1 is the next one, -1 the one before
+
+    Returns
+    -------
+    turns : (n,) float64    radians
+    shifts : (n, 2) float64    (x, z) in metres
+    """
     first, last = int(rounds.min(initial=0)), int(rounds.max(initial=0))
     turns = seam.turn_rad * np.arange(first, last + 1, dtype=np.float64)
     shifts = np.zeros((last - first + 1, 2))
@@ -62,7 +93,18 @@ def moves_of_rounds(seam: LoopSeam, rounds: Ints) -> tuple[Floats, Floats]:
 
 
 def continue_motion(motion: Motion, seam: LoopSeam, before: int, after: int) -> Motion:
-    """A loop with so many frames more at both ends, taken from the rounds before and after it."""
+    """Extend a loop at both ends by frames of the rounds before and after it.
+
+    Parameters
+    ----------
+    motion : Motion    one round of F frames
+    seam : LoopSeam    the move to the next round
+    before, after : int    numbers of frames to add
+
+    Returns
+    -------
+    Motion    before + F + after frames
+    """
     rounds, frames = np.divmod(np.arange(-before, motion.frame_count + after), motion.frame_count)
     turns, shifts = moves_of_rounds(seam, rounds)
     going_on = motion.at_frames(frames)
@@ -72,6 +114,15 @@ def continue_motion(motion: Motion, seam: LoopSeam, before: int, after: int) -> 
 
 
 def about_vertical(angles_rad: Floats) -> Floats:
-    """Rotations (..., 4) by angles (...) about the vertical, to the left."""
+    """Make rotations about the vertical.
+
+    Parameters
+    ----------
+    angles_rad : (...) float64    radians, positive to the left
+
+    Returns
+    -------
+    (..., 4) float64    unit quaternions (w, x, y, z)
+    """
     zero = np.zeros_like(angles_rad)
     return np.stack((np.cos(0.5 * angles_rad), zero, np.sin(0.5 * angles_rad), zero), axis=-1)

@@ -43,15 +43,20 @@ class _Mirror:
 
 
 def mirror_clip(clip: Clip, partners: AnyInts) -> Clip:
-    """The motion seen in a mirror, left limbs doing what right ones did: global positions reflected in x.
+    """Reflect a motion in x, so that left limbs do what right ones did.
 
     Exact where both sides have the same bone lengths, whatever the rest pose and the joints' local axes; twice is the
     motion itself. A joint that has no counterpart, such as a prop in one hand, moves with its parent as before.
 
     Parameters
     ----------
-    partners : (J,) each joint's partner on the other side, itself for joints of the centre
+    clip : Clip    F frames of J joints
+    partners : (J,) int    each joint's partner on the other side, itself for joints of the centre
         (`rigs.symmetric_joints`)
+
+    Returns
+    -------
+    Clip    the mirrored copy; global positions are reflected in x
 
     Raises
     ------
@@ -68,7 +73,22 @@ def mirror_clip(clip: Clip, partners: AnyInts) -> Clip:
 
 
 def mirror_motion(skeleton: Skeleton, partners: AnyInts, motion: Motion) -> Motion:
-    """As `mirror_clip`, in double precision."""
+    """Reflect a motion in x, as `mirror_clip` in double precision.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    partners : (J,) int    each joint's partner on the other side
+    motion : Motion    F frames
+
+    Returns
+    -------
+    Motion    the mirrored copy
+
+    Raises
+    ------
+    MotionError    when `partners` is not a pairing of the skeleton's joints
+    """
     mirror = _mirror_of(skeleton, tuple(int(partner) for partner in partners))
     rotations = quaternions.multiply(mirror.outer, motion.rotations[:, mirror.sources])
     rotations = quaternions.multiply(rotations, mirror.inner)

@@ -1,4 +1,4 @@
-"""The numbers of a clip in double precision: what is computed with between one clip and the next."""
+"""Clips in double precision, as used between the steps of a computation."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from marey_motion.skeleton import Skeleton
 
 
 class Motion(NamedTuple):
-    """F frames of J joints.
+    """F frames of J joints in double precision.
 
     Parameters
     ----------
-    root_translations : (F, 3) metres
-    rotations : (F, J, 4) local, of unit length, continuous in sign
-    translations : (F, k, 3) metres in the parent's frame, in place of the offsets of k translated joints; k may be 0
-    translated_joints : increasing indices of those joints
+    root_translations : (F, 3) float64    absolute, metres
+    rotations : (F, J, 4) float64    local, of unit length, continuous in sign
+    translations : (F, k, 3) float64    metres in the parent's frame, in place of the offsets of k translated joints; k
+        may be 0
+    translated_joints : tuple of int    increasing indices of those joints
     """
 
     root_translations: Floats
@@ -31,7 +32,16 @@ class Motion(NamedTuple):
 
     @classmethod
     def of(cls, clip: Clip) -> Motion:
-        """A clip's own numbers."""
+        """Convert a clip to double precision.
+
+        Parameters
+        ----------
+        clip : Clip    F frames of J joints
+
+        Returns
+        -------
+        Motion    its numbers; rotations brought to unit length, signs made continuous
+        """
         moved = np.zeros((clip.frame_count, 0, 3)) if clip.translations is None else clip.translations
         rotations = _unit_and_continuous(clip.rotations.astype(np.float64))
         return cls(
@@ -40,28 +50,56 @@ class Motion(NamedTuple):
 
     @property
     def frame_count(self) -> int:
-        """F."""
+        """Number of frames F."""
         return len(self.root_translations)
 
     @property
     def poses(self) -> Floats:
-        """(F, 3 + 4·J) root translations and rotations side by side."""
+        """Root translations and rotations side by side, (F, 3 + 4·J) float64."""
         return np.concatenate((self.root_translations, self.rotations.reshape(self.frame_count, -1)), axis=1)
 
     def as_clip(self, skeleton: Skeleton, frame_rate_hz: float) -> Clip:
-        """The motion as a clip of `skeleton`, in single precision."""
+        """Round the motion to a clip in single precision.
+
+        Parameters
+        ----------
+        skeleton : Skeleton    J joints
+        frame_rate_hz : float    frames per second
+
+        Returns
+        -------
+        Clip    the same motion in float32
+        """
         translations = self.translations.astype(np.float32) if self.translated_joints else None
         return Clip(skeleton, frame_rate_hz, self.poses.astype(np.float32), translations, self.translated_joints)
 
     def positions(self, skeleton: Skeleton) -> Floats:
-        """(F, J, 3) where the joints are, metres."""
+        """Compute the positions of the joints in the world.
+
+        Parameters
+        ----------
+        skeleton : Skeleton    J joints
+
+        Returns
+        -------
+        (F, J, 3) float64    metres
+        """
         positions = kinematics.forward_kinematics(
             skeleton, self.poses, translations=self.translations, translated_joints=self.translated_joints
         )
         return np.asarray(positions, dtype=np.float64)
 
     def at_frames(self, frames: NDArray[np.integer]) -> Motion:
-        """The frames (n,) in that order."""
+        """Pick frames.
+
+        Parameters
+        ----------
+        frames : (n,) int    frame numbers, in any order
+
+        Returns
+        -------
+        Motion    the frames in that order, copied
+        """
         return self._replace(
             root_translations=self.root_translations[frames],
             rotations=self.rotations[frames],
@@ -69,7 +107,16 @@ class Motion(NamedTuple):
         )
 
     def sliced(self, start: int, stop: int) -> Motion:
-        """The frames [start, stop), in the same memory."""
+        """Take a range of frames, sharing memory with this motion.
+
+        Parameters
+        ----------
+        start, stop : int    first frame, and the one after the last
+
+        Returns
+        -------
+        Motion    the frames [start, stop)
+        """
         return self._replace(
             root_translations=self.root_translations[start:stop],
             rotations=self.rotations[start:stop],

@@ -1,8 +1,8 @@
-"""Where bones point in poses whose joints move against their parents.
+"""Directions of bones in poses whose joints move relative to their parents.
 
 Some takes keep the shape of the body in position channels: a shoulder blade that slides, a rig whose offsets are not
-those of its performer. There a bone does not point where its joint's rotation says, but from the joint's place to the
-next one's.
+those of its performer. There a bone does not point where its joint's rotation says, but from the joint's position to
+the next one's.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ SHORTEST_BONE_M = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class FollowedBones:
-    """Rotations of a clip that point its bones where they are.
+    """Rotations of a clip that point its bones where its positions say.
 
     Parameters
     ----------
     rotations : (F, 4·J) float32    local rotations; the clip's own where no bone has moved
-    largest_turn_deg : by name of each joint that was turned, the most in any frame
+    largest_turn_deg : mapping of str to float    by name of each joint that was turned, its largest turn in any frame,
+        degrees
     """
 
     rotations: NDArray[np.float32]
@@ -40,7 +41,7 @@ class FollowedBones:
 
     @property
     def warning(self) -> CheckWarning | None:
-        """What a person should know of it; None where no bone has moved."""
+        """A warning for the user, or None where no bone has moved."""
         if not self.largest_turn_deg:
             return None
         name, most = max(self.largest_turn_deg.items(), key=lambda item: item[1])
@@ -54,11 +55,16 @@ class FollowedBones:
 
 
 def follow_moved_bones(clip: Clip, joints: Mapping[str, int]) -> FollowedBones:
-    """Turn each joint the shortest way from where its bone would point without translations to where it points.
+    """Rotate each joint the shortest way from its bone's direction without translations to its real one.
 
     Parameters
     ----------
-    joints : joint by standard name, whose bones are looked at
+    clip : Clip    F frames of J joints
+    joints : mapping of str to int    joints by standard name whose bones are compared
+
+    Returns
+    -------
+    FollowedBones    rotations (F, 4·J) float32 and the largest turns in degrees
     """
     own = clip.poses[:, 3:]
     if clip.translations is None:

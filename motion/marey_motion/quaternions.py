@@ -27,41 +27,106 @@ EULER_BLOCK = 4096
 
 
 def identity(*leading: int, dtype: type[np.floating[Any]] = np.float64) -> AnyFloats:
-    """Rotations that change nothing, shape (*leading, 4)."""
+    """Make rotations that change nothing.
+
+    Parameters
+    ----------
+    leading : int    sizes of the leading axes
+    dtype : floating type    type of the result
+
+    Returns
+    -------
+    (*leading, 4)    unit quaternions
+    """
     result = np.zeros((*leading, 4), dtype=dtype)
     result[..., 0] = 1.0
     return result
 
 
 def multiply(a: ArrayLike, b: ArrayLike) -> AnyFloats:
-    """The rotation that does `b`, then `a`: the Hamilton product a·b, shape (..., 4)."""
+    """Multiply quaternions (the Hamilton product a·b): the rotation that does `b`, then `a`.
+
+    Parameters
+    ----------
+    a, b : (..., 4)    quaternions; leading axes broadcast
+
+    Returns
+    -------
+    (..., 4)    the product
+    """
     (a, b), dtype = _widened((a, 4), (b, 4))
     return _product(a, b).astype(dtype, copy=False)
 
 
 def conjugate(q: ArrayLike) -> AnyFloats:
-    """The inverse of unit rotations (..., 4)."""
+    """Invert unit quaternions.
+
+    Parameters
+    ----------
+    q : (..., 4)    unit quaternions
+
+    Returns
+    -------
+    (..., 4)    the inverse rotations
+    """
     (q,), dtype = _widened((q, 4))
     return (q * (1.0, -1.0, -1.0, -1.0)).astype(dtype, copy=False)
 
 
 def normalise(q: ArrayLike) -> AnyFloats:
-    """Quaternions (..., 4) at unit length; `RotationError` where one has no length."""
+    """Bring quaternions to unit length.
+
+    Parameters
+    ----------
+    q : (..., 4)    quaternions of any length but zero
+
+    Returns
+    -------
+    (..., 4)    unit quaternions
+
+    Raises
+    ------
+    RotationError    where one has no length
+    """
     (q,), dtype = _widened((q, 4))
     return _unit(q, "quaternion").astype(dtype, copy=False)
 
 
 def rotate_vectors(q: ArrayLike, v: ArrayLike) -> AnyFloats:
-    """Vectors (..., 3) turned by unit rotations (..., 4), shape (..., 3)."""
+    """Rotate vectors.
+
+    Parameters
+    ----------
+    q : (..., 4)    unit quaternions
+    v : (..., 3)    vectors; leading axes broadcast
+
+    Returns
+    -------
+    (..., 3)    the rotated vectors, in the unit of `v`
+    """
     (q, v), dtype = _widened((q, 4), (v, 3))
     return _rotated(q, v).astype(dtype, copy=False)
 
 
 def from_matrix(matrix: ArrayLike) -> AnyFloats:
-    """Rotations (..., 4) of rotation matrices (..., 3, 3), which act on column vectors.
+    """Convert rotation matrices to quaternions.
 
+    Parameters
+    ----------
+    matrix : (..., 3, 3)    rotation matrices, which act on column vectors
+
+    Returns
+    -------
+    (..., 4)    unit quaternions
+
+    Raises
+    ------
+    RotationError    for matrices that scale, shear or mirror
+
+    Notes
+    -----
     All four of Shepperd's (1978) forms are laid out as rows of 4·q·qᵀ; the row with the largest diagonal is exact
-    wherever the others cancel. `RotationError` for matrices that scale, shear or mirror.
+    wherever the others cancel.
     """
     (m,), dtype = _widened((matrix, 3))
     if m.shape[-2:] != (3, 3):
@@ -80,7 +145,16 @@ def from_matrix(matrix: ArrayLike) -> AnyFloats:
 
 
 def as_matrix(q: ArrayLike) -> AnyFloats:
-    """Rotation matrices (..., 3, 3), acting on column vectors, of unit rotations (..., 4)."""
+    """Convert quaternions to rotation matrices.
+
+    Parameters
+    ----------
+    q : (..., 4)    unit quaternions
+
+    Returns
+    -------
+    (..., 3, 3)    rotation matrices, which act on column vectors
+    """
     (q,), dtype = _widened((q, 4))
     w, x, y, z = _parts(q)
     m = np.empty((*q.shape[:-1], 3, 3))
@@ -97,14 +171,37 @@ def as_matrix(q: ArrayLike) -> AnyFloats:
 
 
 def from_axis_angle(axis: ArrayLike, angle_rad: ArrayLike) -> AnyFloats:
-    """Rotations (..., 4) by `angle_rad` (...) about the directions `axis` (..., 3), of any length but zero."""
+    """Make rotations from axes and angles.
+
+    Parameters
+    ----------
+    axis : (..., 3)    directions of any length but zero
+    angle_rad : (...)    radians
+
+    Returns
+    -------
+    (..., 4)    unit quaternions
+
+    Raises
+    ------
+    RotationError    where an axis has no length
+    """
     (axis,), dtype = _widened((axis, 3))
     half = 0.5 * np.asarray(angle_rad, dtype=np.float64)[..., None]
     return _joined(np.cos(half), _unit(axis, "axis") * np.sin(half)).astype(dtype, copy=False)
 
 
 def from_rotation_vector(vector: ArrayLike) -> AnyFloats:
-    """Rotations (..., 4) about the vectors (..., 3) by their length in radians (the exponential map)."""
+    """Make rotations about vectors by their length (the exponential map).
+
+    Parameters
+    ----------
+    vector : (..., 3)    radians
+
+    Returns
+    -------
+    (..., 4)    unit quaternions
+    """
     (vector,), dtype = _widened((vector, 3))
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)
     # numpy's sinc is sin(pi x) / (pi x), exact at zero.
@@ -112,13 +209,31 @@ def from_rotation_vector(vector: ArrayLike) -> AnyFloats:
 
 
 def as_rotation_vector(q: ArrayLike) -> AnyFloats:
-    """Axis times angle (..., 3), of at most half a turn, of unit rotations (..., 4) (the logarithmic map)."""
+    """Convert quaternions to axis times angle, of at most half a turn (the logarithmic map).
+
+    Parameters
+    ----------
+    q : (..., 4)    unit quaternions
+
+    Returns
+    -------
+    (..., 3)    radians
+    """
     (q,), dtype = _widened((q, 4))
     return _rotation_vector(q).astype(dtype, copy=False)
 
 
 def angle_between(a: ArrayLike, b: ArrayLike) -> AnyFloats:
-    """Angle (...) of the shortest rotation from `a` to `b`, both (..., 4), in 0 to pi."""
+    """Compute the angle of the shortest rotation between two rotations.
+
+    Parameters
+    ----------
+    a, b : (..., 4)    unit quaternions; leading axes broadcast
+
+    Returns
+    -------
+    (...)    radians, 0 to pi
+    """
     (a, b), dtype = _widened((a, 4), (b, 4))
     turn = _product(a * (1.0, -1.0, -1.0, -1.0), b)
     angle: AnyFloats = 2.0 * np.arctan2(np.linalg.norm(turn[..., 1:], axis=-1), np.abs(turn[..., 0]))
@@ -126,10 +241,24 @@ def angle_between(a: ArrayLike, b: ArrayLike) -> AnyFloats:
 
 
 def from_euler(order: str, angles_rad: ArrayLike, *, intrinsic: bool = True) -> AnyFloats:
-    """Rotations (..., 4) of angles (..., n) about the n axes named in `order`, one to three letters of x, y and z.
+    """Make rotations from Euler angles.
 
     Intrinsic rotations turn about the axes of the moving frame in the order written, as in the channels of BVH: "zxy"
     is Z·X·Y. Extrinsic ones turn about fixed axes, so that the first letter acts first.
+
+    Parameters
+    ----------
+    order : str    one to three of the letters x, y and z, one per angle
+    angles_rad : (..., n)    radians, in the order of the letters
+    intrinsic : bool    turn about moving axes
+
+    Returns
+    -------
+    (..., 4)    unit quaternions
+
+    Raises
+    ------
+    RotationError    for any other order
     """
     axes = _euler_axes(order)
     (angles,), dtype = _widened((angles_rad, len(axes)))
@@ -142,10 +271,24 @@ def from_euler(order: str, angles_rad: ArrayLike, *, intrinsic: bool = True) -> 
 
 
 def as_euler(q: ArrayLike, order: str, *, intrinsic: bool = True) -> AnyFloats:
-    """Angles (..., 3) in radians about three axes, such as "zxy", of unit rotations (..., 4); see `from_euler`.
+    """Convert quaternions to Euler angles about three axes; see `from_euler`.
 
     The middle angle is in -pi/2 to pi/2, or in 0 to pi where first and last axis are the same. In gimbal lock only the
     sum or the difference of the outer angles is defined: that of the turn that acts first is zero then.
+
+    Parameters
+    ----------
+    q : (..., 4)    unit quaternions
+    order : str    three letters, such as "zxy"
+    intrinsic : bool    turn about moving axes
+
+    Returns
+    -------
+    (..., 3)    radians, in the order of the letters
+
+    Raises
+    ------
+    RotationError    unless the order names three axes
 
     Notes
     -----
@@ -175,7 +318,17 @@ def as_euler(q: ArrayLike, order: str, *, intrinsic: bool = True) -> AnyFloats:
 
 
 def slerp(a: ArrayLike, b: ArrayLike, t: ArrayLike) -> AnyFloats:
-    """Rotations at fraction `t` (...) of the shorter arc from `a` to `b`, both (..., 4) (Shoemake 1985)."""
+    """Interpolate along the shorter arc between two rotations (Shoemake 1985).
+
+    Parameters
+    ----------
+    a, b : (..., 4)    unit quaternions
+    t : (...)    fraction of the arc, 0 for `a` and 1 for `b`
+
+    Returns
+    -------
+    (..., 4)    unit quaternions
+    """
     (a, b), dtype = _widened((a, 4), (b, 4))
     t = np.asarray(t, dtype=np.float64)[..., None]
     b = np.where(np.sum(a * b, axis=-1, keepdims=True) < 0.0, -b, b)
@@ -188,11 +341,23 @@ def slerp(a: ArrayLike, b: ArrayLike, t: ArrayLike) -> AnyFloats:
 
 
 def between_vectors(start: ArrayLike, end: ArrayLike, *, half_turn_axis: ArrayLike | None = None) -> AnyFloats:
-    """The shortest rotations (..., 4) from directions `start` to directions `end`, both (..., 3).
+    """Compute the shortest rotations from one direction to another.
 
-    Opposite directions have no shortest rotation: those turn half about `half_turn_axis` (..., 3), made perpendicular
-    to `start`, or, without one, about the perpendicular next to the coordinate axis that `start` is farthest from.
-    `RotationError` where a direction has no length.
+    Opposite directions have no shortest rotation: those turn half about `half_turn_axis`, made perpendicular to
+    `start`, or, without one, about the perpendicular next to the coordinate axis that `start` is farthest from.
+
+    Parameters
+    ----------
+    start, end : (..., 3)    directions of any length but zero
+    half_turn_axis : (..., 3), optional    axis for opposite directions
+
+    Returns
+    -------
+    (..., 4)    unit quaternions
+
+    Raises
+    ------
+    RotationError    where a direction has no length
     """
     (start, end), dtype = _widened((start, 3), (end, 3))
     start, end = np.broadcast_arrays(_unit(start, "start direction"), _unit(end, "end direction"))
@@ -207,7 +372,20 @@ def between_vectors(start: ArrayLike, end: ArrayLike, *, half_turn_axis: ArrayLi
 
 
 def perpendicular(vector: ArrayLike, direction: ArrayLike) -> AnyFloats:
-    """The unit part (..., 3) of `vector` at a right angle to `direction`; `RotationError` where they are parallel."""
+    """Compute the part of a vector at a right angle to a direction, at unit length.
+
+    Parameters
+    ----------
+    vector, direction : (..., 3)    vectors of any length but zero
+
+    Returns
+    -------
+    (..., 3)    unit vectors
+
+    Raises
+    ------
+    RotationError    where the two are parallel
+    """
     (vector, direction), dtype = _widened((vector, 3), (direction, 3))
     direction = _unit(direction, "direction")
     rest = vector - np.sum(vector * direction, axis=-1, keepdims=True) * direction
@@ -215,9 +393,18 @@ def perpendicular(vector: ArrayLike, direction: ArrayLike) -> AnyFloats:
 
 
 def twist_swing(q: ArrayLike, axis: ArrayLike) -> tuple[AnyFloats, AnyFloats]:
-    """Unit rotations (..., 4) as twist about the direction `axis` (..., 3), then swing: q = swing · twist.
+    """Split rotations into a twist about an axis and a swing: q = swing · twist.
 
-    The swing's axis is perpendicular to `axis`. A swing of half a turn leaves the twist open; it is none then.
+    The swing's axis is perpendicular to `axis`. A swing of half a turn leaves the twist open; it is the identity then.
+
+    Parameters
+    ----------
+    q : (..., 4)    unit quaternions
+    axis : (..., 3)    directions of any length but zero
+
+    Returns
+    -------
+    twist, swing : (..., 4) each    unit quaternions
     """
     (q, axis), dtype = _widened((q, 4), (axis, 3))
     axis = _unit(axis, "axis")
@@ -230,9 +417,18 @@ def twist_swing(q: ArrayLike, axis: ArrayLike) -> tuple[AnyFloats, AnyFloats]:
 
 
 def unroll(q: ArrayLike, axis: int = 0) -> AnyFloats:
-    """The same rotations (..., 4) with signs chosen so that neighbours along `axis` (time) are close.
+    """Choose the signs of quaternions so that neighbours in time are close.
 
     q and -q are one rotation; the first frame keeps its sign and each next one takes that of the nearer.
+
+    Parameters
+    ----------
+    q : (..., 4)    quaternions
+    axis : int    axis of time
+
+    Returns
+    -------
+    (..., 4)    the same rotations
     """
     (q,), dtype = _widened((q, 4))
     q = np.moveaxis(q, axis, 0)
@@ -242,9 +438,18 @@ def unroll(q: ArrayLike, axis: int = 0) -> AnyFloats:
 
 
 def angular_velocity(q: ArrayLike, frame_rate_hz: float) -> AnyFloats:
-    """Angular velocity (F, ..., 3) in rad/s, in the frame the rotations (F, ..., 4) map to.
+    """Differentiate rotations over time.
 
     The shortest rotation to the next frame, averaged over both neighbours; at the ends, their linear extrapolation.
+
+    Parameters
+    ----------
+    q : (F, ..., 4)    unit quaternions
+    frame_rate_hz : float    frames per second
+
+    Returns
+    -------
+    (F, ..., 3)    radians per second, in the frame that the rotations map to
     """
     (q,), dtype = _widened((q, 4))
     steps = _rotation_vector(_product(q[1:], q[:-1] * (1.0, -1.0, -1.0, -1.0))) * frame_rate_hz
@@ -252,7 +457,17 @@ def angular_velocity(q: ArrayLike, frame_rate_hz: float) -> AnyFloats:
 
 
 def rate_from_steps(steps: Floats, frame_count: int) -> Floats:
-    """Rates at frames (F, ...) from those between frames (F - 1, ...): means inside, extrapolated at the ends."""
+    """Compute rates at frames from those between frames: means inside, extrapolated at the ends.
+
+    Parameters
+    ----------
+    steps : (F - 1, ...) float64    rates between frames
+    frame_count : int    number of frames F
+
+    Returns
+    -------
+    (F, ...) float64    rates at frames; zero for a single frame
+    """
     rate = np.zeros((frame_count, *steps.shape[1:]))
     if frame_count == 2:
         rate[:] = steps[0]

@@ -19,18 +19,27 @@ CHANNELS = 32
 
 
 def resample_clip(clip: Clip, frame_rate_hz: float, *, seam: LoopSeam | None = None) -> Clip:
-    """The same motion at another rate: first frames coincide, and no frame lies beyond the last one.
+    """Sample a clip at another frame rate.
 
-    Positions follow cubic splines; rotations cubic splines through their sign-continuous components, brought back to
-    unit length. Where all samples fall on frames, those are taken as they are.
+    First frames coincide, and no frame lies beyond the last one. Positions follow cubic splines; rotations cubic
+    splines through their sign-continuous components, brought back to unit length. Where all samples fall on frames,
+    those are taken as they are.
 
     Parameters
     ----------
-    seam : how a round of a loop leads into the next one (`looping.loop_seam`), None for other clips. A round is sampled
-        at even distances, so that one of a fractional number of samples gets slower or faster by less than half a
-        sample.
+    clip : Clip    F frames
+    frame_rate_hz : float    frames per second
+    seam : LoopSeam, optional    the transition from one round of a loop to the next (`looping.loop_seam`), None for
+        other clips. A round is sampled at even distances, so that one of a fractional number of samples gets slower or
+        faster by less than half a sample.
 
-    Raises `ClipError` when the rate is not a positive number.
+    Returns
+    -------
+    Clip    the same motion at that rate
+
+    Raises
+    ------
+    ClipError    when the rate is not a positive number
     """
     if _are_same(frame_rate_hz, clip.frame_rate_hz):
         return clip
@@ -39,7 +48,22 @@ def resample_clip(clip: Clip, frame_rate_hz: float, *, seam: LoopSeam | None = N
 
 
 def resample_motion(motion: Motion, from_hz: float, to_hz: float, *, seam: LoopSeam | None = None) -> Motion:
-    """As `resample_clip`, in double precision."""
+    """Sample a motion at another frame rate, as `resample_clip` in double precision.
+
+    Parameters
+    ----------
+    motion : Motion    F frames
+    from_hz, to_hz : float    its frame rate and the wanted one
+    seam : LoopSeam, optional    as for `resample_clip`
+
+    Returns
+    -------
+    Motion    the same motion at `to_hz`
+
+    Raises
+    ------
+    ClipError    when the rate is not a positive number
+    """
     if not (np.isfinite(to_hz) and to_hz > 0):
         raise ClipError(f"the frame rate is {to_hz}, a positive number is needed", where="frame_rate_hz")
     if _are_same(to_hz, from_hz):
@@ -54,7 +78,17 @@ def resample_motion(motion: Motion, from_hz: float, to_hz: float, *, seam: LoopS
 
 
 def count_samples(frames: int, from_hz: float, to_hz: float) -> int:
-    """How many frames a motion of so many frames has at another rate, none beyond its last one."""
+    """Count the frames of a resampled motion, none beyond its last frame.
+
+    Parameters
+    ----------
+    frames : int    number of frames before
+    from_hz, to_hz : float    frame rates before and after
+
+    Returns
+    -------
+    int    number of frames after
+    """
     # Rates that divide each other must not lose their last frame to rounding.
     return int((frames - 1) / from_hz * to_hz + 1e-6) + 1
 
@@ -64,7 +98,17 @@ def _are_same(rate_hz: float, other_hz: float) -> bool:
 
 
 def sample_motion(motion: Motion, places: Floats) -> Motion:
-    """The motion at fractional frame numbers `places` (n,) from 0 to F - 1; frames are taken as they are."""
+    """Sample a motion at fractional frame numbers.
+
+    Parameters
+    ----------
+    motion : Motion    F frames
+    places : (n,) float64    frame numbers from 0 to F - 1; where all are whole, frames are taken as they are
+
+    Returns
+    -------
+    Motion    n frames
+    """
     nearest = np.round(places).astype(np.int64)
     if np.all(np.abs(places - nearest) <= SAME_RATE * motion.frame_count):
         return motion.at_frames(nearest)

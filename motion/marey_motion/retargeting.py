@@ -1,8 +1,8 @@
-"""Motion of one skeleton on another, joint by joint, whatever their rest poses, proportions and local axes.
+"""Retargeting: motion of one skeleton on another, whatever their rest poses, proportions and local axes.
 
 Both skeletons give each joint two axes in its own frame: twist along the bone and swing across it (`rigs.guess_axes`).
-A target joint takes the global orientation in which its two axes coincide with those of the source joint that plays the
-same standard joint (Herrmann et al. 2019, Algorithm 1, after Monzani et al. 2000).
+A target joint takes the global orientation in which its two axes coincide with those of the source joint with the same
+standard name (Herrmann et al. 2019, Algorithm 1, after Monzani et al. 2000).
 
 The paper rotates twist onto twist, then swing onto swing, for every pose. As both axes are fixed in their joints, that
 comes to one constant rotation per joint: with the axes of source and target as the columns of orthonormal matrices S
@@ -40,7 +40,13 @@ FOOT_DROP = 0.45  # of the ankle-to-toe length: the height of the ankle above th
 
 @dataclass(frozen=True)
 class JointPair:
-    """A standard joint that both skeletons have, and the names it goes by."""
+    """A standard joint that both skeletons have.
+
+    Parameters
+    ----------
+    standard : str    its standard name
+    source, target : str    its names in the two skeletons
+    """
 
     standard: str
     source: str
@@ -49,18 +55,31 @@ class JointPair:
 
 @dataclass(frozen=True, eq=False)
 class RetargetPlan:
-    """All that retargeting clips of one skeleton to another needs to know; made by `plan_retarget`.
+    """Everything that retargeting needs besides the clip; made by `plan_retarget`.
 
     Parameters
     ----------
-    source, target : the skeletons
-    scale : target metres per source metre of pelvis translation
-    pairs : joints that follow the source
-    carried : names of joints outside the mapping that keep their source rotation, because both rigs are the same
-    at_rest : names of the target's other joints, which keep their rest rotation
-    missing : standard joints that only one of the skeletons has
+    source, target : Skeleton    the skeletons
+    scale : float    target metres per source metre of pelvis translation
+    pairs : tuple of JointPair    joints that follow the source
+    carried : tuple of str    joints outside the mapping that keep their source rotation, because both rigs are the
+        same
+    at_rest : tuple of str    the target's other joints, which keep their rest rotation
+    missing : tuple of str    standard joints that only one of the skeletons has
     sources : (K,) int32    source joint that each target joint follows, -1 for none
-    corrections : (K, 4) float64    S·Tᵀ of each mapped joint, identity for the others
+    corrections : (K, 4) float64    S·Tᵀ of each mapped joint as (w, x, y, z), identity for the others
+
+    Examples
+    --------
+    >>> from marey_motion import game_skeleton, guess_axes, map_joints, plan_retarget, studio_skeleton
+    >>> source, target = studio_skeleton(), game_skeleton()
+    >>> joints = map_joints(source), map_joints(target)
+    >>> axes = guess_axes(source, joints[0]), guess_axes(target, joints[1])
+    >>> plan = plan_retarget(source, joints[0], axes[0], target, joints[1], axes[1])
+    >>> len(plan.pairs), plan.pairs[0]
+    (26, JointPair(standard='pelvis', source='Hips', target='pelvis'))
+    >>> plan.changes_no_pose
+    False
     """
 
     source: Skeleton
@@ -75,7 +94,7 @@ class RetargetPlan:
 
     @cached_property
     def changes_no_pose(self) -> bool:
-        """Whether both skeletons are one, and its axes are those of the source."""
+        """Whether both skeletons are the same and no correction turns a joint."""
         turned = quaternions.angle_between(self.corrections, quaternions.identity(len(self.corrections)))
         return same_hierarchy(self.source, self.target, tolerance_m=SAME_SKELETON_M) and bool(np.all(turned < SAME_RAD))
 
@@ -90,17 +109,34 @@ def plan_retarget(
     *,
     scale: float | None = None,
 ) -> RetargetPlan:
-    """Work out which joint follows which, by what correction, and how far the body travels.
+    """Pair the joints of two skeletons and compute their corrections and the scale of travel.
 
     Parameters
     ----------
-    source_mapping, target_mapping : standard joints of the skeletons
-    source_axes, target_axes : twist and swing axes by joint name, at least of the mapped joints
-    scale : target metres per source metre of travel; the ratio of the hip heights when None
+    source : Skeleton    the skeleton that clips come from
+    source_mapping : JointMapping    its standard joints
+    source_axes : mapping of str to JointAxes    its twist and swing axes by joint name, at least of the mapped joints
+    target : Skeleton    the skeleton that clips are wanted for
+    target_mapping : JointMapping    its standard joints
+    target_axes : mapping of str to JointAxes    its axes
+    scale : float, optional    target metres per source metre of travel; the ratio of the hip heights when None
+
+    Returns
+    -------
+    RetargetPlan    input of `retarget`
 
     Raises
     ------
     MappingError    naming the standard joints or axes that are missing
+
+    Examples
+    --------
+    >>> from marey_motion import game_skeleton, guess_axes, map_joints, plan_retarget, studio_skeleton
+    >>> source, target = studio_skeleton(), game_skeleton()
+    >>> joints = map_joints(source), map_joints(target)
+    >>> axes = guess_axes(source, joints[0]), guess_axes(target, joints[1])
+    >>> round(plan_retarget(source, joints[0], axes[0], target, joints[1], axes[1]).scale, 2)
+    1.11
     """
     pairs = _paired(source, source_mapping, target, target_mapping)
     _check_enough(pairs, source_mapping, target_mapping)
@@ -133,20 +169,36 @@ def plan_retarget(
 
 
 def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None) -> Clip:
-    """The clip's motion on the plan's target skeleton.
+    """Retarget a clip to the plan's target skeleton.
 
-    Mapped joints take the source's orientation, all others rest (or keep theirs between copies of one rig). Bones keep
-    the target's lengths, but point where `translations` of the source point its own; on its own skeleton a clip keeps
-    them. The pelvis travels as in the source, times the plan's scale; a root of its own, above the pelvis, moves along
-    without turning.
+    Mapped joints take the source's orientation; all others keep their rest rotation, or their source rotation between
+    copies of one rig. Bones keep the target's lengths, but point where `translations` of the source point its own; on
+    its own skeleton a clip keeps them. The pelvis travels as in the source, times the plan's scale; a root above the
+    pelvis moves along without turning.
 
     Parameters
     ----------
-    bones : result of `moved_bones`, from a caller who has computed it already
+    clip : Clip    motion of the plan's source skeleton
+    plan : RetargetPlan    result of `plan_retarget`
+    bones : FollowedBones, optional    result of `moved_bones`, from a caller who has computed it already
+
+    Returns
+    -------
+    Clip    the motion of the target skeleton, at the same rate
 
     Raises
     ------
-    ClipError    where the clip is of another skeleton than the plan's source
+    ClipError    where the clip belongs to another skeleton than the plan's source
+
+    Examples
+    --------
+    >>> from marey_motion import game_skeleton, generate_gait, guess_axes, map_joints, plan_retarget, retarget
+    >>> clip, target = generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.0, duration_s=2.0), game_skeleton()
+    >>> joints = map_joints(clip.skeleton), map_joints(target)
+    >>> axes = guess_axes(clip.skeleton, joints[0]), guess_axes(target, joints[1])
+    >>> result = retarget(clip, plan_retarget(clip.skeleton, joints[0], axes[0], target, joints[1], axes[1]))
+    >>> result.skeleton is target, result.poses.shape
+    (True, (120, 159))
     """
     from marey_motion import retargeting_kernels as kernels
 
@@ -180,7 +232,17 @@ def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None)
 
 
 def moved_bones(clip: Clip, plan: RetargetPlan) -> FollowedBones:
-    """Compute the source's rotations as its bones point, and which bones its translations turned."""
+    """Compute the source's rotations as its bones point, and which bones its translations turned.
+
+    Parameters
+    ----------
+    clip : Clip    motion of the plan's source skeleton
+    plan : RetargetPlan    result of `plan_retarget`
+
+    Returns
+    -------
+    FollowedBones    rotations (F, 4·J) float32, and the largest turn of each joint in degrees
+    """
     if plan.changes_no_pose:
         return FollowedBones(clip.poses[:, 3:], {})
     return follow_moved_bones(clip, {pair.standard: clip.skeleton.index_of(pair.source) for pair in plan.pairs})

@@ -1,7 +1,7 @@
-"""Joints above the one that carries the body: a static reference on the floor, or a root that goes along with the body.
+"""Joints above the one that carries the body: a static reference on the floor, or a root that moves with the body.
 
-They only move the whole body about: what they do, the carrier may undo. Blended one by one, both cancel no longer and
-the body leaves its path. So the body goes first here, and they follow.
+They only move the whole body: the carrier may undo their motion. Blended one by one, the two no longer cancel and the
+body leaves its path. Therefore the body takes the root's place here, and the root follows.
 """
 
 from __future__ import annotations
@@ -18,10 +18,22 @@ STILL = 1e-5
 
 
 def carried_at(motion: Motion, skeleton: Skeleton, carrier: int, places: Floats, spins: Floats) -> Motion:
-    """The motion with the joint `carrier` at `places` (F, 3), its rotations in the world being `spins` (F, 4).
+    """Place a joint in the world and let the root follow.
 
-    The root is moved along, and what it carries keeps its rotations; translations of `carrier` and of joints above it
-    go into those of the root.
+    The root moves along, and the joints it carries keep their rotations; translations of `carrier` and of joints above
+    it are merged into those of the root.
+
+    Parameters
+    ----------
+    motion : Motion    F frames
+    skeleton : Skeleton    its joints
+    carrier : int    joint that carries the body
+    places : (F, 3) float64    its positions in the world, metres
+    spins : (F, 4) float64    its rotations in the world
+
+    Returns
+    -------
+    Motion    the motion with the carrier there
     """
     above = skeleton.path_to_root(carrier)[:0:-1]
     arm = np.zeros((motion.frame_count, 3))
@@ -37,7 +49,18 @@ def carried_at(motion: Motion, skeleton: Skeleton, carrier: int, places: Floats,
 
 
 def spins_of(motion: Motion, skeleton: Skeleton, joint: int) -> Floats:
-    """Rotations (F, 4) of a joint in the world."""
+    """Compute the rotations of one joint in the world.
+
+    Parameters
+    ----------
+    motion : Motion    F frames
+    skeleton : Skeleton    its joints
+    joint : int    index of the joint
+
+    Returns
+    -------
+    (F, 4) float64    unit quaternions
+    """
     spins = quaternions.identity(motion.frame_count)
     for one in skeleton.path_to_root(joint)[::-1]:
         spins = quaternions.multiply(spins, motion.rotations[:, one])
@@ -45,19 +68,36 @@ def spins_of(motion: Motion, skeleton: Skeleton, joint: int) -> Floats:
 
 
 def root_stands(motion: Motion, skeleton: Skeleton, carrier: int) -> bool:
-    """Whether nothing above the carrier ever turns, as with a static reference; no where the root is the carrier."""
+    """Check whether no joint above the carrier ever turns, as with a static reference.
+
+    Parameters
+    ----------
+    motion : Motion    F frames
+    skeleton : Skeleton    its joints
+    carrier : int    joint that carries the body
+
+    Returns
+    -------
+    bool    False where the root is the carrier
+    """
     above = motion.rotations[:, skeleton.path_to_root(carrier)[1:]]
     return above.size > 0 and bool(np.ptp(above, axis=0).max() < STILL)
 
 
 def body_first(motion: Motion, skeleton: Skeleton, carrier: int, *, root_stays: bool) -> Motion:
-    """The motion with the carrier in the root's place and the root in the carrier's.
-
-    What then moves, turns and blends the root does so with the body, wherever the root of the skeleton is.
+    """Swap the carrier and the root, so that moving, turning and blending the root moves the body.
 
     Parameters
     ----------
-    root_stays : the root is a reference whose rotation is none of the body's business; else it turns with the body
+    motion : Motion    F frames
+    skeleton : Skeleton    its joints
+    carrier : int    joint that carries the body
+    root_stays : bool    the root is a static reference whose rotation does not depend on the body; else it turns with
+        the body
+
+    Returns
+    -------
+    Motion    the carrier in the root's place and the root in the carrier's
     """
     if not carrier:
         return motion
@@ -71,7 +111,19 @@ def body_first(motion: Motion, skeleton: Skeleton, carrier: int, *, root_stays: 
 
 
 def root_first(motion: Motion, skeleton: Skeleton, carrier: int, *, root_stays: bool) -> Motion:
-    """The inverse of `body_first`; the travel of the body is then the root's."""
+    """Undo `body_first`; the travel of the body becomes the root's.
+
+    Parameters
+    ----------
+    motion : Motion    result of `body_first`, or an edit of it
+    skeleton : Skeleton    its joints
+    carrier : int    joint that carries the body
+    root_stays : bool    as for `body_first`
+
+    Returns
+    -------
+    Motion    the motion in the skeleton's own order
+    """
     if not carrier:
         return motion
     spins, root = motion.rotations[:, 0], motion.rotations[:, carrier]

@@ -26,8 +26,15 @@ class EndSite:
 
     Parameters
     ----------
-    joint : index of the joint that carries it
+    joint : int    index of the joint that carries it
     offset : (3,) float64    metres, in that joint's frame
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from marey_motion import EndSite
+    >>> EndSite(joint=5, offset=np.array([0.0, 0.2, 0.0])).offset
+    array([0. , 0.2, 0. ])
     """
 
     joint: int
@@ -39,22 +46,31 @@ class EndSite:
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """A tree of joints in an order where parents come before their children.
+    """A tree of joints, ordered so that parents come before their children.
 
-    Arrays are taken over without a copy where their type fits, and are read-only afterwards.
+    Arrays are used without a copy where their type fits, and are read-only afterwards.
 
     Parameters
     ----------
-    joint_names : unique names; joint 0 is the root
+    joint_names : tuple of str    unique names; joint 0 is the root
     parents : (J,) int32    index of the parent, smaller than the joint's own; -1 for the root
     offsets : (J, 3) float64    metres, in the parent's frame; for the root its rest position
-    rest_rotations : (J, 4) float64    unit local rotation at rest. A clip's rotation replaces it.
-    end_sites : tips of chains
-    display_names : names as in the source file, where they may repeat; `joint_names` when left out
+    rest_rotations : (J, 4) float64    unit local rotation (w, x, y, z) at rest. A clip's rotation replaces it.
+    end_sites : tuple of EndSite    tips of chains
+    display_names : tuple of str    names as in the source file, where they may repeat; `joint_names` when left out
 
     Raises
     ------
     SkeletonError    naming the joint and field that is wrong
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from marey_motion import Skeleton
+    >>> upright = np.tile([1.0, 0.0, 0.0, 0.0], (2, 1))
+    >>> leg = Skeleton(("Hip", "Knee"), [-1, 0], [[0.0, 0.9, 0.0], [0.0, -0.45, 0.0]], upright)
+    >>> leg.rest_global_positions[leg.index_of("Knee")]
+    array([0.  , 0.45, 0.  ])
     """
 
     joint_names: tuple[str, ...]
@@ -119,7 +135,7 @@ class Skeleton:
 
     @cached_property
     def is_depth_first(self) -> bool:
-        """Whether each joint follows its parent or a descendant of it, as nested formats such as BVH write them."""
+        """Whether each joint follows its parent or a descendant of it, as nested formats such as BVH require."""
         open_chain: list[int] = []
         for joint, parent in enumerate(self.parents.tolist()):
             while open_chain and open_chain[-1] != parent:
@@ -134,7 +150,20 @@ class Skeleton:
         return {name: joint for joint, name in enumerate(self.joint_names)}
 
     def index_of(self, name: str) -> int:
-        """Index of the joint called `name`; `UnknownJoint`, with the nearest names, when there is none."""
+        """Find a joint by name.
+
+        Parameters
+        ----------
+        name : str    a joint name, not a display name
+
+        Returns
+        -------
+        int    index into `joint_names`
+
+        Raises
+        ------
+        UnknownJoint    with the nearest names, when no joint has this one
+        """
         joint = self._indices.get(name)
         if joint is None:
             near = difflib.get_close_matches(name, self.joint_names, n=3)
@@ -146,7 +175,16 @@ class Skeleton:
         return name in self._indices
 
     def path_to_root(self, joint: int) -> tuple[int, ...]:
-        """Indices from `joint` to the root, both included."""
+        """List the joints from one joint up to the root.
+
+        Parameters
+        ----------
+        joint : int    index of the first joint
+
+        Returns
+        -------
+        tuple of int    indices from `joint` to the root, both included
+        """
         path = [joint]
         while (parent := int(self.parents[path[-1]])) >= 0:
             path.append(parent)
@@ -154,7 +192,7 @@ class Skeleton:
 
     @cached_property
     def rest_global_rotations(self) -> NDArray[np.float64]:
-        """(J, 4) global rotation of each joint in the rest pose."""
+        """Global rotations (J, 4) of the joints in the rest pose, as (w, x, y, z)."""
         result = self.rest_rotations.copy()
         for joint, parent in enumerate(self.parents.tolist()):
             if parent >= 0:
@@ -164,7 +202,7 @@ class Skeleton:
 
     @cached_property
     def rest_global_positions(self) -> NDArray[np.float64]:
-        """(J, 3) global position of each joint in the rest pose, metres."""
+        """Global positions (J, 3) of the joints in the rest pose, in metres."""
         result = self.offsets.copy()
         rotations = self.rest_global_rotations
         for joint, parent in enumerate(self.parents.tolist()):
@@ -175,9 +213,24 @@ class Skeleton:
 
 
 def same_hierarchy(a: Skeleton, b: Skeleton, *, tolerance_m: float = 0.0) -> bool:
-    """Whether clips of one skeleton are clips of the other: same joints, parents, offsets, rest pose and end sites.
+    """Check whether clips of one skeleton are also clips of another.
 
-    `tolerance_m` allows each component of an offset to differ by so many metres. Display names do not matter.
+    Joints, parents, offsets, rest pose and end sites must be equal; display names need not.
+
+    Parameters
+    ----------
+    a, b : Skeleton    the skeletons
+    tolerance_m : float    metres by which each component of an offset may differ
+
+    Returns
+    -------
+    bool    True where they are interchangeable
+
+    Examples
+    --------
+    >>> from marey_motion import same_hierarchy, studio_skeleton
+    >>> same_hierarchy(studio_skeleton(1.78), studio_skeleton(1.60))
+    False
     """
     if a is b:
         return True

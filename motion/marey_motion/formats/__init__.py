@@ -47,15 +47,29 @@ def read_motion(
 
     Parameters
     ----------
-    data : the file
-    name : its name: its ending helps to tell the format, and messages carry it
-    companion : the ASF of an AMC, the skeleton document of a predecessor's clip
-    companion_name : its name, for messages
-    options : facts that the user knows better than the file
+    data : bytes    the content of the file
+    name : str    its name: the ending helps to detect the format, and messages carry it
+    companion : bytes, optional    the ASF of an AMC, the skeleton document of a predecessor's clip
+    companion_name : str    its name, for messages
+    options : ImportOptions, optional    facts that the user knows better than the file
+
+    Returns
+    -------
+    ImportedMotion    clip and skeleton in metres, Y up, with the record of the import
 
     Raises
     ------
-    FormatError    with file, line and joint; `AmbiguousUnits` where the user has to choose; `UnknownFormat`
+    UnknownFormat    where no reader knows the file
+    AmbiguousUnits    where the user has to choose a unit of length or an axis
+    FormatError    with file, line and joint, where the file is wrong
+
+    Examples
+    --------
+    >>> from marey_motion import generate_gait, read_motion, write_motion
+    >>> walk = write_motion(generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.0, duration_s=2.0), "bvh")
+    >>> read = read_motion(walk, "walk.bvh")
+    >>> read.clip.frame_count, read.source.unit_scale_m, read.warnings
+    (120, 0.01, ())
     """
     options = options or ImportOptions()
     source = read_source(data, name, companion=companion, companion_name=companion_name, options=options)
@@ -73,11 +87,24 @@ def read_source(
     companion_name: str,
     options: ImportOptions,
 ) -> SourceMotion | SourceDocument:
-    """Detect the format of a file and read it in its own unit and axes, or decode a document about something else.
+    """Detect the format of a file and read it in its own unit and axes.
+
+    Parameters
+    ----------
+    data : bytes    the content of the file
+    name : str    its name
+    companion : bytes or None    content of the file that belongs to it
+    companion_name : str    its name
+    options : ImportOptions    facts that the user knows better than the file
+
+    Returns
+    -------
+    SourceMotion or SourceDocument    the motion in its own unit and axes, or a document about a model, tree or graph
 
     Raises
     ------
-    FormatError    with file, line and joint; `UnknownFormat`
+    UnknownFormat    where no reader knows the file
+    FormatError    with file, line and joint, where the file is wrong
     """
     content = bytes(data)
     row = detect_format(content, name)
@@ -94,11 +121,28 @@ def read_source(
 
 
 def write_motion(clip: Clip, file_format: str, **options: Any) -> bytes:
-    """Write a clip in a format that holds motion; the options are those of its writer.
+    """Write a clip in a format that holds motion.
+
+    Parameters
+    ----------
+    clip : Clip    the motion
+    file_format : str    "bvh", "npz" or "predecessor"
+    options    options of the format's writer
+
+    Returns
+    -------
+    bytes    the content of the file
 
     Raises
     ------
-    UnknownFormat    for any other format; `FormatError` where the format cannot hold the clip
+    UnknownFormat    for any other format
+    FormatError    where the format cannot hold the clip
+
+    Examples
+    --------
+    >>> from marey_motion import generate_gait, write_motion
+    >>> write_motion(generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.0, duration_s=2.0), "bvh").splitlines()[:2]
+    [b'HIERARCHY', b'ROOT Hips']
     """
     if file_format not in MOTION_FORMATS:
         raise UnknownFormat(f"there is no writer for {file_format!r}; choose one of {', '.join(MOTION_FORMATS)}")
@@ -107,7 +151,16 @@ def write_motion(clip: Clip, file_format: str, **options: Any) -> bytes:
 
 
 def reader_of(row: FileFormat) -> Callable[..., SourceMotion | SourceDocument]:
-    """Find the reader of a format that has one."""
+    """Find the reader of a format that has one.
+
+    Parameters
+    ----------
+    row : FileFormat    row of the table of formats
+
+    Returns
+    -------
+    callable    the format's `read_<name>`
+    """
     return _function("read", row.name)
 
 

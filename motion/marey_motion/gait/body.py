@@ -30,12 +30,13 @@ SIDES = {"Left": 1, "Right": -1}
 
 @dataclass(frozen=True)
 class GaitMoments:
-    """What drives the pose at n evenly spaced moments.
+    """Inputs of the pose at n evenly spaced moments.
 
     Parameters
     ----------
-    times_s, phases : (n,) seconds and strides done
-    root : the exact path
+    times_s : (n,)    seconds
+    phases : (n,)    strides done
+    root : RootState    the exact path
     """
 
     times_s: AnyFloats
@@ -48,13 +49,35 @@ class GaitMoments:
         return (len(self.times_s) - 1) / float(self.times_s[-1] - self.times_s[0])
 
     def settled(self, values: AnyFloats, window_s: float = BLENDING_S) -> AnyFloats:
-        """Values (n,) averaged over `window_s` before and after, more over the near ones (Hann)."""
+        """Average values over time, with more weight on the near ones (Hann).
+
+        Parameters
+        ----------
+        values : (n,)    any unit
+        window_s : float    seconds before and after
+
+        Returns
+        -------
+        (n,)    averages, in the same unit
+        """
         reach = _reach(window_s, self.frame_rate_hz)
         weights = np.hanning(2 * reach + 3)[1:-1]
         return np.asarray(convolve1d(values, weights / weights.sum(), mode="nearest"))
 
     def settled_below(self, limits: AnyFloats, window_s: float = SETTLING_S) -> AnyFloats:
-        """A smooth curve (n,) nowhere above `limits` (n,): an average of minima, each of which includes the moment."""
+        """Compute a smooth curve that is nowhere above given limits.
+
+        The curve is an average of minima, each of which includes its moment.
+
+        Parameters
+        ----------
+        limits : (n,)    any unit
+        window_s : float    seconds before and after
+
+        Returns
+        -------
+        (n,)    the curve, in the same unit
+        """
         lowest = minimum_filter1d(limits, 2 * _reach(window_s, self.frame_rate_hz) + 1, mode="nearest")
         return self.settled(lowest, window_s)
 
@@ -64,14 +87,35 @@ def _reach(window_s: float, frame_rate_hz: float) -> int:
 
 
 def padding_frames(frame_rate_hz: float) -> int:
-    """Moments needed on either side of those wanted, so that no end disturbs the averages."""
+    """Count the moments needed on either side of the wanted ones, so that no end disturbs the averages.
+
+    Parameters
+    ----------
+    frame_rate_hz : float    moments per second
+
+    Returns
+    -------
+    int    number of moments
+    """
     return 2 * _reach(BLENDING_S, frame_rate_hz) + 1
 
 
 def pose_body(
     skeleton: Skeleton, style: GaitStyle, moments: GaitMoments, feet: Mapping[str, FootMotion]
 ) -> tuple[AnyFloats, AnyFloats]:
-    """Root positions (n, 3) in metres and global rotations (n, J, 4) of the studio skeleton's joints.
+    """Pose the studio skeleton from a root path and two feet.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    the studio skeleton, J joints
+    style : GaitStyle    style of the walker
+    moments : GaitMoments    n moments
+    feet : mapping of str to FootMotion    motion of the "Left" and "Right" foot
+
+    Returns
+    -------
+    positions : (n, 3)    root positions in metres, Y up
+    rotations : (n, J, 4)    rotations of the joints in the world
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""Where and when each foot stands, and its way from one foothold to the next.
+"""Footholds of each foot, and its motion from one to the next.
 
 A foot is its ball, the joint that the toes turn about. While the foot is loaded, the heel or the ball is a fixed point
-of the floor: the foot rolls about the heel when it lands with the toes up, stands flat, then rolls about the ball.
-Between, the ball follows a cubic in the frame of the root, whose ends move with the floor, so that nothing jumps.
+of the floor: the foot rolls about the heel when it lands with the toes up, is flat, then rolls about the ball. Between,
+the ball follows a cubic in the frame of the root, whose ends move with the floor, so that nothing jumps.
 """
 
 from __future__ import annotations
@@ -51,7 +51,13 @@ class FootShape:
 
 @dataclass(frozen=True)
 class Cadence:
-    """Strides over time: the phase grows by one with each stride, continuously, at a rate that suits the speed."""
+    """Strides over time: the phase grows by one with each stride, continuously, at a rate that suits the speed.
+
+    Parameters
+    ----------
+    path : RootPath    path of the root
+    style : GaitStyle    style of the walker
+    """
 
     path: RootPath
     style: GaitStyle
@@ -71,13 +77,31 @@ class Cadence:
         return np.array([self.path.starts_s, np.concatenate(([0.0, 0.0], done)), first, (last - first) / durations])
 
     def phase_at(self, times_s: AnyFloats) -> AnyFloats:
-        """Strides done since time 0, shape (n,)."""
+        """Compute the phase at given times.
+
+        Parameters
+        ----------
+        times_s : (n,)    seconds
+
+        Returns
+        -------
+        (n,)    strides done since time 0
+        """
         start, phase, rate, slope = self._pieces[:, self.path.piece_at(times_s)]
         elapsed = times_s - start
         return np.asarray(phase + rate * elapsed + 0.5 * slope * elapsed**2)
 
     def time_at(self, phases: AnyFloats) -> AnyFloats:
-        """Seconds at which so many strides are done, shape (n,)."""
+        """Compute the times of given phases.
+
+        Parameters
+        ----------
+        phases : (n,)    strides done since time 0
+
+        Returns
+        -------
+        (n,)    seconds
+        """
         piece = np.searchsorted(self._pieces[1, 1:], phases, side="right")
         start, phase, rate, slope = self._pieces[:, piece]
         missing = phases - phase
@@ -87,14 +111,14 @@ class Cadence:
 
 @dataclass(frozen=True)
 class FootMotion:
-    """One foot at n moments.
+    """Motion of one foot at n moments.
 
     Parameters
     ----------
-    balls : (n, 3) position of the ball joint, metres
-    yaws, pitches, toe_pitches : (n,) radians; toes up is positive
-    freedom : (n,) 0 while the foot is loaded, rising to 1 in the middle of its swing
-    heel_planted, ball_planted : (n,) bool    that point of the sole is fixed on the floor
+    balls : (n, 3)    position of the ball joint, metres
+    yaws, pitches, toe_pitches : (n,)    radians; toes up is positive
+    freedom : (n,)    0 while the foot is loaded, rising to 1 in the middle of its swing
+    heel_planted, ball_planted : (n,) bool    True where that point of the sole is fixed on the floor
     """
 
     balls: AnyFloats
@@ -123,10 +147,10 @@ class Footfalls:
 
     Parameters
     ----------
-    cadence : when strides happen, and along which path
-    shape : lengths of the foot
-    side : 1 for the left foot, -1 for the right
-    span_s : first and last moment that is asked for, seconds
+    cadence : Cadence    strides over time, along a path
+    shape : FootShape    lengths of the foot
+    side : int    1 for the left foot, -1 for the right
+    span_s : (float, float)    first and last requested moment, seconds
     """
 
     cadence: Cadence
@@ -142,22 +166,22 @@ class Footfalls:
 
     @cached_property
     def middles(self) -> RootState:
-        """The root in the middle of each stance."""
+        """State of the root in the middle of each stance."""
         return self.cadence.path.at(self.cadence.time_at(self.centre_phases))
 
     @cached_property
     def strikes_s(self) -> AnyFloats:
-        """When each stance begins."""
+        """Start of each stance, in seconds."""
         return self.cadence.time_at(self.centre_phases - 0.5 * styles.stance_share(self.middles.speeds))
 
     @cached_property
     def leaves_s(self) -> AnyFloats:
-        """When each stance ends."""
+        """End of each stance, in seconds."""
         return self.cadence.time_at(self.centre_phases + 0.5 * styles.stance_share(self.middles.speeds))
 
     @cached_property
     def footholds(self) -> Complexes:
-        """Where the ball of each flat foot stands, z + i·x, metres."""
+        """Position of the ball of each flat foot as z + i·x, in metres."""
         root, shape, style = self.middles, self.shape, self.cadence.style
         forward = np.cos(root.travel_angles)
         sideways = np.abs(np.sin(root.travel_angles))
@@ -174,13 +198,22 @@ class Footfalls:
 
     @cached_property
     def lifts_m(self) -> AnyFloats:
-        """Greatest clearance of the step that follows each stance but the last."""
+        """Greatest clearance, in metres, of the step that follows each stance but the last."""
         way = np.abs(np.diff(self.footholds)) + 0.3 * np.abs(np.diff(self.middles.headings))
         highest = styles.clearance_m(0.5 * (self.middles.speeds[1:] + self.middles.speeds[:-1]))
         return np.asarray(self.cadence.style.lift * highest * -np.expm1(-way / SHORT_STEP_M))
 
     def at(self, times_s: AnyFloats) -> FootMotion:
-        """The foot at times within the span, shape (n,), seconds."""
+        """Compute the motion of the foot.
+
+        Parameters
+        ----------
+        times_s : (n,)    seconds, within the span
+
+        Returns
+        -------
+        FootMotion    at those times
+        """
         stance = np.searchsorted(self.strikes_s, times_s, side="right") - 1
         loaded = times_s < self.leaves_s[stance]
         pairs = zip(self._standing(times_s, stance), self._swinging(times_s, stance), strict=True)
@@ -295,5 +328,15 @@ def _cubic(share: AnyFloats, start: Any, start_rate: Any, end: Any, end_rate: An
 
 
 def smooth_positive_part(values: AnyFloats, width: AnyFloats) -> AnyFloats:
-    """max(values, 0), never below it, rounded over about `width` around zero."""
+    """Compute max(values, 0), rounded around zero and never below it.
+
+    Parameters
+    ----------
+    values : (n,)    any unit
+    width : (n,)    width of the rounding, in the same unit
+
+    Returns
+    -------
+    (n,)    in the same unit
+    """
     return np.asarray(0.5 * (values + np.sqrt(values**2 + width**2)))

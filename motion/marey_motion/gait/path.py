@@ -62,7 +62,7 @@ class PathSegment:
 
 @dataclass(frozen=True)
 class RootState:
-    """Where the root is and how it moves at n moments.
+    """Position and motion of the root at n moments.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class RootState:
     velocities : (n,) complex    metres per second
     headings : (n,) float    radians, not wrapped
     turn_rates : (n,) float    radians per second
-    travel_angles : (n,) float    direction of travel against the heading, radians
+    travel_angles : (n,) float    direction of travel relative to the heading, radians
     """
 
     positions: Complexes
@@ -81,7 +81,7 @@ class RootState:
 
     @property
     def speeds(self) -> AnyFloats:
-        """(n,) metres per second."""
+        """Speeds (n,) in metres per second."""
         return np.abs(self.velocities)
 
 
@@ -89,7 +89,11 @@ class RootState:
 class RootPath:
     """Segments one after the other, starting at the origin and heading along +Z at time 0.
 
-    Outside [0, duration_s] the path goes on as it begins and ends: same turn rate, constant speed.
+    Outside [0, duration_s] the path continues as it begins and ends: same turn rate, constant speed.
+
+    Parameters
+    ----------
+    segments : tuple of PathSegment    at least one
     """
 
     segments: tuple[PathSegment, ...]
@@ -106,7 +110,7 @@ class RootPath:
 
     @cached_property
     def starts_s(self) -> AnyFloats:
-        """(pieces,) start of each piece that `pieces` lists, seconds; the first is where its formula is anchored."""
+        """Start of each piece of `pieces` in seconds; the first is where its formula is anchored."""
         ends = np.cumsum([segment.duration_s for segment in self.segments])
         return np.concatenate(([0.0, 0.0], ends))
 
@@ -119,7 +123,16 @@ class RootPath:
         return (before, *self.segments, after)
 
     def rescaled(self, *, length: float, time: float) -> RootPath:
-        """The same course with all lengths and all times multiplied by these factors."""
+        """Multiply all lengths and all times of the path.
+
+        Parameters
+        ----------
+        length, time : float    factors
+
+        Returns
+        -------
+        RootPath    the same course
+        """
         return RootPath(
             tuple(
                 PathSegment(
@@ -134,11 +147,29 @@ class RootPath:
         )
 
     def piece_at(self, times_s: AnyFloats) -> NDArray[np.intp]:
-        """Index into `pieces` for each time."""
+        """Find the piece that each time falls into.
+
+        Parameters
+        ----------
+        times_s : (n,)    seconds
+
+        Returns
+        -------
+        (n,) int    index into `pieces`
+        """
         return np.searchsorted(self.starts_s[1:], times_s, side="right")
 
     def at(self, times_s: AnyFloats) -> RootState:
-        """Exact state at any times, shape (n,), seconds."""
+        """Compute the exact state of the root.
+
+        Parameters
+        ----------
+        times_s : (n,)    seconds, of any range
+
+        Returns
+        -------
+        RootState    at those times
+        """
         times_s = np.asarray(times_s, dtype=np.float64)
         piece = self.piece_at(times_s)
         speed, acceleration, turn_rate, travel = self._columns[:, piece]
@@ -175,14 +206,37 @@ class RootPath:
 
 
 def straight_or_arc(speed_m_s: float, turn_rate_rad_s: float, duration_s: float, **options: float) -> RootPath:
-    """The path of one segment; `options` are the further parameters of `PathSegment`."""
+    """Make a path of one segment.
+
+    Parameters
+    ----------
+    speed_m_s : float    metres per second
+    turn_rate_rad_s : float    radians per second, positive to the left
+    duration_s : float    seconds
+    options : float    further parameters of `PathSegment`
+
+    Returns
+    -------
+    RootPath    starting at the origin along +Z
+    """
     return RootPath((PathSegment(duration_s, speed_m_s, turn_rate_rad_s, **options),))
 
 
 def start_and_stop(
     speed_m_s: float, *, wait_s: float, ramp_s: float, cruise_s: float, turn_rate_rad_s: float = 0.0
 ) -> RootPath:
-    """Stand, speed up evenly, go at `speed_m_s`, slow down evenly, stand; it turns while it travels at full speed."""
+    """Make a path that waits, accelerates evenly, travels at full speed, slows down evenly and waits.
+
+    Parameters
+    ----------
+    speed_m_s : float    full speed, metres per second
+    wait_s, ramp_s, cruise_s : float    seconds of waiting, of each change of speed, and of travel at full speed
+    turn_rate_rad_s : float    radians per second while it travels at full speed
+
+    Returns
+    -------
+    RootPath    starting at the origin along +Z
+    """
     return RootPath(
         (
             PathSegment(wait_s, 0.0),

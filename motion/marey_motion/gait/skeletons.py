@@ -1,4 +1,4 @@
-"""The two built-in human skeletons: the one that gaits are generated on and one that nothing about it resembles."""
+"""The two built-in human skeletons: one that gaits are generated on, and one unlike it in every respect."""
 
 from __future__ import annotations
 
@@ -92,11 +92,26 @@ _GAME_TIPS: dict[str, Point] = {
 
 @lru_cache(maxsize=16)
 def studio_skeleton(stature_m: float = STUDIO_STATURE_M) -> Skeleton:
-    """An adult in a T-pose, facing +Z on the floor y = 0, without rest rotations; 26 joints.
+    """Build an adult in a T-pose, facing +Z on the floor y = 0, without rest rotations.
 
     Parameters
     ----------
-    stature_m : height of the top of the head, metres; all lengths scale with it
+    stature_m : float    height of the top of the head in metres; all lengths scale with it
+
+    Returns
+    -------
+    Skeleton    26 joints
+
+    Raises
+    ------
+    SkeletonError    unless the stature is positive
+
+    Examples
+    --------
+    >>> from marey_motion import studio_skeleton
+    >>> skeleton = studio_skeleton(stature_m=1.78)
+    >>> skeleton.joint_count, skeleton.joint_names[0]
+    (26, 'Hips')
     """
     if not (np.isfinite(stature_m) and stature_m > 0):
         raise SkeletonError(f"a stature of {stature_m} m must be positive", where="stature_m")
@@ -110,10 +125,20 @@ def studio_skeleton(stature_m: float = STUDIO_STATURE_M) -> Skeleton:
 
 
 def game_skeleton() -> Skeleton:
-    """A taller figure in an A-pose with other names, proportions and local axes, twist joints and a prop; 39 joints.
+    """Build a taller figure in an A-pose with other names, proportions and local axes, twist joints and a prop.
 
-    The joints of the trunk and of the left side have x along the bone, the mirrored right side has it against the
-    bone; the root is turned by a quarter about x, as converters from a Z-up world leave it.
+    The joints of the trunk and of the left side have x along the bone, the mirrored right side has it against the bone;
+    the root is rotated by a quarter turn about x, as converters from a Z-up world leave it.
+
+    Returns
+    -------
+    Skeleton    39 joints
+
+    Examples
+    --------
+    >>> from marey_motion import game_skeleton
+    >>> game_skeleton().joint_names[:3]
+    ('root', 'pelvis', 'spine_01')
     """
     bones, tips = _both_sides(_GAME, _GAME_TIPS, ("l", "r"))
     aims = {**tips}

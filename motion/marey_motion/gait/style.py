@@ -1,7 +1,7 @@
-"""How a gait looks at each speed, and what makes one walker differ from the next.
+"""The look of a gait at each speed, and the differences between walkers.
 
 The curves are fits by eye to typical adult values (Winter, Biomechanics and Motor Control of Human Movement, 2009);
-they shape steps and swings and never touch the root's path.
+they shape steps and swings and never change the root's path.
 """
 
 from __future__ import annotations
@@ -48,7 +48,16 @@ class GaitStyle:
 
     @classmethod
     def varied(cls, seed: int) -> GaitStyle:
-        """The style of one walker out of a crowd; the same for the same seed."""
+        """Draw the style of one walker out of a crowd.
+
+        Parameters
+        ----------
+        seed : int    the same seed gives the same style
+
+        Returns
+        -------
+        GaitStyle    factors near 1
+        """
         generator = np.random.default_rng(seed)
         stride, width, lift, bounce, lean, sway, arms = 1.0 + generator.uniform(-1.0, 1.0, 7) * (
             (0.06, 0.25, 0.3, 0.25, 0.5, 0.3, 0.35)
@@ -68,26 +77,63 @@ class GaitStyle:
 
 
 def eased(x: AnyFloats | float) -> AnyFloats:
-    """From 0 at x <= 0 to 1 at x >= 1 with level ends."""
+    """Ease from 0 at x <= 0 to 1 at x >= 1 with level ends.
+
+    Parameters
+    ----------
+    x : (...)    any number
+
+    Returns
+    -------
+    (...)    0 to 1
+    """
     x = np.clip(x, 0.0, 1.0)
     result: AnyFloats = np.asarray(x * x * (3.0 - 2.0 * x))
     return result
 
 
 def running_share(speed_m_s: AnyFloats | float) -> AnyFloats:
-    """0 for a walk, 1 for a run, between them where people change over."""
+    """Compute the share of running at a speed.
+
+    Parameters
+    ----------
+    speed_m_s : (...)    metres per second
+
+    Returns
+    -------
+    (...)    0 for a walk, 1 for a run, between them where people change over
+    """
     return eased((np.asarray(speed_m_s) - 1.9) / 0.5)
 
 
 def blended(walk: AnyFloats | float, run: AnyFloats | float, speed_m_s: AnyFloats | float) -> AnyFloats:
-    """The walk's value, the run's, or between, as the speed asks."""
+    """Blend the values of a walk and a run by speed.
+
+    Parameters
+    ----------
+    walk, run : (...)    the values
+    speed_m_s : (...)    metres per second
+
+    Returns
+    -------
+    (...)    in the unit of the values
+    """
     share = running_share(speed_m_s)
     result: AnyFloats = np.asarray((1.0 - share) * walk + share * run)
     return result
 
 
 def stride_rate_hz(speed_m_s: AnyFloats, turn_rate_rad_s: AnyFloats, travel_angle_rad: AnyFloats) -> AnyFloats:
-    """Strides (two steps) per second."""
+    """Compute the stride rate of a gait.
+
+    Parameters
+    ----------
+    speed_m_s, turn_rate_rad_s, travel_angle_rad : (n,)    metres per second, radians per second, radians
+
+    Returns
+    -------
+    (n,)    strides (two steps) per second
+    """
     stepping = np.hypot(speed_m_s, STEERING_RADIUS_M * turn_rate_rad_s)
     forward = blended(0.45 + 0.36 * stepping, 1.15 + 0.075 * stepping, stepping)
     shorter = 1.0 + 0.35 * np.abs(np.sin(travel_angle_rad)) + 0.15 * np.maximum(-np.cos(travel_angle_rad), 0.0)
@@ -95,29 +141,75 @@ def stride_rate_hz(speed_m_s: AnyFloats, turn_rate_rad_s: AnyFloats, travel_angl
 
 
 def stance_share(speed_m_s: AnyFloats) -> AnyFloats:
-    """Part of a stride in which a foot is on the floor."""
+    """Compute the share of a stride in which a foot is on the floor.
+
+    Parameters
+    ----------
+    speed_m_s : (n,)    metres per second
+
+    Returns
+    -------
+    (n,)    0 to 1
+    """
     return blended(0.68 - 0.05 * speed_m_s, np.maximum(0.46 - 0.035 * speed_m_s, 0.20), speed_m_s)
 
 
 def landing_pitch_rad(speed_m_s: AnyFloats, travel_angle_rad: AnyFloats) -> AnyFloats:
-    """Pitch of the foot when it lands, toes up positive: heel first going forward, ball first going backward."""
+    """Compute the pitch of the foot when it lands: heel first going forward, ball first going backward.
+
+    Parameters
+    ----------
+    speed_m_s, travel_angle_rad : (n,)    metres per second, radians
+
+    Returns
+    -------
+    (n,)    radians, toes up positive
+    """
     along = np.cos(travel_angle_rad)
     size = np.where(along > 0.0, blended(0.33, 0.12, speed_m_s), 0.30)
     return np.asarray(along * size * eased(speed_m_s / 1.2))
 
 
 def leaving_pitch_rad(speed_m_s: AnyFloats, travel_angle_rad: AnyFloats) -> AnyFloats:
-    """Pitch of the foot when it leaves the floor: off the ball going forward, off the heel going backward."""
+    """Compute the pitch of the foot when it leaves the floor: off the ball going forward, off the heel going backward.
+
+    Parameters
+    ----------
+    speed_m_s, travel_angle_rad : (n,)    metres per second, radians
+
+    Returns
+    -------
+    (n,)    radians, toes up positive
+    """
     along = np.cos(travel_angle_rad)
     size = np.where(along > 0.0, blended(1.05, 1.15, speed_m_s), 0.15)
     return np.asarray(-along * size * eased(speed_m_s / 1.2))
 
 
 def clearance_m(speed_m_s: AnyFloats) -> AnyFloats:
-    """Height of the sole above the floor in the middle of a long step."""
+    """Compute the height of the sole above the floor in the middle of a long step.
+
+    Parameters
+    ----------
+    speed_m_s : (n,)    metres per second
+
+    Returns
+    -------
+    (n,)    metres
+    """
     return blended(0.035, 0.04 + 0.045 * speed_m_s, speed_m_s)
 
 
 def bank_rad(speeds: AnyFloats, turn_rates: AnyFloats) -> AnyFloats:
-    """Lean into a turn that balances the centrifugal force, to a limit; positive leans left."""
+    """Compute the lean into a turn that balances the centrifugal force, to a limit.
+
+    Parameters
+    ----------
+    speeds : (n,)    metres per second
+    turn_rates : (n,)    radians per second
+
+    Returns
+    -------
+    (n,)    radians; positive leans left
+    """
     return BANK_LIMIT_RAD * np.tanh(np.arctan(speeds * turn_rates / GRAVITY_M_S2) / BANK_LIMIT_RAD)

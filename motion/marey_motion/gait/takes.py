@@ -42,19 +42,32 @@ def generate_gait(
     stature_m: float = STUDIO_STATURE_M,
     style: GaitStyle | None = None,
 ) -> Clip:
-    """A walk, run, turn on the spot or idle, as the speed asks, on an exact arc from the origin along +Z.
+    """Generate a walk, run, turn on the spot or idle on an exact arc from the origin along +Z.
 
     Parameters
     ----------
-    speed_m_s : metres per second of the root over the ground
-    turn_rate_rad_s : change of heading, radians per second; positive turns left
-    duration_s : seconds; the clip has `duration_s` times `frame_rate_hz` frames, the first at time 0
-    travel_angle_rad : direction of travel against the heading: 0 forward, π/2 to the left, π backward
-    stature_m, style : see `generate_along`
+    speed_m_s : float    metres per second of the root over the ground
+    turn_rate_rad_s : float    change of heading, radians per second; positive turns left
+    duration_s : float    seconds; the clip has `duration_s` times `frame_rate_hz` frames, the first at time 0
+    frame_rate_hz : float    frames per second
+    travel_angle_rad : float    direction of travel relative to the heading: 0 forward, π/2 to the left, π backward
+    stature_m : float    height of the `studio_skeleton` that moves, metres
+    style : GaitStyle, optional    `GaitStyle.varied(seed)` for one walker out of many, neutral when None
+
+    Returns
+    -------
+    Clip    motion of the studio skeleton, metres, Y up
 
     Raises
     ------
     MotionError    naming the parameter that is wrong, or when the gait would need longer legs
+
+    Examples
+    --------
+    >>> from marey_motion import generate_gait
+    >>> walk = generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.5, duration_s=2.0, frame_rate_hz=30.0)
+    >>> walk.frame_count, walk.skeleton.joint_count
+    (60, 26)
     """
     path = straight_or_arc(speed_m_s, turn_rate_rad_s, duration_s, travel_angle_rad=travel_angle_rad)
     return generate_along(path, frame_rate_hz, stature_m=stature_m, style=style)
@@ -67,14 +80,21 @@ def generate_along(
     stature_m: float = STUDIO_STATURE_M,
     style: GaitStyle | None = None,
 ) -> Clip:
-    """A gait whose root is, at frame n, exactly where `path` is after n / `frame_rate_hz` seconds, and so heads.
+    """Generate a gait whose root follows a path exactly.
 
-    Feet that stand do not slide and nothing is below the floor y = 0. Same arguments, same bytes.
+    At frame n the root has the position and heading of `path` after n / `frame_rate_hz` seconds. Planted feet do not
+    slide and nothing is below the floor y = 0. The same arguments give the same bytes.
 
     Parameters
     ----------
-    stature_m : height of the `studio_skeleton` that moves, metres
-    style : `GaitStyle.varied(seed)` for one walker out of many, neutral when None
+    path : RootPath    the path of the root
+    frame_rate_hz : float    frames per second
+    stature_m : float    height of the `studio_skeleton` that moves, metres
+    style : GaitStyle, optional    `GaitStyle.varied(seed)` for one walker out of many, neutral when None
+
+    Returns
+    -------
+    Clip    motion of the studio skeleton, metres, Y up
 
     Raises
     ------
@@ -96,9 +116,20 @@ def generate_along(
 def foot_motions(
     path: RootPath, times_s: AnyFloats, *, stature_m: float = STUDIO_STATURE_M, style: GaitStyle | None = None
 ) -> dict[str, FootMotion]:
-    """What the "Left" and "Right" foot of `generate_along` do at increasing `times_s` (n,): the truth about contacts.
+    """Compute the motion of both feet of `generate_along`, as ground truth for contacts.
 
-    Feet that swing may be drawn nearer to the body in the clip, where the leg would be too short.
+    Swinging feet may be drawn nearer to the body in the clip, where the leg would be too short.
+
+    Parameters
+    ----------
+    path : RootPath    the path of the root
+    times_s : (n,)    increasing seconds
+    stature_m : float    height of the walker, metres
+    style : GaitStyle, optional    as for `generate_along`
+
+    Returns
+    -------
+    dict of str to FootMotion    by "Left" and "Right"
     """
     size = stature_m / STUDIO_STATURE_M
     path, times = _at_studio_size(path, times_s, size)
@@ -122,9 +153,25 @@ def _feet(path: RootPath, style: GaitStyle, times_s: AnyFloats) -> dict[str, Foo
 
 
 def generate_dataset(seed: int = 0, frame_rate_hz: float = 60.0) -> list[GeneratedTake]:
-    """Twenty-four takes of walks, runs, turns, side steps, starts and stops; the same for the same arguments.
+    """Generate twenty-four takes of walks, runs, turns, side steps, starts and stops.
 
     Each is by a walker of its own style, so that no two takes of a speed look the same.
+
+    Parameters
+    ----------
+    seed : int    the same seed gives the same takes
+    frame_rate_hz : float    frames per second
+
+    Returns
+    -------
+    list of GeneratedTake    clips with names and tags
+
+    Examples
+    --------
+    >>> from marey_motion import generate_dataset
+    >>> takes = generate_dataset(seed=1, frame_rate_hz=30.0)
+    >>> len(takes), takes[0].name, takes[0].tags
+    (24, 'idle', ('idle',))
     """
     takes = []
     for number, (name, path, tags) in enumerate(_programme()):

@@ -26,12 +26,19 @@ class ImportOptions:
 
     Parameters
     ----------
-    unit_scale_m : metres per unit of length of the file
-    up_axis : the axis of the file that points up
-    handedness : "left" mirrors a left-handed file in x
-    frame_rate_hz : replaces the file's rate
-    trim_rest_pose : drop a rest pose before or after the motion, where `checks` finds one
-    align_floor : lift or lower the motion so that its lowest contacts lie on y = 0
+    unit_scale_m : float, optional    metres per unit of length of the file
+    up_axis : str, optional    the axis of the file that points up: x, y, z, -x, -y or -z
+    handedness : str    "left" mirrors a left-handed file in x
+    frame_rate_hz : float, optional    replaces the file's rate
+    trim_rest_pose : bool    drop a rest pose before or after the motion, where `checks` finds one
+    align_floor : bool    lift or lower the motion so that its lowest contacts lie on y = 0
+
+    Examples
+    --------
+    >>> from marey_motion import ImportOptions, generate_gait, read_motion, write_motion
+    >>> walk = write_motion(generate_gait(1.2, 0.0, 2.0), "bvh")
+    >>> read_motion(walk, "walk.bvh", options=ImportOptions(frame_rate_hz=30.0)).clip.duration_s
+    4.0
     """
 
     unit_scale_m: float | None = None
@@ -54,20 +61,23 @@ class ImportOptions:
 
 @dataclass(eq=False)
 class SourceMotion:
-    """A motion as its file has it: the file's unit of length and axes, rotations already quaternions.
+    """A motion in its file's unit of length and axes, with rotations already as quaternions.
 
     Parameters
     ----------
-    format : name of the format
-    joint_names, display_names, parents, offsets, rest_rotations : as in `Skeleton`, in the file's unit and axes
-    end_sites : (joint, (3,) offset) pairs
-    root_positions : (F, 3) float64, or None where the file holds no motion
-    rotations : (F, J, 4) float32    unit, sign-continuous in time
-    translations, translated_joints : local positions of joints below the root that replace their offsets, float64
-    frame_rate_hz, declared_frame_time_s : rate to use, and what the file says
-    unit_scale_m, up_axis, declared : what the format itself fixes, with the words for the record
-    channels : per joint the names of its channels in the file's order
-    warnings : what the reader had to overlook
+    format : str    name of the format
+    joint_names, display_names, parents, offsets, rest_rotations    as in `Skeleton`, in the file's unit and axes
+    end_sites : tuple of (int, (3,) float64)    joint and offset of each
+    root_positions : (F, 3) float64, optional    in the file's unit; None where the file holds no motion
+    rotations : (F, J, 4) float32, optional    unit, sign-continuous in time
+    translations : (F, k, 3) float64, optional    local positions of joints below the root that replace their offsets,
+        in the file's unit
+    translated_joints : tuple of int    those k joints
+    frame_rate_hz, declared_frame_time_s : float, optional    rate to use, and the frame time as written
+    unit_scale_m, up_axis, declared    unit in metres and axis where the format itself fixes them, with the words for
+        the record
+    channels : tuple of tuples of str    names of each joint's channels in the file's order
+    warnings : list of CheckWarning    defects that the reader overlooked
     """
 
     format: str
@@ -91,7 +101,7 @@ class SourceMotion:
 
     @cached_property
     def skeleton(self) -> Skeleton:
-        """The joints in the file's unit and axes."""
+        """The skeleton in the file's unit and axes."""
         return Skeleton(
             self.joint_names, self.parents, self.offsets, self.rest_rotations, display_names=self.display_names
         )
@@ -107,18 +117,19 @@ class SourceDocument:
 
 @dataclass(frozen=True)
 class SourceInfo:
-    """Record of what an import found and did, kept with the clip.
+    """Record of the findings and changes of an import, kept with the clip.
 
     Parameters
     ----------
-    format, file : name of the format and of the file
-    unit_scale_m : metres per unit of the file
-    up_axis, handedness : of the file
-    frame_rate_hz, declared_frame_time_s : the rate used and the frame time as written
-    channels : per joint the file's channel names in their order; empty for formats without channels
-    trimmed_frames : frames dropped at the start and at the end
-    floor_shift_m : what was added to every height
-    evidence : why the unit and the axes are what they are
+    format, file : str    name of the format and of the file
+    unit_scale_m : float    metres per unit of the file
+    up_axis, handedness : str    axes of the file
+    frame_rate_hz, declared_frame_time_s : float, optional    the rate used and the frame time as written
+    channels : tuple of tuples of str    per joint the file's channel names in their order; empty for formats without
+        channels
+    trimmed_frames : (int, int)    frames dropped at the start and at the end
+    floor_shift_m : float    metres added to every height
+    evidence : tuple of str    reasons for the unit and the axes, as sentences
     """
 
     format: str
@@ -134,7 +145,12 @@ class SourceInfo:
     evidence: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain JSON types."""
+        """Convert the record to plain JSON types.
+
+        Returns
+        -------
+        dict    one member per field
+        """
         return {
             **asdict(self),
             "channels": [list(names) for names in self.channels],
@@ -145,7 +161,22 @@ class SourceInfo:
 
 @dataclass(frozen=True, eq=False)
 class ImportedMotion:
-    """A file in Marey's convention. `clip` is None where the file holds a skeleton alone."""
+    """A file in Marey's convention: metres, Y up, right-handed.
+
+    Parameters
+    ----------
+    clip : Clip, optional    the motion; None where the file holds a skeleton alone
+    skeleton : Skeleton    its joints
+    source : SourceInfo    record of the import
+    warnings : tuple of CheckWarning    findings of the checks
+
+    Examples
+    --------
+    >>> from marey_motion import generate_gait, read_motion, write_motion
+    >>> read = read_motion(write_motion(generate_gait(1.2, 0.0, 2.0), "bvh"), "walk.bvh")
+    >>> read.skeleton.joint_names[0], read.source.up_axis, read.source.format
+    ('Hips', 'y', 'bvh')
+    """
 
     clip: Clip | None
     skeleton: Skeleton

@@ -66,26 +66,51 @@ _LEG = ("hip", "knee", "ankle", "toe", "heel")
 
 @dataclass(frozen=True)
 class JointAxes:
-    """Unit directions in a joint's local frame: `twist` along the bone, `swing` perpendicular to it."""
+    """Anatomical axes of a joint: unit directions in its local frame.
+
+    Parameters
+    ----------
+    twist : (float, float, float)    direction along the bone
+    swing : (float, float, float)    direction perpendicular to it, about which knees and elbows hinge
+
+    Examples
+    --------
+    >>> from marey_motion import guess_axes, map_joints, studio_skeleton
+    >>> skeleton = studio_skeleton()
+    >>> guess_axes(skeleton, map_joints(skeleton))["LeftLeg"]
+    JointAxes(twist=(0.0, -1.0, 0.0), swing=(1.0, 0.0, 0.0))
+    """
 
     twist: Triple
     swing: Triple
 
 
 def guess_axes(skeleton: Skeleton, mapping: JointMapping, motion: Clip | None = None) -> dict[str, JointAxes]:
-    """Axes of every mapped joint, by joint name.
+    """Determine the anatomical axes of every mapped joint.
 
     Parameters
     ----------
-    mapping : standard names of the skeleton's joints; hips or shoulders of both sides are needed
-    motion : a clip of the skeleton in which the body moves. It is read only for the parts that `rest_pose_doubts`
-        names; without it their swing axes are a guess that retargeting should not rely on.
+    skeleton : Skeleton    the joints
+    mapping : JointMapping    standard names of the skeleton's joints; hips or shoulders of both sides are needed
+    motion : Clip, optional    a clip of the skeleton in which the body moves. It is read only for the parts that
+        `rest_pose_doubts` names; without it their swing axes are a guess that retargeting should not rely on.
+
+    Returns
+    -------
+    dict of str to JointAxes    axes by joint name
 
     Raises
     ------
-    MappingError    where the mapping lacks the joints that tell left and up, or those of an arm stand in one place
+    MappingError    where the mapping lacks the joints that give left and up, or those of an arm coincide
     UnknownJoint    where it names joints that the skeleton does not have
-    ClipError    where the motion is of another skeleton
+    ClipError    where the motion belongs to another skeleton
+
+    Examples
+    --------
+    >>> from marey_motion import guess_axes, map_joints, studio_skeleton
+    >>> skeleton = studio_skeleton()
+    >>> len(guess_axes(skeleton, map_joints(skeleton)))
+    26
     """
     rest = _resting_body(skeleton, mapping)
     moving = rest if motion is None else _moving_body(skeleton, motion, rest.joints)
@@ -99,14 +124,38 @@ def guess_axes(skeleton: Skeleton, mapping: JointMapping, motion: Clip | None = 
 
 
 def bone_end(standard: str, joints: Collection[str]) -> str | None:
-    """Which of these standard joints the bone of one of them leads to; None for the last of a chain."""
+    """Find the standard joint at the other end of a joint's bone.
+
+    Parameters
+    ----------
+    standard : str    standard name of the joint
+    joints : collection of str    standard joints to choose from
+
+    Returns
+    -------
+    str or None    standard name; None for the last joint of a chain
+    """
     side, _, joint = standard.partition("_")
     prefix, joint = (f"{side}_", joint) if side in SIDES else ("", standard)
     return next((prefix + end for end in _TOWARDS.get(joint, ()) if prefix + end in joints), None)
 
 
 def rest_pose_doubts(skeleton: Skeleton, mapping: JointMapping) -> tuple[str, ...]:
-    """Parts of the body ("trunk", "left arm", ...) whose swing axes cannot be read from the rest pose."""
+    """List the parts of the body whose swing axes cannot be read from the rest pose.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    the joints
+    mapping : JointMapping    its standard joints
+
+    Returns
+    -------
+    tuple of str    "trunk", "left arm", ...
+
+    Raises
+    ------
+    MappingError    as `guess_axes`
+    """
     rest = _resting_body(skeleton, mapping)
     parts = dict.fromkeys(_part(standard) for standard in STANDARD_JOINTS if standard in rest.joints)
     return tuple(part for part in parts if part not in rest.readable_parts)

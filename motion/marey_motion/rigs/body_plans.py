@@ -1,7 +1,7 @@
-"""Which pairs of limbs are the legs and arms of a person, and which of their joints bend: by proportions.
+"""Legs and arms of a person among pairs of limbs, and the joints that bend, found by proportions.
 
-A cape, wings or the bones of a skirt are pairs of chains as well, and twist bones stand between the joints that bend. A
-reading of all of them is worth the sum of the logarithms of how common its proportions are among people.
+A cape, wings or the bones of a skirt are pairs of chains as well, and twist bones lie between the joints that bend. The
+score of a reading is the sum of the logarithms of how common its proportions are among people.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SHORTER = -1.5
 
 @dataclass(frozen=True)
 class Build:
-    """Proportions of a limb among people, each with its spread as a logarithm."""
+    """Proportions of a limb among people, each as its usual value and the spread of its logarithm."""
 
     ratio: tuple[float, float]  # upper by lower long bone
     end: tuple[float, float]  # what follows, to the tip of toes or fingers, by both long bones
@@ -57,7 +57,7 @@ ARM_BY_LEG_LIMITS = (0.3, 1.2)
 
 @dataclass(frozen=True)
 class LimbReading:
-    """Where in both chains of a pair the joints are that carry the upper and the lower long bone, and the end."""
+    """A pair of limbs with the joints that start the upper and the lower long bone, and the end."""
 
     pair: LimbPair
     places: tuple[int, int, int]
@@ -66,12 +66,22 @@ class LimbReading:
 
     @property
     def triple(self) -> tuple[int, int, int]:
-        """The three joints on one side, for comparison and for words."""
+        """Indices of the three joints on the first side."""
         a, b, c = (self.pair.limbs[0].chain[place] for place in self.places)
         return a, b, c
 
     def joint(self, side: int, place: int) -> int | None:
-        """Hip, knee, ankle, toe (0 to 3), or what they are in an arm; -1 is the joint before. None where none is."""
+        """Find a joint of the limb.
+
+        Parameters
+        ----------
+        side : int    0 or 1
+        place : int    0 to 3 for hip, knee, ankle and toe, or their counterparts in an arm; -1 for the joint before
+
+        Returns
+        -------
+        int or None    index of the joint, None where the chain has none there
+        """
         chain = self.pair.limbs[side].chain
         at = {-1: self.places[0] - 1, 3: self.places[2] + 1}.get(place)
         at = self.places[place] if at is None else at
@@ -88,7 +98,16 @@ class BodyPlan:
 
 
 def body_plans(tree: BoneTree) -> list[BodyPlan]:
-    """What may be legs and arms, the likeliest first."""
+    """List the pairs of limbs that may be legs and arms.
+
+    Parameters
+    ----------
+    tree : BoneTree    branching and lengths of the skeleton
+
+    Returns
+    -------
+    list of BodyPlan    the likeliest first
+    """
     pairs = sorted(tree.limb_pairs, key=lambda pair: -sum(pair.bones))[:MOST_PAIRS]
     legs = {pair: _readings(tree, pair, LEG) for pair in pairs}
     arms = {pair: _readings(tree, pair, ARM) for pair in pairs}
@@ -163,11 +182,32 @@ def _ends(positions: Floats, legs: LimbReading) -> Iterator[tuple[Floats, Floats
 
 
 def unit(vector: Floats) -> Floats:
+    """Scale a vector to length 1.
+
+    Parameters
+    ----------
+    vector : (3,) float64    metres
+
+    Returns
+    -------
+    (3,) float64    zero for vectors shorter than `SHORTEST_BONE_M`
+    """
     length = float(np.linalg.norm(vector))
     return vector / length if length > SHORTEST_BONE_M else np.zeros(3)
 
 
 def commonness(value: float, usual: tuple[float, float]) -> float:
+    """Score a proportion by how common it is among people.
+
+    Parameters
+    ----------
+    value : float    the proportion
+    usual : (float, float)    its usual value and the spread of its logarithm
+
+    Returns
+    -------
+    float    0 for the usual value, less for others, at least `LEAST_WORTH`
+    """
     expected, spread = usual
     if value <= 0.0:
         return LEAST_WORTH

@@ -1,6 +1,6 @@
-"""Finding the body in a skeleton whose names say nothing: two legs, two arms, a head.
+"""The body in a skeleton whose joint names carry no information: two legs, two arms, a head.
 
-Only lengths and branching are used where possible, because the rest pose of many files is no pose of a body at all.
+Only lengths and branching are used where possible, because the rest pose of many files is not the pose of a body.
 """
 
 from __future__ import annotations
@@ -39,7 +39,14 @@ CLOSE, DOUBTED = 0.3, 0.6
 
 @dataclass(frozen=True)
 class GeometryMatch:
-    """Standard joints found by geometry (by index), how sure that is, and what was assumed."""
+    """Standard joints found by geometry.
+
+    Parameters
+    ----------
+    joints : dict of str to int    index by standard name
+    confidence : float    0 to 1
+    notes : tuple of str    assumptions, as sentences for people
+    """
 
     joints: dict[str, int]
     confidence: float
@@ -47,7 +54,16 @@ class GeometryMatch:
 
 
 def find_body(skeleton: Skeleton) -> GeometryMatch | None:
-    """Legs, arms and head by symmetry, branching and lengths; None when there are no two pairs of limbs."""
+    """Find legs, arms and head by symmetry, branching and lengths.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    joints with any names
+
+    Returns
+    -------
+    GeometryMatch or None    None when there are no two pairs of limbs
+    """
     tree = BoneTree(skeleton)
     plans = body_plans(tree)
     if not plans:

@@ -1,4 +1,4 @@
-"""Recognising a rig by the names of its joints."""
+"""Recognition of a rig by the names of its joints."""
 
 from __future__ import annotations
 
@@ -18,9 +18,13 @@ MOST_PREFIXES = 8
 
 @dataclass(frozen=True)
 class NameMatch:
-    """How well a known rig's names fit a skeleton, and which joints (by index) they name.
+    """The joints of a skeleton that a known rig's names fit.
 
-    `rig` is None where the names are everyday words, of no tool in particular.
+    Parameters
+    ----------
+    rig : str, optional    name of the rig; None where the names are everyday words of no particular tool
+    joints : dict of str to int    index by standard name
+    signature_share : float    share of the rig's signature that was found, 0 to 1
     """
 
     rig: str | None
@@ -29,24 +33,32 @@ class NameMatch:
 
     @property
     def essential_count(self) -> int:
-        """How many of the joints that no body can do without were found."""
+        """Number of essential joints found."""
         return sum(joint in self.joints for joint in ESSENTIAL_JOINTS)
 
     @property
     def essential_share(self) -> float:
-        """The same as a share."""
+        """Share of the essential joints found, 0 to 1."""
         return self.essential_count / len(ESSENTIAL_JOINTS)
 
     @property
     def rank(self) -> tuple[float, bool, float, int]:
-        """Better matches have greater ranks."""
+        """Sort key; better matches have greater ranks."""
         return self.essential_share, self.rig is not None, self.signature_share, len(self.joints)
 
 
 def best_match(skeleton: Skeleton) -> NameMatch | None:
-    """The known rig whose names fit best; of equals, the one listed first, and a tool's before everyday words.
+    """Find the known rig whose names fit best.
 
-    None when no rig's pelvis is found.
+    Of equals, the one listed first, and a tool's before everyday words.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    its display names are compared
+
+    Returns
+    -------
+    NameMatch or None    None when no rig's pelvis is found
     """
     matches = [
         match

@@ -41,7 +41,12 @@ class KnownRig:
     everyday: bool = False
 
     def names(self) -> Iterator[tuple[str, tuple[str, ...]]]:
-        """Each standard joint with the names it may have."""
+        """List each standard joint with its possible names.
+
+        Yields
+        ------
+        standard, names : str, tuple of str    a standard joint and its names, the preferred first
+        """
         for joint in ("pelvis", "neck", "head"):
             yield joint, _alternatives(getattr(self, joint))
         for side, word in zip(SIDES, self.side_words, strict=True):

@@ -20,13 +20,22 @@ MOST_LIMBS = 12
 
 @dataclass(frozen=True)
 class Limb:
-    """The chain from a branching joint to the farthest tip, three joints or more."""
+    """A chain from a branching joint to the farthest tip, three joints or more."""
 
     chain: tuple[int, ...]
     bones: tuple[float, ...]  # length from each joint of the chain to the next
 
     def cut(self, bones: int) -> Limb:
-        """The limb up to the end of so many bones."""
+        """Shorten the limb.
+
+        Parameters
+        ----------
+        bones : int    number of bones to keep
+
+        Returns
+        -------
+        Limb    the first bones of the chain
+        """
         return Limb(self.chain[: bones + 1], self.bones[:bones])
 
 
@@ -40,12 +49,12 @@ class LimbPair:
 
     @cached_property
     def bones(self) -> tuple[float, ...]:
-        """Mean lengths of both sides' bones."""
+        """Mean lengths of both sides' bones, in the skeleton's unit."""
         return tuple((a + b) / 2 for a, b in zip(self.limbs[0].bones, self.limbs[1].bones, strict=True))
 
 
 class BoneTree:
-    """A skeleton's branching and lengths."""
+    """Branching and bone lengths of a skeleton."""
 
     def __init__(self, skeleton: Skeleton) -> None:
         self.skeleton = skeleton
@@ -61,17 +70,46 @@ class BoneTree:
             self.depth[parent] = max(self.depth[parent], 1 + self.depth[joint])
 
     def path_to_root(self, joint: int) -> tuple[int, ...]:
-        """As of the skeleton, worked out once for each joint."""
+        """List the joints up to the root, computed once for each joint.
+
+        Parameters
+        ----------
+        joint : int    index of the first joint
+
+        Returns
+        -------
+        tuple of int    indices from `joint` to the root, both included
+        """
         if joint not in self._paths:
             self._paths[joint] = self.skeleton.path_to_root(joint)
         return self._paths[joint]
 
     def extent(self, joint: int) -> float:
-        """Metres from a joint's parent to the farthest tip below the joint."""
+        """Measure from a joint's parent to the farthest tip below the joint.
+
+        Parameters
+        ----------
+        joint : int    index of the joint
+
+        Returns
+        -------
+        float    length along the bones, in the skeleton's unit
+        """
         return float(self.lengths[joint] + self.reach[joint])
 
     def limb(self, start: int) -> Limb:
-        """The farthest-reaching chain from a joint. End sites are no bones: exporters write anything there."""
+        """Follow the farthest-reaching chain from a joint.
+
+        End sites are not bones: exporters write arbitrary lengths there.
+
+        Parameters
+        ----------
+        start : int    index of the first joint
+
+        Returns
+        -------
+        Limb    the chain to its last joint
+        """
         chain = [start]
         while children := self.skeleton.children[chain[-1]]:
             chain.append(max(children, key=self.extent))
@@ -90,7 +128,16 @@ class BoneTree:
         return tuple(pairs)
 
     def are_apart(self, legs: LimbPair, arms: LimbPair) -> bool:
-        """Whether two pairs sit on different joints, neither on the limbs of the other."""
+        """Check whether two pairs start at different joints, neither on the limbs of the other.
+
+        Parameters
+        ----------
+        legs, arms : LimbPair    the pairs
+
+        Returns
+        -------
+        bool    True where they can belong to one body
+        """
         above_legs, above_arms = (self.path_to_root(pair.parent) for pair in (legs, arms))
         nested = any(limb.chain[0] in above_arms for limb in legs.limbs) or any(
             limb.chain[0] in above_legs for limb in arms.limbs
@@ -98,12 +145,30 @@ class BoneTree:
         return legs.parent != arms.parent and not nested
 
     def common_ancestor(self, a: int, b: int) -> int:
-        """The lowest joint that both descend from, or are."""
+        """Find the lowest joint from which two joints descend.
+
+        Parameters
+        ----------
+        a, b : int    indices of the joints
+
+        Returns
+        -------
+        int    index of the ancestor, which may be one of them
+        """
         above = set(self.path_to_root(a))
         return next(joint for joint in self.path_to_root(b) if joint in above)
 
     def distance(self, a: int, b: int) -> float:
-        """Metres from one joint to another along the bones between them."""
+        """Measure the bones between two joints.
+
+        Parameters
+        ----------
+        a, b : int    indices of the joints
+
+        Returns
+        -------
+        float    length along the bones, in the skeleton's unit
+        """
         between = set(self.path_to_root(a)) ^ set(self.path_to_root(b))
         return float(sum(self.lengths[joint] for joint in between))
 

@@ -1,4 +1,4 @@
-"""Giving a skeleton's joints their standard names."""
+"""Standard names for a skeleton's joints."""
 
 from __future__ import annotations
 
@@ -28,15 +28,23 @@ _ANIMAL_WORDS = ("tail", "paw", "hoof", "hock", "fetlock", "snout", "muzzle")
 
 @dataclass(frozen=True)
 class JointMapping:
-    """Which joint of a skeleton plays which standard joint.
+    """The joints of a skeleton by standard name.
 
     Parameters
     ----------
-    rig : the known rig whose names were recognised, if any
-    joints : standard name to joint name; one joint may play several, as hips that are root and pelvis
-    confidence : 0 to 1; below 0.5 a person should look before it is used
-    method : how it came about
-    notes : what was assumed or is missing, in sentences for people
+    rig : str, optional    the known rig whose names were recognised
+    joints : mapping of str to str    standard name to joint name; one joint may have several, as hips that are root
+        and pelvis
+    confidence : float    0 to 1; below 0.5 a person should check it before use
+    method : str    "names", "geometry" or "manual"
+    notes : tuple of str    assumptions and missing joints, in sentences for people
+
+    Examples
+    --------
+    >>> from marey_motion import map_joints, studio_skeleton
+    >>> mapping = map_joints(studio_skeleton())
+    >>> mapping.joints["left_knee"], mapping.method
+    ('LeftLeg', 'names')
     """
 
     rig: str | None
@@ -46,7 +54,21 @@ class JointMapping:
     notes: tuple[str, ...] = ()
 
     def indices(self, skeleton: Skeleton, standard_names: Iterable[str]) -> tuple[int, ...]:
-        """Indices of these standard joints; `MappingError` that names the ones this mapping lacks."""
+        """Look up the joints of standard names.
+
+        Parameters
+        ----------
+        skeleton : Skeleton    the joints
+        standard_names : iterable of str    names to look up
+
+        Returns
+        -------
+        tuple of int    indices, in the order of the names
+
+        Raises
+        ------
+        MappingError    naming the ones that this mapping lacks
+        """
         names = tuple(standard_names)
         missing = [name for name in names if name not in self.joints]
         if missing:
@@ -55,9 +77,24 @@ class JointMapping:
 
 
 def map_joints(skeleton: Skeleton) -> JointMapping:
-    """Standard joints of a skeleton: by the names of a known rig or, where those say too little, by its build.
+    """Find the standard joints of a skeleton: by the names of a known rig or, failing those, by its build.
 
-    Never fails: what cannot be found is left out and said in the notes, and the confidence tells how much to trust it.
+    Never fails: joints that cannot be found are left out and named in the notes, and the confidence is lower.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    any joints
+
+    Returns
+    -------
+    JointMapping    standard name to joint name
+
+    Examples
+    --------
+    >>> from marey_motion import game_skeleton, map_joints
+    >>> mapping = map_joints(game_skeleton())
+    >>> mapping.joints["left_knee"], mapping.confidence
+    ('calf_l', 1.0)
     """
     match = by_names.best_match(skeleton)
     # Everyday words are trusted only where they name a whole body.
@@ -90,9 +127,21 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
 
 
 def require_trust(mapping: JointMapping) -> JointMapping:
-    """The mapping itself; `MappingError` for one that hardly recognised anything.
+    """Refuse a mapping that recognised hardly anything.
 
-    A dog has legs and a head, too: what is guessed so badly is not used before a person has looked.
+    A dog has legs and a head, too: such a guess is not used before a person has checked it.
+
+    Parameters
+    ----------
+    mapping : JointMapping    result of `map_joints` or a person's
+
+    Returns
+    -------
+    JointMapping    the same mapping
+
+    Raises
+    ------
+    MappingError    where its confidence is below `LEAST_CONFIDENCE`
     """
     if mapping.confidence < LEAST_CONFIDENCE:
         found = f"its joints were recognised with a confidence of {mapping.confidence:.2f} only"
@@ -103,10 +152,19 @@ def require_trust(mapping: JointMapping) -> JointMapping:
 
 
 def symmetric_joints(skeleton: Skeleton, mapping: JointMapping) -> NDArray[np.int32]:
-    """(J,) index of each joint's partner on the other side; its own for joints of the centre.
+    """Pair each joint with its partner on the other side of the body.
 
-    From the mapping where it knows both sides, else from names that differ in their side alone, else from what joints
-    carry: the parents of partners are partners.
+    From the mapping where it knows both sides, else from names that differ in their side alone, else from the joints
+    below: the parents of partners are partners.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    mapping : JointMapping    its standard joints
+
+    Returns
+    -------
+    (J,) int32    index of the partner; its own for joints of the centre
     """
     partners = np.arange(skeleton.joint_count, dtype=np.int32)
     by_name = {parse_name(name): index for index, name in enumerate(skeleton.joint_names)}

@@ -1,4 +1,4 @@
-"""Reading joint names: namespaces, words, and the side of the body they speak of."""
+"""Parsing of joint names: namespaces, words, and the side of the body."""
 
 from __future__ import annotations
 
@@ -10,18 +10,34 @@ _SIDE_WORDS = {"l": "left", "left": "left", "r": "right", "right": "right"}
 
 
 class JointName(NamedTuple):
-    """A name reduced to what it says: the side, "" for the centre, and the rest in lower case without separators."""
+    """A joint name reduced to its side and its words.
+
+    Parameters
+    ----------
+    side : str    "left", "right", or "" for the centre
+    base : str    the rest in lower case without separators
+    """
 
     side: str
     base: str
 
 
 def parse_name(name: str) -> JointName:
-    """Side and base of a joint name, whatever its style.
+    """Parse the side and base of a joint name of any style.
 
     "mixamorig:LeftUpLeg", "L_UpLeg", "upLeg.l" and "UpLeg_L" have one side and differ at most by a prefix of the base.
     A namespace, up to the last ":" or "|", is dropped.
 
+    Parameters
+    ----------
+    name : str    the joint's name in its file
+
+    Returns
+    -------
+    JointName    side and base
+
+    Examples
+    --------
     >>> parse_name("mixamorig:LeftUpLeg")
     JointName(side='left', base='upleg')
     >>> parse_name("CC_Base_R_Thigh")

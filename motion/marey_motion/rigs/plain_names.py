@@ -22,8 +22,18 @@ _NUMBER_BEFORE = re.compile(r"^\d+[^A-Za-z0-9]")
 
 
 def readings(names: Sequence[str]) -> tuple[Names, ...]:
-    """The names as they are, then each time with one more mark taken off that they share.
+    """List the names as they are, then each time with one more shared mark removed.
 
+    Parameters
+    ----------
+    names : sequence of str    names of all joints
+
+    Returns
+    -------
+    tuple of tuples of str    readings, the first one unchanged
+
+    Examples
+    --------
     >>> readings(("Hips.001", "Spine.001", "Head.001"))
     (('Hips.001', 'Spine.001', 'Head.001'), ('Hips', 'Spine', 'Head'))
     """

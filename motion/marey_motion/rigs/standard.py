@@ -44,7 +44,16 @@ CHAINS = (
 
 
 def mirrored(name: str) -> str:
-    """The standard joint on the other side of the body; joints of the centre are their own."""
+    """Name the standard joint on the other side of the body.
+
+    Parameters
+    ----------
+    name : str    standard name
+
+    Returns
+    -------
+    str    standard name; joints of the centre keep theirs
+    """
     for side, other in (SIDES, SIDES[::-1]):
         if name.startswith(f"{side}_"):
             return other + name[len(side) :]

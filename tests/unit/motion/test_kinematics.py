@@ -190,6 +190,6 @@ def test_the_package_has_no_other_names_than_its_own():
 
     with pytest.raises(AttributeError, match="nonsense"):
         marey_motion.nonsense  # noqa: B018
-    for home, names in marey_motion._HOMES.items():
-        for name in names:
-            assert f"{getattr(marey_motion, name).__module__}.".startswith(f"marey_motion.{home}.")
+    assert set(marey_motion.__all__) <= set(dir(marey_motion))
+    for name in marey_motion.__all__:
+        assert getattr(marey_motion, name).__module__.startswith("marey_motion."), name
