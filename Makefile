@@ -40,6 +40,7 @@ lint: $(VENV)/.installed-dev ## Style, types and the arrows between rooms
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m lint
 
 format: $(VENV)/.installed-dev ## Put the code in house style
 	$(BIN)/ruff check --fix .

@@ -38,7 +38,7 @@ class Scope(StrEnum):
 
 DisplayName = Annotated[str, StringConstraints(min_length=1, max_length=255)]
 Password = Annotated[SecretStr, Field(min_length=10, max_length=1024)]
-ScopeText = Annotated[str, StringConstraints(pattern=r"^(?:read|write|jobs|work|admin)(?:!project=[a-z0-9_-]{1,64})?$")]
+ScopeText = Annotated[str, StringConstraints(pattern=rf"^(?:{'|'.join(Scope)})(?:!project=[a-z0-9_-]{{1,64}})?$")]
 """A scope, optionally bound to one project: `write!project=walk`."""
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from marey_schemas.access import Scope
+
 
 @dataclass(frozen=True, slots=True)
 class Principal:
@@ -31,5 +33,5 @@ class Principal:
 
 
 ANONYMOUS = Principal("anonymous")
-SYSTEM = Principal("system", administrator=True, scopes=("read", "write", "jobs", "work", "admin"))
+SYSTEM = Principal("system", administrator=True, scopes=tuple(scope.value for scope in Scope))
 """The server itself: reaper, garbage collection, first start."""

@@ -32,7 +32,7 @@ SORT_KEYS: dict[str, ColumnElement[Any]] = {
     "priority": job.c.priority,
 }
 
-UNFINISHED = ("waiting", "queued", "running")
+UNFINISHED = tuple(state.value for state in JobState if not state.terminal)
 
 
 @dataclass(frozen=True, slots=True)

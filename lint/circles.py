@@ -1,0 +1,22 @@
+"""Rule: no module imports itself over others, neither at its top, nor in a function, nor for types only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+
+from lint.sources import House, Offence
+
+
+def find(house: House) -> Iterator[Offence]:
+    """Find a circle of imports in each package that has one."""
+    for package in sorted({name.partition(".")[0] for name in house.modules}):
+        names = sorted(name for name in house.modules if name.partition(".")[0] == package)
+        try:
+            TopologicalSorter({name: sorted(house.imports[name]) for name in names}).prepare()
+        except CycleError as error:
+            circle = list(reversed(error.args[1][1:]))
+            first = circle.index(min(circle))
+            circle = [*circle[first:], *circle[:first], circle[first]]
+            message = f"modules import each other: {' -> '.join(circle)}"
+            yield Offence(house.modules[circle[0]].path, 1, circle[0], message)

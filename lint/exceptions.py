@@ -1,0 +1,66 @@
+"""Exceptions to rules: places with their reasons, and counts of texts that are still to be rewritten."""
+
+from __future__ import annotations
+
+import tomllib
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from lint.sources import Offence
+
+EXCEPTIONS = Path(__file__).with_name("exceptions.toml")
+BASELINE = Path(__file__).with_name("wording.toml")
+
+
+def read_exceptions(path: Path = EXCEPTIONS) -> dict[str, dict[str, str]]:
+    """Read the reason of each exception by rule and subject."""
+    return tomllib.loads(path.read_text("utf-8"))
+
+
+def apply_exceptions(rule: str, offences: Iterable[Offence], reasons: Mapping[str, str]) -> Iterator[Offence]:
+    """Leave out offences that have a reason, and report reasons that no offence needs any more.
+
+    The keys of `reasons` are subjects, or patterns of them such as "marey_server.handlers.*".
+    """
+    unused = set(reasons)
+    for offence in offences:
+        fitting = {pattern for pattern in reasons if fnmatchcase(offence.subject, pattern)}
+        unused -= fitting
+        if not fitting:
+            yield offence
+    for subject in sorted(unused):
+        yield Offence(EXCEPTIONS, 1, subject, f"the exception {rule}.{subject!r} is not needed any more; remove it")
+
+
+def read_baseline(path: Path = BASELINE) -> dict[str, int]:
+    """Read how many offences against the wording each file may have."""
+    return tomllib.loads(path.read_text("utf-8")) if path.exists() else {}
+
+
+def apply_baseline(offences: Iterable[Offence], allowed: Mapping[str, int], root: Path) -> Iterator[Offence]:
+    """Report the offences of files that have more than they may, and counts that are larger than they need to be."""
+    by_file: dict[str, list[Offence]] = {}
+    for offence in offences:
+        by_file.setdefault(shown(offence.path, root), []).append(offence)
+    for name in sorted(by_file.keys() | allowed.keys()):
+        found, most = by_file.get(name, []), allowed.get(name, 0)
+        if len(found) > most:
+            yield from found
+        elif len(found) < most:
+            message = f"{name} has {len(found)} offences, not {most}: run `python -m lint --shrink`"
+            yield Offence(BASELINE, 1, name, message)
+
+
+def shrink_baseline(offences: Iterable[Offence], root: Path, path: Path = BASELINE) -> None:
+    """Lower the counts of the baseline to what is left; none is raised."""
+    allowed = read_baseline(path)
+    counts = Counter(shown(offence.path, root) for offence in offences)
+    left = {name: min(most, counts[name]) for name, most in sorted(allowed.items()) if counts[name]}
+    path.write_text("".join(f'"{name}" = {count}\n' for name, count in left.items()), "utf-8")
+
+
+def shown(path: Path, root: Path) -> str:
+    """A path as people write it: below the checkout, with slashes."""
+    return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.as_posix()

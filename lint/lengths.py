@@ -1,0 +1,41 @@
+"""Rule: a function has at most 40 lines without signature, a module at most 400; docstrings do not count."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+
+from lint.sources import Definition, House, Offence
+
+MOST_LINES_OF_FUNCTION = 40
+MOST_LINES_OF_MODULE = 400
+
+
+def find(house: House) -> Iterator[Offence]:
+    """Find functions and modules that are too long to be read at once."""
+    for module in house.modules.values():
+        documented = [node for _, node in module.definitions]
+        lines = module.lines - sum(docstring_lines(node) for node in (module.tree, *documented))
+        if lines > MOST_LINES_OF_MODULE:
+            message = f"{lines} lines, more than {MOST_LINES_OF_MODULE}; split it"
+            yield Offence(module.path, 1, module.name, message)
+        for name, node in module.definitions:
+            if isinstance(node, ast.ClassDef):
+                continue
+            lines = body_lines(node)
+            if lines > MOST_LINES_OF_FUNCTION:
+                message = f"{name} has {lines} lines, more than {MOST_LINES_OF_FUNCTION}; split it"
+                yield Offence(module.path, node.lineno, f"{module.name}.{name}", message)
+
+
+def docstring_lines(node: Definition | ast.Module) -> int:
+    """Count the lines of a docstring."""
+    if ast.get_docstring(node, clean=False) is None:
+        return 0
+    return (node.body[0].end_lineno or 0) - node.body[0].lineno + 1
+
+
+def body_lines(node: Definition) -> int:
+    """Count the lines of a definition after its docstring."""
+    body = node.body[1:] if ast.get_docstring(node, clean=False) is not None else node.body
+    return (node.end_lineno or 0) - body[0].lineno + 1 if body else 0

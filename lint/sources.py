@@ -1,0 +1,123 @@
+"""The files that rules look at: modules with their syntax trees and imports, and pages of text."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+PACKAGES = {
+    "schemas": "marey_schemas",
+    "motion": "marey_motion",
+    "reports": "marey_reports",
+    "client": "marey_client",
+    "server": "marey_server",
+    "worker": "marey_worker",
+}
+"""Folder of each package of the product, and its name."""
+
+Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+
+
+class Offence(NamedTuple):
+    """A place that breaks a rule. `subject` is what an exception names."""
+
+    path: Path
+    line: int
+    subject: str
+    message: str
+
+
+@dataclass(frozen=True)
+class Module:
+    """One Python file."""
+
+    name: str
+    path: Path
+    text: str
+    is_package: bool = False
+
+    @cached_property
+    def tree(self) -> ast.Module:
+        """The syntax tree."""
+        return ast.parse(self.text)
+
+    @cached_property
+    def lines(self) -> int:
+        """The number of lines."""
+        return len(self.text.splitlines())
+
+    @cached_property
+    def definitions(self) -> list[tuple[str, Definition]]:
+        """Every class and function with its qualified name, nested ones too."""
+        return list(_definitions(self.tree, ""))
+
+
+def _definitions(node: ast.AST, prefix: str) -> Iterator[tuple[str, Definition]]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, Definition):
+            yield prefix + child.name, child
+            yield from _definitions(child, f"{prefix}{child.name}.")
+        else:
+            yield from _definitions(child, prefix)
+
+
+@dataclass(frozen=True)
+class House:
+    """All modules of the product by name, and the pages that people read."""
+
+    modules: dict[str, Module]
+    pages: dict[Path, str] = field(default_factory=dict)
+    users: dict[Path, str] = field(default_factory=dict)
+
+    @cached_property
+    def imports(self) -> dict[str, set[str]]:
+        """Modules of the product that each module imports anywhere: inside functions and for types only, too."""
+        return {name: set(_imported(module, self.modules)) - {name} for name, module in self.modules.items()}
+
+    @cached_property
+    def importers(self) -> dict[str, set[str]]:
+        """Modules of the product that import each module."""
+        found: dict[str, set[str]] = {name: set() for name in self.modules}
+        for importer, targets in self.imports.items():
+            for target in targets:
+                found[target].add(importer)
+        return found
+
+
+def _imported(module: Module, known: dict[str, Module]) -> Iterator[str]:
+    for node in ast.walk(module.tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                if (target := inner if inner in known else node.module) in known:
+                    yield target
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in known)
+
+
+def read_house(root: Path) -> House:
+    """Read every module of the product below a checkout, its pages, and the other places that may use its names."""
+    modules = [
+        read_module(path, root / folder)
+        for folder, package in PACKAGES.items()
+        for path in sorted((root / folder / package).rglob("*.py"))
+    ]
+    pages = [*sorted((root / "docs").rglob("*.md")), *sorted(root.glob("*.md"))]
+    users = [*(root / "docs").rglob("*.py"), *(root / "benchmarks").rglob("*.py"), *(root / "migrations").rglob("*.py")]
+    users += [root / "pyproject.toml", root / "Makefile", *root.glob("*/marey_*/__init__.pyi")]
+    return House(
+        {module.name: module for module in modules},
+        {path: path.read_text("utf-8") for path in pages},
+        {path: path.read_text("utf-8") for path in users if path.is_file()},
+    )
+
+
+def read_module(path: Path, root: Path) -> Module:
+    """Read a module whose name is its path below `root`."""
+    parts = path.relative_to(root).with_suffix("").parts
+    is_package = parts[-1] == "__init__"
+    return Module(".".join(parts[:-1] if is_package else parts), path, path.read_text("utf-8"), is_package)

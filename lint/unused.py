@@ -1,0 +1,76 @@
+"""Rule: what only tests call is dead. Every function, class and method is named by other code of the product.
+
+Names count, not bindings: a method is used when any code names an attribute like it. Names in the docs' code blocks
+and in benchmarks count, too: their readers are users of the SDK and of the library.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter
+from collections.abc import Iterator
+
+from lint.sources import Definition, House, Module, Offence
+
+_WORD = re.compile(r"[A-Za-z_]\w*")
+# Called by a framework: Tornado, pydantic, logging, SQLAlchemy, httpx.
+_CALLED_BY_NAME = {
+    "get", "head", "post", "put", "patch", "delete", "options", "initialize", "prepare", "data_received", "on_finish",
+    "on_connection_close", "write_error", "log_exception", "set_default_headers", "compute_etag", "find_handler",
+    "model_post_init", "emit", "format", "formatTime", "formatException", "filter", "convert", "run", "gather",
+    "process_bind_param", "process_result_value", "auth_flow", "settings_customise_sources",
+}  # fmt: skip
+_ENTRY_DECORATORS = {"command", "callback", "validator", "field_validator", "model_validator", "listens_for", "reads"}
+_ENTRY_DECORATORS |= {"writes", "overload", "field_serializer", "model_serializer", "compiles", "register"}
+
+
+def find(house: House) -> Iterator[Offence]:
+    """Find definitions that nothing but tests refers to."""
+    named = _named(house)
+    for module in house.modules.values():
+        for name, node in module.definitions:
+            if named[node.name] or _is_entry(node):
+                continue
+            yield Offence(
+                module.path, node.lineno, f"{module.name}.{name}", f"{name} is used by tests only, or by nothing"
+            )
+
+
+def _is_entry(node: Definition) -> bool:
+    """Whether a framework calls a definition, so that no code names it."""
+    if (node.name.startswith("__") and node.name.endswith("__")) or node.name in _CALLED_BY_NAME:
+        return True
+    return any(
+        isinstance(part, ast.Name | ast.Attribute) and _last_name(part) in _ENTRY_DECORATORS
+        for decorator in node.decorator_list
+        for part in ast.walk(decorator)
+    )
+
+
+def _named(house: House) -> Counter[str]:
+    """Count every mention of a name, other than its definition and imports of it."""
+    named: Counter[str] = Counter()
+    for module in house.modules.values():
+        named.update(_mentions(module))
+    for text in (*house.pages.values(), *house.users.values()):
+        named.update(_WORD.findall(text))
+    return named
+
+
+def _mentions(module: Module) -> Iterator[str]:
+    for node in ast.walk(module.tree):
+        if isinstance(node, ast.Name | ast.Attribute):
+            yield _last_name(node)
+        elif isinstance(node, ast.keyword) and node.arg:
+            yield node.arg
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.isidentifier():
+            yield node.value
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and re.fullmatch(r"[\w.:]+", node.value):
+            yield from _WORD.findall(node.value)
+        elif isinstance(node, ast.ImportFrom) and module.is_package:
+            yield from (alias.name for alias in node.names)
+
+
+def _last_name(node: ast.Name | ast.Attribute) -> str:
+    return node.id if isinstance(node, ast.Name) else node.attr

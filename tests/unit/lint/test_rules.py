@@ -1,0 +1,171 @@
+"""Each rule of the house fails on a planted offence, and says where it is."""
+
+from pathlib import Path
+
+import pytest
+from lint import circles, class_names, folders, lengths, lists, small_modules, unused, wording
+from lint.commit_subject import faults_of
+from lint.exceptions import apply_baseline, apply_exceptions, read_baseline, shrink_baseline
+from lint.sources import House, Module, Offence
+
+ROOT = Path("/checkout")
+LONG = "\n".join("x = 1" for _ in range(70)) + "\n"
+
+
+def house(modules: dict[str, str], pages: dict[str, str] | None = None) -> House:
+    """A house of modules by name, in the folders that their names say."""
+    found = {name: Module(name, ROOT / f"{name.replace('.', '/')}.py", text) for name, text in modules.items()}
+    return House(found, {ROOT / name: text for name, text in (pages or {}).items()})
+
+
+def messages(offences) -> list[str]:
+    return [offence.message for offence in offences]
+
+
+@pytest.mark.parametrize(
+    "back",
+    [
+        "from marey_x.a import A\n",
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from marey_x.a import A\n",
+        "def f():\n    import marey_x.a\n",
+    ],
+    ids=["at the top", "for types only", "in a function"],
+)
+def test_modules_that_import_each_other_are_found(back):
+    circle = house({"marey_x.a": "from marey_x import b\n", "marey_x.b": "import marey_x.c\n", "marey_x.c": back})
+    (offence,) = circles.find(circle)
+    assert offence.message.endswith("marey_x.a -> marey_x.b -> marey_x.c -> marey_x.a")
+
+
+def test_modules_that_import_downwards_are_no_circle():
+    assert not list(circles.find(house({"marey_x.a": "from marey_x import b\n", "marey_x.b": ""})))
+
+
+def test_a_folder_of_26_modules_is_full():
+    full = {f"marey_x.m{number}": "" for number in range(26)}
+    assert messages(folders.find(house(full))) == ["26 modules, more than 25; make rooms of them"]
+    del full["marey_x.m0"]
+    assert not list(folders.find(house(full)))
+
+
+def test_a_small_module_with_one_importer_belongs_into_it():
+    modules = {"marey_x.small": "", "marey_x.one": f"import marey_x.small\n{LONG}", "marey_x.other": LONG}
+    assert messages(small_modules.find(house(modules))) == ["0 lines, imported only by marey_x.one; merge it"]
+    modules["marey_x.other"] = f"from marey_x.small import x\n{LONG}"
+    assert not list(small_modules.find(house(modules)))
+
+
+def test_two_classes_of_one_name_are_found_with_both_places():
+    (offence,) = class_names.find(house({"marey_x.a": "class Take: ...\n", "marey_y.b": "\nclass Take: ...\n"}))
+    assert (offence.subject, offence.line) == ("Take", 2)
+    assert "marey_x.a, line 1" in offence.message
+
+
+def test_a_function_that_only_its_definition_names_is_unused():
+    text = "def used(): ...\n\ndef dead(): ...\n\nclass A:\n    def dead_too(self): used()\n\nA()\n"
+    found = [offence.subject for offence in unused.find(house({"marey_x.a": text}))]
+    assert found == ["marey_x.a.dead", "marey_x.a.A.dead_too"]
+
+
+def test_names_in_the_docs_are_used():
+    modules = {"marey_x.a": "def of_the_sdk(): ...\n"}
+    assert not list(unused.find(house(modules, {"docs/use.md": "`project.of_the_sdk()`"})))
+
+
+def test_long_functions_and_modules_are_found_and_docstrings_do_not_count():
+    body = "".join(f"    x = {number}\n" for number in range(41))
+    docstring = '    """Do it.\n' + "\n" * 50 + '    """\n'
+    assert messages(lengths.find(house({"marey_x.a": f"def f():\n{docstring}{body}"}))) == [
+        "f has 41 lines, more than 40; split it"
+    ]
+    assert not list(lengths.find(house({"marey_x.a": f"def f():\n{docstring}{body[:-11]}"})))
+    assert messages(lengths.find(house({"marey_x.a": "x = 1\n" * 401}))) == ["401 lines, more than 400; split it"]
+
+
+def test_a_list_that_repeats_words_of_a_vocabulary_is_found():
+    home = "class State(StrEnum):\n    A = 'waiting'\n    B = 'queued'\n    C = 'running'\n    D = 'failed'\n"
+    copy = "OPEN = ('waiting', 'queued', 'running')\n"
+    (offence,) = lists.find(house({"marey_schemas.jobs": home, "marey_x.a": copy}))
+    assert "words of marey_schemas.jobs.State" in offence.message
+    other = "OPEN = ('waiting', 'queued', 'opened')\n"
+    assert not list(lists.find(house({"marey_schemas.jobs": home, "marey_x.a": other})))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '"""What is left of it."""\n',
+        'def f():\n    """How often it was tried."""\n',
+        'class A:\n    """Where it lies."""\n',
+        'x = "this tells the caller"\n',
+        'x = "the caller is told"\n',
+        'x = "the name stands in the file"\n',
+        'x = "it is read anew"\n',
+        'x = "what becomes of it"\n',
+        'x = f"hand in {1} jobs"\n',
+        'x = "the last word of an attempt"\n',
+        'x = "mirrored twins of clips"\n',
+        'x = "a made-up clip"\n',
+        "class Allowance: ...\n",
+        "def earlier_answer(): ...\n",
+    ],
+)
+def test_phrases_and_names_of_the_word_list_are_found(text):
+    assert len(list(wording.find(house({"marey_x.a": text})))) == 1
+
+
+@pytest.mark.parametrize(
+    "text", ['"""Counts retries."""\n', 'x = "it is made up of parts"\n', 'x = "a foot that stands still"\n']
+)
+def test_plain_english_is_left_alone(text):
+    assert not list(wording.find(house({"marey_x.a": text})))
+
+
+def test_pages_are_read_but_not_their_code():
+    page = "# Title\n\n```sh\ntell me\n```\n\nIt tells nobody.\n"
+    (offence,) = wording.find(house({}, {"docs/page.md": page}))
+    assert offence.line == 7
+
+
+def test_a_module_of_an_old_name_is_found():
+    assert messages(wording.find(house({"marey_x.settling": ""}))) == ["module settling is called propagation now"]
+
+
+def test_an_exception_with_a_reason_lets_one_offence_pass_and_is_reported_when_nothing_needs_it():
+    offences = [Offence(ROOT / "a.py", 1, "marey_x.a", "too long"), Offence(ROOT / "b.py", 1, "marey_y.b", "too long")]
+    assert [one.subject for one in apply_exceptions("lengths", offences, {"marey_x.*": "a table"})] == ["marey_y.b"]
+    (left,) = apply_exceptions("lengths", [], {"marey_x.a": "a table"})
+    assert "not needed any more" in left.message
+
+
+def test_the_baseline_of_the_wording_only_shrinks(tmp_path):
+    path = tmp_path / "wording.toml"
+    path.write_text('"a.py" = 2\n"b.py" = 1\n', "utf-8")
+    offences = [Offence(ROOT / "a.py", line, "told", "'told'") for line in (1, 2, 3)]
+    assert len(list(apply_baseline(offences, {"a.py": 2}, ROOT))) == 3, "one more than allowed shows all of the file"
+    assert not list(apply_baseline(offences, {"a.py": 3}, ROOT))
+    (left,) = apply_baseline(offences[:1], {"a.py": 3}, ROOT)
+    assert "--shrink" in left.message
+    shrink_baseline(offences, ROOT, path)
+    assert read_baseline(path) == {"a.py": 2}
+    shrink_baseline(offences[:1], ROOT, path)
+    assert read_baseline(path) == {"a.py": 1}
+
+
+@pytest.mark.parametrize(
+    ("subject", "fault"),
+    [
+        ("Mend the store", "area"),
+        ("store: mended the pool", "imperative"),
+        ("store: mending the pool", "imperative"),
+        ("store: mend the pool.", "full stop"),
+        ("store: " + "x" * 66, "72"),
+    ],
+)
+def test_a_commit_subject_that_is_not_in_form_is_refused(subject, fault):
+    assert any(fault in one for one in faults_of(subject))
+
+
+@pytest.mark.parametrize("subject", ["store: omit the password from Database.shown", 'Revert "store: omit it"'])
+def test_a_commit_subject_in_form_passes(subject):
+    assert faults_of(subject) == []
