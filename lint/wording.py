@@ -16,7 +16,7 @@ PHRASES = {
     r"\banew\b": "again",
     r"\bgone by\b": "used, or past",
     r"\b(?:becomes?|became|become) of\b": "happens to, or the result of",
-    r"(?<!by )\bhand(?:s|ed|ing)? in\b": "submit, or send",
+    r"(?<!by\s)\bhand(?:s|ed|ing)? in\b": "submit, or send",
     r"\blast word\b": "final answer",
     r"\btwins?\b": "mirrored copy",
     r"\bmade[- ]up\b(?! of)": "synthetic",
