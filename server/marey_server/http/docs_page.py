@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from html import escape
 from typing import Any
+
+from markupsafe import escape
 
 from marey_server import errors
 

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
+import sys
 from dataclasses import dataclass
-from enum import Enum, auto
+
+from python_multipart.exceptions import MultipartParseError
+from python_multipart.multipart import MultipartParser, parse_options_header
 
 from marey_server.errors import BadRequestProblem, TooLargeProblem, UnsupportedMediaTypeProblem
 
 MAX_HEAD_BYTES = 16 * 1024
-_BOUNDARY = re.compile(r'boundary=(?:"([^"]{1,70})"|([^\s;,"]{1,70}))', re.IGNORECASE)
-_PARAMETER = re.compile(r';\s*([\w*]+)\s*=\s*(?:"((?:[^"\\]|\\.)*)"|([^;\s]*))')
+MAX_BOUNDARY_BYTES = 70
+"""RFC 2046, section 5.1.1."""
 
 
 @dataclass(frozen=True, slots=True)
 class PartHead:
-    """The head of a part: the form field, and the file name where it is a file."""
+    """The head of a part: the form field, and the file name if it is a file."""
 
     field: str
     file_name: str | None
@@ -30,108 +31,117 @@ class PartEnd:
 Piece = PartHead | bytes | PartEnd
 
 
-class _State(Enum):
-    PREAMBLE = auto()
-    HEAD = auto()
-    BODY = auto()
-    EPILOGUE = auto()
-
-
 def boundary_of(content_type: str) -> bytes:
-    """The boundary of a Content-Type header. Raises `UnsupportedMediaTypeProblem` or `BadRequestProblem`."""
-    if not content_type.lower().startswith("multipart/form-data"):
+    """Return the boundary of a Content-Type header. Raises `UnsupportedMediaTypeProblem` or `BadRequestProblem`."""
+    media_type, parameters = parse_options_header(content_type)
+    if media_type != b"multipart/form-data":
         raise UnsupportedMediaTypeProblem(
             f"Files are sent as multipart/form-data, not {content_type or 'without a type'}."
         )
-    match = _BOUNDARY.search(content_type)
-    if match is None:
-        raise BadRequestProblem("The Content-Type names no boundary.", code="bad-multipart")
-    return (match[1] or match[2]).encode("latin-1")
+    boundary = parameters.get(b"boundary", b"")
+    if not 0 < len(boundary) <= MAX_BOUNDARY_BYTES:
+        raise BadRequestProblem(
+            f"The Content-Type names no boundary of 1 to {MAX_BOUNDARY_BYTES} bytes.", code="bad-multipart"
+        )
+    return boundary
 
 
 class MultipartReader:
-    """Cuts a stream into parts: for every part one `PartHead`, its bytes in pieces, one `PartEnd`."""
+    """Cuts a stream into parts: for every part one `PartHead`, its bytes in pieces, one `PartEnd`.
+
+    `python-multipart` parses; this class bounds the heads and the number of parts, and skips a preamble.
+    """
 
     def __init__(self, boundary: bytes, *, max_parts: int) -> None:
-        self._delimiter = b"\r\n--" + boundary
-        self._buffer = bytearray(b"\r\n")  # so that the first delimiter looks like the others
-        self._state = _State.PREAMBLE
+        self._first_delimiter = b"\r\n--" + boundary
+        self._preamble: bytes | None = b"\r\n"  # None once the first delimiter was found
         self._parts_left = max_parts
+        self._pieces: list[Piece] = []
+        self._head_bytes = 0
+        self._name, self._value = bytearray(), bytearray()
+        self._disposition: bytes | None = None
+        self._ended = False
+        self._parser = MultipartParser(
+            boundary,
+            {
+                "on_part_begin": self._begin_part,
+                "on_header_field": self._add_header_name,
+                "on_header_value": self._add_header_value,
+                "on_header_end": self._end_header,
+                "on_headers_finished": self._end_head,
+                "on_part_data": lambda data, start, stop: self._pieces.append(data[start:stop]),
+                "on_part_end": lambda: self._pieces.append(PartEnd()),
+                "on_end": self._end,
+            },
+            max_header_count=MAX_HEAD_BYTES,
+            max_header_size=sys.maxsize,  # `_count_head` bounds the whole head
+        )
 
-    def feed(self, data: bytes) -> Iterator[Piece]:
-        """What the next bytes of the stream complete. Raises `BadRequestProblem` or `TooLargeProblem`."""
-        self._buffer += data
-        while True:
-            if self._state is _State.HEAD:
-                head = self._take_head()
-                if head is None:
-                    return
-                yield head
-            elif self._state is _State.EPILOGUE:
-                self._buffer.clear()
-                return
-            else:
-                in_body = self._state is _State.BODY
-                before, found = self._take_until_delimiter()
-                if before and in_body:
-                    yield before
-                if not found:
-                    return
-                if in_body:
-                    yield PartEnd()
+    def feed(self, data: bytes) -> list[Piece]:
+        """Return what the next bytes of the stream complete. Raises `BadRequestProblem` or `TooLargeProblem`."""
+        if self._preamble is not None:
+            data = self._skip_preamble(self._preamble + data)
+        try:
+            self._parser.write(data)
+        except MultipartParseError as error:
+            raise BadRequestProblem(f"The multipart body is malformed: {error}.", code="bad-multipart") from error
+        pieces, self._pieces = self._pieces, []
+        return pieces
 
     def finish(self) -> None:
-        """The stream has ended. Raises `BadRequestProblem` where it ended too early."""
-        if self._state is not _State.EPILOGUE:
+        """Check that the stream ended with the closing boundary. Raises `BadRequestProblem`."""
+        if not self._ended:
             raise BadRequestProblem("The multipart body ends before its closing boundary.", code="bad-multipart")
 
-    def _take_until_delimiter(self) -> tuple[bytes, bool]:
-        """Bytes before the next delimiter, and whether it was found whole; then what follows it is next."""
-        at = self._buffer.find(self._delimiter)
-        end = at + len(self._delimiter)
-        if at < 0 or len(self._buffer) < end + 2:
-            keep = len(self._buffer) - at if at >= 0 else min(len(self._buffer), len(self._delimiter) - 1)
-            before = bytes(self._buffer[: len(self._buffer) - keep])
-            del self._buffer[: len(before)]
-            return before, False
-        before, after = bytes(self._buffer[:at]), bytes(self._buffer[end : end + 2])
-        if after not in (b"\r\n", b"--"):
-            raise BadRequestProblem(
-                "A boundary of the multipart body is followed by other bytes.", code="bad-multipart"
-            )
-        del self._buffer[: end + 2]
-        self._state = _State.HEAD if after == b"\r\n" else _State.EPILOGUE
-        return before, True
-
-    def _take_head(self) -> PartHead | None:
-        at = self._buffer.find(b"\r\n\r\n")
-        if at > MAX_HEAD_BYTES or (at < 0 and len(self._buffer) > MAX_HEAD_BYTES):
-            raise TooLargeProblem(f"The head of a part is longer than {MAX_HEAD_BYTES} bytes.")
+    def _skip_preamble(self, data: bytes) -> bytes:
+        at = data.find(self._first_delimiter)
         if at < 0:
-            return None
+            self._preamble = data[1 - len(self._first_delimiter) :]
+            return b""
+        self._preamble = None
+        return data[at + len(b"\r\n") :]
+
+    def _begin_part(self) -> None:
         if self._parts_left == 0:
             raise TooLargeProblem("The request has too many parts.", code="too-many-parts")
         self._parts_left -= 1
-        head = bytes(self._buffer[:at])
-        del self._buffer[: at + 4]
-        self._state = _State.BODY
-        return _parse_head(head)
+        self._head_bytes = 0
+        self._disposition = None
+
+    def _add_header_name(self, data: bytes, start: int, stop: int) -> None:
+        self._count_head(stop - start)
+        self._name += data[start:stop]
+
+    def _add_header_value(self, data: bytes, start: int, stop: int) -> None:
+        self._count_head(stop - start)
+        self._value += data[start:stop]
+
+    def _count_head(self, more_bytes: int) -> None:
+        self._head_bytes += more_bytes
+        if self._head_bytes > MAX_HEAD_BYTES:
+            raise TooLargeProblem(f"The head of a part is longer than {MAX_HEAD_BYTES} bytes.")
+
+    def _end_header(self) -> None:
+        if self._name.strip().lower() == b"content-disposition" and self._disposition is None:
+            self._disposition = bytes(self._value)
+        self._name.clear()
+        self._value.clear()
+
+    def _end_head(self) -> None:
+        disposition, parameters = parse_options_header(self._disposition)
+        if disposition != b"form-data" or b"name" not in parameters:
+            raise BadRequestProblem("A part lacks Content-Disposition: form-data with a name.", code="bad-multipart")
+        file_name = parameters.get(b"filename")
+        self._pieces.append(PartHead(_text(parameters[b"name"]), None if file_name is None else _text(file_name)))
+
+    def _end(self) -> None:
+        self._ended = True
 
 
-def _parse_head(head: bytes) -> PartHead:
-    for line in head.split(b"\r\n"):
-        name, _, value = line.partition(b":")
-        if name.strip().lower() == b"content-disposition":
-            try:
-                text = value.decode("utf-8").strip()
-            except UnicodeDecodeError:
-                raise BadRequestProblem("The head of a part is not UTF-8.", code="bad-multipart") from None
-            found = {key.lower(): _unquoted(quoted) or bare for key, quoted, bare in _PARAMETER.findall(text)}
-            if not text.lower().startswith("form-data") or "name" not in found:
-                break
-            return PartHead(found["name"], found.get("filename"))
-    raise BadRequestProblem("A part lacks Content-Disposition: form-data with a name.", code="bad-multipart")
-
-
-def _unquoted(text: str) -> str:
-    return re.sub(r"\\(.)", r"\1", text).replace("%22", '"').replace("%0D", "\r").replace("%0A", "\n")
+def _text(value: bytes) -> str:
+    """Decode a field or file name; browsers write quotation marks and line ends in it as `%22`, `%0D` and `%0A`."""
+    try:
+        text = value.decode("utf-8")
+    except UnicodeDecodeError:
+        raise BadRequestProblem("The head of a part is not UTF-8.", code="bad-multipart") from None
+    return text.replace("%22", '"').replace("%0D", "\r").replace("%0A", "\n")

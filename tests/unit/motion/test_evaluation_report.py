@@ -92,7 +92,7 @@ def test_notes_of_the_evaluation_are_told(result, figures):
 
 
 def test_markup_is_escaped_unless_it_was_made_here():
-    assert element("p", "<b>", element("b", "&"), class_='x"y') == '<p class="x&quot;y">&lt;b&gt;<b>&amp;</b></p>'
+    assert element("p", "<b>", element("b", "&"), class_='x"y') == '<p class="x&#34;y">&lt;b&gt;<b>&amp;</b></p>'
     assert element("td", None, ["a", None, "b"], data_value="1", title=None) == '<td data-value="1">ab</td>'
     assert text("a\x00b\ud800") == "a\ufffdb\ufffd"
 

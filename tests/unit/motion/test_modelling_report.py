@@ -65,7 +65,7 @@ def test_the_same_model_gives_the_same_page(model, figures):
 
 
 def test_the_page_may_load_nothing(model):
-    assert "default-src &#x27;none&#x27;" in rendered(*model)
+    assert "default-src &#39;none&#39;" in rendered(*model)
     assert not re.search(r"(?:href|src)=\"(?!#|data:)", rendered(*model))
 
 

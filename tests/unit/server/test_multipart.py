@@ -68,8 +68,42 @@ def test_escaped_quotes_in_file_names_are_read_in_both_spellings():
     assert [part.file_name for part, _ in found] == ['a"b.bvh', 'a"b.bvh']
 
 
-def test_what_comes_before_the_first_part_is_ignored():
-    assert read(b"preamble\r\n" + body_of([(head("x"), b"1")])) == [(PartHead("x", None), b"1")]
+@pytest.mark.parametrize("preamble", [b"preamble\r\n", b"--front\r\n--\r\n", b"\r\n", b"x" * 200_000 + b"\r\n"])
+def test_what_comes_before_the_first_part_is_ignored_wherever_the_stream_is_cut(preamble):
+    body = preamble + body_of([(head("x"), b"1")])
+    for cut in range(len(preamble) - 5, len(preamble) + 15):
+        assert read(body, [max(cut, 0)]) == [(PartHead("x", None), b"1")]
+
+
+fragments = st.lists(
+    st.one_of(
+        st.binary(max_size=20),
+        st.sampled_from([
+            b"--" + BOUNDARY, b"--" + BOUNDARY + b"--", b"\r\n", b"\r\n\r\n", head("x"), head("f", "a.bvh"),
+            b";", b":", b'"',
+            b"Content-Disposition: ", b"form-data; name=", b"\xff",
+        ]),
+    ),
+    max_size=30,
+).map(b"".join)  # fmt: skip
+
+
+@given(body=fragments, cuts=st.lists(st.integers(0, 300), max_size=10))
+def test_any_bytes_are_read_or_refused_alike_wherever_the_stream_is_cut(body, cuts):
+    def outcome(places):
+        try:
+            return read(body, places)
+        except (BadRequestProblem, TooLargeProblem) as refused:
+            return type(refused)
+
+    assert outcome([cut for cut in cuts if cut < len(body)]) == outcome([])
+
+
+def test_nothing_of_a_file_is_held_back_but_what_may_be_a_boundary():
+    reader = MultipartReader(BOUNDARY, max_parts=1)
+    reader.feed(body_of([(head("files", "a.bvh"), b"")]).partition(b"\r\n\r\n")[0] + b"\r\n\r\n")
+    given_bytes = sum(len(piece) for _ in range(50) for piece in reader.feed(b"\r\n--front" * 10_000))
+    assert given_bytes >= 50 * 90_000 - len(BOUNDARY) - 4
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -33,37 +34,39 @@ def fit_one(values: AnyFloats) -> Normals:
 
 
 def fit_two(values: AnyFloats, second: NDArray[np.bool_]) -> Normals:
-    """Two normal distributions by expectation maximisation, begun at the two groups that `second` makes.
+    """Fit two normal distributions by scikit-learn, started from the two groups that `second` makes.
 
-    A begin that is known, as from the wished speed of each tick, makes the fit repeatable. Where one group is empty the
-    values are split at their mean. Values without spread give two equal components.
+    A given start, such as the demanded speed of each tick, makes the fit repeatable. If one group is empty, the values
+    are split at their mean. Values without spread give two equal components.
     """
-    spread = float(values.std())
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.mixture import GaussianMixture
+
     if np.ptp(values) == 0.0:
         one = fit_one(values)
         return Normals(np.full(2, 0.5), np.repeat(one.means, 2), np.repeat(one.deviations, 2))
     if second.all() or not second.any():
         second = values > values.mean()
-    shares = np.stack((~second, second), axis=1).astype(np.float64)
-    before = -np.inf
-    for _ in range(MOST_STEPS):
-        fit = _maximised(values, shares, NARROWEST * spread)
-        densities = _densities(values, fit)
-        total = np.maximum(densities.sum(axis=1, keepdims=True), np.finfo(float).tiny)
-        shares = densities / total
-        likelihood = float(np.log(total).mean())
-        if likelihood - before < TOLERANCE:
-            break
-        before = likelihood
-    order = np.argsort(fit.means, kind="stable")
-    return Normals(fit.weights[order], fit.means[order], fit.deviations[order])
-
-
-def _maximised(values: AnyFloats, shares: AnyFloats, narrowest: float) -> Normals:
-    held = np.maximum(shares.sum(axis=0), np.finfo(float).tiny)
-    means = shares.T @ values / held
-    variances = (shares * (values[:, None] - means) ** 2).sum(axis=0) / held
-    return Normals(held / len(values), means, np.maximum(np.sqrt(variances), narrowest))
+    groups = (values[~second], values[second])
+    narrowest = NARROWEST * float(values.std())
+    mixture = GaussianMixture(
+        2,
+        covariance_type="spherical",
+        tol=TOLERANCE,
+        reg_covar=narrowest**2,
+        max_iter=MOST_STEPS,
+        weights_init=[len(group) / len(values) for group in groups],
+        means_init=[[group.mean()] for group in groups],
+        precisions_init=[1.0 / max(float(group.std()), narrowest) ** 2 for group in groups],
+        init_params="random",  # replaced by the start above
+        random_state=0,
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # after so many steps a picture shows no difference
+        mixture.fit(values[:, None])
+    means, deviations = mixture.means_[:, 0], np.sqrt(mixture.covariances_)
+    order = np.argsort(means, kind="stable")
+    return Normals(mixture.weights_[order], means[order], deviations[order])
 
 
 def _densities(values: AnyFloats, fit: Normals) -> AnyFloats:
