@@ -1,4 +1,4 @@
-"""Skeletons, mappings, clips and annotations to and from the documents that travel."""
+"""Conversion of skeletons, mappings, clips and annotations to and from documents."""
 
 from __future__ import annotations
 
@@ -21,7 +21,16 @@ from marey_schemas.editing.edits import EditDocument
 
 
 def skeleton_to_document(skeleton: Skeleton) -> skeletons.SkeletonHierarchy:
-    """Part `hierarchy` of a skeleton."""
+    """Convert a skeleton to its part `hierarchy`.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+
+    Returns
+    -------
+    SkeletonHierarchy    the document, in metres
+    """
     joints = tuple(
         skeletons.Joint(
             name=name,
@@ -46,7 +55,20 @@ def skeleton_to_document(skeleton: Skeleton) -> skeletons.SkeletonHierarchy:
 
 
 def skeleton_from_document(document: skeletons.SkeletonHierarchy) -> Skeleton:
-    """The skeleton of a `hierarchy` part; `SkeletonError` where its numbers describe none."""
+    """Convert a `hierarchy` part to a skeleton.
+
+    Parameters
+    ----------
+    document : SkeletonHierarchy    the part
+
+    Returns
+    -------
+    Skeleton    J joints
+
+    Raises
+    ------
+    SkeletonError    where its numbers describe none
+    """
     return Skeleton(
         joint_names=tuple(joint.name for joint in document.joints),
         parents=np.array([joint.parent for joint in document.joints], dtype=np.int32),
@@ -58,7 +80,17 @@ def skeleton_from_document(document: skeletons.SkeletonHierarchy) -> Skeleton:
 
 
 def clip_to_document(clip: Clip, skeleton: RevisionRef | OutputRef) -> clips.MotionDocument:
-    """Part `motion` of a clip whose skeleton is stored as `skeleton`."""
+    """Convert a clip to its part `motion`.
+
+    Parameters
+    ----------
+    clip : Clip    F frames
+    skeleton : RevisionRef or OutputRef    where its skeleton is stored
+
+    Returns
+    -------
+    MotionDocument    the document, with the joints' names and order
+    """
     names = clip.skeleton.joint_names
     return clips.MotionDocument(
         skeleton=skeleton,
@@ -71,9 +103,20 @@ def clip_to_document(clip: Clip, skeleton: RevisionRef | OutputRef) -> clips.Mot
 
 
 def clip_from_document(document: clips.MotionDocument, skeleton: Skeleton) -> Clip:
-    """The clip of a `motion` part, with its rotations in the skeleton's order.
+    """Convert a `motion` part to a clip, with its rotations in the skeleton's order.
 
-    `ClipError` where the document is not of this skeleton or its numbers are no motion.
+    Parameters
+    ----------
+    document : MotionDocument    the part
+    skeleton : Skeleton    its skeleton
+
+    Returns
+    -------
+    Clip    F frames
+
+    Raises
+    ------
+    ClipError    where the document belongs to another skeleton or its numbers are no motion
     """
     if set(document.joints) != set(skeleton.joint_names) or len(document.joints) != skeleton.joint_count:
         odd = sorted(set(document.joints) ^ set(skeleton.joint_names)) or ["a repeated name"]
@@ -100,7 +143,19 @@ def layer_to_document(
     name: str,
     made_by: Literal["person", "algorithm"] = "person",
 ) -> annotation_documents.Annotation:
-    """Part `annotation` of a layer of this name over a clip that is stored as `clip`."""
+    """Convert an annotation layer to its part `annotation`.
+
+    Parameters
+    ----------
+    layer : Layer    segments and keyframes
+    clip : RevisionRef or OutputRef    where the annotated clip is stored
+    name : str    name of the layer
+    made_by : str    "person" or "algorithm"
+
+    Returns
+    -------
+    Annotation    the document
+    """
     return annotation_documents.Annotation(
         clip=clip,
         layer=name,
@@ -111,7 +166,21 @@ def layer_to_document(
 
 
 def layer_from_document(document: annotation_documents.Annotation, frame_count: int) -> Layer:
-    """The layer of an `annotation` part over a clip of so many frames; `AnnotationError` where it goes beyond them."""
+    """Convert an `annotation` part to a layer.
+
+    Parameters
+    ----------
+    document : Annotation    the part
+    frame_count : int    frames of the annotated clip
+
+    Returns
+    -------
+    Layer    segments and keyframes
+
+    Raises
+    ------
+    AnnotationError    where it exceeds the clip
+    """
     return Layer(
         frame_count,
         tuple(Segment(one.label, one.start, one.end) for one in document.segments),
@@ -120,7 +189,17 @@ def layer_from_document(document: annotation_documents.Annotation, frame_count: 
 
 
 def mapping_to_document(mapping: JointMapping, axes: Mapping[str, JointAxes]) -> skeletons.SkeletonMapping:
-    """Part `mapping` of a skeleton."""
+    """Convert a joint mapping with its axes to the part `mapping` of a skeleton.
+
+    Parameters
+    ----------
+    mapping : JointMapping    standard joints
+    axes : mapping of str to JointAxes    axes by joint name
+
+    Returns
+    -------
+    SkeletonMapping    the document
+    """
     return skeletons.SkeletonMapping(
         rig=mapping.rig,
         method=mapping.method,
@@ -134,10 +213,23 @@ def mapping_to_document(mapping: JointMapping, axes: Mapping[str, JointAxes]) ->
 def mapping_from_document(
     document: skeletons.SkeletonMapping, skeleton: Skeleton
 ) -> tuple[JointMapping, dict[str, JointAxes]]:
-    """Mapping and axes of a `mapping` part that people may have edited.
+    """Convert a `mapping` part, which people may have edited, to a mapping and its axes.
 
-    Axes are brought to unit length and the swing made perpendicular to the twist. `MappingError` where a standard name
-    is unknown, a joint is not of the skeleton, or an axis has no direction.
+    Axes are brought to unit length and the swing made perpendicular to the twist.
+
+    Parameters
+    ----------
+    document : SkeletonMapping    the part
+    skeleton : Skeleton    its skeleton
+
+    Returns
+    -------
+    mapping : JointMapping    standard joints
+    axes : dict of str to JointAxes    axes by joint name
+
+    Raises
+    ------
+    MappingError    where a standard name is unknown, a joint is missing from the skeleton, or an axis has no direction
     """
     for standard, name in document.joints.items():
         if standard not in STANDARD_JOINTS:
@@ -155,7 +247,16 @@ def mapping_from_document(
 
 
 def commands_of_edit(edit: EditDocument) -> tuple[tuple[str, dict[str, Any]], ...]:
-    """Names and parameters as `editing.registry` takes them: angles in radians, `_rad` where documents say `_deg`."""
+    """Convert an edit to the names and parameters that `editing.registry` takes.
+
+    Parameters
+    ----------
+    edit : EditDocument    the document; its angles are in degrees
+
+    Returns
+    -------
+    tuple of (str, dict)    name and parameters of each command; angles in radians, `_rad` in place of `_deg`
+    """
     trees = (command.model_dump() for command in edit.commands)
     return tuple((str(tree.pop("command")), _in_radians(tree)) for tree in trees)
 

@@ -1,4 +1,4 @@
-"""Which code computes."""
+"""Version of the package."""
 
 from __future__ import annotations
 
@@ -6,7 +6,12 @@ from importlib.metadata import PackageNotFoundError, version
 
 
 def code_version() -> str:
-    """The version of the package, as results and reports say it."""
+    """Name the version of the package for results and reports.
+
+    Returns
+    -------
+    str    "marey@" and the version
+    """
     try:
         return f"marey@{version('marey')}"
     except PackageNotFoundError:  # run from a source tree that is not installed

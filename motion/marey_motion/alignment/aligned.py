@@ -1,4 +1,4 @@
-"""What alignment makes of clips: motions in one canonical frame and one canonical time, and the way back."""
+"""Results of an alignment: motions in one canonical frame and time, with the data to undo it."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from marey_motion.skeleton import Skeleton
 
 @dataclass(frozen=True)
 class Placement:
-    """Where on the ground a clip began: what bringing it to the canonical frame took away.
+    """Start of a clip on the ground, which moving it to the canonical frame removed.
 
-    A point p of the canonical frame stood at R(heading) p + (x, y, z), R turning about the vertical.
+    A point p of the canonical frame was at R(heading) p + (x, y, z), R rotating about the vertical.
 
     Parameters
     ----------
-    heading_rad : where the body faced in the first frame, 0 along +z, positive to the left
-    x, z : where the joint that carries the body stood in the first frame, metres
-    y : what was taken off all heights, metres: nothing where they are kept, as they are by default
-    joint : the joint that carries the body (`MatchingBody.carrier`): the root, or, below a root that is a static
-        reference on the floor, mostly the hips
+    heading_rad : float    heading in the first frame, 0 along +z, positive to the left
+    x, z : float    position of `joint` in the first frame, metres
+    y : float    metres removed from all heights; 0 where heights are kept, as by default
+    joint : int    the joint that carries the body (`MatchingBody.carrier`): the root, or, below a root that is a
+        static reference on the floor, mostly the hips
     """
 
     heading_rad: float
@@ -36,19 +36,19 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class AlignedClip:
-    """One example.
+    """One aligned example of N canonical frames.
 
     Parameters
     ----------
-    uid : unique among the clips
-    name : for people; ties are broken by it, then by the uid, which is another one wherever the clips are stored anew
-    motion : N canonical frames, in the canonical frame: the body begins at x = z = 0 and faces +z. Joints between a
+    uid : str    unique among the clips
+    name : str    for people; orders the clips, before the uid
+    motion : Motion    N frames in the canonical frame: the body begins at x = z = 0 and faces +z. Joints between a
         static root and the one that carries the body are not translated.
-    time_function : (N,) fractional frame of the source (at the set's rate) at each canonical frame; strictly
-        increasing from 0 to the last frame of the source
-    placement : what was taken away
-    cost : mean cost per frame of the way that the time function follows, metres squared
-    source_frames : frames of the source at the set's rate
+    time_function : (N,) float64    fractional frame of the source (at the set's rate) at each canonical frame;
+        strictly increasing from 0 to the last frame of the source
+    placement : Placement    start of the source on the ground
+    cost : float    mean cost per frame of the path behind the time function, square metres
+    source_frames : int    frames of the source at the set's rate
     """
 
     uid: str
@@ -66,11 +66,11 @@ class AlignedSet:
 
     Parameters
     ----------
-    skeleton : of all of them
-    frame_rate_hz : of canonical frames, that of the reference
-    clips : ordered by name, then uid
-    reference : uid of the clip whose time is the canonical time
-    keyframes : canonical frame by label
+    skeleton : Skeleton    of all of them
+    frame_rate_hz : float    canonical frames per second, those of the reference
+    clips : tuple of AlignedClip    ordered by name, then uid
+    reference : str    uid of the clip whose time is the canonical time
+    keyframes : mapping of str to int    canonical frame by label
     """
 
     skeleton: Skeleton
@@ -81,15 +81,15 @@ class AlignedSet:
 
     @property
     def frame_count(self) -> int:
-        """N, canonical frames."""
+        """Number of canonical frames N."""
         return self.clips[0].motion.frame_count
 
     @property
     def poses(self) -> Floats:
-        """(clips, N, 3 + 4·J) root translations and rotations."""
+        """Root translations (metres) and rotations of all clips, (clips, N, 3 + 4·J) float64."""
         return np.stack([clip.motion.poses for clip in self.clips])
 
     @property
     def time_functions(self) -> Floats:
-        """(clips, N) source frames."""
+        """Source frames of all clips, (clips, N) float64."""
         return np.stack([clip.time_function for clip in self.clips])

@@ -1,4 +1,4 @@
-"""Aligned examples to and from trees of plain values and arrays that travel and are kept, one example in each."""
+"""Conversion of aligned examples to and from trees of plain values and arrays, one example in each."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class StoredExample(NamedTuple):
 
     Parameters
     ----------
-    uid : what names it where its tree does not tell which clip it is of
-    clip : its canonical frames
-    info : the tree that `example_to_tree` made
+    uid : str    names the example where its tree does not
+    clip : Clip    its canonical frames
+    info : mapping    the tree made by `example_to_tree`
     """
 
     uid: str
@@ -38,19 +38,36 @@ class StoredExample(NamedTuple):
 
 
 def uid_of(item: str, revision: int, *, mirrored: bool = False) -> str:
-    """What an aligned set calls a stored clip."""
+    """Make the uid of a stored clip in an aligned set.
+
+    Parameters
+    ----------
+    item : str    id of the clip
+    revision : int    its revision
+    mirrored : bool    whether it is the mirrored copy
+
+    Returns
+    -------
+    str    "item@revision", with `~mirrored` for a mirrored copy
+    """
     return f"{item}@{revision}{MIRRORED if mirrored else ''}"
 
 
 def example_to_tree(
     aligned: AlignedSet, example: AlignedClip, *, digest: str | None = None, options: Tree | None = None
 ) -> Tree:
-    """Part `info` of one example of a set whose uids are those of `uid_of`.
+    """Make the part `info` of one example of a set whose uids are those of `uid_of`.
 
     Parameters
     ----------
-    digest : of the whole set
-    options : how it was aligned
+    aligned : AlignedSet    the set
+    example : AlignedClip    one of its clips
+    digest : str, optional    digest of the whole set
+    options : dict, optional    options of the alignment
+
+    Returns
+    -------
+    dict    plain values and arrays
     """
     placement = example.placement
     return {
@@ -76,10 +93,20 @@ def example_to_tree(
 
 
 def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
-    """The set that stored examples make up, ordered by name and uid. It may lack some that were aligned with them.
+    """Assemble a set from stored examples, ordered by name and uid. Some of the set's examples may be missing.
 
-    Raises `MotionError` where there are none, and naming the first example that was aligned with others than those
-    before it, that moves another skeleton, or stands twice.
+    Parameters
+    ----------
+    examples : sequence of StoredExample    examples of one alignment
+
+    Returns
+    -------
+    AlignedSet    the set
+
+    Raises
+    ------
+    MotionError    where there are none; or naming the first example that was aligned with others, has another
+        skeleton, or is repeated
     """
     if not examples:
         raise MotionError("there are no aligned clips", code="too-few-clips")
@@ -101,10 +128,20 @@ def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
 
 
 def restored_clip(clip: Clip, info: Mapping[str, Any]) -> Clip:
-    """The clip that a stored example was made of: its frames at the set's rate, in its own time, where it stood.
+    """Restore the clip that a stored example was made from: its frames at the set's rate, in its own time and place.
 
-    `clip` holds the canonical frames, `info` is the tree that `example_to_tree` made. Raises `MotionError` where the
-    two do not belong together.
+    Parameters
+    ----------
+    clip : Clip    the canonical frames
+    info : mapping    the tree made by `example_to_tree`
+
+    Returns
+    -------
+    Clip    the source at the set's rate
+
+    Raises
+    ------
+    MotionError    where the two do not belong together
     """
     example = _example(StoredExample("", clip, info))
     return restore(example, clip.skeleton).as_clip(clip.skeleton, clip.frame_rate_hz)

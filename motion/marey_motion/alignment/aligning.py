@@ -1,4 +1,4 @@
-"""Examples of one action, brought to one canonical frame and one canonical time."""
+"""Alignment of examples of one action to one canonical frame and one canonical time."""
 
 from __future__ import annotations
 
@@ -56,9 +56,11 @@ class SourceExample:
 
     Parameters
     ----------
-    uid : what names the example for good
-    name : for people; ties go to the lower one, then to the lower uid
-    cuts : frames of the clip that all examples have under the same labels, in the order of time (`segments.cuts_of`)
+    uid : str    stable name of the example
+    name : str    for people; ties go to the lower one, then to the lower uid
+    clip : Clip    the motion
+    cuts : tuple of Cut    frames of the clip that all examples have under the same labels, in the order of time
+        (`segments.cuts_of`)
     """
 
     uid: str
@@ -108,7 +110,17 @@ OnRefusal = Callable[[SourceExample, MotionError], None]
 
 
 def with_mirrored(examples: Sequence[SourceExample], body: MatchingBody) -> list[SourceExample]:
-    """The examples, and each once more with left and right exchanged, its uid and name ending in `~mirrored`."""
+    """Add a mirrored copy of each example, with `~mirrored` at the end of its uid and name.
+
+    Parameters
+    ----------
+    examples : sequence of SourceExample    the examples
+    body : MatchingBody    body of their skeleton
+
+    Returns
+    -------
+    list of SourceExample    the examples and their mirrored copies
+    """
     mirrored = [
         replace(one, uid=one.uid + MIRRORED, name=one.name + MIRRORED, clip=mirror_clip(one.clip, body.partners))
         for one in examples
@@ -127,13 +139,25 @@ def align_clips(
 ) -> AlignedSet:
     """Align examples of an action with one of them, in space and in time, section by section where cuts are given.
 
-    The same bytes come out for any number of threads and any order of the clips.
+    The result has the same bytes for any number of threads and any order of the clips.
 
     Parameters
     ----------
-    on_refusal : told of each example that does not fit, which is then left out; without it the first one raises
+    clips : sequence of SourceExample    clips of one skeleton
+    body : MatchingBody    body of that skeleton
+    options : AlignOptions, optional    options
+    threads : int    threads to use
+    progress : callable, optional    called as progress(done, total, note)
+    on_refusal : callable, optional    called with each example that does not fit and its error, and the example is
+        left out; without it the first one raises
 
-    Raises `MotionError` for options that do not fit the clips, and where fewer than two examples are left.
+    Returns
+    -------
+    AlignedSet    the aligned examples
+
+    Raises
+    ------
+    MotionError    for options that do not fit the clips, and where fewer than two examples are left
     """
     run = _Aligning(body, options or AlignOptions(), threads, progress or (lambda _done, _total, _note: None))
     run.on_refusal = on_refusal
@@ -307,7 +331,16 @@ class _Aligning:
 
 
 def body_weights(body: MatchingBody) -> Floats:
-    """Weights (J,) of the cost: 1 for joints that the body consists of, 0 for those that its carrier does not carry."""
+    """Compute the weights of the joints in the cost.
+
+    Parameters
+    ----------
+    body : MatchingBody    J joints
+
+    Returns
+    -------
+    (J,) float64    1 for the carrier and the joints below it, 0 for others
+    """
     paths = (body.skeleton.path_to_root(joint) for joint in range(body.skeleton.joint_count))
     return np.array([float(body.carrier in path) for path in paths])
 
@@ -318,8 +351,17 @@ def _with_signs_of(motion: Motion, reference: Motion) -> Motion:
 
 
 def restore(clip: AlignedClip, skeleton: Skeleton) -> Motion:
-    """The source again, at the set's rate and where it stood: what `align_clips` did to it, undone.
+    """Undo `align_clips` for one clip.
 
     Exact where the time function is the identity; elsewhere poses between those of canonical frames are interpolated.
+
+    Parameters
+    ----------
+    clip : AlignedClip    the aligned example
+    skeleton : Skeleton    its skeleton
+
+    Returns
+    -------
+    Motion    the source at the set's rate, at its original place
     """
     return placed(warped(clip.motion, inverse(clip.time_function)), clip.placement, skeleton)

@@ -1,4 +1,4 @@
-"""The canonical frame of a motion: it begins where the axes cross, and faces +z."""
+"""The canonical frame of a motion: it begins at the origin of the ground and faces +z."""
 
 from __future__ import annotations
 
@@ -15,20 +15,27 @@ from marey_motion.skeleton import Skeleton
 
 
 def to_canonical(motion: Motion, body: MatchingBody, *, keep_height: bool = True) -> tuple[Motion, Placement]:
-    """The motion turned and moved as a whole so that its first frame stands at x = z = 0 and faces +z.
+    """Rotate and move a motion as a whole so that its first frame is at x = z = 0 and faces +z.
 
-    What stands there is the joint that carries the body: the root, except where that is a static reference on the
-    floor. Such a reference keeps its rotations and is moved along so that the body comes where it belongs; translations
-    of joints between the two go into those of the root.
-
-    Where the body faces is what hips and shoulders say together; where they say nothing in the first frame, the first
-    frame counts in which they do.
+    The joint that carries the body is placed there: the root, except where that is a static reference on the floor.
+    Such a reference keeps its rotations and is moved along; translations of joints between the two are merged into
+    those of the root. The facing direction comes from hips and shoulders; where it is undefined in the first frame, the
+    first frame with a direction counts.
 
     Parameters
     ----------
-    keep_height : leave heights above the floor as they are; else the body begins at y = 0, too
+    motion : Motion    F frames
+    body : MatchingBody    body of its skeleton
+    keep_height : bool    leave heights above the floor as they are; else the body begins at y = 0, too
 
-    Raises `MotionError` when hips and shoulders never tell a direction.
+    Returns
+    -------
+    motion : Motion    F frames in the canonical frame
+    placement : Placement    input of `placed`
+
+    Raises
+    ------
+    MotionError    when no frame has a facing direction
     """
     positions = motion.positions(body.skeleton)
     directions = forward_directions(positions, body.lefts, body.rights)
@@ -41,7 +48,18 @@ def to_canonical(motion: Motion, body: MatchingBody, *, keep_height: bool = True
 
 
 def placed(motion: Motion, placement: Placement, skeleton: Skeleton) -> Motion:
-    """A motion of the canonical frame where it was: the inverse of `to_canonical`."""
+    """Move a motion of the canonical frame to its original place: the inverse of `to_canonical`.
+
+    Parameters
+    ----------
+    motion : Motion    F frames in the canonical frame
+    placement : Placement    result of `to_canonical`
+    skeleton : Skeleton    its skeleton
+
+    Returns
+    -------
+    Motion    F frames in the world
+    """
     turn = _turn(placement.heading_rad)
     carrier = motion.positions(skeleton)[:, placement.joint]
     places = quaternions.rotate_vectors(turn, carrier) + _origin(placement)

@@ -1,4 +1,4 @@
-"""How much the poses of two motions differ: the cost of each pair of their frames."""
+"""Cost of each pair of frames of two motions: the difference of their poses."""
 
 from __future__ import annotations
 
@@ -41,16 +41,17 @@ class CostOptions:
 
 
 class CostPoints(NamedTuple):
-    """The points of one motion of n frames, made ready for all comparisons with others.
+    """The points of one motion of n frames, prepared for comparison with others.
 
     F is n, or with a window of W frames n + W - 1.
 
     Parameters
     ----------
-    rows : (F, P, 3) what each frame is compared with: weighted by the square root of each point's share
-    columns : (P, 3, F) the same
-    energies : (n,) weighted squares on the ground, about their centre, summed over each frame's window
-    centres : (n, 2) weighted centre on the ground of each frame's window; zero where frames are centred one by one
+    rows : (F, P, 3) float64    positions, weighted by the square root of each point's share
+    columns : (P, 3, F) float64    the same, transposed
+    energies : (n,) float64    weighted squares on the ground, about their centre, summed over each frame's window
+    centres : (n, 2) float64    weighted centre on the ground of each frame's window; zero where frames are centred one
+        by one
     """
 
     rows: Floats
@@ -60,11 +61,23 @@ class CostPoints(NamedTuple):
 
 
 def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None) -> Floats:
-    """Cost (n, m), in metres squared, of each pair of frames of points `a` (n, P, 3) and `b` (m, P, 3), Y up.
+    """Compute the cost of each pair of frames of two motions.
 
-    The mean over points, weighted, of their squared distances (and over the frames of the window, if there is one).
+    The weighted mean over points of their squared distances (and over the frames of the window, if there is one).
 
-    Raises `MotionError` for points that do not match or are not finite, and for weights that are none.
+    Parameters
+    ----------
+    a : (n, P, 3) float64    points in metres, Y up
+    b : (m, P, 3) float64    the same points
+    options : CostOptions, optional    options
+
+    Returns
+    -------
+    (n, m) float64    square metres
+
+    Raises
+    ------
+    MotionError    for points that do not match or are not finite, and for invalid weights
 
     Notes
     -----
@@ -79,7 +92,21 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None) -> Flo
 
 
 def cost_points(points: Floats, options: CostOptions) -> CostPoints:
-    """Points (n, P, 3) of a motion, ready to be compared."""
+    """Prepare the points of a motion for comparison.
+
+    Parameters
+    ----------
+    points : (n, P, 3) float64    metres, Y up
+    options : CostOptions    options
+
+    Returns
+    -------
+    CostPoints    input of `costs_between`
+
+    Raises
+    ------
+    MotionError    for positions that are not finite
+    """
     columns = np.array(points.transpose(1, 2, 0), dtype=np.float64, order="C")
     if not np.isfinite(columns).all():
         raise MotionError("positions must be finite", where=f"frame {int(np.argwhere(~np.isfinite(points))[0, 0])}")
@@ -100,7 +127,17 @@ def cost_points(points: Floats, options: CostOptions) -> CostPoints:
 
 
 def costs_between(a: CostPoints, b: CostPoints, options: CostOptions) -> Floats:
-    """As `frame_costs`, of points that are ready."""
+    """Compute `frame_costs` for prepared points.
+
+    Parameters
+    ----------
+    a, b : CostPoints    n and m frames, prepared with the same options
+    options : CostOptions    options
+
+    Returns
+    -------
+    (n, m) float64    square metres
+    """
     from marey_motion.alignment import cost_kernels as kernels
 
     costs = np.empty((len(a.energies), len(b.energies)))

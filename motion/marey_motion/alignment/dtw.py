@@ -1,7 +1,7 @@
-"""Dynamic time warping: the cheapest way through a matrix of costs from its first cell to its last.
+"""Dynamic time warping: the cheapest path through a matrix of costs from its first cell to its last.
 
-A way goes by steps of one frame in both motions (1-1), in the first alone (1-0) or in the second alone (0-1), and costs
-the sum of all cells on it (Sakoe and Chiba 1978, without weights). All results are exact; there is no band.
+A path has steps of one frame in both motions (1-1), in the first alone (1-0) or in the second alone (0-1), and costs
+the sum of all its cells (Sakoe and Chiba 1978, without weights). All results are exact; there is no band.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ _ROUNDING_SLACK = 1.0 - 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """A way through n × m cells.
+    """A path through n × m cells.
 
     Parameters
     ----------
     path : (L, 2) int32    frame of the first and of the second motion, from (0, 0) to (n - 1, m - 1)
-    total : sum of the costs along it
+    total : float    sum of the costs along it
     """
 
     path: NDArray[np.int32]
@@ -34,14 +34,23 @@ class Alignment:
 
 
 def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
-    """The cheapest way, and of equally cheap ones that which goes by 1-1 rather than 1-0, and 1-0 rather than 0-1.
+    """Find the cheapest path.
+
+    Among equally cheap paths a step 1-1 is preferred to 1-0, and 1-0 to 0-1.
 
     Parameters
     ----------
-    costs : (n, m) finite
-    max_run : at most so many steps 1-0, or 0-1, in a row (the slope limit of Kovar and Gleicher 2003); None for any
+    costs : (n, m) float    finite
+    max_run : int, optional    at most so many steps 1-0, or 0-1, in a row (the slope limit of Kovar and Gleicher
+        2003); None for any
 
-    Raises `MotionError` for costs that are not finite, and where no way keeps the limit.
+    Returns
+    -------
+    Alignment    path and total
+
+    Raises
+    ------
+    MotionError    for costs that are not finite, and where no path keeps the limit
     """
     from marey_motion.alignment import dtw_kernels as kernels
 
@@ -61,7 +70,17 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
 
 
 def least_total(costs: Floats, *, max_run: int | None = None) -> float:
-    """The total of `align` alone, infinite where no way keeps the limit; costs as `frame_costs` makes them."""
+    """Compute only the total of `align`.
+
+    Parameters
+    ----------
+    costs : (n, m) float64    result of `frame_costs`
+    max_run : int, optional    as for `align`
+
+    Returns
+    -------
+    float    in the unit of the costs; infinite where no path keeps the limit
+    """
     from marey_motion.alignment import dtw_kernels as kernels
 
     costs = np.ascontiguousarray(costs)
@@ -81,7 +100,17 @@ def _checked(costs: ArrayLike, max_run: int | None) -> Floats:
 
 
 def distances(a: NDArray[np.floating], b: NDArray[np.floating]) -> Floats:
-    """Mean distance (n, m) of the points of each frame of `a` (n, P, 3) from those of each frame of `b` (m, P, 3)."""
+    """Compute the mean distance of the points of each pair of frames.
+
+    Parameters
+    ----------
+    a : (n, P, 3)    metres
+    b : (m, P, 3)    metres
+
+    Returns
+    -------
+    (n, m) float64    metres
+    """
     from marey_motion.alignment import dtw_kernels as kernels
 
     found = np.empty((len(a), len(b)))
@@ -90,9 +119,19 @@ def distances(a: NDArray[np.floating], b: NDArray[np.floating]) -> Floats:
 
 
 def warped_distance(a: NDArray[np.floating], b: NDArray[np.floating], *, limit: float = np.inf) -> float:
-    """The total of the cheapest way through `distances(a, b)`, divided by the frames of the longer motion.
+    """Compute the total of the cheapest path through `distances(a, b)`, divided by the frames of the longer motion.
 
-    Infinite as soon as it is certain to be above `limit`; memory grows with the frames, not with their product.
+    Memory grows with the frames, not with their product.
+
+    Parameters
+    ----------
+    a : (n, P, 3)    metres
+    b : (m, P, 3)    metres
+    limit : float    stop as soon as the result is certain to exceed it
+
+    Returns
+    -------
+    float    metres; infinite where it exceeds `limit`
     """
     from marey_motion.alignment import dtw_kernels as kernels
 
@@ -106,11 +145,21 @@ def warped_distance(a: NDArray[np.floating], b: NDArray[np.floating], *, limit: 
 
 
 def distance_bound(a: NDArray[np.floating], b: NDArray[np.floating], *, frames_per_box: int = FRAMES_PER_BOX) -> float:
-    """A number that `warped_distance(a, b)` is never below, found much faster.
+    """Compute a lower bound of `warped_distance(a, b)`, much faster.
 
-    Every frame of either motion lies on the way at least once, and costs no less than its distance from the nearest of
+    Every frame of either motion lies on the path at least once, and costs no less than its distance from the nearest of
     the boxes about `frames_per_box` consecutive frames of the other motion. The first and the last cell are on every
-    way.
+    path.
+
+    Parameters
+    ----------
+    a : (n, P, 3)    metres
+    b : (m, P, 3)    metres
+    frames_per_box : int    frames in each box
+
+    Returns
+    -------
+    float    metres
     """
     one, other = _points(a, b)[0], _points(b, a)[0]
     boxes = _box_costs(one, other, frames_per_box).sum(), _box_costs(other, one, frames_per_box).sum()
@@ -119,12 +168,12 @@ def distance_bound(a: NDArray[np.floating], b: NDArray[np.floating], *, frames_p
 
 
 class RangeBounds:
-    """Coarser bounds than `distance_bound`'s, with one box about each motion, of one motion with many others at once.
+    """Lower bounds of the warped distances between one motion and many others, with one box about each motion.
 
     Parameters
     ----------
-    points : (N, P, 3) of all motions
-    starts, stops : (R,) of each motion's frames, [start, stop) and not empty
+    points : (N, P, 3)    points of all motions, metres
+    starts, stops : (R,) int    frames [start, stop) of each motion, not empty
     """
 
     def __init__(self, points: NDArray[np.floating], starts: NDArray[np.int64], stops: NDArray[np.int64]) -> None:
@@ -134,9 +183,17 @@ class RangeBounds:
         self._low, self._high = (np.stack([edge(part, axis=0) for part in ranges]) for edge in (np.min, np.max))
 
     def between(self, one: int, others: NDArray[np.int64], *, limit: float = np.inf) -> Floats:
-        """Numbers (K,) that the `warped_distance` of a motion from each of K others is never below.
+        """Compute lower bounds of `warped_distance` from one motion to others.
 
-        Bounds above `limit` are above it, and no more is known of them.
+        Parameters
+        ----------
+        one : int    number of the motion
+        others : (K,) int64    numbers of the others
+        limit : float    bounds above it are not refined
+
+        Returns
+        -------
+        (K,) float64    metres
         """
         from marey_motion.alignment import dtw_kernels as kernels
 

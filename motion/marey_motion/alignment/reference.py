@@ -1,4 +1,4 @@
-"""Which of several motions all others are aligned with."""
+"""Choice of the motion that all others are aligned with."""
 
 from __future__ import annotations
 
@@ -20,14 +20,31 @@ SAME = 1e-9
 
 
 def nearest_mean_length(frame_counts: Sequence[int]) -> int:
-    """The motion whose number of frames is nearest to the mean; of several, the first."""
+    """Choose the motion whose number of frames is nearest to the mean.
+
+    Parameters
+    ----------
+    frame_counts : sequence of int    frames of each motion
+
+    Returns
+    -------
+    int    index; of several, the first
+    """
     return int(np.argmin(np.abs(np.array(frame_counts) - np.mean(frame_counts))))
 
 
 def medoid(totals: Floats) -> int:
-    """The motion with the least sum of the costs (n, n) of aligning it with each; of several, the first.
+    """Choose the motion with the least sum of costs of aligning it with each.
 
     Motions that cannot be aligned with some others (infinite costs) come after those that can with more.
+
+    Parameters
+    ----------
+    totals : (n, n) float64    costs of aligning each pair
+
+    Returns
+    -------
+    int    index; of several, the first
     """
     impossible = np.isinf(totals).sum(axis=1)
     sums = np.where(np.isinf(totals), 0.0, totals).sum(axis=1)
@@ -44,14 +61,22 @@ def pairwise_totals(
     threads: int = 1,
     progress: Advance | None = None,
 ) -> Floats:
-    """Costs (n, n) of aligning each two motions, section by section; infinite where that is not possible.
+    """Compute the costs of aligning each pair of motions, section by section.
 
-    Both directions cost the same, so that each two are aligned once.
+    Both directions cost the same, so each pair is aligned once.
 
     Parameters
     ----------
-    points : of each motion
-    bounds : of each motion's sections, equally many
+    points : sequence of CostPoints    points of each motion
+    bounds : sequence of sequences of int    bounds of each motion's sections, equally many
+    options : CostOptions    options of the cost
+    max_run : int or None    slope limit of `dtw.align`
+    threads : int    threads to use
+    progress : callable, optional    called as progress(done, total)
+
+    Returns
+    -------
+    (n, n) float64    square metres; infinite where alignment is impossible
     """
     count = len(points)
     totals = np.zeros((count, count))

@@ -18,7 +18,13 @@ from marey_motion.errors import AnnotationError
 
 
 class Cut(NamedTuple):
-    """A frame that is known in every example of an action, under the same labels."""
+    """A frame that every example of an action has, under the same labels.
+
+    Parameters
+    ----------
+    labels : tuple of str    labels of the frame
+    frame : int    frame of the clip
+    """
 
     labels: tuple[str, ...]
     frame: int
@@ -29,9 +35,9 @@ class Sections(NamedTuple):
 
     Parameters
     ----------
-    bounds : increasing frames, the first 0 and the last one the motion's last: neighbours bound a section and belong to
-        both sections beside them
-    labels : the labels of each bound, none where only the motion begins or ends there
+    bounds : tuple of int    increasing frames, the first 0 and the last one the motion's last: neighbours bound a
+        section and belong to both sections beside them
+    labels : tuple of tuples of str    the labels of each bound, none where only the motion begins or ends there
     """
 
     bounds: tuple[int, ...]
@@ -44,10 +50,18 @@ class Sections(NamedTuple):
 
 
 def cuts_of(layer: Layer) -> tuple[Cut, ...]:
-    """The cuts that an annotation makes: keyframes, and where segments begin or end.
+    """List the cuts that an annotation makes: keyframes, and starts and ends of segments.
 
     A segment begins under its own label. It ends as `end of <label>` unless another segment begins there or the clip
-    ends with it. A label that stands several times is numbered: `step`, `step 2`, `step 3`.
+    ends with it. A label that is repeated is numbered: `step`, `step 2`, `step 3`.
+
+    Parameters
+    ----------
+    layer : Layer    segments and keyframes
+
+    Returns
+    -------
+    tuple of Cut    in the order of time
     """
     begins = [(segment.start, segment.label) for segment in layer.segments]
     starts = {start for start, _ in begins} | {layer.frame_count}
@@ -65,9 +79,21 @@ def cuts_of(layer: Layer) -> tuple[Cut, ...]:
 
 
 def sections_of(cuts: Sequence[Cut], frame_count: int, *, rate_ratio: float = 1.0) -> Sections:
-    """The sections of a motion of so many frames, at `rate_ratio` times the rate that the cuts count in.
+    """Compute the sections of a motion.
 
-    Raises `AnnotationError` where that leaves a section without two frames.
+    Parameters
+    ----------
+    cuts : sequence of Cut    cuts of the clip
+    frame_count : int    frames of the motion
+    rate_ratio : float    frame rate of the motion, divided by that of the clip
+
+    Returns
+    -------
+    Sections    bounds and labels
+
+    Raises
+    ------
+    AnnotationError    where a section would have fewer than two frames
     """
     last = frame_count - 1
     bounds: dict[int, tuple[str, ...]] = {0: (), last: ()}
@@ -85,14 +111,32 @@ def sections_of(cuts: Sequence[Cut], frame_count: int, *, rate_ratio: float = 1.
 
 
 def common_labels(all_labels: Mapping[str, tuple[tuple[str, ...], ...]]) -> tuple[tuple[str, ...], ...]:
-    """The labels of bounds that most examples have, given by uid; of several, those of the first example."""
+    """Find the labels of bounds that most examples have.
+
+    Parameters
+    ----------
+    all_labels : mapping of str to tuple    labels of each example's bounds, by uid
+
+    Returns
+    -------
+    tuple of tuples of str    of several, those of the first example
+    """
     counts = Counter(all_labels.values())
     most = max(counts.values())
     return next(labels for labels in all_labels.values() if counts[labels] == most)
 
 
 def require_labels(own: tuple[tuple[str, ...], ...], common: tuple[tuple[str, ...], ...]) -> None:
-    """Raises `AnnotationError` where an example's cuts are not, in order, those of the others."""
+    """Check that an example has the same cuts in the same order as the others.
+
+    Parameters
+    ----------
+    own, common : tuple of tuples of str    labels of its bounds and of the others'
+
+    Raises
+    ------
+    AnnotationError    where they differ
+    """
     if own != common:
         raise AnnotationError(
             f"it has the cuts {_shown(own)}, the others have {_shown(common)}: all need the same labels in one order",
@@ -117,9 +161,9 @@ class SectionedAlignment(NamedTuple):
 
     Parameters
     ----------
-    path : (L, 2) from the first to the last frames of both motions, through each pair of bounds once
-    total : sum of the costs along it
-    times : (N,) source frame at each frame of the reference
+    path : (L, 2) int32    from the first to the last frames of both motions, through each pair of bounds once
+    total : float    sum of the costs along it, square metres
+    times : (N,) float64    source frame at each frame of the reference
     """
 
     path: NDArray[np.int32]
@@ -128,7 +172,7 @@ class SectionedAlignment(NamedTuple):
 
     @property
     def mean_cost(self) -> float:
-        """Cost per cell of the path."""
+        """Cost per cell of the path, in square metres."""
         return self.total / len(self.path)
 
 
@@ -138,15 +182,21 @@ def align_sections(
     source: Sequence[int],
     align: Callable[[Floats], Alignment],
 ) -> SectionedAlignment:
-    """Align two motions section by section: each pair of bounds is matched with each other.
+    """Align two motions section by section, matching each pair of bounds.
 
     Parameters
     ----------
-    costs : (N, M) of reference and source frames
-    reference, source : as many bounds of each, from 0 to N - 1 and to M - 1
-    align : finds the way through the costs of one section
+    costs : (N, M) float64    costs of reference and source frames
+    reference, source : sequence of int    equally many bounds of each, from 0 to N - 1 and to M - 1
+    align : callable    finds the path through the costs of one section
 
-    Raises what `align` raises, and `MotionError` for sections without two frames.
+    Returns
+    -------
+    SectionedAlignment    the whole path
+
+    Raises
+    ------
+    MotionError    for sections without two frames
     """
     paths: list[NDArray[np.int32]] = []
     times: list[Floats] = []

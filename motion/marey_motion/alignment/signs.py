@@ -9,11 +9,20 @@ from marey_motion.arrays import Floats
 
 
 def consistent_signs(rotations: Floats, reference: Floats) -> Floats:
-    """Rotations (m, N, J, 4) of m aligned clips with signs under which they can be averaged.
+    """Choose signs of the rotations of aligned clips under which they can be averaged.
 
-    Each joint is made continuous in time first; then its whole course is turned over where its mean dot product with
-    that of the reference (N, J, 4) is negative. Deciding frame by frame instead would cut the course of a joint that
-    turns by more than half a turn.
+    Each joint is made continuous in time first; then all its signs are changed where its mean dot product with that of
+    the reference is negative. Deciding frame by frame instead would cut the course of a joint that turns by more than
+    half a turn.
+
+    Parameters
+    ----------
+    rotations : (m, N, J, 4) float64    rotations of m aligned clips
+    reference : (N, J, 4) float64    rotations of the reference
+
+    Returns
+    -------
+    (m, N, J, 4) float64    the same rotations
     """
     smooth = quaternions.unroll(rotations, axis=1)
     agreement = np.einsum("mfjc,fjc->mj", smooth, quaternions.unroll(reference, axis=0))
@@ -21,7 +30,17 @@ def consistent_signs(rotations: Floats, reference: Floats) -> Floats:
 
 
 def consistent_poses(poses: Floats, reference: Floats) -> Floats:
-    """Poses (m, N, 3 + 4·J) with the signs of `consistent_signs`; the reference is (N, 3 + 4·J)."""
+    """Choose the signs of poses as `consistent_signs` does.
+
+    Parameters
+    ----------
+    poses : (m, N, 3 + 4·J) float64    root translations and rotations
+    reference : (N, 3 + 4·J) float64    those of the reference
+
+    Returns
+    -------
+    (m, N, 3 + 4·J) float64    the same poses
+    """
     clips, frames, _ = poses.shape
     rotations = consistent_signs(poses[..., 3:].reshape(clips, frames, -1, 4), reference[:, 3:].reshape(frames, -1, 4))
     return np.concatenate((poses[..., :3], rotations.reshape(clips, frames, -1)), axis=2)

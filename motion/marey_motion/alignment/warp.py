@@ -1,4 +1,4 @@
-"""Time functions: which moment of a motion belongs to each frame of another, and motions played by them.
+"""Time functions: the moment of one motion for each frame of another.
 
 A time function gives a fractional frame of the source for each canonical frame. It is strictly increasing, begins at 0
 and ends at the source's last frame; between canonical frames it is linear.
@@ -21,13 +21,23 @@ _WHOLE = 1e-9
 
 
 def time_function(path: NDArray[np.integer]) -> Floats:
-    """The time function (N,) of a way (L, 2) through the N frames of a reference and those of a source.
+    """Compute the time function of a path through the frames of a reference and of a source.
 
     Each canonical frame belongs to the mean of the source frames that it is matched with. Source frames that are
     matched with several canonical frames belong to the middle of those, and time passes evenly in between. Both ends
     are pinned. Slopes below `LEAST_SLOPE` are raised to it by the least change, in the sense of squares, of all slopes.
 
-    Raises `MotionError` where one of the motions is too short for that.
+    Parameters
+    ----------
+    path : (L, 2) int    N reference frames and those of the source
+
+    Returns
+    -------
+    (N,) float64    source frames
+
+    Raises
+    ------
+    MotionError    where one of the motions is too short
     """
     if len(path) < 2 or (path[-1] <= path[0]).any():
         raise MotionError("a time function needs at least two frames in both motions", code="too-few-frames")
@@ -69,14 +79,34 @@ def _with_least_slope(times: Floats) -> Floats:
 
 
 def inverse(times: Floats) -> Floats:
-    """The canonical time (M,) of each source frame 0 to M - 1, of a time function (N,)."""
+    """Invert a time function.
+
+    Parameters
+    ----------
+    times : (N,) float64    source frame of each canonical frame, up to M - 1
+
+    Returns
+    -------
+    (M,) float64    canonical frame of each source frame
+    """
     return np.interp(np.arange(round(times[-1]) + 1, dtype=np.float64), times, np.arange(len(times), dtype=np.float64))
 
 
 def warped(motion: Motion, times: ArrayLike) -> Motion:
-    """The motion at fractional frames (n,): positions linear, rotations by slerp between neighbouring frames.
+    """Sample a motion at fractional frames: positions linear, rotations by slerp between neighbouring frames.
 
-    Raises `MotionError` for times that the motion does not have.
+    Parameters
+    ----------
+    motion : Motion    F frames
+    times : (n,) float    frames from 0 to F - 1
+
+    Returns
+    -------
+    Motion    n frames
+
+    Raises
+    ------
+    MotionError    for times outside the motion
     """
     places = np.asarray(times, dtype=np.float64)
     last = motion.frame_count - 1

@@ -1,6 +1,6 @@
-"""What a person should know about a motion before using it: one warning per finding, each with a stable code.
+"""Warnings about a motion before it is used: one per finding, each with a stable code.
 
-The checks look and never change anything; `without_rest_pose` and `on_the_floor` make a changed clip on request.
+The checks never change anything; `without_rest_pose` and `on_the_floor` make a changed clip on request.
 """
 
 from __future__ import annotations
@@ -68,11 +68,11 @@ class CheckWarning:
 
     Parameters
     ----------
-    code : stable slug
-    message : what was found, in a sentence with its numbers
-    joints : names of the joints concerned
-    frames : half-open range of the frames concerned, None for all of them
-    values : the numbers behind the sentence
+    code : str    stable slug
+    message : str    the finding, as a sentence with its numbers
+    joints : tuple of str    names of the joints concerned
+    frames : (int, int), optional    half-open range of the frames concerned, None for all of them
+    values : dict    the numbers behind the sentence
     """
 
     code: str
@@ -82,7 +82,12 @@ class CheckWarning:
     values: dict[str, Any] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain JSON types."""
+        """Convert the warning to plain JSON types.
+
+        Returns
+        -------
+        dict    one member per field
+        """
         return {**asdict(self), "joints": list(self.joints), "frames": list(self.frames) if self.frames else None}
 
 
@@ -112,7 +117,17 @@ class _Tracks:
 
 
 def check_clip(clip: Clip, landmarks: Landmarks | None = None) -> tuple[CheckWarning, ...]:
-    """Everything worth knowing about a clip; `landmarks` of its skeleton, where they are known already."""
+    """Check a clip for defects and peculiarities.
+
+    Parameters
+    ----------
+    clip : Clip    F frames
+    landmarks : Landmarks, optional    those of its skeleton, where they are known already
+
+    Returns
+    -------
+    tuple of CheckWarning    the findings
+    """
     tracks = _track(clip, landmarks)
     warnings = [_position_channels(clip), *_rest_poses(clip, tracks)]
     if tracks.soles:
@@ -122,7 +137,17 @@ def check_clip(clip: Clip, landmarks: Landmarks | None = None) -> tuple[CheckWar
 
 
 def without_rest_pose(clip: Clip) -> tuple[Clip, tuple[int, int]]:
-    """The clip without a rest pose at its start and end, and how many frames were dropped at each."""
+    """Remove a rest pose at the start and end of a clip.
+
+    Parameters
+    ----------
+    clip : Clip    F frames
+
+    Returns
+    -------
+    clip : Clip    the frames between
+    dropped : (int, int)    numbers of frames removed at the start and at the end
+    """
     start, end = _rest_pose_frames(clip, _track(clip))
     if start + end == 0 or start == clip.frame_count:
         return clip, (0, 0)
@@ -130,7 +155,17 @@ def without_rest_pose(clip: Clip) -> tuple[Clip, tuple[int, int]]:
 
 
 def on_the_floor(clip: Clip) -> tuple[Clip, float]:
-    """The clip with its ground at height zero, and the metres that were added to every height; itself without feet."""
+    """Move a clip so that its ground is at height zero.
+
+    Parameters
+    ----------
+    clip : Clip    F frames
+
+    Returns
+    -------
+    clip : Clip    the moved clip; unchanged without feet
+    shift_m : float    metres added to every height
+    """
     tracks = _track(clip)
     if not tracks.soles:
         return clip, 0.0
@@ -163,7 +198,18 @@ def _track(clip: Clip, landmarks: Landmarks | None = None) -> _Tracks:
 
 
 def sole_points(skeleton: Skeleton, foot: int) -> list[int]:
-    """The foot's joints from the ankle down, and its end sites as the points that `end_sites` puts after the joints."""
+    """List the points of a foot that may touch the ground.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    foot : int    index of the ankle
+
+    Returns
+    -------
+    list of int    the joints from the ankle down, and their end sites as the points that `end_sites` appends after the
+        joints
+    """
     below = {foot}
     for joint in range(foot + 1, skeleton.joint_count):
         if int(skeleton.parents[joint]) in below:

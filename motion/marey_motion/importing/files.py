@@ -47,7 +47,7 @@ _READER_OPTIONS = tuple(option.name for option in fields(ImportOptions))
 
 @dataclass(frozen=True)
 class FileDigests:
-    """The names of a file's bytes and of its companion's, for the record of where a clip comes from."""
+    """Digests of a file's bytes and of its companion's, for the record of a clip's origin."""
 
     file: str
     companion: str | None = None
@@ -86,7 +86,16 @@ class ImportedDocuments:
 
 
 def import_options(given: Mapping[str, Any]) -> ImportOptions:
-    """Options of the readers out of those of an import, with the unit by name or by its size in metres."""
+    """Select the options of the readers from those of an import.
+
+    Parameters
+    ----------
+    given : mapping of str to object    options of an import, the unit by name or by its size in metres
+
+    Returns
+    -------
+    ImportOptions    options of the readers
+    """
     chosen = {name: given[name] for name in _READER_OPTIONS if given.get(name) is not None}
     if given.get("unit") is not None:
         chosen.setdefault("unit_scale_m", unit_in_metres(given["unit"]))
@@ -101,6 +110,18 @@ def import_file(
     companion: bytes | memoryview | None = None,
 ) -> ImportedDocuments:
     """Read one file and make its documents.
+
+    Parameters
+    ----------
+    planned : PlannedFile    plan of the file
+    data : bytes    its content
+    digests : FileDigests    digests of the file and its companion
+    request : ImportRequest    facts given by the user
+    companion : bytes, optional    content of the companion
+
+    Returns
+    -------
+    ImportedDocuments    documents of the skeleton and the clip or model
 
     Raises
     ------
@@ -143,7 +164,18 @@ def _anatomy(imported: ImportedMotion) -> tuple[JointMapping, dict[str, JointAxe
 
 
 def anatomy_of(skeleton: Skeleton, clip: Clip | None) -> tuple[JointMapping, dict[str, JointAxes]]:
-    """Mapping and axes; without axes, and with a note, where too little of a body is recognised to tell them."""
+    """Determine the joint mapping and axes of a skeleton.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    clip : Clip or None    motion to read the axes from
+
+    Returns
+    -------
+    mapping : JointMapping    standard joints; with a note where the axes cannot be determined
+    axes : dict of str to JointAxes    by joint name; empty where they cannot be determined
+    """
     mapping = map_joints(skeleton)
     try:
         return mapping, guess_axes(skeleton, mapping, clip)
@@ -152,7 +184,16 @@ def anatomy_of(skeleton: Skeleton, clip: Clip | None) -> tuple[JointMapping, dic
 
 
 def as_tree(document: Any) -> Tree:
-    """The document as plain values and arrays."""
+    """Convert a document to plain values and arrays.
+
+    Parameters
+    ----------
+    document : model    a document of `marey_schemas`
+
+    Returns
+    -------
+    dict    plain values and arrays
+    """
     tree: Tree = document.model_dump(by_alias=True, exclude_none=True)
     return tree
 

@@ -39,7 +39,24 @@ def import_modelled(
     digests: FileDigests,
     tree: bytes | None,
 ) -> ImportedDocuments:
-    """A model with its tree, or a graph, of a file of the predecessor. Raises `FormatError`."""
+    """Convert a file of the predecessor that holds no motion: a model with its tree, or a graph.
+
+    Parameters
+    ----------
+    planned : PlannedFile    plan of the file
+    source : SourceDocument    the decoded file
+    request : ImportRequest    facts given by the user
+    digests : FileDigests    digests of the file and its companion
+    tree : bytes or None    content of the file with the tree over the model's samples
+
+    Returns
+    -------
+    ImportedDocuments    documents of the model and its skeleton, or the graph
+
+    Raises
+    ------
+    FormatError    where the file is wrong
+    """
     file = planned.name
     if source.subject == "tree":
         message = "a tree over samples of a model; import it together with its model, named alike, as in walk_mm.json"

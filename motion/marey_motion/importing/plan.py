@@ -50,7 +50,16 @@ class Pairing:
 
 
 def plan_imports(names: Sequence[str]) -> list[PlannedFile]:
-    """Plan each file of a batch by its name, in the order given. Folders in names become folders below the target."""
+    """Plan each file of a batch by its name. Folders in names become folders below the target.
+
+    Parameters
+    ----------
+    names : sequence of str    paths of one upload
+
+    Returns
+    -------
+    list of PlannedFile    in the order given
+    """
     companions = {pairing.file: pairing for pairing in pair_companions(names)}
     trees = pair_trees(names)
     needed = {*trees.values(), *(one.companion for one in companions.values() if one.companion is not None)}
@@ -90,10 +99,18 @@ def _place(name: str, taken: set[tuple[str, str]]) -> PlannedFile:
 
 
 def pair_companions(names: Iterable[str]) -> tuple[Pairing, ...]:
-    """Find the companion of every file that needs one, such as the ASF of an AMC, among the paths of one upload.
+    """Find the companion of every file that needs one, such as the ASF of an AMC.
 
     In the same folder: the file of the same stem, else the one whose stem the file's begins with up to a separator
     (16_01.amc with 16.asf, 07_01-walk.amc with 07.asf), the longest of several; else the folder's only companion.
+
+    Parameters
+    ----------
+    names : iterable of str    paths of one upload
+
+    Returns
+    -------
+    tuple of Pairing    one for each file that needs a companion
     """
     paths = sorted({PurePosixPath(name.replace("\\", "/")): name for name in names}.items())
     pairings: list[Pairing] = []

@@ -1,7 +1,7 @@
-"""The unit of length and the upward axis of a file, from the body it shows; and the record of why.
+"""The unit of length and the upward axis of a file, inferred from the body, with the evidence.
 
-Files rarely say either. A body does: an adult's leg is about 0.9 m long, heads are above feet, and what touches the
-ground keeps its height. Every finding is kept as a sentence with its numbers; where the findings do not decide, the
+Files rarely state either. A body shows both: an adult's leg is about 0.9 m long, heads are above feet, and feet on the
+ground keep their height. Every finding is kept as a sentence with its numbers; where the findings do not decide, the
 user is asked.
 """
 
@@ -36,7 +36,20 @@ _CLEARLY_FLATTER = 3.0
 
 
 def unit_in_metres(unit: str | float) -> float:
-    """Metres of a unit given by name (`UNITS_M`) or as its size in metres."""
+    """Convert a unit of length to metres.
+
+    Parameters
+    ----------
+    unit : str or float    name (`UNITS_M`) or size in metres
+
+    Returns
+    -------
+    float    metres
+
+    Raises
+    ------
+    MotionError    for an unknown name or a size that is not positive
+    """
     metres = UNITS_M.get(unit.lower()) if isinstance(unit, str) else float(unit)
     if metres is None or not (np.isfinite(metres) and metres > 0):
         raise MotionError(
@@ -73,12 +86,18 @@ class _Measurements:
 
 
 def infer_conversion(source: SourceMotion, landmarks: Landmarks, file: str, options: ImportOptions) -> Conversion:
-    """Decide unit and upward axis: what the options say, else what the format fixes, else what the body shows.
+    """Decide the unit and the upward axis: from the options, else from the format, else from the body.
 
     Parameters
     ----------
-    landmarks : of the source's skeleton
-    file : its name, for messages
+    source : SourceMotion    the file in its own unit and axes
+    landmarks : Landmarks    those of the source's skeleton
+    file : str    its name, for messages
+    options : ImportOptions    facts given by the user
+
+    Returns
+    -------
+    Conversion    unit, axes and evidence
 
     Raises
     ------
@@ -307,7 +326,18 @@ def _hip_height(body: _Measurements, up_axis: UpAxis) -> float:
 
 
 def hip_heights(positions: NDArray[np.float64], landmarks: Landmarks, up_axis: UpAxis = "y") -> NDArray[np.float64]:
-    """(F,) heights of the hips above the lowest that feet or toes come, in the unit of `positions` (F, J, 3)."""
+    """Measure the heights of the hips above the lowest positions of feet or toes.
+
+    Parameters
+    ----------
+    positions : (F, J, 3) float64    in any unit
+    landmarks : Landmarks    joints of the body
+    up_axis : str    the axis that points up
+
+    Returns
+    -------
+    (F,) float64    in the unit of `positions`
+    """
     ground = np.quantile(_heights(positions[:, list(landmarks.ground_joints)], up_axis).min(axis=1), 0.05)
     heights: NDArray[np.float64] = _heights(positions[:, landmarks.hips], up_axis) - ground
     return heights

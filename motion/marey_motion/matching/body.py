@@ -1,4 +1,4 @@
-"""The joints of a skeleton that motion matching looks at."""
+"""The joints of a skeleton that motion matching uses."""
 
 from __future__ import annotations
 
@@ -49,7 +49,21 @@ class MatchingBody:
 
     @classmethod
     def from_mapping(cls, skeleton: Skeleton, mapping: JointMapping) -> MatchingBody:
-        """The parts by their standard names. Raises `MappingError` naming the standard joints that are missing."""
+        """Find the joints by their standard names.
+
+        Parameters
+        ----------
+        skeleton : Skeleton    J joints
+        mapping : JointMapping    its standard joints
+
+        Returns
+        -------
+        MatchingBody    indices of the joints
+
+        Raises
+        ------
+        MappingError    naming the standard joints that are missing
+        """
         hips, left_foot, right_foot = mapping.indices(skeleton, ("pelvis", "left_ankle", "right_ankle"))
 
         def optional(name: str, otherwise: int) -> int:

@@ -1,4 +1,4 @@
-"""From clips to a matching database."""
+"""Construction of a matching database from clips."""
 
 from __future__ import annotations
 
@@ -37,17 +37,25 @@ def build_database(
     normaliser: Normaliser | None = None,
     progress: Progress | None = None,
 ) -> MatchingDatabase:
-    """Everything motion matching needs of clips of one skeleton; the same whatever order they come in.
+    """Build a matching database from clips of one skeleton; the same whatever their order.
 
     Parameters
     ----------
-    normaliser : one that was fitted before ("pinned"); it brings its own weights. Fitted to these clips when None
-    progress : called as progress(clips done, of how many, name of the last one)
+    clips : sequence of SourceClip    clips of the body's skeleton
+    body : MatchingBody    the joints to match
+    options : DatabaseOptions    rate, horizons and weights
+    normaliser : Normaliser, optional    one that was fitted before ("pinned"); it brings its own weights. Fitted to
+        these clips when None
+    progress : callable, optional    called as progress(clips done, total, name of the last one)
+
+    Returns
+    -------
+    MatchingDatabase    features, root motion and poses
 
     Raises
     ------
-    MotionError    naming the clip that moves another skeleton, faces nowhere or lacks the frames asked for; when uids
-        repeat, options make no sense, or the normaliser is one of other dimensions
+    MotionError    naming the clip that has another skeleton, no facing direction or too few frames; when uids repeat,
+        options are invalid, or the normaliser has other dimensions
     """
     layout = feature_layout(options, body)
     if normaliser is not None:
@@ -78,17 +86,40 @@ def build_database(
 
 
 def with_normaliser(database: MatchingDatabase, normaliser: Normaliser) -> MatchingDatabase:
-    """The same database under another normaliser. Raises `MotionError` when that is one of other dimensions."""
+    """Replace the normaliser of a database.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the database
+    normaliser : Normaliser    the new one
+
+    Returns
+    -------
+    MatchingDatabase    the same rows
+
+    Raises
+    ------
+    MotionError    when the normaliser has other dimensions
+    """
     normaliser.require_fit(database.layout)
     kept = [note for note in database.notes if note.code != "scale-floored"]
     return replace(database, normaliser=normaliser, notes=(*kept, *_normaliser_notes(normaliser)))
 
 
 def union_normaliser(databases: Sequence[MatchingDatabase]) -> Normaliser:
-    """One normaliser fitted to the rows of several databases together, so that their costs can be compared.
+    """Fit one normaliser to the rows of several databases together, so that their costs can be compared.
 
-    The order of the databases does not matter. Raises `MotionError` when they match different joints or horizons, or
-    with different weights.
+    Parameters
+    ----------
+    databases : sequence of MatchingDatabase    in any order
+
+    Returns
+    -------
+    Normaliser    fitted to all rows
+
+    Raises
+    ------
+    MotionError    when they match different joints or horizons, or with different weights
     """
     if not databases:
         raise MotionError("there are no databases to fit a normaliser to", code="no-features")
@@ -108,7 +139,16 @@ def union_normaliser(databases: Sequence[MatchingDatabase]) -> Normaliser:
 
 
 def database_digest(database: MatchingDatabase) -> str:
-    """ "sha256:…" of all that a search and a controller see of a database, but for its normaliser."""
+    """Compute a digest of everything that a search and a controller use of a database, except its normaliser.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the database
+
+    Returns
+    -------
+    str    "sha256:…"
+    """
     clips = [(clip.uid, clip.start, clip.stop, clip.loop) for clip in database.clips]
     return _digest_of(
         [

@@ -1,4 +1,4 @@
-"""Motion matching played along a wished trajectory."""
+"""Motion matching along a desired trajectory."""
 
 from __future__ import annotations
 
@@ -96,10 +96,24 @@ class _Arrays(NamedTuple):
 
 
 def run_trial(database: MatchingDatabase, index: SearchIndex, guide: Guide, options: ControllerOptions) -> TrialRecord:
-    """Let motion matching follow a guide from its first tick on.
+    """Play motion matching along a trajectory from its first tick on.
 
-    `index` is that of the database's normalised features. The same arguments give the same record, to the last bit.
-    Raises `MotionError` for options that make no sense, and where index, guide and database do not belong together.
+    The same arguments give the same record, to the last bit.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    N rows
+    index : SearchIndex    index of the database's normalised features
+    guide : trajectory    T ticks at the database's rate; ground positions in metres, headings in radians
+    options : ControllerOptions    options of the controller
+
+    Returns
+    -------
+    TrialRecord    T ticks
+
+    Raises
+    ------
+    MotionError    for invalid options, and where index, trajectory and database do not belong together
     """
     from marey_motion.matching import controller_kernels as kernels
 
@@ -129,7 +143,21 @@ def run_trial(database: MatchingDatabase, index: SearchIndex, guide: Guide, opti
 
 
 def rules_of(options: ControllerOptions, rate_hz: float) -> Rules:
-    """The options at `rate_hz` ticks per second. Raises `MotionError` naming the one that makes no sense."""
+    """Convert options to constants per tick.
+
+    Parameters
+    ----------
+    options : ControllerOptions    options of the controller
+    rate_hz : float    ticks per second
+
+    Returns
+    -------
+    named tuple    durations in ticks, and factors of one tick
+
+    Raises
+    ------
+    MotionError    naming the option that is invalid
+    """
     _check(options, rate_hz)
     return Rules(
         follow=("time", "path", "open_loop").index(options.follow),
@@ -163,7 +191,20 @@ def _check(options: ControllerOptions, rate_hz: float) -> None:
 
 
 def wish_of(guide: Guide) -> Wish:
-    """The guide's arrays. Raises `MotionError` when they are shorter than its ticks."""
+    """Collect the arrays of a trajectory.
+
+    Parameters
+    ----------
+    guide : trajectory    T ticks
+
+    Returns
+    -------
+    named tuple    arrays in float64, contiguous
+
+    Raises
+    ------
+    MotionError    when they are shorter than its ticks
+    """
     arrays = (guide.positions, guide.headings, guide.speeds_m_s, guide.turn_rates_rad_s)
     positions, headings, speeds, turn_rates = (np.ascontiguousarray(array, dtype=np.float64) for array in arrays)
     if not 1 <= guide.tick_count <= min(map(len, arrays)):
@@ -172,7 +213,16 @@ def wish_of(guide: Guide) -> Wish:
 
 
 def playback_of(database: MatchingDatabase) -> Playback:
-    """The database's arrays."""
+    """Collect the arrays of a database.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    N rows
+
+    Returns
+    -------
+    named tuple    arrays in the types that compiled code takes
+    """
     rate_hz = database.options.rate_hz
     ticks = np.round(np.array(database.options.horizons_s) * rate_hz)
     return Playback(

@@ -1,4 +1,4 @@
-"""A set of clips as motion matching searches it: features, root motion and poses, row by row."""
+"""A set of clips for motion matching: features, root motion and poses, row by row."""
 
 from __future__ import annotations
 
@@ -44,9 +44,20 @@ class RootMotion(NamedTuple):
 def root_motion(
     positions: NDArray[np.float64], headings: NDArray[np.float64], starts: NDArray[np.int64], wraps: NDArray[np.bool_]
 ) -> RootMotion:
-    """Steps of a root at `positions` (N, 2) with `headings` (N,), for clips that begin at `starts` (C + 1,).
+    """Compute the steps of a root from row to row.
 
-    The step that closes a clip marked in `wraps` (C,) is the mean of its neighbours: the last step and the first.
+    The step that closes a clip marked in `wraps` is the mean of its neighbours: the last step and the first.
+
+    Parameters
+    ----------
+    positions : (N, 2) float64    (x, z) in metres
+    headings : (N,) float64    radians
+    starts : (C + 1,) int64    first row of each clip, and N
+    wraps : (C,) bool    clips whose last row leads to their first one
+
+    Returns
+    -------
+    RootMotion    successors and steps of N rows
     """
     count = len(headings)
     successors = np.arange(1, count + 1, dtype=np.int64)
@@ -107,7 +118,7 @@ class DatabaseClip:
 
     @property
     def frame_count(self) -> int:
-        """Rows at the database's rate."""
+        """Number of rows at the database's rate."""
         return self.stop - self.start
 
 
@@ -165,26 +176,26 @@ class MatchingDatabase:
 
     @property
     def row_count(self) -> int:
-        """N."""
+        """Number of rows N."""
         return len(self.features)
 
     @cached_property
     def starts(self) -> NDArray[np.int64]:
-        """(C + 1,) first row of each clip, and N."""
+        """First row of each clip, and N; (C + 1,) int64."""
         return np.array([clip.start for clip in self.clips] + [self.row_count], dtype=np.int64)
 
     @cached_property
     def layout(self) -> FeatureLayout:
-        """What the D dimensions of the features are."""
+        """Names, groups and weights of the D dimensions of the features."""
         return feature_layout(self.options, self.body)
 
     @cached_property
     def clip_of_row(self) -> NDArray[np.int32]:
-        """(N,) index of each row's clip."""
+        """Index of each row's clip, (N,) int32."""
         return np.repeat(np.arange(len(self.clips), dtype=np.int32), np.diff(self.starts))
 
     @cached_property
     def root_motion(self) -> RootMotion:
-        """What follows each row, and how the root moves there."""
+        """Successor of each row, and the step of the root to it."""
         wraps = np.array([clip.loop and self.options.end_policy == "loop" for clip in self.clips], dtype=np.bool_)
         return root_motion(self.root_positions, self.root_headings, self.starts, wraps)

@@ -1,4 +1,4 @@
-"""What a viewer sees of a trial: the chosen poses blended by inertialisation, on the recorded root."""
+"""The displayed motion of a trial: the chosen poses blended by inertialisation, on the recorded root."""
 
 from __future__ import annotations
 
@@ -16,7 +16,18 @@ from marey_motion.matching.record import TrialRecord
 
 
 def displayed_clip(database: MatchingDatabase, record: TrialRecord, options: ControllerOptions) -> Clip:
-    """The motion of a trial as a clip: every joint inertialised at every switch, the root where the record has it."""
+    """Make a clip of a trial: every joint inertialised at every switch, the root at its recorded place.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the database that the trial used
+    record : TrialRecord    T ticks
+    options : ControllerOptions    options of the trial
+
+    Returns
+    -------
+    Clip    T frames
+    """
     joints = np.arange(database.body.skeleton.joint_count)
     poses, places = _inertialised(database, record.rows, joints, options.half_life_s)
     half = 0.5 * record.headings
@@ -37,10 +48,21 @@ def displayed_clip(database: MatchingDatabase, record: TrialRecord, options: Con
 
 
 def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: ControllerOptions) -> Floats:
-    """Distance in metres (T,), summed over the pose joints, between the displayed pose and the next one.
+    """Compute the distances between the displayed pose and the next one.
 
-    Both stand in the frame of the root. The displayed pose has what is left of earlier switches; the next one is the
-    row that was chosen for the next tick as it is in the database. After the last tick that is the row that follows.
+    Both are in the frame of the root. The displayed pose includes the remaining offsets of earlier switches; the next
+    one is the row that was chosen for the next tick as it is in the database. After the last tick that is the row that
+    follows.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the database that the trial used
+    rows : (T,) int32    displayed rows
+    options : ControllerOptions    options of the trial
+
+    Returns
+    -------
+    (T,) float64    metres, summed over the pose joints
     """
     chain, skeleton = database.body.pose_chain
     poses, places = _inertialised(database, rows, chain, options.half_life_s)
@@ -54,7 +76,17 @@ def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: Con
 
 
 def switched_rows(database: MatchingDatabase, rows: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Per tick (T,) the row that took the place of the displayed one after its tick, -1 where it was just followed."""
+    """Find the row that replaced the displayed one after each tick.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the database that the trial used
+    rows : (T,) int32    displayed rows
+
+    Returns
+    -------
+    (T,) int64    -1 where the clip was continued
+    """
     successors = database.root_motion.successors
     following = rows[1:].astype(np.int64)
     clips = np.searchsorted(database.starts, following, side="right") - 1

@@ -1,4 +1,4 @@
-"""Why motion matching chose what it chose: the best candidates of one tick and what each of them costs."""
+"""Explanation of a choice of motion matching: the best candidates of one tick and their costs."""
 
 from __future__ import annotations
 
@@ -74,11 +74,28 @@ def explain_choice(
     count: int = 10,
     others: Sequence[int] = (),
 ) -> Explanation:
-    """The `count` cheapest candidates at a tick of a trial and why one of them, or none, was chosen.
+    """List the cheapest candidates at a tick of a trial and the reason why one of them, or none, was chosen.
 
-    `record` is what `run_trial` gave for the other arguments. At ticks without a search the candidates are those that
-    it would have had. `others` are rows to list beside them: why were these not chosen? Raises `MotionError` for ticks
-    and rows that there are not.
+    At ticks without a search the candidates are those that it would have had.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the database that the trial used
+    index : SearchIndex    its index
+    guide : trajectory    the trajectory of the trial
+    options : ControllerOptions    options of the trial
+    record : TrialRecord    result of `run_trial` for these arguments
+    tick : int    tick to explain
+    count : int    number of candidates
+    others : sequence of int    rows to list beside them
+
+    Returns
+    -------
+    Explanation    candidates with their costs by group
+
+    Raises
+    ------
+    MotionError    for ticks and rows that do not exist
     """
     if record.rows.max(initial=0) >= database.row_count:
         raise MotionError("the record is of another database: it shows rows that this one does not have")

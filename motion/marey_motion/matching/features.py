@@ -1,4 +1,4 @@
-"""What motion matching compares: feet and hips as the root sees them, and where the root goes within a second."""
+"""Features of motion matching: feet and hips in the frame of the root, and the root's trajectory of the next second."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from marey_motion.matching.simulation_root import SimulationRoot
 
 
 class FeatureGroup(NamedTuple):
-    """Dimensions [start, stop) that share a scale. `joint` is the joint they describe, None for the trajectory."""
+    """Dimensions [start, stop) that share a scale; `joint` is the joint they describe, None for the trajectory."""
 
     name: str
     start: int
@@ -41,25 +41,36 @@ class FeatureLayout:
 
     @property
     def dimension_count(self) -> int:
-        """D."""
+        """Number of dimensions D."""
         return len(self.names)
 
     @property
     def pose_dimensions(self) -> int:
-        """How many dimensions the pose has. Those of the trajectory follow: (x, z) at each horizon, then directions."""
+        """Number of dimensions of the pose. Those of the trajectory follow: (x, z) at each horizon, then directions."""
         return self.dimension_count - 4 * len(self.horizons_s)
 
     @property
     def matched_joints(self) -> tuple[int, ...]:
-        """Joints that are matched, in order of their groups."""
+        """Indices of the matched joints, in order of their groups."""
         return tuple(dict.fromkeys(group.joint for group in self.groups if group.joint is not None))
 
 
 def feature_layout(options: DatabaseOptions, body: MatchingBody) -> FeatureLayout:
-    """The dimensions that these options ask for; 27 unless joints or horizons are added.
+    """List the dimensions that options ask for; 27 unless joints or horizons are added.
 
-    Raises `MotionError` for a joint that the body lacks, a weight below 0, and horizons that are less than a frame
-    ahead or apart.
+    Parameters
+    ----------
+    options : DatabaseOptions    joints, horizons and weights
+    body : MatchingBody    the joints
+
+    Returns
+    -------
+    FeatureLayout    D dimensions
+
+    Raises
+    ------
+    MotionError    for a joint that the body lacks, a weight below 0, and horizons that are less than a frame ahead or
+        apart
     """
     _check(options, body)
     weights = options.weights
@@ -111,23 +122,53 @@ def _check(options: DatabaseOptions, body: MatchingBody) -> None:
 
 
 def in_root_frame(points: Floats, root: SimulationRoot) -> Floats:
-    """Positions (F, K, 3) in the world as each frame's root sees them: (left, up, forward), metres."""
+    """Convert positions to the frame of each frame's root.
+
+    Parameters
+    ----------
+    points : (F, K, 3) float64    positions in the world, metres
+    root : SimulationRoot    F frames
+
+    Returns
+    -------
+    (F, K, 3) float64    left, up, forward in metres
+    """
     seen = points.copy()
     seen[..., (0, 2)] -= root.positions[:, None]
     return turned_to_root(seen, root)
 
 
 def turned_to_root(vectors: Floats, root: SimulationRoot) -> Floats:
-    """Vectors (F, K, 3) of the world along the axes of each frame's root: (left, up, forward)."""
+    """Convert vectors to the axes of each frame's root.
+
+    Parameters
+    ----------
+    vectors : (F, K, 3) float64    vectors in the world
+    root : SimulationRoot    F frames
+
+    Returns
+    -------
+    (F, K, 3) float64    left, up, forward in the same unit
+    """
     turned = vectors.copy()
     turned[..., (0, 2)] = rotated(vectors[..., (0, 2)], -root.headings[:, None])
     return turned
 
 
 def look_ahead(root: SimulationRoot, ticks: NDArray[np.int64], *, wraps: bool) -> SimulationRoot:
-    """The root `ticks` (H,) frames ahead of each frame: positions (F, H, 2) and headings (F, H).
+    """Look up the root some frames ahead of each frame.
 
-    Beyond the end a clip stays where it ends, and a loop that wraps goes on with its next rounds.
+    Beyond the end a clip stays at its end, and a loop that wraps continues with its next rounds.
+
+    Parameters
+    ----------
+    root : SimulationRoot    F frames
+    ticks : (H,) int64    frames to look ahead
+    wraps : bool    the root is a loop that wraps
+
+    Returns
+    -------
+    SimulationRoot    positions (F, H, 2) in metres and headings (F, H) in radians
     """
     count = len(root.headings)
     ahead = np.arange(count)[:, None] + ticks
@@ -143,13 +184,18 @@ def look_ahead(root: SimulationRoot, ticks: NDArray[np.int64], *, wraps: bool) -
 def extract_features(
     layout: FeatureLayout, positions: Floats, velocities: Floats, root: SimulationRoot, future: SimulationRoot
 ) -> Floats:
-    """Features (F, D), metres and metres per second in the frame of each frame's root.
+    """Compute the features of frames.
 
     Parameters
     ----------
-    positions, velocities : (F, J, 3) in the world
-    root : of the frames
-    future : the root at each horizon, positions (F, H, 2) and headings (F, H)
+    layout : FeatureLayout    D dimensions with H horizons
+    positions, velocities : (F, J, 3) float64    in the world, metres and metres per second
+    root : SimulationRoot    root of the frames
+    future : SimulationRoot    the root at each horizon, positions (F, H, 2) and headings (F, H)
+
+    Returns
+    -------
+    (F, D) float64    metres and metres per second in the frame of each frame's root
     """
     features = np.empty((len(positions), layout.dimension_count))
     for group in layout.groups:

@@ -1,4 +1,4 @@
-"""Blending by inertialisation: at a switch the difference to the new motion is kept, and dies away.
+"""Inertialisation: at a switch the difference to the new motion is kept, and decays.
 
 The offset is a critically damped spring with half-life h in closed form, so that the result does not depend on how time
 is cut into ticks: x(t) = e^(-y·t)·(x0 + (v0 + y·x0)·t) with y = 2·ln 2 / h.
@@ -11,7 +11,17 @@ from numpy.typing import NDArray
 
 
 def decay_matrix(half_life_s: float, elapsed_s: float) -> NDArray[np.float64]:
-    """(2, 2) matrix that takes an offset and its velocity, in units per second, to what they are `elapsed_s` later."""
+    """Compute the matrix that advances an offset and its velocity in time.
+
+    Parameters
+    ----------
+    half_life_s : float    seconds
+    elapsed_s : float    seconds to advance
+
+    Returns
+    -------
+    (2, 2) float64    acts on (offset, velocity per second)
+    """
     rate = 2.0 * np.log(2.0) / half_life_s
     decay = np.exp(-rate * elapsed_s)
     grown = rate * elapsed_s

@@ -1,4 +1,4 @@
-"""What brings features of different units onto one scale."""
+"""Normalisation of features of different units to one scale."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ UNMATCHED_SCALE = 1e30
 
 @dataclass(frozen=True, eq=False)
 class Normaliser:
-    """Offset and scale per feature dimension, frozen and named by a digest.
+    """Offset and scale per feature dimension, named by a digest.
 
     Parameters
     ----------
     offset, scale : (D,) float64    `apply` gives (features - offset) / scale; weights are part of the scale
-    fitted_on : digest of the data it was fitted on
-    names : of the D dimensions; empty when they are not known
-    floored : groups whose scale was raised to the least one
+    fitted_on : str    digest of the data it was fitted on
+    names : tuple of str    names of the D dimensions; empty when they are not known
+    floored : tuple of str    groups whose scale was raised to the least one
     """
 
     offset: NDArray[np.float64]
@@ -40,21 +40,39 @@ class Normaliser:
     floored: tuple[str, ...] = ()
 
     def apply(self, features: Floats) -> Floats:
-        """Normalised features (..., D); costs are squared distances between such rows."""
+        """Normalise features.
+
+        Parameters
+        ----------
+        features : (..., D) float64    metres, metres per second
+
+        Returns
+        -------
+        (..., D) float64    without a unit; costs are squared distances between such rows
+        """
         normalised = features - self.offset
         normalised /= self.scale
         return normalised
 
     @property
     def digest(self) -> str:
-        """What a pinned normaliser is called: "sha256:…" of dimensions, offsets and scales."""
+        """Digest of dimensions, offsets and scales, "sha256:…"."""
         content = hashlib.sha256(json.dumps(self.names).encode())
         for values in (self.offset, self.scale):
             content.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
         return f"sha256:{content.hexdigest()}"
 
     def require_fit(self, layout: FeatureLayout) -> None:
-        """Raise `MotionError` unless this normaliser is one of the layout's dimensions."""
+        """Check that this normaliser fits the dimensions of a layout.
+
+        Parameters
+        ----------
+        layout : FeatureLayout    D dimensions
+
+        Raises
+        ------
+        MotionError    where it does not
+        """
         if len(self.offset) != layout.dimension_count:
             raise MotionError(
                 f"the normaliser has {len(self.offset)} dimensions, the features have {layout.dimension_count}; "
@@ -72,7 +90,12 @@ class Normaliser:
             )
 
     def as_tree(self) -> dict[str, Any]:
-        """Plain values and arrays, to keep or send; `from_tree` takes them back."""
+        """Convert to plain values and arrays for `from_tree`.
+
+        Returns
+        -------
+        dict    plain values and arrays
+        """
         return {
             "digest": self.digest,
             "fitted_on": self.fitted_on,
@@ -84,7 +107,20 @@ class Normaliser:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> Normaliser:
-        """The normaliser of `as_tree`. Raises `MotionError` naming the member that is wrong or was changed."""
+        """Convert a tree of `as_tree` to a normaliser.
+
+        Parameters
+        ----------
+        tree : mapping    plain values and arrays
+
+        Returns
+        -------
+        Normaliser    the same normaliser
+
+        Raises
+        ------
+        MotionError    naming the member that is wrong or was changed
+        """
         try:
             offset, scale = (np.asarray(tree[name], dtype=np.float64) for name in ("offset", "scale"))
             names, floored = tuple(tree["names"]), tuple(tree["floored"])
@@ -114,14 +150,23 @@ class Normaliser:
 
 
 def fit_normaliser(features: Floats, layout: FeatureLayout, fitted_on: str) -> Normaliser:
-    """Means, and one scale per group: the mean of its standard deviations divided by its weight.
+    """Fit means, and one scale per group: the mean of its standard deviations divided by its weight.
+
+    Groups that hardly vary get the least scale, and are named in `floored`.
 
     Parameters
     ----------
-    features : (N, D) before normalisation
-    fitted_on : digest of the data they are of
+    features : (N, D) float64    before normalisation
+    layout : FeatureLayout    groups and weights of the D dimensions
+    fitted_on : str    digest of the data
 
-    Groups that hardly vary get the least scale, and are named in `floored`.
+    Returns
+    -------
+    Normaliser    offset and scale
+
+    Raises
+    ------
+    MotionError    without rows
     """
     if not len(features):
         raise MotionError("there are no features to fit a normaliser to", code="no-features")

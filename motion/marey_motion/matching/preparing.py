@@ -1,4 +1,4 @@
-"""From a source clip to the motion that a database samples: the frames to use, at the database's rate."""
+"""The frames of a source clip that a database uses, at the database's rate."""
 
 from __future__ import annotations
 
@@ -55,16 +55,29 @@ class PreparedClip:
 
     @property
     def uid(self) -> str:
-        """What names the clip in the database."""
+        """Name of the clip in the database."""
         return f"{self.source.uid}~mirrored" if self.mirrored else self.source.uid
 
 
 def prepare_clip(
     source: SourceClip, body: MatchingBody, options: DatabaseOptions, landmarks: Landmarks
 ) -> PreparedClip:
-    """The frames of a source clip that belong into a database, at its rate.
+    """Select the frames of a source clip that belong into a database, at its rate.
 
-    Raises `MotionError` when it moves another skeleton or its range of frames is not there.
+    Parameters
+    ----------
+    source : SourceClip    the clip
+    body : MatchingBody    the joints to match
+    options : DatabaseOptions    rate and horizons
+    landmarks : Landmarks    joints of the body, for the checks
+
+    Returns
+    -------
+    PreparedClip    the frames with notes
+
+    Raises
+    ------
+    MotionError    when it has another skeleton or lacks its range of frames
     """
     notes: list[DatabaseNote] = []
 
@@ -82,7 +95,18 @@ def prepare_clip(
 
 
 def mirror_prepared(clip: PreparedClip, body: MatchingBody, *, keep_notes: bool) -> PreparedClip:
-    """The same with left and right exchanged."""
+    """Make the mirrored copy of a prepared clip.
+
+    Parameters
+    ----------
+    clip : PreparedClip    the clip
+    body : MatchingBody    pairs of joints
+    keep_notes : bool    copy the notes, too
+
+    Returns
+    -------
+    PreparedClip    left and right exchanged
+    """
     seam = clip.seam
     if seam is not None:
         seam = LoopSeam(-seam.turn_rad, seam.shift_m * (-1.0, 1.0))

@@ -1,4 +1,4 @@
-"""What a simulated trial leaves behind: every tick of it."""
+"""The record of a simulated trial, tick by tick."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One clip as rows of a matching database: on its simulation root, with its features."""
+"""Rows of a matching database for one clip, on its simulation root and with its features."""
 
 from __future__ import annotations
 
@@ -44,10 +44,23 @@ class ClipRows(NamedTuple):
 def clip_rows(
     motion: Motion, seam: LoopSeam | None, body: MatchingBody, layout: FeatureLayout, options: DatabaseOptions
 ) -> ClipRows:
-    """The rows of a motion at the database's rate.
+    """Compute the rows of a motion at the database's rate.
 
-    `seam` is that of a loop that looks ahead to its own beginning. Raises `MotionError` when the body never faces
-    anywhere.
+    Parameters
+    ----------
+    motion : Motion    F frames
+    seam : LoopSeam or None    seam of a loop that looks ahead to its own beginning
+    body : MatchingBody    the joints
+    layout : FeatureLayout    D dimensions
+    options : DatabaseOptions    rate, horizons and end of clips
+
+    Returns
+    -------
+    ClipRows    F rows
+
+    Raises
+    ------
+    MotionError    when no frame has a facing direction
     """
     rate_hz, frames = options.rate_hz, motion.frame_count
     # A loop is seen going on at both ends, so that filters and differences know nothing of a cut.

@@ -64,17 +64,23 @@ def build_index(
     *,
     method: Method = "auto",
 ) -> SearchIndex:
-    """Make normalised features searchable.
+    """Index normalised features for search.
 
     Parameters
     ----------
     normalised : (N, D) float64    features divided by their scales
     starts : (C + 1,) int64    first row of each clip, and N
     selectable : (N,) bool    rows a search may choose
-    method : "auto" decides between boxes and scan by how much of the database a few mixtures of its own rows would look
-        at; it depends on the data alone, and changes the time a search takes, not what it finds
+    method : str    "auto" chooses between "boxes" and "scan" by how much of the database a few mixtures of its own
+        rows would visit; it depends on the data alone, and changes the time of a search, not its result
 
-    Raises `MotionError` when no row is selectable or a value is not finite or larger than `LARGEST`.
+    Returns
+    -------
+    SearchIndex    input of searches
+
+    Raises
+    ------
+    MotionError    when no row is selectable or a value is not finite or larger than `LARGEST`
     """
     rows = np.ascontiguousarray(normalised, dtype=np.float64)
     mask = np.ascontiguousarray(selectable, dtype=np.bool_)
@@ -181,18 +187,20 @@ def find_nearest(
     warm_rows: NDArray[np.int64] | None = None,
     skips: NDArray[np.int64] | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The nearest selectable row of each query, the lowest among equals, and its squared distance.
+    """Find the nearest selectable row of each query, the lowest among equals, and its squared distance.
 
     Parameters
     ----------
+    index : SearchIndex    N rows of D dimensions
     queries : (Q, D) float64    normalised like the rows
-    weights : (D,) float64, at least 0    of each dimension's squared difference; 1 when None
-    warm_rows : (Q,) int64    a row likely to be near each query, or -1; it makes the search quicker, no more
-    skips : (Q, 2) int64    rows [start, stop) that each query may not choose
+    weights : (D,) float64, optional    factors, at least 0, of each dimension's squared difference; 1 when None
+    warm_rows : (Q,) int64, optional    a row likely to be near each query, or -1; it only makes the search quicker
+    skips : (Q, 2) int64, optional    rows [start, stop) that each query may not choose
 
     Returns
     -------
-    (Q,) int64 rows, -1 where all are skipped, and (Q,) float64 costs, infinite there
+    rows : (Q,) int64    -1 where all are skipped
+    costs : (Q,) float64    infinite where all are skipped
     """
     from marey_motion.matching import search_kernels as kernels
 
@@ -213,9 +221,20 @@ def find_best(
     weights: NDArray[np.float64] | None = None,
     skip: tuple[int, int] = (0, 0),
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The `count` selectable rows nearest to a query (D,), nearest first and the lowest first among equals.
+    """Find the selectable rows nearest to a query, nearest first and the lowest first among equals.
 
-    Fewer when there are fewer outside `skip` [start, stop). Costs are those of `find_nearest`, bit for bit.
+    Parameters
+    ----------
+    index : SearchIndex    N rows of D dimensions
+    query : (D,) float64    normalised like the rows
+    count : int    number of rows; fewer when fewer are selectable
+    weights : (D,) float64, optional    as for `find_nearest`
+    skip : (int, int)    rows [start, stop) that may not be chosen
+
+    Returns
+    -------
+    rows : (count,) int64    the rows
+    costs : (count,) float64    those of `find_nearest`, bit for bit
     """
     from marey_motion.matching import search_kernels as kernels
 

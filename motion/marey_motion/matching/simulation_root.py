@@ -1,4 +1,4 @@
-"""Where a body is on the ground and where it heads, smooth enough to be followed and steered."""
+"""Smoothed position and heading of a body on the ground, suitable for steering."""
 
 from __future__ import annotations
 
@@ -21,20 +21,34 @@ SHORTEST_MEAN = 1e-3
 
 
 class SimulationRoot(NamedTuple):
-    """A root on the ground: positions (F, 2) in metres, headings (F,) in radians, continuous in time."""
+    """A root on the ground.
+
+    Parameters
+    ----------
+    positions : (F, 2) float64    (x, z) in metres
+    headings : (F,) float64    radians, continuous in time
+    """
 
     positions: Floats
     headings: Floats
 
 
 def simulation_root(positions: Floats, body: MatchingBody, rate_hz: float) -> SimulationRoot:
-    """The smoothed ground projection of the torso, heading as hips and shoulders face on average.
+    """Compute the smoothed ground projection of the torso, with the mean heading of hips and shoulders.
 
     Parameters
     ----------
-    positions : (F, J, 3) metres, of all joints
+    positions : (F, J, 3) float64    positions of all joints, metres
+    body : MatchingBody    the joints
+    rate_hz : float    frames per second
 
-    Raises `MotionError` when hips and shoulders never tell a direction.
+    Returns
+    -------
+    SimulationRoot    F frames
+
+    Raises
+    ------
+    MotionError    when no frame has a facing direction
 
     Notes
     -----
@@ -51,16 +65,42 @@ def simulation_root(positions: Floats, body: MatchingBody, rate_hz: float) -> Si
 
 
 def raw_root(positions: Floats, body: MatchingBody) -> SimulationRoot:
-    """As `simulation_root`, not smoothed."""
+    """Compute the root of `simulation_root` without smoothing.
+
+    Parameters
+    ----------
+    positions : (F, J, 3) float64    positions of all joints, metres
+    body : MatchingBody    the joints
+
+    Returns
+    -------
+    SimulationRoot    F frames
+
+    Raises
+    ------
+    MotionError    when no frame has a facing direction
+    """
     facing = forward_directions(positions, body.lefts, body.rights)
     return SimulationRoot(positions[:, body.torso, ::2], headings(facing))
 
 
 def bone_root(motion: Motion, body: MatchingBody) -> SimulationRoot:
-    """The skeleton's own root joint as it moves on the ground, for data whose root was made to lead the character.
+    """Compute the motion of the root joint on the ground, for data whose root leads the character.
 
-    It heads where the rest pose faces, turned as the root is turned about the vertical. Raises `MotionError` when the
-    rest pose faces nowhere.
+    Its heading is that of the rest pose, rotated as the root is about the vertical.
+
+    Parameters
+    ----------
+    motion : Motion    F frames
+    body : MatchingBody    the joints
+
+    Returns
+    -------
+    SimulationRoot    F frames
+
+    Raises
+    ------
+    MotionError    when the rest pose has no facing direction
     """
     skeleton = body.skeleton
     rest = rest_heading(body)
@@ -70,13 +110,36 @@ def bone_root(motion: Motion, body: MatchingBody) -> SimulationRoot:
 
 
 def rest_heading(body: MatchingBody) -> float:
-    """Heading of the rest pose. Raises `MotionError` when it faces nowhere."""
+    """Compute the heading of the rest pose.
+
+    Parameters
+    ----------
+    body : MatchingBody    the joints
+
+    Returns
+    -------
+    float    radians
+
+    Raises
+    ------
+    MotionError    when it has no facing direction
+    """
     positions = body.skeleton.rest_global_positions[None]
     return float(headings(forward_directions(positions, body.lefts, body.rights))[0])
 
 
 def window_frames(window_s: float, rate_hz: float) -> int:
-    """The odd number of frames next to a window of so many seconds: 31 for half a second at 60 Hz."""
+    """Round a window to an odd number of frames: 31 for half a second at 60 Hz.
+
+    Parameters
+    ----------
+    window_s : float    seconds
+    rate_hz : float    frames per second
+
+    Returns
+    -------
+    int    odd number of frames
+    """
     return 2 * round(0.5 * window_s * rate_hz) + 1
 
 
