@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import typer
+from docs.library import library_page
 from pydantic_core import PydanticUndefined
 
 import marey_server.app  # noqa: F401 - loads every module, and so every class of errors
@@ -31,6 +32,7 @@ def pages() -> dict[str, str]:
         "job-kinds.md": job_kinds_page(),
         "checks.md": checks_page(),
         "errors.md": errors_page(),
+        "motion-library.md": NOTE + library_page(),
     }
 
 
