@@ -59,6 +59,21 @@ class PartSummary(Answer):
     size_bytes: int
 
 
+class PartPlace(Request):
+    """Which document to read: a part of a revision of an item."""
+
+    kind: Kind
+    item: str = Field(max_length=64)
+    revision: int = Field(ge=1, le=(1 << 31) - 1)
+    part: str = Field(max_length=64)
+
+
+class PartsRequest(Request):
+    """Read several documents at once."""
+
+    parts: tuple[PartPlace, ...] = Field(min_length=1, max_length=256)
+
+
 class Item(Answer):
     """A named thing of one kind, at its newest revision."""
 

@@ -9,6 +9,8 @@ import pytest
 from tests.support.rest_server import Server
 
 from marey_schemas.access import Role
+from marey_schemas.encoding.codecs import decode_tree
+from marey_server.store.items import reading
 
 STUDY = {"schema": "marey/document@1", "answer": 42}
 FORMS = ("application/json", "application/msgpack", "application/bson", "application/msgpack; arrays=blocks")
@@ -83,3 +85,37 @@ def test_a_deleted_item_is_gone_for_who_read_it_before(owner: httpx.Client, read
     assert ok(reader.get(part)) == STUDY
     assert owner.delete(study, headers={"If-Match": "*"}).is_success
     assert reader.get(part).status_code == 404
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_documents_of_several_items_are_read_in_one_request(owner: httpx.Client, study: str, form: str) -> None:
+    item = study.rpartition("/")[2]
+    assert owner.put(f"{study}/parts/study", json={**STUDY, "answer": 43}, headers={"If-Match": "*"}).is_success
+    places = [
+        {"kind": "study", "item": item, "revision": 2, "part": "study"},
+        {"kind": "study", "item": "nobody", "revision": 1, "part": "study"},
+        {"kind": "clip", "item": item, "revision": 1, "part": "study"},
+        {"kind": "study", "item": item, "revision": 1, "part": "study"},
+    ]
+    answer = owner.post("/projects/lab/parts", json={"parts": places}, headers={"Accept": form})
+    assert answer.headers["Content-Type"] == form
+    newest, nobody, of_another_kind, first = decode_tree(answer.content, form.partition(";")[0])["documents"]
+    assert (newest["answer"], first["answer"]) == (43, 42)
+    assert nobody is of_another_kind is None
+
+
+def test_several_documents_are_read_by_those_who_may_read_the_project(
+    owner: httpx.Client, reader: httpx.Client, study: str
+) -> None:
+    place = {"kind": "study", "item": study.rpartition("/")[2], "revision": 1, "part": "study"}
+    assert ok(reader.post("/projects/lab/parts", json={"parts": [place]}))["documents"] == [STUDY]
+    assert owner.delete("/projects/lab/members/rita", headers={"If-Match": "*"}).is_success
+    assert reader.post("/projects/lab/parts", json={"parts": [place]}).status_code == 404
+
+
+def test_documents_that_are_large_together_are_left_out_at_the_end(
+    owner: httpx.Client, study: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reading, "MOST_BYTES_AT_ONCE", 10)
+    place = {"kind": "study", "item": study.rpartition("/")[2], "revision": 1, "part": "study"}
+    assert ok(owner.post("/projects/lab/parts", json={"parts": [place, place]}))["documents"] == [STUDY]

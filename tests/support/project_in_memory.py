@@ -42,6 +42,10 @@ class ProjectInMemory:
             assert held is not None or not required
             yield pin, held
 
+    def documents_of_each(self, pins, *parts):
+        for pin in pins:
+            yield pin, tuple(self.parts.get((pin.item, pin.revision, part)) for part in parts)
+
     def item(self, kind, item):
         return Item(
             id=item, kind=kind, name=item.upper(), collection="rigs", revision=1, created_at=NOW, updated_at=NOW, rev=1

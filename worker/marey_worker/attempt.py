@@ -9,16 +9,18 @@ import tempfile
 import threading
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 from marey_client.errors import LeaseLost, MareyError, NotFound
+from marey_schemas.items import PartPlace
 from marey_schemas.job_kinds import find_kind
 from marey_schemas.worker_protocol import CompleteRequest, FailRequest, Lease
 from marey_worker import faults, signatures
@@ -34,7 +36,7 @@ from marey_worker.messages import (
     PutFile,
     ReadBlob,
     ReadItem,
-    ReadPart,
+    ReadParts,
     ReadResults,
     Request,
     Run,
@@ -49,6 +51,7 @@ WATCH_EVERY_S = 0.1
 WEIGH_EVERY_S = 0.5
 LOG_EVERY_S = 2.0
 LOG_LIMIT_BYTES = 64 * MIB
+ANSWER_LIMIT_BYTES = 32 * MIB
 TRANSFERS_AT_ONCE = 4
 
 
@@ -233,12 +236,12 @@ class RunningAttempt:
 
     def _carried_out(self, request: Request) -> Any:
         match request:
-            case ReadPart(_, kind, item, revision, part):
-                return self._kept(f"{item}@{revision}/{part}", lambda: self._api.read_part(kind, item, revision, part))
+            case ReadParts(_, places):
+                return self._read_parts(places)
             case ReadItem(_, kind, item):
                 return self._api.read_item(kind, item)
             case ReadBlob(_, digest):
-                return self._kept(digest, lambda: self._api.read_blob(digest))
+                return self._cache.get(self._cache_key(digest), lambda: self._api.read_blob(digest))
             case ReadResults():
                 return self._api.read_results()
             case PutFile(_, path):
@@ -250,9 +253,16 @@ class RunningAttempt:
                 faults.point("worker.after_blob")
                 return None
 
-    def _kept(self, name: str, fetch: Callable[[], bytes]) -> bytes:
-        """Bytes from the cache. Names of things are names within a server and a project's rights; digests are too."""
-        return self._cache.get(f"{self._server} {self._lease.project} {name}", fetch)
+    def _read_parts(self, places: Sequence[PartPlace]) -> list[bytes | None]:
+        """Documents from the cache or the server, as many of the first ones as fit into one answer."""
+        keys = [self._cache_key(f"{place.item}@{place.revision}/{place.part}") for place in places]
+        found = self._cache.get_many(keys, lambda missing: self._api.read_parts([places[index] for index in missing]))
+        sizes = accumulate(len(data or b"") for data in found)
+        return found[: max(1, sum(size <= ANSWER_LIMIT_BYTES for size in sizes))]
+
+    def _cache_key(self, name: str) -> str:
+        """Names of things are names within a server and a project's rights; digests are too."""
+        return f"{self._server} {self._lease.project} {name}"
 
     def _death(self, child: ChildProcess) -> Failed:
         status = child.wait()

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import httpx
+import msgpack  # type: ignore[import-untyped]
 
 from marey_client.blobs import Blobs
 from marey_client.errors import Conflict, LeaseLost, Unauthenticated
 from marey_client.paging import pages
 from marey_client.retries import Retries
 from marey_client.transport import BLOCKS, Transport, as_json, read_model
-from marey_schemas.items import Item
+from marey_schemas.items import Item, PartPlace, PartsRequest
 from marey_schemas.jobs import Progress, TaskResult
 from marey_schemas.kinds import Kind
 from marey_schemas.worker_protocol import (
@@ -32,6 +33,8 @@ PATIENT = Retries(tries=100, longest_s=10.0, total_s=600.0)
 """For the last word of an attempt: computed results are worth waiting for."""
 
 PLAIN_TEXT = "text/plain; charset=utf-8"
+
+_NONE: bytes = msgpack.packb(None)
 
 
 def claim(transport: Transport, request: ClaimRequest) -> tuple[Lease, ...]:
@@ -79,11 +82,16 @@ class AttemptApi:
         """End the attempt without success; the same request again is answered the same."""
         self._post("fail", as_json(request))
 
-    def read_part(self, kind: Kind, item: str, revision: int, part: str) -> bytes:
-        """A part's document as MessagePack with arrays in blocks, undecoded."""
-        path = f"/projects/{self._project}/{kind.plural}/{item}/parts/{part}"
+    def read_parts(self, places: Sequence[PartPlace]) -> list[bytes | None]:
+        """Read documents as MessagePack with arrays in blocks, undecoded; None for one that is not there.
+
+        Documents at the end of a long list may be left out, never the first one.
+        """
+        path = f"/projects/{self._project}/parts"
+        body = as_json(PartsRequest(parts=tuple(places)))
         with _dead_token_is_lost_lease():
-            return self._transport.send("GET", path, params={"revision": revision}, headers={"Accept": BLOCKS}).content
+            answer = self._transport.send("POST", path, content=body, repeatable=True, headers={"Accept": BLOCKS})
+        return _split_documents(answer.content)
 
     def read_item(self, kind: Kind, item: str) -> Item:
         """An item as it is now."""
@@ -120,3 +128,18 @@ def _dead_token_is_lost_lease() -> Iterator[None]:
         yield
     except Unauthenticated as error:
         raise LeaseLost(error.problem) from error
+
+
+def _split_documents(data: bytes) -> list[bytes | None]:
+    """The bytes of each document in the MessagePack of `{"documents": [...]}`."""
+    unpacker = msgpack.Unpacker(max_buffer_size=len(data))
+    unpacker.feed(data)
+    if unpacker.read_map_header() != 1 or unpacker.unpack() != "documents":
+        raise ValueError("an answer to a read of several documents holds the member documents and no other")
+    documents: list[bytes | None] = []
+    for _ in range(unpacker.read_array_header()):
+        start = unpacker.tell()
+        unpacker.skip()
+        document = data[start : unpacker.tell()]
+        documents.append(None if document == _NONE else document)
+    return documents

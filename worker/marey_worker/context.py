@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
-from marey_schemas.items import Item
+from marey_schemas.items import Item, PartPlace
 from marey_schemas.jobs import Progress
 from marey_schemas.kinds import Kind
 from marey_schemas.worker_protocol import PinnedInput, StagedOutput, StageRequest
@@ -20,7 +21,7 @@ from marey_worker.messages import (
     PutFile,
     ReadBlob,
     ReadItem,
-    ReadPart,
+    ReadParts,
     ReadResults,
     Request,
     Run,
@@ -32,7 +33,8 @@ T = TypeVar("T")
 _numbers = itertools.count(1)
 """Of requests, throughout the process: an answer that comes after its job has ended is nobody's."""
 
-READ_AHEAD = 4
+DOCUMENTS_PER_REQUEST = 16
+REQUESTS_AHEAD = 2
 STAGED_AT_ONCE = 2
 
 
@@ -85,24 +87,33 @@ class Context:
 
     def document(self, kind: Kind, item: str, revision: int, part: str) -> Any:
         """A part of a revision; arrays are numpy arrays. Raises `NoSuchThing` where there is none."""
-        asked = self._send(lambda request: ReadPart(request, kind, item, revision, part))
-        return _decoded(self._value(asked, f"no-{kind}"))
+        ((_, document),) = self._read_ahead([(None, PartPlace(kind=kind, item=item, revision=revision, part=part))])
+        if document is None:
+            raise NoSuchThing(f"There is no part {part!r} of {kind} {item!r} at revision {revision}.", f"no-{kind}")
+        return document
 
     def documents(
         self, pins: Iterable[PinnedInput], part: str, *, required: bool = True
     ) -> Iterator[tuple[PinnedInput, Any]]:
         """Each input with a part of it, read ahead while the caller works; None where it lacks one that may lack."""
+        for pin, (document,) in self.documents_of_each(pins, part):
+            if document is None and required:
+                detail = f"There is no part {part!r} of {pin.kind} {pin.item!r} at revision {pin.revision}."
+                raise NoSuchThing(detail, f"no-{pin.kind}")
+            yield pin, document
 
-        def request_for(pin: PinnedInput, request: int) -> ReadPart:
-            return ReadPart(request, pin.kind, pin.item, pin.revision, part)
-
-        for pin, request in self._read_ahead(pins, request_for):
-            try:
-                yield pin, _decoded(self._value(request, f"no-{pin.kind}"))
-            except NoSuchThing:
-                if required:
-                    raise
-                yield pin, None
+    def documents_of_each(
+        self, pins: Iterable[PinnedInput], *parts: str
+    ) -> Iterator[tuple[PinnedInput, tuple[Any, ...]]]:
+        """Each input with several parts of it, read ahead while the caller works; None for a part that it lacks."""
+        wanted = (
+            (pin, PartPlace(kind=pin.kind, item=pin.item, revision=pin.revision, part=part))
+            for pin in pins
+            for part in parts
+        )
+        found = self._read_ahead(wanted)
+        while documents := tuple(islice(found, len(parts))):
+            yield documents[0][0], tuple(document for _, document in documents)
 
     def item(self, kind: Kind, item: str) -> Item:
         """An item as it is now. Raises `NoSuchThing` where there is none."""
@@ -150,14 +161,25 @@ class Context:
 
     # -- the pipe --
 
-    def _read_ahead(self, things: Iterable[T], request_for: Callable[[T, int], Request]) -> Iterator[tuple[T, int]]:
-        """Each thing with its request, a few of which are sent before the first is waited for."""
-        waiting: deque[tuple[T, int]] = deque()
-        for thing in things:
-            waiting.append((thing, self._send(lambda request, thing=thing: request_for(thing, request))))  # type: ignore[misc]
-            if len(waiting) > READ_AHEAD:
-                yield waiting.popleft()
-        yield from waiting
+    def _read_ahead(self, wanted: Iterable[tuple[T, PartPlace]]) -> Iterator[tuple[T, Any]]:
+        """Each thing with its document, or None; some requests are sent before the first one is waited for."""
+        rest = iter(wanted)
+        waiting: deque[tuple[int, list[tuple[T, PartPlace]]]] = deque()
+        while True:
+            while len(waiting) < REQUESTS_AHEAD and (batch := list(islice(rest, DOCUMENTS_PER_REQUEST))):
+                waiting.append((self._request_parts(batch), batch))
+            if not waiting:
+                return
+            request, batch = waiting.popleft()
+            answered: list[bytes | None] = self._value(request)
+            if left_out := batch[len(answered) :]:
+                waiting.appendleft((self._request_parts(left_out), left_out))
+            for (thing, _), data in zip(batch, answered, strict=False):
+                yield thing, None if data is None else _decoded(data)
+
+    def _request_parts(self, wanted: Sequence[tuple[Any, PartPlace]]) -> int:
+        places = tuple(place for _, place in wanted)
+        return self._send(lambda request: ReadParts(request, places))
 
     def _ask(self, make: Callable[[int], Request]) -> Any:
         return self._value(self._send(make))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from marey_schemas.items import PartPlace
 from marey_schemas.jobs import Progress
 from marey_schemas.kinds import Kind
 from marey_schemas.worker_protocol import PinnedInput
@@ -51,14 +52,14 @@ class Ready:
 
 
 @dataclass(frozen=True)
-class ReadPart:
-    """Read a part of a revision: the document as it travels."""
+class ReadParts:
+    """Read parts of revisions: the documents as they travel, None for one that is not there.
+
+    The answer may leave out documents at the end of a long list, never the first one.
+    """
 
     request: int
-    kind: Kind
-    item: str
-    revision: int
-    part: str
+    places: tuple[PartPlace, ...]
 
 
 @dataclass(frozen=True)
@@ -125,5 +126,5 @@ class Failed:
     retryable: bool
 
 
-Request = ReadPart | ReadItem | ReadBlob | ReadResults | PutFile | Stage
+Request = ReadParts | ReadItem | ReadBlob | ReadResults | PutFile | Stage
 End = Done | Failed

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Request
-from marey_schemas.items import Item
+from marey_schemas.items import Item, PartPlace, PartsRequest
 from marey_schemas.kinds import Kind
 from marey_schemas.names import Message
 from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
 from marey_server.http.declarations import Access, Document, RequestBody, reads, writes
+from marey_server.http.negotiation import MediaType
 from marey_server.http.queries import MAX_INTEGER, CommaSeparated
-from marey_server.http.reply import Lasting, Rendered, Reply
+from marey_server.http.reply import Lasting, Rendered, Reply, encode
 from marey_server.http.resource import Resource
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
@@ -102,4 +103,25 @@ class PartResource(Resource):
         )
 
 
-RESOURCES: tuple[type[Resource], ...] = (PartResource,)
+def _read_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace], media: MediaType) -> bytes:
+    documents = items.load_parts(tx, project, wanted, arrays="encoded" if media.arrays == "blocks" else "decoded")
+    return encode({"documents": documents}, media)
+
+
+class Parts(Resource):
+    """Documents of several items."""
+
+    path = "/projects/{project}/parts"
+    tag = "Items"
+
+    @reads(access=Access.READER, body=PartsRequest, answer=Document)
+    async def post(self, project: str, body: PartsRequest) -> Reply:
+        """Read documents of several items in one request.
+
+        The answer is `{"documents": [...]}` in the order asked, with null for a document that is not there. Where
+        they are large together, the last ones are missing from the list: ask for those again.
+        """
+        return Reply(await self.look_up(_read_parts, project, body.parts, self.media))
+
+
+RESOURCES: tuple[type[Resource], ...] = (PartResource, Parts)

@@ -16,6 +16,7 @@ from typing import Protocol
 
 from sqlalchemy import Connection, bindparam, delete, insert, select
 
+from marey_server.store.database.prepared import Prepared
 from marey_server.store.tables import blob_chunk
 
 CHUNK_BYTES = 2**20
@@ -49,8 +50,10 @@ class BlobBacking(Protocol):
         ...
 
 
-_CHUNK = select(blob_chunk.c.data).where(
-    blob_chunk.c.digest == bindparam("digest"), blob_chunk.c.position == bindparam("position")
+_CHUNK = Prepared(
+    select(blob_chunk.c.data).where(
+        blob_chunk.c.digest == bindparam("digest"), blob_chunk.c.position == bindparam("position")
+    )
 )
 
 
@@ -65,9 +68,10 @@ class DatabaseBlobs:
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
         """Bytes `start` to `stop`."""
         for position in range(start // CHUNK_BYTES, -(-stop // CHUNK_BYTES)):
-            data = connection.execute(_CHUNK, {"digest": digest, "position": position}).scalar()
-            if data is None:
+            rows = _CHUNK.run(connection, {"digest": digest, "position": position})
+            if not rows:
                 return
+            data: bytes = rows[0].data
             base = position * CHUNK_BYTES
             yield data if start <= base and base + len(data) <= stop else data[max(start - base, 0) : stop - base]
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -23,6 +23,7 @@ from marey_schemas.problems import FieldError
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.field_errors import field_errors
 from marey_server.store import blobs
+from marey_server.store.database.prepared import Prepared, padded
 from marey_server.store.tables import blob, document, document_blob
 from marey_server.store.transaction import Transaction
 
@@ -219,36 +220,53 @@ def _refer(tx: Transaction, digest: str, held: Mapping[str, str]) -> None:
 # -- reading ----------------------------------------------------------------------------------------------------------
 
 
-_BLOBS_OF_DOCUMENT = (  # built once: every read of a motion runs it
-    select(document_blob.c.pointer, document_blob.c.blob_digest, blob.c.size_bytes)
+_BODIES = Prepared(
+    select(document.c.digest, document.c.body).where(document.c.digest.in_(bindparam("digests", expanding=True)))
+)
+_BLOBS_OF_DOCUMENTS = Prepared(
+    select(document_blob.c.document_digest, document_blob.c.pointer, document_blob.c.blob_digest, blob.c.size_bytes)
     .join(blob, blob.c.digest == document_blob.c.blob_digest)
-    .where(document_blob.c.document_digest == bindparam("digest"))
+    .where(document_blob.c.document_digest.in_(bindparam("digests", expanding=True)))
 )
 
 
 def load_document(tx: Transaction, digest: str, *, arrays: Literal["encoded", "decoded", "none"] = "encoded") -> Tree:
-    """A stored document; its arrays as stored, as numpy arrays, or as references."""
-    body = load_body(tx, digest)  # freshly read, so that it may be changed
-    if arrays == "none":
-        return body
-    return attach_stored(tx, digest, body, (lambda stored: stored.decode()) if arrays == "decoded" else None)
+    """Load a stored document with its arrays as stored, as numpy arrays, or as references."""
+    return load_documents(tx, [digest], arrays=arrays)[digest]
+
+
+def load_documents(
+    tx: Transaction, digests: Collection[str], *, arrays: Literal["encoded", "decoded", "none"] = "encoded"
+) -> dict[str, Tree]:
+    """Load stored documents by digest, as `load_document` does. Raises `NotFoundProblem` where one is missing."""
+    bodies = load_bodies(tx, digests)  # freshly read, so that they may be changed
+    if bodies and arrays != "none":
+        _attach_stored(tx, bodies, (lambda stored: stored.decode()) if arrays == "decoded" else None)
+    return bodies
 
 
 def load_body(tx: Transaction, digest: str) -> Tree:
-    """The document with references in place of its arrays."""
-    body = tx.execute(select(document.c.body).where(document.c.digest == digest)).scalar()
-    if body is None:
-        raise NotFoundProblem(f"There is no document {digest}.")
-    return dict(body)
+    """Load a document with references in place of its arrays."""
+    return load_bodies(tx, [digest])[digest]
 
 
-def attach_stored(
-    tx: Transaction, digest: str, body: Tree, convert: Callable[[EncodedArray], Any] | None = None
-) -> Tree:
-    """`body` with its arrays in place of the references, each passed through `convert`; `body` itself is changed."""
+def load_bodies(tx: Transaction, digests: Collection[str]) -> dict[str, Tree]:
+    """Load documents by digest, with references in place of their arrays."""
+    if not digests:
+        return {}
+    bodies = {row.digest: dict(row.body) for row in tx.run(_BODIES, {"digests": padded(digests)})}
+    if missing := [digest for digest in digests if digest not in bodies]:
+        raise NotFoundProblem(f"There is no document {missing[0]}.")
+    return bodies
+
+
+def _attach_stored(
+    tx: Transaction, bodies: Mapping[str, Tree], convert: Callable[[EncodedArray], Any] | None = None
+) -> None:
+    """Put arrays in place of the references in documents, given by digest, each passed through `convert`."""
     loaded: dict[str, Any] = {}
-    for row in tx.execute(_BLOBS_OF_DOCUMENT, {"digest": digest}).all():
-        holder, key = _place(body, row.pointer)
+    for row in tx.run(_BLOBS_OF_DOCUMENTS, {"digests": padded(bodies)}):
+        holder, key = _place(bodies[row.document_digest], row.pointer)
         leaf = holder[key]
         if not _is_reference(leaf):  # the name of a file
             continue
@@ -257,7 +275,6 @@ def attach_stored(
             stored = EncodedArray(leaf["dtype"], tuple(leaf["shape"]), data)
             loaded[leaf["content"]] = convert(stored) if convert else stored
         holder[key] = loaded[leaf["content"]]
-    return body
 
 
 def _place(tree: Any, pointer: str) -> tuple[Any, str | int]:

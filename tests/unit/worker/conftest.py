@@ -19,7 +19,7 @@ from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 
 THIRD_PARTY = Path(__file__).parent / "thirdparty"
 ATTEMPT = re.compile(r"/api/v1/jobs/(\w+)/attempts/(\d+)/(\w+)")
-PART = re.compile(r"/api/v1/projects/lab/(\w+)/(\w+)/parts/(\w+)\?revision=(\d+)")
+PARTS = re.compile(r"/api/v1/projects/lab/parts")
 RESULTS = re.compile(r"/api/v1/jobs/(\w+)/results")
 BLOB = re.compile(r"/api/v1/blobs/(sha256:[0-9a-f]{64})")
 
@@ -82,6 +82,12 @@ class FakeServer:
             time.sleep(0.01)
         return []
 
+    def read(self, places):
+        """Documents as the server sends them: at most three at once, so that workers have to ask again."""
+        keys = [(place["item"], place["revision"], place["part"]) for place in places[:3]]
+        self.reads += keys
+        return encode_tree({"documents": [self.documents.get(key) for key in keys]}, MSGPACK, arrays="blocks")
+
     def _lease(self, job, kind, params, inputs, time_limit_s, memory_limit_mb, position, size):
         return {
             "job": job, "project": "lab", "kind": kind, "params": params, "inputs": inputs, "into": "out", "seed": 0,
@@ -127,6 +133,8 @@ def _handler(server):
             server.tokens_seen.add(self.headers["Authorization"])
             if self.path == "/api/v1/leases":
                 return self.reply(200, json.dumps({"leases": server.claim(json.loads(body))}).encode())
+            if PARTS.fullmatch(self.path):
+                return self.reply(200, server.read(json.loads(body)["parts"]), "application/msgpack; arrays=blocks")
             job, _fence, what = ATTEMPT.fullmatch(self.path).groups()
             if job in server.lost:
                 return self.problem(409, "lease-lost")
@@ -158,14 +166,6 @@ def _handler(server):
             self.reply(200, json.dumps({"job": job, "state": "queued"}).encode())
 
         def do_GET(self):
-            if found := PART.fullmatch(self.path):
-                _, item, part, revision = found.groups()
-                server.reads.append((item, int(revision), part))
-                document = server.documents.get((item, int(revision), part))
-                if document is None:
-                    return self.problem(404, "not-found")
-                body = encode_tree(document, MSGPACK, arrays="blocks")
-                return self.reply(200, body, "application/msgpack; arrays=blocks")
             if found := RESULTS.match(self.path):
                 told = [
                     {"job": f"task{n}", "position": n, "state": "succeeded", "result": result}

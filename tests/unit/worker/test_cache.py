@@ -137,3 +137,23 @@ def test_many_threads_may_ask_for_the_same(tmp_path, source):
         thread.join()
     assert wrong == []
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".new-")]
+
+
+def test_several_keys_are_fetched_at_once_without_those_at_hand(tmp_path):
+    cache = InputCache(tmp_path, 1 << 20)
+    cache.get("b", lambda: b"B")
+    asked = []
+
+    def fetch(missing):
+        asked.append(missing)
+        return [{0: b"A", 2: None}[index] for index in missing]
+
+    for _ in range(2):
+        assert cache.get_many(["a", "b", "c"], fetch) == [b"A", b"B", None]
+    assert asked == [[0, 2], [2]]
+
+
+def test_what_is_not_fetched_ends_the_answer(tmp_path):
+    cache = InputCache(tmp_path, 1 << 20)
+    cache.get("c", lambda: b"C")
+    assert cache.get_many(["a", "b", "c"], lambda _missing: [b"A"]) == [b"A"]

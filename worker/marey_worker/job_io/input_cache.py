@@ -7,7 +7,7 @@ import logging
 import os
 import threading
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 log = logging.getLogger(__name__)
@@ -32,14 +32,26 @@ class InputCache:
         self._bytes = sum(size for _, size, _ in self._files())
 
     def get(self, key: str, fetch: Callable[[], bytes]) -> bytes:
-        """The bytes of `key`: from the folder, or from `fetch`, and then kept."""
-        path = self.folder / hashlib.sha256(key.encode()).hexdigest()
-        held = self._read(path)
-        if held is not None:
-            return held
-        data = fetch()
-        self._keep(path, data)
+        """Return the bytes of `key`: from the folder, or from `fetch`, and then kept."""
+        (data,) = self.get_many([key], lambda _missing: [fetch()])
+        assert data is not None
         return data
+
+    def get_many(self, keys: Sequence[str], fetch: Callable[[list[int]], Sequence[bytes | None]]) -> list[bytes | None]:
+        """Return the bytes of `keys`: from the folder, or from `fetch`, which gets the indices of the others.
+
+        `fetch` may answer for the first of them only; then the result ends before the first key it left out. None is
+        returned as it is, and not kept.
+        """
+        paths = [self.folder / hashlib.sha256(key.encode()).hexdigest() for key in keys]
+        held = [self._read(path) for path in paths]
+        missing = [index for index, data in enumerate(held) if data is None]
+        fetched = fetch(missing) if missing else ()
+        for index, data in zip(missing, fetched, strict=False):
+            held[index] = data
+            if data is not None:
+                self._keep(paths[index], data)
+        return held if len(fetched) == len(missing) else held[: missing[len(fetched)]]
 
     def _read(self, path: Path) -> bytes | None:
         """What is kept, or None; another worker may remove it at any moment."""

@@ -21,7 +21,7 @@ from marey_schemas.editing.edits import EditDocument
 from marey_schemas.job_params import EditParams
 from marey_schemas.kinds import Kind
 from marey_schemas.worker_protocol import PinnedInput, StagedOutput
-from marey_worker.context import Context, JobRefused, NoSuchThing
+from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import ResultPlaces
 from marey_worker.job_io.skeleton_cache import Rig, read_rigged
@@ -61,10 +61,10 @@ class _Editing:
         pins = self._context.inputs["clips"]
         started = time.monotonic()
         sources = self._read_sources()
-        for done, (pin, motion) in enumerate(self._context.documents(pins, "motion", required=False)):
+        for done, (pin, (motion, info)) in enumerate(self._context.documents_of_each(pins, "motion", "info")):
             self._context.progress(done, len(pins), f"editing {pin.name}")
             try:
-                outputs = list(self._edited(pin, MotionDocument.model_validate(present(pin, motion)), sources))
+                outputs = list(self._edited(pin, MotionDocument.model_validate(present(pin, motion)), info, sources))
             except UNUSABLE as error:
                 self._refusals.add(pin, error)
                 continue
@@ -90,7 +90,9 @@ class _Editing:
                 raise JobRefused(error.code, f"the source {pin.path}: {error}") from error
         return sources
 
-    def _edited(self, pin: PinnedInput, motion: MotionDocument, sources: Mapping[str, Clip]) -> Iterator[StagedOutput]:
+    def _edited(
+        self, pin: PinnedInput, motion: MotionDocument, known: dict[str, Any] | None, sources: Mapping[str, Clip]
+    ) -> Iterator[StagedOutput]:
         """The results of one clip. Raises `MotionError`, `NoSuchThing`."""
         if self._params.in_place:
             self._require_newest(pin)
@@ -99,7 +101,7 @@ class _Editing:
         made = edit_clip(clip, self._commands, body=body, sources=sources)
         if self._params.in_place and len(made) > 1:
             raise EditError("it was split, and several clips cannot take the place of one", code="several-clips")
-        info = self._info(pin)
+        info = self._info(pin, known)
         names = [f"{pin.name}{self._params.suffix}" + "".join(f"-{n}" for n in one.pieces) for one in made]
         if self._params.in_place:
             self._places.keep(pin)
@@ -147,13 +149,11 @@ class _Editing:
             self._bodies[used] = EditedBody(skeleton, find_mapping)
         return self._bodies[used]
 
-    def _info(self, pin: PinnedInput) -> ClipInfo:
+    def _info(self, pin: PinnedInput, stored: dict[str, Any] | None) -> ClipInfo:
         """What was known of the clip and still holds, and what was done to it."""
         edit = None if self._edit_pin is None else self._edit_pin.as_input().model_dump()
         done = {"clip": pin.as_input().model_dump(), "edit": edit, "commands": [name for name, _ in self._commands]}
-        try:
-            stored = self._context.document(Kind.CLIP, pin.item, pin.revision, "info")
-        except NoSuchThing:
+        if stored is None:
             return ClipInfo(source=ClipSource(format="edited", details=done))
         known = ClipInfo.model_validate(stored)
         source = ClipSource(format="edited", details=done)

@@ -21,6 +21,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted
 from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import Context, JobRefused, NoSuchThing
+from marey_worker.job_io.refusals import present
 
 EPOCH = (1980, 1, 1, 0, 0, 0)
 """The earliest time a ZIP archive can tell; every file gets it, so that the same clips make the same bytes."""
@@ -49,10 +50,11 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
     written: set[str] = set()
     pins = sorted(context.inputs["clips"], key=lambda pin: (pin.collection, pin.name, pin.item))
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as target:
-        for done, pin in enumerate(pins):
+        parts = ("info",) if params.format == "original" else ("info", "motion")
+        for done, (pin, (info, *motion)) in enumerate(context.documents_of_each(pins, *parts)):
             context.progress(done, len(pins), f"writing {pin.name}")
             try:
-                file = exporting.file_of(pin)
+                file = exporting.file_of(pin, info or {}, *motion)
             except (_Unwritable, MotionError, NoSuchThing) as error:
                 refused.append({"name": _place(pin), "item": pin.item, "code": error.code, "detail": str(error)})
                 continue
@@ -74,14 +76,15 @@ class _Exporting:
         self._params = params
         self._skeletons: dict[RevisionRef, tuple[Skeleton, dict[str, Any]]] = {}
 
-    def file_of(self, pin: PinnedInput) -> _File:
-        """The file of a clip. Raises `_Unwritable` or `MotionError` where there is none in this format."""
-        info = self._part(pin, "info") or {}
+    def file_of(self, pin: PinnedInput, info: dict[str, Any], tree: Any = None) -> _File:
+        """Write the file of a clip, which its original needs no motion for.
+
+        Raises `_Unwritable`, `MotionError` or `NoSuchThing` where the clip has no file in this format.
+        """
         if self._params.format == "original":
             return self._original(pin, info)
-        tree = self._context.document(pin.kind, pin.item, pin.revision, "motion")
         try:
-            motion = MotionDocument.model_validate(tree)
+            motion = MotionDocument.model_validate(present(pin, tree))
         except ValidationError as error:
             raise _Unwritable("bad-document", str(error)) from error
         skeleton, hierarchy = self._skeleton(RevisionRef.model_validate(motion.skeleton.model_dump()))
@@ -114,13 +117,6 @@ class _Exporting:
             skeleton = documents.skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
             self._skeletons[ref] = skeleton, hierarchy
         return self._skeletons[ref]
-
-    def _part(self, pin: PinnedInput, part: str) -> dict[str, Any] | None:
-        try:
-            document: dict[str, Any] = self._context.document(pin.kind, pin.item, pin.revision, part)
-        except NoSuchThing:
-            return None
-        return document
 
 
 def _place(pin: PinnedInput) -> str:

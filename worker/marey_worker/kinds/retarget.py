@@ -13,7 +13,7 @@ from marey_schemas.documents.references import RevisionRef
 from marey_schemas.job_params import RetargetParams
 from marey_schemas.kinds import Kind
 from marey_schemas.worker_protocol import PinnedInput, StagedOutput
-from marey_worker.context import Context, JobRefused, NoSuchThing
+from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import ResultPlaces
 from marey_worker.job_io.skeleton_cache import Rig, plan_between, read_rigged
@@ -51,10 +51,10 @@ class _Retargeting:
         """All clips; what became of them."""
         pins = self._context.inputs["clips"]
         started = time.monotonic()
-        for done, (pin, motion) in enumerate(self._context.documents(pins, "motion", required=False)):
+        for done, (pin, (motion, info)) in enumerate(self._context.documents_of_each(pins, "motion", "info")):
             self._context.progress(done, len(pins), f"retargeting {pin.name}")
             try:
-                self._results.add(self._retargeted(pin, MotionDocument.model_validate(present(pin, motion))))
+                self._results.add(self._retargeted(pin, MotionDocument.model_validate(present(pin, motion)), info))
             except UNUSABLE as error:
                 self._refusals.add(pin, error)
         self._results.flush()
@@ -65,7 +65,7 @@ class _Retargeting:
             "refused": self._refusals.entries,
         }
 
-    def _retargeted(self, pin: PinnedInput, motion: MotionDocument) -> StagedOutput:
+    def _retargeted(self, pin: PinnedInput, motion: MotionDocument, info: dict[str, Any] | None) -> StagedOutput:
         name = f"{pin.name}{self._params.suffix}"
         self._places.take(Kind.CLIP, pin.folder, name)
         used = RevisionRef.model_validate(motion.skeleton.model_dump())
@@ -85,7 +85,7 @@ class _Retargeting:
             tags=self._params.tags,
             parts={
                 "motion": documents.clip_to_document(clip, self._target.skeleton).model_dump(by_alias=True),
-                "info": self._info(pin, plan, checks).model_dump(mode="json", by_alias=True, exclude_none=True),
+                "info": self._info(info, plan, checks).model_dump(mode="json", by_alias=True, exclude_none=True),
             },
             sources={
                 "clips": (pin.as_input(),),
@@ -94,7 +94,7 @@ class _Retargeting:
             },
         )
 
-    def _info(self, pin: PinnedInput, plan: RetargetPlan, checks: tuple[Check, ...]) -> ClipInfo:
+    def _info(self, stored: dict[str, Any] | None, plan: RetargetPlan, checks: tuple[Check, ...]) -> ClipInfo:
         """What was known of the source and holds for the result, and how it was made."""
         details = {
             "scale": plan.scale,
@@ -104,11 +104,6 @@ class _Retargeting:
             "carried": list(plan.carried),
         }
         made = ClipSource(format="retargeted", details=details)
-        try:
-            stored = self._context.document(Kind.CLIP, pin.item, pin.revision, "info")
-        except NoSuchThing:
+        if stored is None:
             return ClipInfo(source=made, checks=checks)
-        known = ClipInfo.model_validate(stored)
-        return known.model_copy(update={"source": made, "checks": checks})
-
-    # -- results --
+        return ClipInfo.model_validate(stored).model_copy(update={"source": made, "checks": checks})

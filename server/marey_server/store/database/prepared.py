@@ -12,10 +12,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any
+from typing import Any, TypeVar
 
 from sqlalchemy import BindParameter, Connection, Delete, Dialect, Insert, Select, Update, exc
 from sqlalchemy.sql.schema import ScalarElementColumnDefault
+
+T = TypeVar("T")
 
 Statement = Select[Any] | Insert | Update | Delete
 Convert = Callable[[Any], Any]
@@ -65,6 +67,12 @@ class Prepared:
     @staticmethod
     def _key(dialect: Dialect, lists: Iterable[str], parameters: Parameters) -> tuple[object, ...]:
         return (dialect.name, *parameters, *[len(parameters[name]) for name in lists])
+
+
+def padded(values: Iterable[T]) -> list[T]:
+    """Repeat the last value of a list for `IN` up to a power of two, so that few lengths are compiled."""
+    known = list(values)
+    return known + known[-1:] * ((1 << max(len(known) - 1, 0).bit_length()) - len(known))
 
 
 def run_text(connection: Connection, text: str) -> None:

@@ -18,7 +18,7 @@ from marey_server.store.items.drafts import Draft, Published, StoredDocument
 from marey_server.store.items.history import list_revisions, read_lineage, read_revision, read_staleness
 from marey_server.store.items.listing import ItemFilters, list_items
 from marey_server.store.items.publishing import publish
-from marey_server.store.items.reading import FoundPart, Part, find_part, load_part, read_item, read_part
+from marey_server.store.items.reading import FoundPart, Part, find_part, load_part, load_parts, read_item, read_part
 
 __all__ = [
     "Draft",
@@ -36,6 +36,7 @@ __all__ = [
     "list_items",
     "list_revisions",
     "load_part",
+    "load_parts",
     "prepare_part",
     "prepare_parts",
     "publish",

@@ -8,12 +8,12 @@ from typing import Any, Literal
 
 from sqlalchemy import Row, Select, bindparam, select
 
-from marey_schemas.items import Item, PartSummary
+from marey_schemas.items import Item, PartPlace, PartSummary
 from marey_schemas.kinds import Kind
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.store import documents, projects
 from marey_server.store.database.clock import datetime_of
-from marey_server.store.database.prepared import Prepared
+from marey_server.store.database.prepared import Prepared, padded
 from marey_server.store.items.slices import slice_motion
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import collection, document, item, item_tag, revision_part
@@ -58,6 +58,20 @@ _PART = (
     .join(revision_part, revision_part.c.item_id == item.c.id)
     .where(*_THIS_ITEM, item.c.deleted_us.is_(None), revision_part.c.part == bindparam("part"))
 )
+_PARTS_OF_PROJECT = Prepared(
+    select(
+        item.c.kind, revision_part.c.item_id, revision_part.c.number, revision_part.c.part, document.c.digest,
+        document.c.size_bytes,
+    )
+    .join(item, item.c.id == revision_part.c.item_id)
+    .join(document, document.c.digest == revision_part.c.document_digest)
+    .where(
+        item.c.project_id == bindparam("project_id"),
+        item.c.deleted_us.is_(None),
+        revision_part.c.item_id.in_(bindparam("items", expanding=True)),
+        revision_part.c.number.in_(bindparam("numbers", expanding=True)),
+    )
+)  # fmt: skip
 _PART_OF_HEAD = Prepared(_PART.where(revision_part.c.number == item.c.head))
 _PART_OF_REVISION = Prepared(_PART.where(revision_part.c.number == bindparam("number")))
 
@@ -180,3 +194,32 @@ def read_part(
     found = find_part(tx, project, kind, item_id, part, revision=revision)
     tree = load_part(tx, found, arrays=arrays)
     return Part(found.digest, found.revision, found.rev, tree)
+
+
+MOST_BYTES_AT_ONCE = 32 << 20
+
+
+def load_parts(
+    tx: Transaction, project: str, wanted: Sequence[PartPlace], *, arrays: Literal["encoded", "decoded"] = "encoded"
+) -> list[dict[str, Any] | None]:
+    """Load the documents of parts, in the order wanted; None for one that is not there.
+
+    Documents are left out at the end where all of them would be large; the first one never is.
+    """
+    project_row = projects.require(tx, project)
+    keys = {
+        "items": padded({place.item for place in wanted}),
+        "numbers": padded({place.revision for place in wanted}),
+    }
+    rows = tx.run(_PARTS_OF_PROJECT, {"project_id": project_row.id, **keys})
+    found = {(row.kind, row.item_id, row.number, row.part): row for row in rows}
+    chosen: list[str | None] = []
+    size_bytes = 0
+    for place in wanted:
+        row = found.get((place.kind.value, place.item, place.revision, place.part))
+        size_bytes += row.size_bytes if row is not None else 0
+        if chosen and size_bytes > MOST_BYTES_AT_ONCE:
+            break
+        chosen.append(None if row is None else row.digest)
+    loaded = documents.load_documents(tx, {digest for digest in chosen if digest is not None}, arrays=arrays)
+    return [None if digest is None else loaded[digest] for digest in chosen]
