@@ -22,7 +22,7 @@ def library_page() -> str:
     text = (
         "# Motion library\n\n"
         "`marey_motion` takes arrays and gives arrays; it knows no server. Right-handed, Y up, metres, seconds,\n"
-        "radians; quaternions are (w, x, y, z). F counts frames, J joints. Install it with `pip install 'marey[motion]'`.\n\n"
+        "radians; quaternions are (w, x, y, z). F counts frames, J joints. Install: `pip install 'marey[motion]'`.\n\n"
         "## Exported names\n\n"
     )
     for module, name in exported_names():
