@@ -52,7 +52,12 @@ _AMC = b":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 16 0 0 0 0\nfemur 10\n2\nroot 0 1
 
 
 def kernel_sources() -> list[Path]:
-    """List the modules of the package that contain compiled functions: those that import the compiler."""
+    """List the modules of the package that contain compiled functions: those that import the compiler.
+
+    Returns
+    -------
+    list of Path    source files
+    """
     return [source for source in PACKAGE.rglob("*.py") if _IMPORTS_COMPILER.search(source.read_text("utf-8"))]
 
 
@@ -84,7 +89,13 @@ def _note_done() -> None:
 
 
 def compile_kernels(stages: Sequence[str], processes: int = 1) -> None:
-    """Go through stages of `STAGES`, the first one before the others, which run side by side in so many processes."""
+    """Run stages of `STAGES`, the first one before the others, which run side by side.
+
+    Parameters
+    ----------
+    stages : sequence of str    names of stages
+    processes : int    number of processes
+    """
     first, *others = stages
     _compile(first)
     if processes < 2 or len(others) < 2:

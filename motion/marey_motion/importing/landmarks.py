@@ -1,4 +1,4 @@
-"""The few joints that tell which way is up, how tall somebody is and where the ground is."""
+"""Landmarks of a body: the joints that give the upward direction, the stature and the ground."""
 
 from __future__ import annotations
 
@@ -33,7 +33,16 @@ class Landmarks:
 
 
 def find_landmarks(skeleton: Skeleton) -> Landmarks:
-    """Look the landmarks up among the standard joints; lengths may be in any unit and axes in any order."""
+    """Find the landmarks among the standard joints.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    joints; lengths may be in any unit and axes in any order
+
+    Returns
+    -------
+    Landmarks    joint indices
+    """
     mapping = map_joints(skeleton)
 
     def pair(part: str) -> tuple[int, int] | None:
@@ -55,13 +64,33 @@ def find_landmarks(skeleton: Skeleton) -> Landmarks:
 
 
 def path_length(skeleton: Skeleton, top: int, end: int) -> float:
-    """Length of the bones from joint `top` down to joint `end`."""
+    """Measure the bones between two joints.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    the joints
+    top, end : int    indices of the upper and the lower joint
+
+    Returns
+    -------
+    float    length in the skeleton's unit
+    """
     path = skeleton.path_to_root(end)
     return float(np.linalg.norm(skeleton.offsets[list(path[: path.index(top)])], axis=1).sum())
 
 
 def common_ancestor(parents: NDArray[np.int32], pair: tuple[int, int]) -> int:
-    """The last joint that both joints hang from."""
+    """Find the lowest joint from which two joints descend.
+
+    Parameters
+    ----------
+    parents : (J,) int32    index of each joint's parent
+    pair : (int, int)    joint indices
+
+    Returns
+    -------
+    int    joint index
+    """
     a, b = pair
     while a != b:
         if a > b:

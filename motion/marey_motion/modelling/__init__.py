@@ -1,1 +1,1 @@
-"""Statistical models of motion: aligned examples become functional data, their principal components a distribution."""
+"""Statistical models of motion: functional data, their principal components, and a distribution."""

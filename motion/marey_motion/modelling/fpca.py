@@ -24,7 +24,7 @@ SMALLEST_RELATIVE_SPREAD = 1e-11
 
 @dataclass(frozen=True)
 class Keep:
-    """How many components are kept: the fewest that hold `share` of the variance, at most `most`; or exactly `count`.
+    """Number of components to keep: the fewest that hold `share` of the variance, at most `most`; or exactly `count`.
 
     A count beyond the rank of the examples gives as many as there are.
     """
@@ -40,10 +40,10 @@ class PrincipalExamples:
 
     Parameters
     ----------
-    functions : to be kept
-    energy : (r,) cumulative share of the variance, of all r components that the examples have
-    scores : (m, r) of the examples on all of them, centred
-    deviations : (m, n, D) of the examples' coefficients from their mean
+    functions : FunctionalComponents    the components to keep
+    energy : (r,) float64    cumulative share of the variance, of all r components that the examples have
+    scores : (m, r) float64    scores of the examples on all of them, centred
+    deviations : (m, n, D) float64    deviations of the examples' coefficients from their mean
     """
 
     functions: FunctionalComponents
@@ -53,7 +53,7 @@ class PrincipalExamples:
 
     @cached_property
     def directions(self) -> Floats:
-        """(r, n, D) of all components: what one unit of each score adds to the coefficients."""
+        """Change of the coefficients per unit of each score, for all components; (r, n, D) float64."""
         return np.tensordot((self.scores / (self.scores**2).sum(axis=0)).T, self.deviations, axes=1)
 
 
@@ -64,20 +64,28 @@ def find_components(
     keep: Keep = Keep(),
     inner_product: InnerProduct = "coefficients",
 ) -> PrincipalExamples:
-    """The principal functions of m examples.
+    """Compute the principal functions of m examples.
 
     Parameters
     ----------
-    coefficients : (m, n, D) of the examples in `basis`
-    weights : (D,) positive; channels are multiplied by them before the analysis, which is undone in the result
-    inner_product : `coefficients` sums products of coefficients; `l2` integrates products of functions over canonical
-        time, so that the result does not depend on where the knots are (Ramsay and Silverman 2005, 8.4.2)
+    basis : SplineBasis    splines with n coefficients
+    coefficients : (m, n, D) float64    coefficients of the examples in `basis`
+    weights : (D,) float64    positive; channels are multiplied by them before the analysis, which is undone in the
+        result
+    keep : Keep    number of components to keep
+    inner_product : str    "coefficients" sums products of coefficients; "l2" integrates products of functions over
+        canonical time, so that the result does not depend on the position of the knots (Ramsay and Silverman 2005,
+        8.4.2)
+
+    Returns
+    -------
+    PrincipalExamples    components and scores
 
     Notes
     -----
     Fewer examples than coefficients: the eigenvectors u of the (m, m) matrix of the examples' inner products are those
     of the covariance, at a fraction of the cost. A direction is the sum of the deviations weighted by u, whatever the
-    inner product; the product enters with what takes the scores off again. The share of variance is of all
+    inner product; the product enters with the projections that compute scores. The share of variance is of all
     components. The largest entry of each direction is positive.
     """
     examples = len(coefficients)
@@ -109,7 +117,18 @@ def find_components(
 
 
 def dual_coefficients(basis: SplineBasis, coefficients: Floats, inner_product: InnerProduct) -> Floats:
-    """What coefficients (..., n, D) are multiplied with, one by one, to give inner products with their functions."""
+    """Compute the coefficients whose elementwise products with others give inner products of the functions.
+
+    Parameters
+    ----------
+    basis : SplineBasis    splines with n coefficients
+    coefficients : (..., n, D) float64    coefficients of functions
+    inner_product : str    "coefficients" or "l2"
+
+    Returns
+    -------
+    (..., n, D) float64    dual coefficients
+    """
     return coefficients if inner_product == "coefficients" else np.asarray(basis.products @ coefficients)
 
 

@@ -13,13 +13,13 @@ from marey_motion.errors import MotionError
 
 @dataclass(frozen=True, eq=False)
 class LatentMixture:
-    """K normal distributions with full covariances in L dimensions; L may be 0, where there is nothing to vary.
+    """K normal distributions with full covariances in L dimensions; L may be 0, where nothing varies.
 
     Parameters
     ----------
-    weights : (K,) positive, of sum 1
-    means : (K, L)
-    covariances : (K, L, L) symmetric, positive definite
+    weights : (K,) float64    positive, of sum 1
+    means : (K, L) float64    means
+    covariances : (K, L, L) float64    symmetric, positive definite
     """
 
     weights: Floats
@@ -36,12 +36,12 @@ class LatentMixture:
 
     @property
     def dimensions(self) -> int:
-        """L."""
+        """Number of dimensions L."""
         return int(self.means.shape[1])
 
     @cached_property
     def cholesky(self) -> Floats:
-        """(K, L, L) lower triangular factors of the covariances."""
+        """Lower triangular factors of the covariances, (K, L, L)."""
         try:
             return np.asarray(np.linalg.cholesky(self.covariances), dtype=np.float64)
         except np.linalg.LinAlgError:
@@ -49,30 +49,56 @@ class LatentMixture:
 
     @cached_property
     def whitening(self) -> Floats:
-        """(K, L, L) inverses of the Cholesky factors: `whitening[k] @ (s - means[k])` has unit covariance."""
+        """Inverses (K, L, L) of the Cholesky factors: `whitening[k] @ (s - means[k])` has unit covariance."""
         return np.asarray(np.linalg.inv(self.cholesky), dtype=np.float64)
 
     @cached_property
     def log_peaks(self) -> Floats:
-        """(K,) ln of weight times density at the mean of each component."""
+        """Natural logarithm of weight times density at the mean of each component, (K,)."""
         log_roots = np.log(np.diagonal(self.cholesky, axis1=1, axis2=2)).sum(axis=1)
         return np.asarray(np.log(self.weights) - log_roots - 0.5 * self.dimensions * np.log(2.0 * np.pi))
 
     def component_log_densities(self, latents: Floats) -> Floats:
-        """ln(pi_k N_k(s)) as (n, K) of latent vectors (n, L)."""
+        """Compute ln(pi_k N_k(s)) of each component.
+
+        Parameters
+        ----------
+        latents : (n, L) float64    latent vectors
+
+        Returns
+        -------
+        (n, K) float64    natural logarithms
+        """
         away = np.einsum("kij,nkj->nki", self.whitening, latents[:, None, :] - self.means)
         return np.asarray(self.log_peaks - 0.5 * np.einsum("nki,nki->nk", away, away))
 
     def log_density(self, latents: Floats) -> Floats:
-        """ln p(s) as (n,) of latent vectors (n, L)."""
+        """Compute ln p(s).
+
+        Parameters
+        ----------
+        latents : (n, L) float64    latent vectors
+
+        Returns
+        -------
+        (n,) float64    natural logarithms
+        """
         each = self.component_log_densities(latents)
         highest = each.max(axis=1)
         return np.asarray(highest + np.log(np.exp(each - highest[:, None]).sum(axis=1)))
 
     def sample(self, count: int, seed: int, attempt: int = 0) -> Floats:
-        """Latent vectors (count, L), the same for the same seed; the first are those of a smaller count.
+        """Draw latent vectors; the first ones are those of a smaller count.
 
-        Each attempt gives others.
+        Parameters
+        ----------
+        count : int    number of vectors
+        seed : int    the same seed gives the same vectors
+        attempt : int    each attempt gives others
+
+        Returns
+        -------
+        (count, L) float64    latent vectors
         """
         generator = np.random.Generator(np.random.Philox(seed).jumped(attempt))
         # One stream of rows: what a row holds must not depend on how many follow.

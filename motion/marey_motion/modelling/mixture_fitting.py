@@ -50,14 +50,17 @@ class MixtureOptions:
 
 @dataclass(frozen=True)
 class MixtureCandidate:
-    """A mixture of so many components, as the criterion sees it.
+    """A mixture of a given number of components, with its criteria.
 
     Parameters
     ----------
-    log_likelihood : of all examples, natural logarithm
-    smallest_weight : of a component
-    refusal : why it was not taken whatever its criterion: it leaves a component with too few examples, or makes those
-        not seen less likely than one component does
+    components : int    number of components
+    bic, aic : float    Bayesian and Akaike information criterion
+    log_likelihood : float    of all examples, natural logarithm
+    smallest_weight : float    the least weight of a component
+    converged : bool    whether the fit converged
+    refusal : str    reason for not taking it whatever its criterion: "small-component" where a component has too few
+        examples, "held-out" where it makes unseen examples less likely than one component does
     """
 
     components: int
@@ -71,14 +74,16 @@ class MixtureCandidate:
 
 @dataclass(frozen=True, eq=False)
 class FittedMixture:
-    """A mixture, how it came about, and what else was tried.
+    """A mixture, its method, and the candidates compared.
 
     Parameters
     ----------
-    method : `em`: expectation maximisation; `shrunk`: one component of shrunk covariance, for few examples; `point`:
-        examples that do not vary
-    candidates : by number of components; empty unless the method is `em`
-    held_out : (n,) ln p of each example under mixtures of as many components fitted without its fold, or None
+    mixture : LatentMixture    the mixture
+    method : str    "em": expectation maximisation; "shrunk": one component of shrunk covariance, for few examples;
+        "point": examples that do not vary
+    candidates : tuple of MixtureCandidate    by number of components; empty unless the method is "em"
+    held_out : (n,) float64, optional    ln p of each example under mixtures of as many components fitted without its
+        fold
     """
 
     mixture: LatentMixture
@@ -89,7 +94,12 @@ class FittedMixture:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Linear algebra and clustering on one thread: how sums are rounded depends on how many threads share them."""
+    """Run linear algebra and clustering on one thread: the rounding of sums depends on the number of threads.
+
+    Yields
+    ------
+    None    once, within the context
+    """
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     for module in ("scipy.linalg", "sklearn.mixture"):
@@ -99,12 +109,22 @@ def one_thread() -> Iterator[None]:
 
 
 def fit_mixture(latents: Floats, options: MixtureOptions | None = None, *, seed: int = 0) -> FittedMixture:
-    """The mixture of n latent vectors (n, d), the same for the same seed.
+    """Fit a mixture to latent vectors.
 
     With no more than d + 1 examples a full covariance is singular; one component then has a covariance shrunk towards a
-    sphere (Ledoit and Wolf 2004). Otherwise numbers of components are compared by their criterion. A number is out of
-    the question if a component is left with fewer examples than it has dimensions (or than 5), or if it makes held-out
-    examples less likely than one component does.
+    sphere (Ledoit and Wolf 2004). Otherwise numbers of components are compared by their criterion. A number is excluded
+    if a component has fewer examples than dimensions (or than 5), or if it makes held-out examples less likely than one
+    component does.
+
+    Parameters
+    ----------
+    latents : (n, d) float64    latent vectors
+    options : MixtureOptions, optional    options
+    seed : int    the same seed gives the same mixture
+
+    Returns
+    -------
+    FittedMixture    mixture and candidates
     """
     examples, dimensions = latents.shape
     wanted = options or MixtureOptions()

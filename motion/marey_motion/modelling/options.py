@@ -1,4 +1,4 @@
-"""What can be chosen when a model is trained."""
+"""Options of training a model."""
 
 from __future__ import annotations
 
@@ -62,7 +62,12 @@ class ModelOptions:
                 raise ModelError(f"{value} is not between {least:g} and {most:g}", where=name)
 
     def as_tree(self) -> dict[str, str | float | int | bool | None]:
-        """By name."""
+        """Convert the options to plain values.
+
+        Returns
+        -------
+        dict    value by name
+        """
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 

@@ -57,15 +57,33 @@ class FunctionalComponents:
 
     @property
     def count(self) -> int:
-        """k."""
+        """Number of components k."""
         return len(self.directions)
 
     def coefficients(self, scores: Floats) -> Floats:
-        """Spline coefficients (m, n, D) of scores (m, k)."""
+        """Compute spline coefficients from scores.
+
+        Parameters
+        ----------
+        scores : (m, k) float64    scores
+
+        Returns
+        -------
+        (m, n, D) float64    coefficients
+        """
         return np.asarray(self.mean + np.tensordot(scores, self.directions, axes=1), dtype=np.float64)
 
     def scores(self, coefficients: Floats) -> Floats:
-        """Scores (m, k) of spline coefficients (m, n, D)."""
+        """Compute scores from spline coefficients.
+
+        Parameters
+        ----------
+        coefficients : (m, n, D) float64    coefficients
+
+        Returns
+        -------
+        (m, k) float64    scores
+        """
         return np.asarray(np.tensordot(coefficients - self.mean, self.projections, axes=([1, 2], [1, 2])))
 
 
@@ -119,26 +137,35 @@ class MotionPrimitive:
 
     @property
     def frame_count(self) -> int:
-        """N, canonical frames."""
+        """Number of canonical frames N."""
         return self.spatial.basis.frame_count
 
     @property
     def dimensions(self) -> int:
-        """L, numbers of a latent vector."""
+        """Number of dimensions L of a latent vector."""
         return self.spatial.count + self.temporal.count
 
     @property
     def log_slope_bounds(self) -> tuple[float, float]:
-        """What logarithms of steps are cut off at: `log_slope_range`, or that of any motion."""
+        """Limits of the logarithms of steps: `log_slope_range`, or the limits for any motion."""
         return self.log_slope_range or (-MOST_LOG_SLOPE, MOST_LOG_SLOPE)
 
     # -- from latent vectors -------------------------------------------------------------------------------------------
 
     def sample(self, count: int, seed: int) -> Floats:
-        """Latent vectors (count, L) drawn from the mixture, the same for the same seed.
+        """Draw latent vectors from the mixture.
 
-        Those whose motions would last too short or too long are drawn again; that depends on nothing but the place in
-        the row, so that the first are those of a smaller count.
+        Vectors whose motions would be too short or too long are drawn again; that depends only on the place in the row,
+        so that the first ones are those of a smaller count.
+
+        Parameters
+        ----------
+        count : int    number of vectors
+        seed : int    the same seed gives the same vectors
+
+        Returns
+        -------
+        (count, L) float64    latent vectors
         """
         latents = self.mixture.sample(count, seed)
         if self.duration_range_s is None:
@@ -153,9 +180,16 @@ class MotionPrimitive:
         return latents
 
     def poses(self, latents: Floats, times: ArrayLike | None = None) -> Floats:
-        """Poses (m, T, 3 + 4·J) of latent vectors (m, L) at canonical times (T,), with unit quaternions.
+        """Compute poses with unit quaternions.
 
-        Without times: at every canonical frame.
+        Parameters
+        ----------
+        latents : (m, L) float64    latent vectors
+        times : (T,) float, optional    canonical frames; every one when None
+
+        Returns
+        -------
+        (m, T, 3 + 4·J) float64    root translation in metres in the canonical frame, then local rotations (w, x, y, z)
         """
         values = self.spatial.basis.at_frames if times is None else self.spatial.basis.matrix(times)
         poses = values @ self.spatial.coefficients(latents[:, : self.spatial.count])
@@ -164,9 +198,17 @@ class MotionPrimitive:
         return np.asarray(poses, dtype=np.float64)
 
     def time_functions(self, latents: Floats) -> Floats:
-        """Frames of real time (m, N), at `frame_rate_hz`, that have passed at each canonical frame; the first is 0.
+        """Compute the frames of real time that have passed at each canonical frame.
 
-        A motion that would last longer or shorter than `duration_range_s` allows is played faster or slower as a whole.
+        A motion that would exceed `duration_range_s` is played faster or slower as a whole.
+
+        Parameters
+        ----------
+        latents : (m, L) float64    latent vectors
+
+        Returns
+        -------
+        (m, N) float64    frames at `frame_rate_hz`; the first is 0
         """
         passed = self._passed(latents)
         if self.duration_range_s is not None:
@@ -182,13 +224,34 @@ class MotionPrimitive:
         return passed
 
     def durations_s(self, latents: Floats) -> Floats:
-        """How long the motions (m,) last."""
+        """Compute the durations of motions.
+
+        Parameters
+        ----------
+        latents : (m, L) float64    latent vectors
+
+        Returns
+        -------
+        (m,) float64    seconds
+        """
         return np.asarray(self.time_functions(latents)[:, -1] / self.frame_rate_hz)
 
     def motions(self, latents: Floats) -> list[Motion]:
-        """Motions in real time at `frame_rate_hz`; each lasts a whole number of frames, at most half a frame off.
+        """Compute motions in real time.
 
-        Raises `MotionError` for latent vectors so odd that a motion would have more than `MOST_FRAMES` frames.
+        Each has a whole number of frames, at most half a frame off.
+
+        Parameters
+        ----------
+        latents : (m, L) float64    latent vectors
+
+        Returns
+        -------
+        list of Motion    at `frame_rate_hz`, in the canonical frame
+
+        Raises
+        ------
+        MotionError    for latent vectors so extreme that a motion would have more than `MOST_FRAMES` frames
         """
         made = []
         for latent in latents:
@@ -206,16 +269,34 @@ class MotionPrimitive:
     # -- to latent vectors ---------------------------------------------------------------------------------------------
 
     def latents_of(self, poses: Floats, time_functions: Floats) -> Floats:
-        """Latent vectors (m, L) of aligned poses (m, N, 3 + 4·J) and their time functions (m, N).
+        """Compute the latent vectors of aligned examples.
 
         Quaternions must have the signs of the training examples (dot products with the mean motion not negative).
+
+        Parameters
+        ----------
+        poses : (m, N, 3 + 4·J) float64    root translations in metres and local rotations
+        time_functions : (m, N) float64    frames of real time at each canonical frame
+
+        Returns
+        -------
+        (m, L) float64    latent vectors
         """
         scores = self.spatial.scores(self.spatial.basis.fit(poses))
         temporal = self.temporal.scores(fit_log_slopes(self.temporal.basis, time_functions))
         return np.concatenate((scores, self.temporal_weight * temporal), axis=1)
 
     def log_density(self, latents: Floats) -> Floats:
-        """ln p(s) as (m,) of latent vectors (m, L)."""
+        """Compute ln p(s) of latent vectors under the mixture.
+
+        Parameters
+        ----------
+        latents : (m, L) float64    latent vectors
+
+        Returns
+        -------
+        (m,) float64    natural logarithms
+        """
         return self.mixture.log_density(latents)
 
 

@@ -1,4 +1,4 @@
-"""Motion primitives and their training reports, to and from trees of plain values and arrays that are kept."""
+"""Conversion of motion primitives and their training reports to and from plain values and arrays."""
 
 from __future__ import annotations
 
@@ -28,7 +28,17 @@ Tree = dict[str, Any]
 
 
 def primitive_to_tree(primitive: MotionPrimitive, skeleton: Mapping[str, Any]) -> Tree:
-    """Part `model` of a primitive whose skeleton is stored as `skeleton`, a reference to a revision."""
+    """Make part `model` of a primitive.
+
+    Parameters
+    ----------
+    primitive : MotionPrimitive    the model
+    skeleton : mapping    reference to the revision of its skeleton
+
+    Returns
+    -------
+    dict    plain values and arrays
+    """
     return {
         "schema": PRIMITIVE_SCHEMA,
         "name": primitive.name,
@@ -50,11 +60,17 @@ def primitive_to_tree(primitive: MotionPrimitive, skeleton: Mapping[str, Any]) -
 
 
 def trained_to_tree(trained: TrainedPrimitive, skeleton: Mapping[str, Any], provenance: Mapping[str, Any]) -> Tree:
-    """Part `model` with how it was trained and how good it is.
+    """Make part `model` of a trained primitive, with its training and report.
 
     Parameters
     ----------
-    provenance : where the examples come from
+    trained : TrainedPrimitive    the model with its report
+    skeleton : mapping    reference to the revision of its skeleton
+    provenance : mapping    origin of the examples
+
+    Returns
+    -------
+    dict    plain values and arrays
     """
     return {
         **primitive_to_tree(trained.primitive, skeleton),
@@ -71,9 +87,20 @@ def trained_to_tree(trained: TrainedPrimitive, skeleton: Mapping[str, Any], prov
 
 
 def primitive_from_tree(tree: Mapping[str, Any], skeleton: Skeleton) -> MotionPrimitive:
-    """The primitive of a part `model`; its joints must be those of the skeleton, in any order.
+    """Read the primitive of a part `model`; its joints must be those of the skeleton, in any order.
 
-    Raises `ModelError` where they are not, and where the numbers describe no model.
+    Parameters
+    ----------
+    tree : mapping    plain values and arrays
+    skeleton : Skeleton    its skeleton
+
+    Returns
+    -------
+    MotionPrimitive    the model
+
+    Raises
+    ------
+    ModelError    where the joints differ, and where the numbers describe no model
     """
     if tree.get("schema") != PRIMITIVE_SCHEMA:
         raise ModelError(f"a document of the schema {tree.get('schema')!r}, not {PRIMITIVE_SCHEMA!r}")

@@ -1,4 +1,4 @@
-"""How far joints are off when motions are reconstructed from a few components, also of examples left out."""
+"""Errors of joint positions when motions are reconstructed from a few components, also for examples left out."""
 
 from __future__ import annotations
 
@@ -49,7 +49,20 @@ def reconstruction_errors(
     threads: int = 1,
     progress: Progress | None = None,
 ) -> ReconstructionErrors:
-    """The errors of m aligned examples, poses (m, N, D) with consistent signs, by number of components.
+    """Compute the errors of m aligned examples by number of components.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    principal : PrincipalExamples    components of the examples
+    poses : (m, N, D) float64    poses with consistent signs
+    most_components : int    largest number of components
+    threads : int    threads to use
+    progress : callable, optional    called as progress(done, total, name of the step)
+
+    Returns
+    -------
+    ReconstructionErrors    centimetres
 
     Notes
     -----
@@ -83,7 +96,16 @@ def reconstruction_errors(
 
 
 def comparison_frames(basis: SplineBasis) -> NDArray[np.int64]:
-    """Canonical frames that tell how well motions agree: two for each coefficient of the splines."""
+    """Choose the canonical frames at which motions are compared: two for each coefficient of the splines.
+
+    Parameters
+    ----------
+    basis : SplineBasis    splines with n coefficients
+
+    Returns
+    -------
+    (k,) int64    canonical frames, at most 2·n
+    """
     count = min(basis.frame_count, 2 * basis.count)
     return np.unique(np.linspace(0, basis.frame_count - 1, count).round().astype(np.int64))
 

@@ -1,4 +1,4 @@
-"""What can be wrong with motions drawn from a model: feet below the floor, feet that slide, odd durations."""
+"""Defects of motions drawn from a model: feet below the floor, feet that slide, unusual durations."""
 
 from __future__ import annotations
 
@@ -34,13 +34,37 @@ class FootQuality:
 
 
 def foot_speeds(toes: Floats, time_functions: Floats, frame_rate_hz: float) -> Floats:
-    """(m, N - 1, k) speeds on the ground, m/s, of toes (m, N, k, 3) in steps of canonical time."""
+    """Compute the speeds of feet on the ground in steps of canonical time.
+
+    Parameters
+    ----------
+    toes : (m, N, k, 3) float64    positions, metres
+    time_functions : (m, N) float64    frames of real time at each canonical frame
+    frame_rate_hz : float    frames of real time per second
+
+    Returns
+    -------
+    (m, N - 1, k) float64    metres per second
+    """
     moved = np.linalg.norm(np.diff(toes[..., (0, 2)], axis=1), axis=-1)
     return np.asarray(moved / np.diff(time_functions, axis=1)[..., None] * frame_rate_hz)
 
 
 def standing_steps(toes: Floats, time_functions: Floats, frame_rate_hz: float) -> NDArray[np.bool_]:
-    """(N - 1, k) where most examples have a foot on the ground: slower than the limit of contacts, height included."""
+    """Find the steps in which most examples have a foot on the ground.
+
+    Such a foot is slower than the limit of contacts, height included.
+
+    Parameters
+    ----------
+    toes : (m, N, k, 3) float64    positions, metres
+    time_functions : (m, N) float64    frames of real time at each canonical frame
+    frame_rate_hz : float    frames of real time per second
+
+    Returns
+    -------
+    (N - 1, k) bool    True where the foot is on the ground
+    """
     moved = np.linalg.norm(np.diff(toes, axis=1), axis=-1)
     speeds = moved / np.diff(time_functions, axis=1)[..., None] * frame_rate_hz
     return np.asarray((speeds < CONTACT_SPEED_M_S).mean(axis=0) > 0.5)
@@ -49,7 +73,19 @@ def standing_steps(toes: Floats, time_functions: Floats, frame_rate_hz: float) -
 def foot_quality(
     toes: Floats, time_functions: Floats, frame_rate_hz: float, standing: NDArray[np.bool_]
 ) -> FootQuality:
-    """Of m motions with toes (m, N, k, 3) in metres."""
+    """Measure the feet of motions.
+
+    Parameters
+    ----------
+    toes : (m, N, k, 3) float64    positions, metres
+    time_functions : (m, N) float64    frames of real time at each canonical frame
+    frame_rate_hz : float    frames of real time per second
+    standing : (N - 1, k) bool    result of `standing_steps` for the training examples
+
+    Returns
+    -------
+    FootQuality    depth below the floor and sliding speed
+    """
     lowest = toes[..., 1].min(axis=2)
     below = lowest < 0.0
     speeds = foot_speeds(toes, time_functions, frame_rate_hz)[:, standing]
@@ -62,7 +98,18 @@ def foot_quality(
 
 
 def toe_positions(skeleton: Skeleton, poses: Floats, joints: tuple[int, ...]) -> Floats:
-    """(m, N, k, 3) where k joints are in poses (m, N, D), metres."""
+    """Compute the positions of joints in poses.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    poses : (m, N, D) float64    root translations in metres and local rotations
+    joints : tuple of int    indices of k joints
+
+    Returns
+    -------
+    (m, N, k, 3) float64    metres
+    """
     motions, frames, width = poses.shape
     positions = kinematics.forward_kinematics(skeleton, np.ascontiguousarray(poses).reshape(-1, width))
     return np.asarray(positions[:, list(joints)].reshape(motions, frames, len(joints), 3), dtype=np.float64)

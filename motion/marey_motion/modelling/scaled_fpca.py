@@ -33,15 +33,23 @@ def optimised_weights(
     keep: Keep,
     inner_product: InnerProduct = "coefficients",
 ) -> tuple[Floats, Keep]:
-    """Weights (D,), one for each root axis and each joint, that minimise the squared distance of joints.
+    """Optimise weights, one for each root axis and each joint, that minimise the squared distance of joints.
 
-    The number of components is that which `keep` gives under the first of the weights to start from, and stays; it is
-    returned with the weights.
+    The number of components is that which `keep` gives under the first of the starting weights, and stays.
 
     Parameters
     ----------
-    coefficients : (m, n, D) of examples with consistent signs
-    starts : weights (D,); the best of them is improved
+    skeleton : Skeleton    J joints
+    basis : SplineBasis    splines with n coefficients
+    coefficients : (m, n, D) float64    coefficients of examples with consistent signs
+    starts : sequence of (D,) float64    weights to start from; the best of them is improved
+    keep : Keep    number of components
+    inner_product : str    "coefficients" or "l2"
+
+    Returns
+    -------
+    weights : (D,) float64    positive
+    keep : Keep    the number of components used
 
     Notes
     -----

@@ -19,9 +19,17 @@ MOST_DIFFERENCES = 1_000_000
 
 
 def root_max_weights(poses: Floats) -> Floats:
-    """(D,) weights that bring each root axis of poses (m, N, D) to a maximum of 1, as the published code does.
+    """Compute weights that bring each root axis to a maximum of 1, as the published code does.
 
     Each axis by itself; one that hardly moves keeps its unit.
+
+    Parameters
+    ----------
+    poses : (m, N, D) float64    root translations in metres and local rotations
+
+    Returns
+    -------
+    (D,) float64    weights, 1 for rotations
     """
     extents = np.abs(poses[..., :3]).max(axis=(0, 1))
     weights = np.ones(poses.shape[2])
@@ -30,15 +38,20 @@ def root_max_weights(poses: Floats) -> Floats:
 
 
 def jacobian_weights(skeleton: Skeleton, poses: Floats) -> Floats:
-    """(D,) weights under which a step of any channel counts by how far it moves the body, metres.
+    """Compute weights by which a step of any channel counts as far as it moves the body.
 
-    A unit step of a joint's quaternion turns what hangs below it by 2 radians. The joint's weight is the root mean
-    square, over all joints of the body, of how far that moves them: twice their lever arms, and nothing for those that
-    do not hang below it. (The mean over the joints below alone would give a finger the say of a spine.)
+    A unit step of a joint's quaternion rotates the joints below it by 2 radians. The joint's weight is the root mean
+    square, over all joints of the body, of their displacement: twice their lever arms, and 0 for those that are not
+    below it. (The mean over the joints below alone would give a finger the weight of a spine.)
 
     Parameters
     ----------
-    poses : (F, D) typical ones, as those of the mean motion
+    skeleton : Skeleton    J joints
+    poses : (F, D) float64    typical ones, as those of the mean motion
+
+    Returns
+    -------
+    (D,) float64    metres per unit of each channel
     """
     joints = kinematics.forward_kinematics(skeleton, poses)
     below = _descent(skeleton)

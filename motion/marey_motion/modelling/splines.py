@@ -21,7 +21,16 @@ SHARE_OF_FRAMES = 0.2
 
 
 def coefficient_count(frames: int) -> int:
-    """Coefficients of a motion of so many canonical frames: a fifth of them, at least 7, never more than the frames."""
+    """Choose the number of coefficients for a motion: a fifth of the frames, at least 7, never more than the frames.
+
+    Parameters
+    ----------
+    frames : int    canonical frames
+
+    Returns
+    -------
+    int    coefficients
+    """
     return min(frames, max(LEAST_COEFFICIENTS, round(SHARE_OF_FRAMES * frames)))
 
 
@@ -48,7 +57,18 @@ class SplineBasis:
 
     @classmethod
     def clamped(cls, frames: int, coefficients: int, degree: int = DEGREE) -> SplineBasis:
-        """Evenly spaced knots over `frames` canonical frames, clamped at both ends."""
+        """Make a basis with evenly spaced knots, clamped at both ends.
+
+        Parameters
+        ----------
+        frames : int    canonical frames
+        coefficients : int    number of coefficients n
+        degree : int    3 for a cubic
+
+        Returns
+        -------
+        SplineBasis    over canonical time 0 to frames - 1
+        """
         if coefficients <= degree:
             raise MotionError(f"a spline of degree {degree} needs more than {degree} coefficients, not {coefficients}")
         if frames < 2:
@@ -58,16 +78,26 @@ class SplineBasis:
 
     @property
     def count(self) -> int:
-        """n, the number of coefficients."""
+        """Number of coefficients n."""
         return len(self.knots) - self.degree - 1
 
     @property
     def span(self) -> tuple[float, float]:
-        """The canonical time that the splines cover."""
+        """First and last canonical frame that the splines cover."""
         return float(self.knots[self.degree]), float(self.knots[-self.degree - 1])
 
     def matrix(self, times: ArrayLike, *, derivative: int = 0) -> Floats:
-        """Values (m, n) of the basis functions, or of their derivatives, at canonical times (m,) within the span."""
+        """Evaluate the basis functions or their derivatives.
+
+        Parameters
+        ----------
+        times : (m,) float    canonical frames within the span
+        derivative : int    order of the derivative
+
+        Returns
+        -------
+        (m, n) float64    values, per frame to the power of the order
+        """
         from scipy.interpolate import BSpline
 
         start, stop = self.span
@@ -80,7 +110,16 @@ class SplineBasis:
         return np.asarray(splines(places, nu=derivative), dtype=np.float64)
 
     def fit(self, values: Floats) -> Floats:
-        """Least-squares coefficients (..., n, D) of samples (..., N, D) at N canonical frames 0 to N - 1."""
+        """Fit coefficients to samples by least squares.
+
+        Parameters
+        ----------
+        values : (..., N, D) float64    samples at canonical frames 0 to N - 1
+
+        Returns
+        -------
+        (..., n, D) float64    coefficients
+        """
         frames = values.shape[-2]
         if frames != self.frame_count:
             raise MotionError(f"{frames} samples where the knots span {self.frame_count} canonical frames")
@@ -88,7 +127,7 @@ class SplineBasis:
 
     @property
     def frame_count(self) -> int:
-        """N, the whole canonical frames that the knots span."""
+        """Number of whole canonical frames N that the knots span."""
         start, stop = self.span
         return round(stop - start) + 1
 
@@ -99,7 +138,7 @@ class SplineBasis:
 
     @cached_property
     def products(self) -> Floats:
-        """(n, n) integrals over canonical time of the products of basis functions, by Gauss's rule, which is exact."""
+        """Integrals (n, n) over canonical time of the products of basis functions, by Gauss's rule, which is exact."""
         nodes, shares = np.polynomial.legendre.leggauss(self.degree + 1)
         breaks = np.unique(self.knots)
         half = 0.5 * np.diff(breaks)[:, None]

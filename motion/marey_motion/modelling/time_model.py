@@ -1,4 +1,4 @@
-"""The time of a motion as a function: logarithms of slopes, so that whatever is drawn from a model runs forward."""
+"""Time functions of motions as logarithms of slopes, so that every sample of a model runs forward."""
 
 from __future__ import annotations
 
@@ -10,10 +10,19 @@ from marey_motion.modelling.splines import SplineBasis
 
 
 def fit_log_slopes(basis: SplineBasis, time_functions: Floats) -> Floats:
-    """Coefficients (m, n, 1) of the logarithm of the slopes of time functions (m, N), over their N - 1 steps.
+    """Fit splines to the logarithms of the slopes of time functions.
 
-    Least squares on the logarithms; then each is shifted as a whole, so that the motion lasts exactly as long as it
-    did. (Smoothing logarithms would shorten it: the logarithm of a mean is above the mean of logarithms.)
+    Least squares on the logarithms; then each is shifted as a whole, so that the motion keeps its exact duration.
+    (Smoothing logarithms would shorten it: the logarithm of a mean is above the mean of logarithms.)
+
+    Parameters
+    ----------
+    basis : SplineBasis    splines over the N - 1 steps
+    time_functions : (m, N) float64    strictly increasing frames of real time
+
+    Returns
+    -------
+    (m, n, 1) float64    coefficients
     """
     slopes = np.diff(time_functions, axis=1)
     if not (np.isfinite(slopes).all() and (slopes > 0.0).all()):
@@ -26,11 +35,16 @@ def fit_log_slopes(basis: SplineBasis, time_functions: Floats) -> Floats:
 
 
 def equalising_weight(spatial_variances: Floats, temporal_variances: Floats) -> float:
-    """The factor that gives the temporal part of latent vectors the variance of the spatial part; 1 if either has none.
+    """Compute the factor that gives the temporal part of latent vectors the variance of the spatial part.
 
     Parameters
     ----------
-    spatial_variances, temporal_variances : (k,), (l,) of the scores
+    spatial_variances : (k,) float64    variances of the spatial scores
+    temporal_variances : (l,) float64    variances of the temporal scores
+
+    Returns
+    -------
+    float    1 if either has none
     """
     spatial, temporal = float(spatial_variances.sum()), float(temporal_variances.sum())
     return float(np.sqrt(spatial / temporal)) if spatial > 0.0 and temporal > 0.0 else 1.0

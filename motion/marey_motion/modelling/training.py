@@ -1,4 +1,4 @@
-"""Trains a motion primitive on aligned examples, and reports how good it is."""
+"""Training of a motion primitive on aligned examples, with a report of its quality."""
 
 from __future__ import annotations
 
@@ -69,17 +69,24 @@ def train_primitive(
     threads: int = 1,
     progress: Progress = _silent,
 ) -> TrainedPrimitive:
-    """A generative model of aligned examples: splines, principal components, a mixture (Herrmann et al. 2019, 3).
+    """Train a generative model of aligned examples: splines, principal components, a mixture (Herrmann et al. 2019, 3).
 
     Parameters
     ----------
-    seed : of the mixture's starts, the folds and the samples of the report
-    threads : for leaving examples out; the result does not depend on it
-    progress : called with steps done, steps in all where they are known, and what is being done
+    aligned : AlignedSet    m examples of N frames
+    options : ModelOptions    options
+    name : str    name of the action
+    seed : int    seed of the mixture's starts, the folds and the samples of the report
+    threads : int    threads for leaving examples out; the result does not depend on it
+    progress : callable    called as progress(steps done, total where known, name of the step)
+
+    Returns
+    -------
+    TrainedPrimitive    model, report and warnings
 
     Raises
     ------
-    ModelError    where the examples are none that a model could be made of
+    ModelError    where no model can be made of the examples
     """
     check_examples(aligned)
     with one_thread():
@@ -98,7 +105,16 @@ def train_primitive(
 
 
 def check_examples(aligned: AlignedSet) -> None:
-    """Raise `ModelError` where no model could be made of the examples, saying which one is wrong."""
+    """Check that a model can be made of examples.
+
+    Parameters
+    ----------
+    aligned : AlignedSet    the examples
+
+    Raises
+    ------
+    ModelError    naming the example that is wrong
+    """
     if not 1 <= len(aligned.clips) <= MOST_EXAMPLES:
         raise ModelError(f"{len(aligned.clips)} examples; a model is of 1 to {MOST_EXAMPLES:,}", code="example-count")
     frames = aligned.frame_count
@@ -124,7 +140,17 @@ def check_examples(aligned: AlignedSet) -> None:
 
 
 def fit_examples(aligned: AlignedSet, options: ModelOptions) -> FittedExamples:
-    """The functional components of space and time."""
+    """Compute the functional components of space and time.
+
+    Parameters
+    ----------
+    aligned : AlignedSet    the examples
+    options : ModelOptions    options
+
+    Returns
+    -------
+    FittedExamples    poses, components and weights
+    """
     frames = aligned.frame_count
     # The reference itself may be among the examples that somebody left out.
     reference = next((clip for clip in aligned.clips if clip.uid == aligned.reference), aligned.clips[0])
@@ -150,7 +176,22 @@ def fit_examples(aligned: AlignedSet, options: ModelOptions) -> FittedExamples:
 def channel_weights(
     aligned: AlignedSet, basis: SplineBasis, poses: Floats, coefficients: Floats, keep: Keep, options: ModelOptions
 ) -> tuple[Floats, Keep]:
-    """The weights (D,) of the chosen scaling, and how many components to keep under it."""
+    """Compute the weights of the chosen scaling, and the number of components to keep.
+
+    Parameters
+    ----------
+    aligned : AlignedSet    the examples
+    basis : SplineBasis    splines with n coefficients
+    poses : (m, N, D) float64    poses with consistent signs
+    coefficients : (m, n, D) float64    their coefficients
+    keep : Keep    number of components
+    options : ModelOptions    options
+
+    Returns
+    -------
+    weights : (D,) float64    positive
+    keep : Keep    number of components under these weights
+    """
     if options.scaling == "none":
         return np.ones(poses.shape[2]), keep
     if options.scaling == "root_max":

@@ -1,4 +1,4 @@
-"""How good a trained model is: what it explains, what it cannot, and what its samples look like."""
+"""Quality of a trained model: the variance it explains, its errors, and its samples."""
 
 from __future__ import annotations
 
@@ -107,8 +107,20 @@ def report_on(
 
     Parameters
     ----------
-    poses : (m, N, D) of the examples, with consistent signs
-    latents : (m, L) of the examples
+    primitive : MotionPrimitive    the model
+    aligned : AlignedSet    m examples
+    poses : (m, N, D) float64    their poses, with consistent signs
+    spatial, temporal : PrincipalExamples    components before any was dropped
+    latents : (m, L) float64    latent vectors of the examples
+    fitted : FittedMixture    mixture and candidates
+    options : ModelOptions    options of the training
+    seed : int    seed of the samples
+    threads : int    threads for leaving examples out
+    progress : callable    called as progress(steps done, total where known, name of the step)
+
+    Returns
+    -------
+    TrainingReport    the measures
     """
     densities = primitive.log_density(latents)
     held_out = fitted.held_out

@@ -1,4 +1,4 @@
-"""What somebody should look at before using a model."""
+"""Warnings about a trained model."""
 
 from __future__ import annotations
 
@@ -28,7 +28,18 @@ class Warned:
 
 
 def warnings_of(primitive: MotionPrimitive, report: TrainingReport, options: ModelOptions) -> tuple[Warned, ...]:
-    """Everything that is noteworthy, gravest first."""
+    """List the warnings about a model, gravest first.
+
+    Parameters
+    ----------
+    primitive : MotionPrimitive    the model
+    report : TrainingReport    its measures
+    options : ModelOptions    options of the training
+
+    Returns
+    -------
+    tuple of Warned    codes and sentences
+    """
     return (*_of_examples(primitive, report, options), *_of_mixture(report), *_of_samples(report))
 
 

@@ -1,4 +1,4 @@
-"""A trained model in one sentence, and in the few numbers that lists show."""
+"""Summary of a trained model: one sentence, and a few numbers for lists."""
 
 from __future__ import annotations
 
@@ -9,7 +9,16 @@ Headline = dict[str, float | int | str | None]
 
 
 def verdict_of(trained: TrainedPrimitive) -> str:
-    """How good the model is, in a sentence or two."""
+    """Describe the quality of a model in a sentence or two.
+
+    Parameters
+    ----------
+    trained : TrainedPrimitive    the model
+
+    Returns
+    -------
+    str    for people
+    """
     report, primitive = trained.report, trained.primitive
     count = len(report.examples)
     parts = [f"{counted(count, 'example')} in {primitive.dimensions} dimensions"]
@@ -28,7 +37,16 @@ def verdict_of(trained: TrainedPrimitive) -> str:
 
 
 def headline_of(trained: TrainedPrimitive) -> Headline:
-    """The numbers that lists show; units stand at the ends of the names."""
+    """Select the numbers that lists show.
+
+    Parameters
+    ----------
+    trained : TrainedPrimitive    the model
+
+    Returns
+    -------
+    dict    value by name; names end with the unit
+    """
     report, primitive = trained.report, trained.primitive
     durations, feet = report.training_durations, report.sample_feet
     return {

@@ -1,4 +1,4 @@
-"""How near a model comes to places that real motions reached: targets from examples that it has not seen."""
+"""Check of a model's search: distances to positions that unseen examples reached."""
 
 from __future__ import annotations
 
@@ -52,13 +52,18 @@ class SearchCheck:
 def check_search(
     aligned: AlignedSet, standard_joints: Mapping[str, int], options: ModelOptions, *, seed: int
 ) -> SearchCheck | None:
-    """Leave every fifth example out, and look for where its hands and feet were.
+    """Leave every fifth example out, and search for the positions of its hands and feet.
 
     Parameters
     ----------
-    standard_joints : joint index by standard name
+    aligned : AlignedSet    the examples
+    standard_joints : mapping of str to int    joint index by standard name
+    options : ModelOptions    options of the training
+    seed : int    seed of training and samples
 
-    Returns None for fewer than ten examples, and where no hand or foot is known.
+    Returns
+    -------
+    SearchCheck or None    None for fewer than ten examples, and without known hands and feet
     """
     joints = {name: standard_joints[name] for name in REACHING if name in standard_joints}
     if len(aligned.clips) < LEAST_EXAMPLES or not joints:

@@ -1,8 +1,8 @@
-"""What a motion shall do at a moment: where a joint is, how it is turned, where the body stands and faces, and when.
+"""Constraints on a motion at a moment: position or orientation of a joint, place and heading of the body, and time.
 
-A moment is the label of a keyframe of the model, `start`, `end`, or a canonical frame, which may be a fraction. Places
-and directions are in the world; the model's canonical frame lies in it by a `Placement`, at its origin unless one is
-given. Each constraint has a tolerance sigma, the error that counts as 1, and a weight.
+A moment is the label of a keyframe of the model, `start`, `end`, or a canonical frame, which may be a fraction.
+Positions and directions are in the world; a `Placement` gives the model's canonical frame in it, at its origin by
+default. Each constraint has a tolerance sigma, the error that counts as 1, and a weight.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ TOLERANCE_S = 0.05
 
 
 class InvalidConstraint(MotionError):
-    """The constraint makes no sense, or the model has not what it names."""
+    """The constraint is invalid, or the model lacks the joint or keyframe it names."""
 
     default_code = "constraint-invalid"
 
@@ -168,7 +168,16 @@ Constraint = JointPosition | JointOrientation | LookDirection | RootPosition | R
 
 
 def tolerance_of(constraint: Constraint) -> float:
-    """Sigma in metres, radians or seconds."""
+    """Look up the tolerance sigma of a constraint.
+
+    Parameters
+    ----------
+    constraint : constraint    any kind
+
+    Returns
+    -------
+    float    metres, radians or seconds
+    """
     match constraint:
         case JointPosition() | RootPosition():
             return constraint.tolerance_m
@@ -179,7 +188,21 @@ def tolerance_of(constraint: Constraint) -> float:
 
 
 def frame_at(primitive: MotionPrimitive, at: Moment) -> float:
-    """The canonical frame of a moment. Raises `InvalidConstraint`, naming the keyframes that there are."""
+    """Convert a moment to a canonical frame.
+
+    Parameters
+    ----------
+    primitive : MotionPrimitive    the model
+    at : str or float    the moment
+
+    Returns
+    -------
+    float    canonical frame
+
+    Raises
+    ------
+    InvalidConstraint    naming the existing keyframes
+    """
     last = primitive.frame_count - 1
     if isinstance(at, str):
         moments: Mapping[str, int] = {START: 0, END: last, **primitive.keyframes}
@@ -193,7 +216,22 @@ def frame_at(primitive: MotionPrimitive, at: Moment) -> float:
 
 
 def joint_index(primitive: MotionPrimitive, name: str, standard_joints: Mapping[str, int]) -> int:
-    """The joint of this name, or of this standard name. Raises `UnknownJoint`."""
+    """Find a joint by its name or its standard name.
+
+    Parameters
+    ----------
+    primitive : MotionPrimitive    the model
+    name : str    either name
+    standard_joints : mapping of str to int    joint index by standard name
+
+    Returns
+    -------
+    int    joint index
+
+    Raises
+    ------
+    UnknownJoint    where neither name exists
+    """
     if name not in primitive.skeleton and name in standard_joints:
         return standard_joints[name]
     return primitive.skeleton.index_of(name)

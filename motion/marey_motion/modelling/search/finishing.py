@@ -1,4 +1,4 @@
-"""What a found motion still misses its constraints by, taken out by inverse kinematics."""
+"""Removal of the remaining errors of a found motion by inverse kinematics."""
 
 from __future__ import annotations
 
@@ -41,9 +41,19 @@ class Finished:
 
 
 def finish_motion(steps: Sequence[Step], found: FoundMotion, mapping: JointMapping) -> Finished:
-    """Bring joints exactly to their places, turns and looks at the frames nearest to the constraints' moments.
+    """Bring joints exactly to their targets at the frames nearest to the constraints' moments.
 
-    Only the limb, or the chain up to the pelvis, moves; where the body stands and when things happen stay as they are.
+    Only the limb, or the chain up to the pelvis, moves; the place of the body and its timing stay the same.
+
+    Parameters
+    ----------
+    steps : sequence of Step    the steps with their constraints
+    found : FoundMotion    the motion found for them
+    mapping : JointMapping    standard joints of the skeleton
+
+    Returns
+    -------
+    Finished    the motion and the remaining errors
     """
     axes = _axes_if_known(found, mapping)
     places: list[tuple[int, int]] = []

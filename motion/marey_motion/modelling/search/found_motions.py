@@ -1,4 +1,4 @@
-"""The motions of latent vectors that a search found, in the world and in real time."""
+"""Motions of latent vectors that a search found, in the world and in real time."""
 
 from __future__ import annotations
 
@@ -38,7 +38,18 @@ class FoundMotion:
     passed: tuple[Floats, ...]
 
     def frame_of(self, step: int, primitive: MotionPrimitive, at: Moment) -> int:
-        """The frame that is nearest to a moment of a step."""
+        """Find the frame nearest to a moment of a step.
+
+        Parameters
+        ----------
+        step : int    number of the step
+        primitive : MotionPrimitive    its model
+        at : str or float    the moment
+
+        Returns
+        -------
+        int    frame of the motion
+        """
         passed = self.passed[step]
         place = float(np.interp(frame_at(primitive, at), np.arange(len(passed)), passed))
         share = place / passed[-1]
@@ -52,9 +63,20 @@ class FoundMotion:
 
 
 def found_motion(steps: Sequence[Step], sequel: Sequel) -> FoundMotion:
-    """The motions of all steps, one after the other.
+    """Join the motions of all steps.
 
-    Raises `InvalidConstraint` where steps move different skeletons, or have different frame rates.
+    Parameters
+    ----------
+    steps : sequence of Step    the steps
+    sequel : Sequel    latent vectors and placements found for them
+
+    Returns
+    -------
+    FoundMotion    one motion in the world
+
+    Raises
+    ------
+    InvalidConstraint    where steps have different skeletons or frame rates
     """
     first = steps[0].primitive
     for number, step in enumerate(steps):

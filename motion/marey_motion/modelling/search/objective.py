@@ -1,4 +1,4 @@
-"""How far motions miss constraints: Equation 1 for many latent vectors at once, residuals and slopes for one."""
+"""Errors of motions: Equation 1 for many latent vectors, residuals and derivatives for one."""
 
 from __future__ import annotations
 
@@ -92,25 +92,48 @@ class Objective:
     rows: Rows
 
     def errors(self, latents: Floats) -> Floats:
-        """How far each constraint is missed, (n, m), by latent vectors (n, L): metres, radians or seconds."""
+        """Compute the error of each constraint.
+
+        Parameters
+        ----------
+        latents : (n, L) float64    latent vectors
+
+        Returns
+        -------
+        (n, m) float64    metres, radians or seconds
+        """
         out = np.empty((len(latents), len(self.constraints)))
         kernels.errors(self.chains, self.clocks, self.rows, as_row(self.placement), np.ascontiguousarray(latents), out)
         return out
 
     def costs(self, latents: Floats) -> Floats:
-        """Equation 1 of latent vectors (n, L), as (n,): the sum of weight times error, each in its tolerance."""
+        """Compute Equation 1: the sum of weight times error, each in its tolerance.
+
+        Parameters
+        ----------
+        latents : (n, L) float64    latent vectors
+
+        Returns
+        -------
+        (n,) float64    costs
+        """
         out = np.empty(len(latents))
         kernels.costs(self.prices, self.errors(latents), out)
         return out
 
     def linearise(self, stacked: Floats, first: int, placement: Floats, moved: Floats) -> Linearised:
-        """Errors and derivatives by all numbers of a stack of steps.
+        """Compute errors and their derivatives by all numbers of a stack of steps.
 
         Parameters
         ----------
-        stacked : (W,) latent vectors one after the other, this step's from `first` on
-        placement : (3,) heading, x and z of the canonical frame, in place of that of this objective
-        moved : (3, W) its derivatives
+        stacked : (W,) float64    latent vectors one after the other, this step's from `first` on
+        first : int    first number of this step
+        placement : (3,) float64    heading, x and z of the canonical frame, in place of that of this objective
+        moved : (3, W) float64    derivatives of the placement
+
+        Returns
+        -------
+        LinearisedConstraints    residuals and derivatives
         """
         width, items, clocks = len(stacked), len(self.chains.turned), len(self.clocks.weights)
         points, turns = np.empty((items, 3)), np.empty((items, 4))
@@ -131,7 +154,7 @@ class Objective:
 
     @cached_property
     def prices(self) -> Floats:
-        """(m,) weight over tolerance."""
+        """Weight over tolerance of each constraint, (m,) float64."""
         return np.array([one.weight / tolerance_of(one) for one in self.constraints])
 
 
@@ -147,13 +170,19 @@ def build_objective(
 
     Parameters
     ----------
-    standard_joints : joint index by standard name, as far as they are known
-    placement : where the canonical frame lies in the world that targets are in
-    also : what else is to be tracked, besides what constraints look at; it comes first
+    primitive : MotionPrimitive    the model
+    constraints : sequence of constraints    m constraints
+    standard_joints : mapping of str to int    joint index by standard name, as far as they are known
+    placement : Placement    the canonical frame in the world of the targets
+    also : sequence of Tracked    further points to track; they come first
+
+    Returns
+    -------
+    Objective    ready to be evaluated
 
     Raises
     ------
-    ConstraintError    naming the constraint and what is wrong with it
+    InvalidConstraint    naming the constraint and its defect
     """
     if len(constraints) > MOST_CONSTRAINTS:
         raise InvalidConstraint(f"{len(constraints)} constraints are more than {MOST_CONSTRAINTS}", where="constraints")
@@ -177,7 +206,16 @@ def build_objective(
 
 
 def as_row(placement: Placement) -> Floats:
-    """(3,) heading, x, z."""
+    """Convert a placement to an array.
+
+    Parameters
+    ----------
+    placement : Placement    heading and position
+
+    Returns
+    -------
+    (3,) float64    heading in radians, x and z in metres
+    """
     return np.array((placement.heading_rad, placement.x, placement.z))
 
 

@@ -1,9 +1,9 @@
-"""Refining latent vectors by Levenberg and Marquardt (Herrmann et al. 2019, Equation 2, in the form of a posterior).
+"""Refinement of latent vectors by Levenberg and Marquardt (Herrmann et al. 2019, Equation 2, as a posterior).
 
-Minimised is ½ Σ w (e / σ)² - λ Σ ln p(s): errors in their tolerances, and how likely the motions are. For the steps,
-the mixture stands for its most likely component at the current vector, whose whitened distance is a residual like any
-other (max-mixture, Olson and Agarwal 2013); the constant that belongs to it moves no step and is left out. What is
-accepted is judged by the whole mixture.
+The cost is ½ Σ w (e / σ)² - λ Σ ln p(s): errors in their tolerances, and the likelihood of the motions. For the steps,
+the mixture is replaced by its most likely component at the current vector, whose whitened distance is a residual like
+any other (max-mixture, Olson and Agarwal 2013); the constant that belongs to it moves no step and is left out. A step
+is accepted by the cost under the whole mixture.
 """
 
 from __future__ import annotations
@@ -68,24 +68,42 @@ class Refined:
 
 
 class LeastSquares(Protocol):
-    """Sums of squares with a prior."""
+    """A least-squares problem with a prior."""
 
     @property
     def priors(self) -> Sequence[LatentMixture]:
-        """Of the latent vectors, one after the other."""
+        """Mixtures of the latent vectors, one after the other."""
 
     def linearise(self, stacked: Floats) -> tuple[Floats, Floats]:
-        """Residuals (r,) and their derivatives (r, W)."""
+        """Compute residuals and their derivatives.
+
+        Parameters
+        ----------
+        stacked : (W,) float64    latent vectors one after the other
+
+        Returns
+        -------
+        residuals : (r,) float64    in tolerances
+        derivatives : (r, W) float64    by the latent vectors
+        """
 
 
 def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAULT_REFINING) -> Refined:
-    """Improve latent vectors; the result is never worse than the start, by what is minimised.
+    """Improve latent vectors; the cost of the result is never above that of the start.
 
     Parameters
     ----------
-    start : (W,) latent vectors one after the other
+    problem : LeastSquares    residuals and priors
+    start : (W,) float64    latent vectors one after the other
+    options : RefineOptions    weight of the likelihood and number of iterations
 
-    Raises `MotionError` where the start has no finite cost.
+    Returns
+    -------
+    Refined    latent vectors and costs
+
+    Raises
+    ------
+    MotionError    where the start has no finite cost
     """
     prior = _Prior(problem.priors, options.likelihood_weight)
     here = np.array(start, dtype=np.float64)

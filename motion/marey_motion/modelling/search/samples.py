@@ -1,4 +1,4 @@
-"""Looking for the sample of a primitive that meets constraints best (Herrmann et al. 2019, section 3, Equation 1)."""
+"""Search for the sample of a primitive that meets constraints best (Herrmann et al. 2019, section 3, Equation 1)."""
 
 from __future__ import annotations
 
@@ -40,16 +40,22 @@ class FoundSamples:
 
 
 def search_tree(objective: Objective, tree: SampleTree, *, candidates: int = CANDIDATES, top: int = 1) -> FoundSamples:
-    """Go down a tree with the best nodes of each level, and keep the best samples on the way.
+    """Descend a tree with the best nodes of each level, and keep the best samples.
 
     All children of all candidates of a level are evaluated at once, nodes by the mean of their samples, nodes of one
-    sample and the samples of leaves by themselves. What is returned are samples, never means, which need not be
-    likely motions. Equal costs go by place. With as many candidates as there are nodes it is an exhaustive search.
+    sample and the samples of leaves by themselves. The result is samples, never means, which need not be likely
+    motions. Equal costs go by place. With as many candidates as there are nodes it is an exhaustive search.
 
     Parameters
     ----------
-    candidates : nodes that are followed from each level to the next
-    top : samples to return
+    objective : Objective    constraints
+    tree : SampleTree    samples of the same primitive
+    candidates : int    nodes that are followed from each level to the next
+    top : int    samples to return
+
+    Returns
+    -------
+    FoundSamples    the best samples, the best first
     """
     _check(objective, tree, candidates, top)
     return _descend(objective, tree, candidates, top, lambda latents: latents)
@@ -58,10 +64,21 @@ def search_tree(objective: Objective, tree: SampleTree, *, candidates: int = CAN
 def search_closely(
     objective: Objective, tree: SampleTree, *, candidates: int = CANDIDATES, passes: int = PASSES
 ) -> FoundSamples:
-    """The best sample, and then what is better close to it: as `search_tree`, several times.
+    """Find the best sample, then better ones close to it: `search_tree` several times.
 
-    Each further pass goes down the same tree once more, with all samples drawn together about the best motion so far,
-    so that they are a quarter as far apart as in the pass before. What is found there is about as likely as a sample.
+    Each further pass descends the same tree once more, with all samples drawn together about the best motion so far, so
+    that they are a quarter as far apart as in the pass before. A result is about as likely as a sample.
+
+    Parameters
+    ----------
+    objective : Objective    constraints
+    tree : SampleTree    samples of the same primitive
+    candidates : int    nodes that are followed from each level to the next
+    passes : int    number of searches
+
+    Returns
+    -------
+    FoundSamples    the best sample
     """
     best = search_tree(objective, tree, candidates=candidates)
     middle = tree.means[0]

@@ -1,4 +1,4 @@
-"""Finding motions for several steps: each by its tree, where the one before it ended, then all of them together."""
+"""Search for motions of several steps: each in its tree, from the end of the one before it, then all together."""
 
 from __future__ import annotations
 
@@ -61,14 +61,20 @@ def search_steps(
 
     Parameters
     ----------
-    trees : over samples of each step's primitive
-    start : of the first step's canonical frame
-    candidates, passes : see `search_closely`
-    refining : None to keep the samples that were found
+    steps : sequence of Step    the steps
+    trees : sequence of SampleTree    samples of each step's primitive
+    start : Placement    the first step's canonical frame in the world
+    candidates, passes : int    see `search_closely`
+    refining : RefineOptions or None    None to keep the samples that were found
+    transitions : TransitionOptions    continuity between steps
+
+    Returns
+    -------
+    Sequel    latent vectors, placements and errors
 
     Raises
     ------
-    ConstraintError    naming step and constraint
+    InvalidConstraint    naming step and constraint
     MotionError    where numbers become too large to compute with
     """
     problem = SeveralSteps.of(steps, start, transitions)

@@ -1,7 +1,8 @@
-"""Several motions one after the other, and what constraints on all of them come to.
+"""Several motions one after the other, with constraints on all of them.
 
-Each step's canonical frame is placed so that its first root stands where the step before it ended, and faces that way:
-root and heading are continuous whatever the latent vectors are. Hands, feet and the height of the root are asked to be.
+Each step's canonical frame is placed so that its first root is where the step before it ended, with the same heading:
+root and heading are continuous whatever the latent vectors are. Continuity of hands, feet and the height of the root is
+a constraint.
 """
 
 from __future__ import annotations
@@ -128,7 +129,22 @@ class SeveralSteps:
     def of(
         cls, steps: Sequence[Step], start: Placement = AT_ORIGIN, transitions: TransitionOptions = DEFAULT_TRANSITIONS
     ) -> SeveralSteps:
-        """Prepare steps. Raises `InvalidConstraint`, naming step and constraint."""
+        """Prepare steps for the search.
+
+        Parameters
+        ----------
+        steps : sequence of Step    the steps
+        start : Placement    the first step's canonical frame in the world
+        transitions : TransitionOptions    continuity between steps
+
+        Returns
+        -------
+        SeveralSteps    ready to be evaluated
+
+        Raises
+        ------
+        InvalidConstraint    naming step and constraint
+        """
         if not 1 <= len(steps) <= MOST_STEPS:
             raise InvalidConstraint(f"{len(steps)} steps are not within 1 to {MOST_STEPS}", where="steps")
         joints = tuple(name for name in transitions.joints if all(name in step.standard_joints for step in steps))
@@ -146,15 +162,34 @@ class SeveralSteps:
 
     @property
     def priors(self) -> Sequence[LatentMixture]:
-        """Those of the steps' primitives."""
+        """Mixtures of the steps' primitives."""
         return tuple(one.objective.primitive.mixture for one in self.links)
 
     def parts(self, stacked: Floats) -> tuple[Floats, ...]:
-        """The latent vector of each step."""
+        """Split stacked latent vectors.
+
+        Parameters
+        ----------
+        stacked : (W,) float64    latent vectors one after the other
+
+        Returns
+        -------
+        tuple of (L,) float64    the latent vector of each step
+        """
         return tuple(np.split(stacked, [one.first for one in self.links[1:]]))
 
     def linearise(self, stacked: Floats) -> tuple[Floats, Floats]:
-        """Errors of all constraints and all jumps, in tolerances, and their derivatives."""
+        """Compute the errors of all constraints and all jumps and their derivatives.
+
+        Parameters
+        ----------
+        stacked : (W,) float64    latent vectors one after the other
+
+        Returns
+        -------
+        residuals : (r,) float64    in tolerances
+        derivatives : (r, W) float64    by the latent vectors
+        """
         walked = list(self._walk(stacked, len(self.links)))
         residuals = [part for one in walked for part in (one.found.residuals, self._scale * one.jumps.ravel())]
         jumps = [self._scale * one.jump_slopes.reshape(one.jumps.size, len(stacked)) for one in walked]
@@ -162,7 +197,16 @@ class SeveralSteps:
         return np.concatenate(residuals), np.concatenate(slopes)
 
     def carried_on(self, latents: Sequence[Floats]) -> CarriedOn:
-        """Where the step after these begins, as far as its own motion has no say in it."""
+        """Compute the start of the step after given ones, as far as it does not depend on its own motion.
+
+        Parameters
+        ----------
+        latents : sequence of (L,) float64    latent vectors of the steps before it
+
+        Returns
+        -------
+        CarriedOn    placement and transition joints
+        """
         if not latents:
             return CarriedOn(self.start, {})
         *_, last = self._walk(np.concatenate(latents), len(latents))
@@ -171,7 +215,16 @@ class SeveralSteps:
         return CarriedOn(placement, dict(zip(self.joints, ended[2:], strict=False)))
 
     def measure(self, stacked: Floats) -> Measured:
-        """Placements, errors and jumps of stacked latent vectors."""
+        """Compute placements, errors and jumps.
+
+        Parameters
+        ----------
+        stacked : (W,) float64    latent vectors one after the other
+
+        Returns
+        -------
+        Measured    metres, radians and seconds
+        """
         walked = list(self._walk(stacked, len(self.links)))
         placements = tuple(Placement(*one.placement.tolist()) for one in walked)
         errors = tuple(

@@ -1,7 +1,7 @@
-"""What is computed of a primitive's motions to evaluate constraints: a few joints at a few moments, and no more.
+"""The few joints and moments of a primitive's motions that constraints need.
 
-A spline at a fixed moment is linear in the scores, so each channel of a joint costs one product with numbers that are
-known before.
+A spline at a fixed moment is linear in the scores, so each channel of a joint costs one product with precomputed
+numbers.
 """
 
 from __future__ import annotations
@@ -82,12 +82,36 @@ class Clocks(NamedTuple):
 
 
 def standing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
-    """Where the body stands: its pelvis, for a root above that may be a static reference; else the root."""
+    """Choose the point that gives the place of the body: the pelvis, else the root.
+
+    Parameters
+    ----------
+    frame : float    canonical frame
+    standard_joints : mapping of str to int    joint index by standard name
+
+    Returns
+    -------
+    Tracked    the joint at that frame
+    """
     return Tracked(frame, (standard_joints.get("pelvis", 0),))
 
 
 def facing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
-    """The body's axis from right to left. Raises `MappingError` where hips or shoulders are not known."""
+    """Choose the points that give the body's axis from right to left.
+
+    Parameters
+    ----------
+    frame : float    canonical frame
+    standard_joints : mapping of str to int    joint index by standard name
+
+    Returns
+    -------
+    Tracked    a difference of joints at that frame
+
+    Raises
+    ------
+    MappingError    where hips or shoulders are not known
+    """
     missing = [name for name in (*LEFTS, *RIGHTS) if name not in standard_joints]
     if missing:
         raise MappingError(f"a heading needs {', '.join(missing)}, which the skeleton's mapping does not name")
@@ -96,7 +120,17 @@ def facing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
 
 
 def track_points(primitive: MotionPrimitive, tracked: Sequence[Tracked]) -> Chains:
-    """The joints that carry tracked points, with their channels at the moments asked for."""
+    """Prepare the joints that carry tracked points, with their channels at the requested moments.
+
+    Parameters
+    ----------
+    primitive : MotionPrimitive    the model
+    tracked : sequence of Tracked    n points
+
+    Returns
+    -------
+    Chains    arrays for compiled code
+    """
     nodes = _nodes(primitive, tracked)
     places = {node: place for place, node in enumerate(nodes)}
     frames = sorted({frame for frame, _ in nodes})
@@ -128,7 +162,17 @@ def track_points(primitive: MotionPrimitive, tracked: Sequence[Tracked]) -> Chai
 
 
 def track_times(primitive: MotionPrimitive, moments: Sequence[float]) -> Clocks:
-    """The steps of canonical time, with how much of each has passed at the moments."""
+    """Prepare the steps of canonical time, with the share of each that has passed at the moments.
+
+    Parameters
+    ----------
+    primitive : MotionPrimitive    the model
+    moments : sequence of float    n canonical frames
+
+    Returns
+    -------
+    Clocks    arrays for compiled code
+    """
     temporal = primitive.temporal
     steps = np.arange(primitive.frame_count - 1)
     passed = np.clip(np.asarray(moments, dtype=np.float64)[:, None] - steps, 0.0, 1.0)

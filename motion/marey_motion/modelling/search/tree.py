@@ -100,30 +100,39 @@ class SampleTree:
 
     @property
     def dimensions(self) -> int:
-        """L."""
+        """Number of dimensions L."""
         return int(self.samples.shape[1])
 
     @cached_property
     def first_children(self) -> Ints32:
-        """(M,) first child of each node, as far as it has any."""
+        """First child of each node that has any, (M,) int32."""
         return np.asarray(1 + np.cumsum(self.children) - self.children, dtype=np.int32)
 
     @cached_property
     def starts(self) -> Ints32:
-        """(M,) first sample of each node."""
+        """First sample of each node, (M,) int32."""
         starts = np.zeros(len(self.sizes), dtype=np.int32)
         kernels.locate(self.sizes, self.children, starts)
         return starts
 
     @cached_property
     def means(self) -> Floats:
-        """(M, L) mean of each node's samples."""
+        """Mean of each node's samples, (M, L) float64."""
         means = np.empty((len(self.sizes), self.dimensions))
         kernels.average(self.samples, self.starts, self.sizes, means)
         return means
 
     def most_evaluations(self, candidates: int) -> int:
-        """The motions that going down from the best `candidates` nodes of each level may have to evaluate."""
+        """Bound the number of motions that a search evaluates.
+
+        Parameters
+        ----------
+        candidates : int    nodes that are followed from each level to the next
+
+        Returns
+        -------
+        int    motions
+        """
         total, start, stop = 0, 0, 1
         while start < stop:
             children, sizes = self.children[start:stop], self.sizes[start:stop]
@@ -142,11 +151,18 @@ def build_tree(
     *,
     end_effectors: Sequence[int] = (),
 ) -> SampleTree:
-    """Draw samples of a primitive and group them; the same for the same seed.
+    """Draw samples of a primitive and group them.
 
     Parameters
     ----------
-    end_effectors : joint indices, for features of that kind
+    primitive : MotionPrimitive    the model
+    seed : int    the same seed gives the same tree
+    options : TreeOptions    options
+    end_effectors : sequence of int    joint indices, for features of that kind
+
+    Returns
+    -------
+    SampleTree    samples in the order of the tree
     """
     count = options.samples if primitive.dimensions else 1
     samples = primitive.sample(count, seed).astype(np.float32)
@@ -161,7 +177,16 @@ def build_tree(
 
 
 def feature_frames(primitive: MotionPrimitive) -> list[float]:
-    """The canonical frames at which end effectors are looked at: keyframes, middle and end."""
+    """List the canonical frames for features of end effectors: keyframes, middle and end.
+
+    Parameters
+    ----------
+    primitive : MotionPrimitive    the model
+
+    Returns
+    -------
+    list of float    canonical frames
+    """
     last = primitive.frame_count - 1
     return sorted({*map(float, primitive.keyframes.values()), 0.5 * last, float(last)})
 

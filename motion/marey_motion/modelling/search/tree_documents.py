@@ -1,4 +1,4 @@
-"""Trees over samples to and from trees of plain values and arrays that travel and are kept."""
+"""Conversion of trees over samples to and from plain values and arrays."""
 
 from __future__ import annotations
 
@@ -19,12 +19,18 @@ Tree = dict[str, Any]
 def sample_tree_to_tree(
     tree: SampleTree, *, model_digest: str | PartDigestRef, seed: int, options: TreeOptions
 ) -> Tree:
-    """Part `tree` of a model.
+    """Make part `tree` of a model.
 
     Parameters
     ----------
-    model_digest : of the part `model` that the samples are of
-    seed, options : that it was made with
+    tree : SampleTree    the samples
+    model_digest : str or PartDigestRef    the part `model` that the samples belong to
+    seed : int    seed of the samples
+    options : TreeOptions    options of the tree
+
+    Returns
+    -------
+    dict    plain values and arrays
     """
     return {
         "schema": TREE_SCHEMA,
@@ -38,5 +44,18 @@ def sample_tree_to_tree(
 
 
 def sample_tree_from_tree(tree: Mapping[str, Any]) -> SampleTree:
-    """The tree of a part `tree`. Raises `MotionError` where its nodes are none of a tree."""
+    """Read a part `tree`.
+
+    Parameters
+    ----------
+    tree : mapping    plain values and arrays
+
+    Returns
+    -------
+    SampleTree    the samples
+
+    Raises
+    ------
+    MotionError    where its nodes do not form a tree
+    """
     return SampleTree(*(np.asarray(tree[name]) for name in ("samples", "sizes", "children")))

@@ -1,7 +1,7 @@
-"""How much work a search is, before it is done: about as many nanoseconds of one thread.
+"""Estimates of the work of a search, in nanoseconds of one thread.
 
-Counted from what decides it (samples, moments, joints, nodes of trees, constraints, iterations) and weighed by what was
-measured, so that the same question is always answered, or always refused, whatever else the machine does.
+Computed from the inputs (samples, moments, joints, nodes of trees, constraints, iterations) with measured weights, so
+that the same question is always answered, or always refused, whatever the load of the machine.
 """
 
 from __future__ import annotations
@@ -29,7 +29,18 @@ _PER_SPAN, _PER_NUMBER_OF_SPAN, _ROUNDS_OF_SPANS = 2_000_000, 10, 13
 def drawing_work(
     primitive: MotionPrimitive, options: TreeOptions = DEFAULT_TREE, *, end_effectors: Sequence[int] = ()
 ) -> float:
-    """Of `build_tree` with the same arguments."""
+    """Estimate the work of `build_tree` for the same arguments.
+
+    Parameters
+    ----------
+    primitive : MotionPrimitive    the model
+    options : TreeOptions    options
+    end_effectors : sequence of int    joint indices
+
+    Returns
+    -------
+    float    nanoseconds of one thread
+    """
     spatial, times = primitive.spatial.count, primitive.frame_count * (primitive.temporal.count + _PER_STEP_OF_TIME)
     drawn = primitive.dimensions**2 + (0 if primitive.duration_range_s is None else 4 * times)
     levels = min(options.depth, 1 + log(max(1.0, options.samples / options.leaf_size), options.branching))
@@ -45,7 +56,19 @@ def drawing_work(
 def searching_work(
     problem: SeveralSteps, trees: Sequence[SampleTree], *, candidates: int, passes: int, refining: RefineOptions | None
 ) -> float:
-    """Of `search_steps` with the same arguments."""
+    """Estimate the work of `search_steps` for the same arguments.
+
+    Parameters
+    ----------
+    problem : SeveralSteps    the steps
+    trees : sequence of SampleTree    samples of each step's primitive
+    candidates, passes : int    see `search_closely`
+    refining : RefineOptions or None    options of refinement
+
+    Returns
+    -------
+    float    nanoseconds of one thread
+    """
     width = sum(link.objective.primitive.dimensions for link in problem.links)
     searched = sum(
         passes * tree.most_evaluations(candidates) * _evaluation_work(link.objective)
@@ -62,7 +85,17 @@ def searching_work(
 
 
 def finishing_work(steps: Sequence[Step], found: FoundMotion) -> float:
-    """Of `finish_motion` with the same arguments."""
+    """Estimate the work of `finish_motion` for the same arguments.
+
+    Parameters
+    ----------
+    steps : sequence of Step    the steps
+    found : FoundMotion    the motion found for them
+
+    Returns
+    -------
+    float    nanoseconds of one thread
+    """
     kinds = JointPosition | JointOrientation | LookDirection
     spans = sum(isinstance(constraint, kinds) for step in steps for constraint in step.constraints)
     rounds = _ROUNDS_OF_SPANS if spans > 1 else 1
