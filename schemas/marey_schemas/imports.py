@@ -50,6 +50,11 @@ class ImportEntry(Answer):
     error: Refusal | None = None
 
 
+def refused_entry(name: str, refusal: Refusal) -> ImportEntry:
+    """Make the entry of a file that was refused."""
+    return ImportEntry(name=name, status="failed", error=refusal)
+
+
 def skeleton_output(file_name: str) -> str:
     """What an import job calls the skeleton of a file among its outputs; the clip has the file's own name."""
     return f"{file_name}#skeleton"

@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from marey_schemas.base import Request
+from marey_schemas.formats import IMPORTED
 from marey_schemas.job_params import (
     AlignParams,
     AnnotateParams,
@@ -57,6 +58,7 @@ class KindDeclaration:
 
     * `place_counts`: the collection they go to.
     * `newest_of`: parameters that each name an item, or none, whose newest revision is read.
+    * `never_cached_for`: says of parameters whether a job with them goes by names as they are while it runs.
     * `in_place`: a parameter with which results replace what they are made of, if that is still the newest.
       `never_cached_without`: inputs without which a job goes by names as they are while it runs. The results of such
       jobs answer no other.
@@ -81,6 +83,7 @@ class KindDeclaration:
     newest_of: tuple[str, ...] = ()
     in_place: str | None = None
     never_cached_without: tuple[str, ...] = ()
+    never_cached_for: Callable[[Mapping[str, Any]], bool] | None = None
     named_after: str | None = None
     unclear_place: Callable[[Any, str], str | None] | None = None
 
@@ -140,14 +143,22 @@ _RIGS = InputSpec(
     description="Skeletons of the clips whose mapping was edited since, at the revision to go by.",
 )
 
+
+def _may_hold_graphs(params: Mapping[str, Any]) -> bool:
+    """Whether a file of an import may be a graph, whose models are found by their names."""
+    rows = [row for row in IMPORTED if "graph" in row.reads]
+    return any(row.names(file["name"]) for file in params["files"] for row in rows)
+
+
 IMPORT = KindDeclaration(
     name="import",
-    description="Reads files the server already has and makes clips, skeletons and models of them.",
+    description="Reads files the server already has and makes clips, skeletons, models and graphs of them.",
     params=ImportParams,
     implementation="marey_worker.kinds.imports:run",
-    version=2,
-    outputs={"clips": Kind.CLIP, "skeletons": Kind.SKELETON, "models": Kind.MODEL},
+    version=3,
+    outputs={"clips": Kind.CLIP, "skeletons": Kind.SKELETON, "models": Kind.MODEL, "graphs": Kind.GRAPH},
     newest_of=("skeleton",),
+    never_cached_for=_may_hold_graphs,
 )
 
 RETARGET = KindDeclaration(

@@ -6,7 +6,7 @@ import numpy as np
 
 from marey_motion.formats.predecessor.skeleton import skeleton_document
 from marey_motion.gait import generate_gait
-from marey_motion.importing.files import FileDigests, ImportRequest, import_file
+from marey_motion.importing.files import FileToImport, import_file
 from marey_motion.importing.plan import plan_imports
 from marey_motion.modelling.splines import SplineBasis
 
@@ -143,5 +143,8 @@ def imported():
     planned, companion = plan_imports(["in/walk_mm.json", "in/walk_cluster_tree.json"])
     assert (planned.companion, companion.role) == ("in/walk_cluster_tree.json", "companion")
     data, beside = (json.dumps(one).encode() for one in (layout_3(), tree()))
-    found = import_file(planned, data, FileDigests(FILE, TREE_FILE, companion.name), ImportRequest(), beside)
-    return found.modelled.parts, found.hierarchy
+    found = import_file(FileToImport(planned, data, FILE, companion=beside, companion_digest=TREE_FILE))
+    skeleton, model = found.items
+    assert model.parts["model"]["skeleton"] == {"output": skeleton.name}
+    model.parts["model"]["skeleton"] = {"output": "skeleton"}
+    return model.parts, skeleton.parts["hierarchy"]

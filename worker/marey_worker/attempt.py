@@ -32,6 +32,7 @@ from marey_worker.messages import (
     ChildReply,
     Done,
     Failed,
+    FindItems,
     Made,
     PutFile,
     ReadBlob,
@@ -240,6 +241,8 @@ class RunningAttempt:
                 return self._read_parts(places)
             case ReadItem(_, kind, item):
                 return self._api.read_item(kind, item)
+            case FindItems(_, kind, name, collection):
+                return self._api.find_items(kind, name, collection)
             case ReadBlob(_, digest):
                 return self._cache.get(self._cache_key(digest), lambda: self._api.read_blob(digest))
             case ReadResults():

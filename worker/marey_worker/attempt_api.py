@@ -98,6 +98,14 @@ class AttemptApi:
         with _dead_token_is_lost_lease():
             return self._transport.get(Item, f"/projects/{self._project}/{kind.plural}/{item}")
 
+    def find_items(self, kind: Kind, name: str, collection: str | None) -> list[Item]:
+        """Find the items of that name directly in a collection; None: anywhere in the project."""
+        asked = f"{name}*" if name.endswith("*") else name  # a final asterisk asks for names that begin so
+        query = {"name": asked, "directly_in": collection}
+        with _dead_token_is_lost_lease():
+            found = pages(self._transport, Item, f"/projects/{self._project}/{kind.plural}", query)
+            return [item for item in found if item.name == name]
+
     def read_results(self) -> list[dict[str, Any]]:
         """What the tasks of the job returned, in their order."""
         with _dead_token_is_lost_lease():

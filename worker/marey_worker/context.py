@@ -17,6 +17,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.worker_protocol import PinnedInput, StagedOutput, StageRequest
 from marey_worker.messages import (
     ChildReply,
+    FindItems,
     Made,
     PutFile,
     ReadBlob,
@@ -119,6 +120,11 @@ class Context:
         """An item as it is now. Raises `NoSuchThing` where there is none."""
         asked = self._send(lambda request: ReadItem(request, kind, item))
         found: Item = self._value(asked, f"no-{kind}")
+        return found
+
+    def find_items(self, kind: Kind, name: str, collection: str | None) -> list[Item]:
+        """Find the items of that name directly in a collection; None: anywhere in the project."""
+        found: list[Item] = self._ask(lambda request: FindItems(request, kind, name, collection))
         return found
 
     def task_results(self) -> list[dict[str, Any]]:

@@ -72,6 +72,16 @@ class ReadItem:
 
 
 @dataclass(frozen=True)
+class FindItems:
+    """Find items by their name, directly in a collection or anywhere in the project."""
+
+    request: int
+    kind: Kind
+    name: str
+    collection: str | None
+
+
+@dataclass(frozen=True)
 class ReadBlob:
     """Read bytes by digest."""
 
@@ -126,5 +136,5 @@ class Failed:
     retryable: bool
 
 
-Request = ReadParts | ReadItem | ReadBlob | ReadResults | PutFile | Stage
+Request = ReadParts | ReadItem | FindItems | ReadBlob | ReadResults | PutFile | Stage
 End = Done | Failed

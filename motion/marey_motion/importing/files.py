@@ -1,16 +1,21 @@
-"""Import of one file: bytes in, documents of skeletons, clips and models out. No files, network or database."""
+"""Import of one file: bytes and options in, items with their documents out.
+
+`import_file` is the one boundary between whoever received a file and the readers. It needs no files, network or
+database, keeps nothing between calls that changes a result, and takes and returns plain values, bytes and arrays alone,
+so that a caller may run it in a process of its own.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from marey_motion.clip import Clip
-from marey_motion.documents import clip_to_document, mapping_to_document, skeleton_to_document
-from marey_motion.errors import FormatError, MappingError
+from marey_motion.documents import clip_to_document, mapping_to_document, skeleton_from_document, skeleton_to_document
+from marey_motion.errors import FormatError, MappingError, MotionError
 from marey_motion.formats import read_source
 from marey_motion.formats.conversion import convert
 from marey_motion.formats.predecessor.graph import PredecessorGraph
@@ -19,163 +24,203 @@ from marey_motion.importing.source import ImportedMotion, ImportOptions, SourceD
 from marey_motion.importing.units import unit_in_metres
 from marey_motion.rigs import JointAxes, JointMapping, guess_axes, map_joints
 from marey_motion.skeleton import Skeleton
+from marey_schemas.documents.skeletons import SkeletonHierarchy
+from marey_schemas.imports import ImportEntry, Refusal, refused_entry, skeleton_output
+from marey_schemas.kinds import Kind
+from marey_schemas.options.imports import ImportOptions as UserOptions
 
-SKELETON_OUTPUT = "skeleton"
-"""What a clip calls the skeleton of its own file until both are stored."""
+SKELETON_COLLECTION = "skeletons"
 SAME_OFFSET_M = 1e-3
+_READER_OPTIONS = tuple(option.name for option in fields(ImportOptions))
+_LONGEST_COLLECTION = 1024
 
 Tree = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class ImportRequest:
-    """What the user says about a whole batch, beside `ImportOptions`: words for the record, and the skeleton to use.
+class GivenSkeleton:
+    """A stored skeleton that the clips must use: its revision and its part `hierarchy`."""
 
-    `skeleton_ref` is `{"item", "revision"}` of `skeleton`.
-    """
+    item: str
+    revision: int
+    hierarchy: Mapping[str, Any]
 
-    options: ImportOptions = field(default_factory=ImportOptions)
-    subject: str | None = None
-    licence: str | None = None
-    capture_system: str | None = None
-    skeleton: Skeleton | None = None
-    skeleton_ref: Mapping[str, Any] | None = None
-
-
-_READER_OPTIONS = tuple(option.name for option in fields(ImportOptions))
+    @property
+    def ref(self) -> Tree:
+        """The reference that documents hold."""
+        return {"item": self.item, "revision": self.revision}
 
 
 @dataclass(frozen=True)
-class FileDigests:
-    """Digests of a file's bytes and of its companion's, for the record of a clip's origin."""
-
-    file: str
-    companion: str | None = None
-    companion_name: str | None = None
-
-
-@dataclass(frozen=True)
-class ModelledDocuments:
-    """What a file of the predecessor says that is no motion: a model, with a tree over its samples; or a graph.
+class FileToImport:
+    """A file with everything that its import needs.
 
     Parameters
     ----------
-    name : what it is called
-    parts : of a model: `model`, whose skeleton may be called `SKELETON_OUTPUT`, and perhaps `tree`
+    planned : its plan
+    data, digest : its bytes and their name, for the record of where a clip comes from
+    companion, companion_digest : the same of the file that the plan names as its companion
+    options : of the user
+    skeleton : that the clips must use
+    """
+
+    planned: PlannedFile
+    data: bytes | memoryview
+    digest: str
+    options: UserOptions = field(default_factory=UserOptions)
+    companion: bytes | memoryview | None = None
+    companion_digest: str | None = None
+    skeleton: GivenSkeleton | None = None
+
+    @property
+    def collection(self) -> str:
+        """The collection of the items that the file becomes."""
+        return "/".join(part for part in (self.options.collection, self.planned.folder) if part)
+
+
+@dataclass(frozen=True)
+class ImportedItem:
+    """An item to store: its place and its documents.
+
+    `name` identifies it within the import: other items refer to it as `{"output": name}` until it is stored.
     """
 
     name: str
-    parts: Mapping[str, Tree] = field(default_factory=dict)
-    graph: PredecessorGraph | None = None
+    kind: Kind
+    item_name: str
+    collection: str
+    parts: Mapping[str, Tree]
+    tags: Sequence[str] = ()
+    reuse: Literal["by_name", "by_content"] = "by_name"
 
 
 @dataclass(frozen=True)
-class ImportedDocuments:
-    """The documents of one file: a skeleton, and a clip or a model unless it holds none.
+class ImportedGraph:
+    """A graph whose models are not found yet, since that takes the project: see `importing.graphs`."""
 
-    Clips and models may use a skeleton that was given.
-    """
-
-    skeleton_name: str
-    hierarchy: Tree | None
-    mapping: Tree | None
-    motion: Tree | None
-    info: Tree | None
-    checks: tuple[Tree, ...]
-    modelled: ModelledDocuments | None = None
+    name: str
+    collection: str
+    tags: Sequence[str]
+    graph: PredecessorGraph
+    file: str
+    digest: str
 
 
-def import_options(given: Mapping[str, Any]) -> ImportOptions:
-    """Select the options of the readers from those of an import.
+@dataclass(frozen=True)
+class ImportedFile:
+    """The items of one file, or why it was refused.
 
     Parameters
     ----------
-    given : mapping of str to object    options of an import, the unit by name or by its size in metres
+    items : a skeleton, then a clip or a model that uses it; a skeleton alone; a clip or a model alone
+    checks : findings about the motion, as documents
+    frames : of the clip
+    graph : what a file of a graph holds instead of items
+    """
+
+    name: str
+    items: tuple[ImportedItem, ...] = ()
+    checks: tuple[Tree, ...] = ()
+    frames: int | None = None
+    graph: ImportedGraph | None = None
+    refusal: Refusal | None = None
+
+
+def planned_entry(planned: PlannedFile) -> ImportEntry | None:
+    """Make the entry of a file that is not read itself: a companion of others, or one that its name refuses."""
+    if planned.role == "companion":
+        return ImportEntry(name=planned.name, status="companion")
+    if planned.role == "refused":
+        return refused_entry(planned.name, Refusal(code=planned.code, detail=f"{planned.name}: {planned.reason}"))
+    return None
+
+
+def import_file(file: FileToImport) -> ImportedFile:
+    """Read one file and make the documents of its items; whatever is wrong with it is a refusal, not an error.
+
+    Parameters
+    ----------
+    file : FileToImport    bytes, plan and options; its plan's role is `motion` or `skeleton`
 
     Returns
     -------
-    ImportOptions    options of the readers
+    ImportedFile    items with their documents, in metres, right-handed, Y up; or the refusal
     """
-    chosen = {name: given[name] for name in _READER_OPTIONS if given.get(name) is not None}
-    if given.get("unit") is not None:
-        chosen.setdefault("unit_scale_m", unit_in_metres(given["unit"]))
+    try:
+        if len(file.collection) > _LONGEST_COLLECTION:
+            raise FormatError(f"its collection has over {_LONGEST_COLLECTION} characters", code="name-invalid")
+        return _imported(file)
+    except MotionError as error:
+        return ImportedFile(file.planned.name, refusal=refusal_of(error))
+
+
+def refusal_of(error: MotionError) -> Refusal:
+    """Describe an error for the entry of its file, with line and joint where they are known."""
+    place = {name: value for name in ("line", "joint") if (value := getattr(error, name, None)) is not None}
+    return Refusal(code=error.code, detail=str(error), **place)
+
+
+def _imported(file: FileToImport) -> ImportedFile:
+    options = reader_options(file.options)
+    source = read_source(
+        file.data,
+        file.planned.name,
+        companion=file.companion,
+        companion_name=file.planned.companion or "the companion",
+        options=options,
+    )
+    if isinstance(source, SourceDocument):
+        from marey_motion.importing.models import import_document
+
+        return import_document(file, source)
+    imported = convert(source, file.planned.name, options)
+    checks = tuple(_check_document(warning.as_dict()) for warning in imported.warnings)
+    items: list[ImportedItem] = []
+    clip, reference = imported.clip, {"output": skeleton_output(file.planned.name)}
+    if file.skeleton is not None and clip is not None:
+        clip = _on_skeleton(clip, given_skeleton(file.skeleton), file.planned.name)
+        reference = file.skeleton.ref
+    else:
+        items.append(skeleton_item(file, imported.skeleton, clip))
+    if clip is not None:
+        motion = as_tree(clip_to_document(clip, reference))  # type: ignore[arg-type]
+        parts = {"motion": motion, "info": _info(imported, file, checks)}
+        items.append(main_item(file, Kind.CLIP, file.planned.item_name, parts))
+    return ImportedFile(file.planned.name, tuple(items), checks, None if clip is None else clip.frame_count)
+
+
+def reader_options(given: UserOptions) -> ImportOptions:
+    """Translate the user's options for the readers; a unit by name becomes its size in metres."""
+    chosen = {name: value for name in _READER_OPTIONS if (value := getattr(given, name, None)) is not None}
+    if given.unit is not None:
+        chosen.setdefault("unit_scale_m", unit_in_metres(given.unit))
     return ImportOptions(**chosen)
 
 
-def import_file(
-    planned: PlannedFile,
-    data: bytes | memoryview,
-    digests: FileDigests,
-    request: ImportRequest,
-    companion: bytes | memoryview | None = None,
-) -> ImportedDocuments:
-    """Read one file and make its documents.
-
-    Parameters
-    ----------
-    planned : PlannedFile    plan of the file
-    data : bytes    its content
-    digests : FileDigests    digests of the file and its companion
-    request : ImportRequest    facts given by the user
-    companion : bytes, optional    content of the companion
-
-    Returns
-    -------
-    ImportedDocuments    documents of the skeleton and the clip or model
-
-    Raises
-    ------
-    MotionError    with code, file, line and joint where they are known
-    """
-    source = read_source(
-        data,
-        planned.name,
-        companion=companion,
-        companion_name=planned.companion or "the companion",
-        options=request.options,
-    )
-    if isinstance(source, SourceDocument):
-        from marey_motion.importing.models import import_modelled
-
-        return import_modelled(planned, source, request, digests, None if companion is None else bytes(companion))
-    imported = convert(source, planned.name, request.options)
-    checks = tuple(_check_document(warning.as_dict()) for warning in imported.warnings)
-    info = _info(imported, planned, digests, request, checks) if imported.clip is not None else None
-    if request.skeleton is not None and imported.clip is not None:
-        clip = _on_skeleton(imported.clip, request.skeleton, planned.name)
-        motion = clip_to_document(clip, dict(request.skeleton_ref or {}))  # type: ignore[arg-type]
-        return ImportedDocuments("", None, None, as_tree(motion), info, checks)
-    mapping, axes = _anatomy(imported)
-    motion_tree = None
-    if imported.clip is not None:
-        motion_tree = as_tree(clip_to_document(imported.clip, {"output": SKELETON_OUTPUT}))  # type: ignore[arg-type]
-    return ImportedDocuments(
-        mapping.rig or "skeleton",
-        as_tree(skeleton_to_document(imported.skeleton)),
-        as_tree(mapping_to_document(mapping, axes)),
-        motion_tree,
-        info,
-        checks,
-    )
+def given_skeleton(given: GivenSkeleton) -> Skeleton:
+    """Make the skeleton of a stored hierarchy."""
+    return skeleton_from_document(SkeletonHierarchy.model_validate(given.hierarchy))
 
 
-def _anatomy(imported: ImportedMotion) -> tuple[JointMapping, dict[str, JointAxes]]:
-    return anatomy_of(imported.skeleton, imported.clip)
+def skeleton_item(file: FileToImport, skeleton: Skeleton, clip: Clip | None) -> ImportedItem:
+    """Make the item of a file's own skeleton; an equal skeleton of the project is used instead."""
+    mapping, axes = _anatomy(skeleton, clip)
+    parts = {
+        "hierarchy": as_tree(skeleton_to_document(skeleton)),
+        "mapping": as_tree(mapping_to_document(mapping, axes)),
+    }
+    name = skeleton_output(file.planned.name)
+    item_name = mapping.rig or "skeleton"
+    return ImportedItem(name, Kind.SKELETON, item_name, SKELETON_COLLECTION, parts, reuse="by_content")
 
 
-def anatomy_of(skeleton: Skeleton, clip: Clip | None) -> tuple[JointMapping, dict[str, JointAxes]]:
-    """Determine the joint mapping and axes of a skeleton.
+def main_item(file: FileToImport, kind: Kind, item_name: str, parts: Mapping[str, Tree]) -> ImportedItem:
+    """Make the item that the file is about, with the file's name, in the user's collection, with the user's tags."""
+    return ImportedItem(file.planned.name, kind, item_name, file.collection, parts, file.options.tags)
 
-    Parameters
-    ----------
-    skeleton : Skeleton    J joints
-    clip : Clip or None    motion to read the axes from
 
-    Returns
-    -------
-    mapping : JointMapping    standard joints; with a note where the axes cannot be determined
-    axes : dict of str to JointAxes    by joint name; empty where they cannot be determined
-    """
+def _anatomy(skeleton: Skeleton, clip: Clip | None) -> tuple[JointMapping, dict[str, JointAxes]]:
+    """Find mapping and axes; no axes, and a note, where too little of a body is recognised."""
     mapping = map_joints(skeleton)
     try:
         return mapping, guess_axes(skeleton, mapping, clip)
@@ -184,16 +229,7 @@ def anatomy_of(skeleton: Skeleton, clip: Clip | None) -> tuple[JointMapping, dic
 
 
 def as_tree(document: Any) -> Tree:
-    """Convert a document to plain values and arrays.
-
-    Parameters
-    ----------
-    document : model    a document of `marey_schemas`
-
-    Returns
-    -------
-    dict    plain values and arrays
-    """
+    """Convert a document to plain values and arrays."""
     tree: Tree = document.model_dump(by_alias=True, exclude_none=True)
     return tree
 
@@ -202,27 +238,21 @@ def _check_document(warning: Tree) -> Tree:
     return {key: value for key, value in warning.items() if value is not None}
 
 
-def _info(
-    imported: ImportedMotion,
-    planned: PlannedFile,
-    digests: FileDigests,
-    request: ImportRequest,
-    checks: tuple[Tree, ...],
-) -> Tree:
+def _info(imported: ImportedMotion, file: FileToImport, checks: tuple[Tree, ...]) -> Tree:
     details = {key: value for key, value in imported.source.as_dict().items() if key not in ("format", "file")}
     source = {
-        "file": digests.file,
-        "file_name": planned.name,
-        "companion": digests.companion,
-        "companion_name": digests.companion_name,
+        "file": file.digest,
+        "file_name": file.planned.name,
+        "companion": file.companion_digest,
+        "companion_name": file.planned.companion,
         "format": imported.source.format,
         "details": details,
     }
     info = {
         "schema": "marey/clip-info@1",
-        "subject": request.subject,
-        "capture_system": request.capture_system,
-        "licence": request.licence,
+        "subject": file.options.subject,
+        "capture_system": file.options.capture_system,
+        "licence": file.options.licence,
         "source": {key: value for key, value in source.items() if value is not None},
         "checks": list(checks),
     }
@@ -230,7 +260,7 @@ def _info(
 
 
 def _on_skeleton(clip: Clip, skeleton: Skeleton, file: str) -> Clip:
-    """The clip on a given skeleton, which must be the file's own but for its name and its order of joints."""
+    """Move the clip to a given skeleton, which must be the file's own but for its name and its order of joints."""
     own = clip.skeleton
     if set(own.joint_names) != set(skeleton.joint_names):
         odd = ", ".join(sorted(set(own.joint_names) ^ set(skeleton.joint_names))[:5])

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
-from marey_schemas.imports import ImportAnswer, ImportEntry, ImportRequest, Refusal
+from marey_schemas.imports import ImportAnswer, ImportEntry, ImportRequest
 from marey_schemas.jobs import Job, JobCreate
 from marey_schemas.options.imports import ImportOptions
-from marey_server.errors import ApiProblem, BadRequestProblem, InvalidProblem, TooLargeProblem
+from marey_server.errors import BadRequestProblem, InvalidProblem, TooLargeProblem
 from marey_server.field_errors import field_errors
 from marey_server.http.declarations import MIB, Access, Files, RequestBody, writes
 from marey_server.http.multipart import MultipartReader, PartHead, Piece, boundary_of
@@ -28,15 +28,16 @@ from marey_server.store.jobs import submission
 from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:
+    from marey_motion.importing.files import GivenSkeleton
     from marey_motion.importing.plan import PlannedFile
 
 MAX_FILES = 1000
 MAX_UPLOAD_BYTES = 2048 * MIB
 MAX_FORM_BYTES = 256 * 1024
 FILES_AHEAD = 2
-"""Files that are read while the one before them is being published."""
-REFUSED_ALTOGETHER = (401, 403, 404, 503, 507)
-"""Refusals that concern the request, not one of its files."""
+"""Files that are read at once, beside the next one in order."""
+FILES_PER_WRITE = 16
+"""Files that are stored in one transaction."""
 
 
 class ProjectImports(Resource):
@@ -143,65 +144,49 @@ class ProjectImports(Resource):
         return Reply(job, status=202, location=f"/jobs/{job.id}", headers={"Retry-After": "1"})
 
     async def _import_now(self, project: str, options: ImportOptions) -> list[ImportEntry]:
+        """Read files in threads while those before them are stored; one entry per file, in their order."""
         skeleton = None
         if options.skeleton is not None:
             skeleton = await self.look_up(importing.read_skeleton, project, options.skeleton)
-        request = await self.compute(importing.motion_request, options, skeleton)
         plans = await self.compute(importing.plan, [file.name for file in self.files])
         by_name = {file.name: file for file in reversed(self.files)}
-        entries = []
-        ahead: deque[tuple[PlannedFile, asyncio.Task[PreparedImport]]] = deque()
-        for planned in plans:
-            companion = by_name.get(planned.companion or "")
-            file = by_name[planned.name]
-            work = self._prepare(planned, file, companion, options, request)
-            ahead.append((planned, asyncio.ensure_future(work)))
-            if len(ahead) > FILES_AHEAD:
-                entries.append(await self._publish(project, by_name, *ahead.popleft()))
-        while ahead:
-            entries.append(await self._publish(project, by_name, *ahead.popleft()))
+        entries: list[ImportEntry] = []
+        reading = deque(plans)
+        ahead: deque[asyncio.Task[PreparedImport]] = deque()
+        storing: asyncio.Task[list[ImportEntry]] | None = None
+        while reading or ahead:
+            ready: list[PreparedImport] = []
+            while (reading or ahead) and len(ready) < FILES_PER_WRITE:
+                while reading and len(ahead) <= FILES_AHEAD:
+                    work = self._prepare(reading.popleft(), by_name, options, skeleton)
+                    ahead.append(asyncio.ensure_future(work))
+                ready.append(await ahead.popleft())
+            if storing is not None:
+                entries += await storing
+            storing = asyncio.ensure_future(self.change(importing.publish, project, ready))
+        if storing is not None:
+            entries += await storing
+        for entry in entries:
+            self.services.metrics.imports.labels(entry.status).inc()
         return entries
 
     async def _prepare(
-        self, planned: PlannedFile, file: SourceFile, companion: SourceFile | None, options: ImportOptions, request: Any
+        self,
+        planned: PlannedFile,
+        by_name: dict[str, SourceFile],
+        options: ImportOptions,
+        skeleton: GivenSkeleton | None,
     ) -> PreparedImport:
-        if planned.role in ("refused", "companion"):
-            detail = f"{planned.name}: {planned.reason}"
-            return PreparedImport(planned.name, refusal=Refusal(code=planned.code, detail=detail))
-        read = [await self._with_bytes(one) for one in (file, companion) if one is not None]
-        return await self.compute(
-            importing.prepare, planned, read[0], read[1] if len(read) > 1 else None, options, request
-        )
+        names = [planned.name] if planned.companion is None else [planned.name, planned.companion]
+        read = planned.role not in ("refused", "companion")
+        sources = [await self._with_bytes(by_name[name]) for name in names] if read else []
+        return await self.compute(importing.prepare, planned, sources, options, skeleton)
 
     async def _with_bytes(self, file: SourceFile) -> SourceFile:
         if file.content is not None:
             return file
         data = await self.look_up(blobs.read_range, file.digest, 0, file.size_bytes)
         return SourceFile(file.name, file.digest, file.size_bytes, data)
-
-    async def _publish(
-        self,
-        project: str,
-        by_name: dict[str, SourceFile],
-        planned: PlannedFile,
-        work: asyncio.Task[PreparedImport],
-    ) -> ImportEntry:
-        prepared = await work
-        if planned.role == "companion":
-            entry = ImportEntry(name=planned.name, status="companion")
-        elif prepared.refusal is not None:
-            entry = importing.entry_of(prepared, ())
-        else:
-            sources = [by_name[name] for name in (planned.name, planned.companion) if name is not None]
-            try:
-                entry = importing.entry_of(prepared, await self.change(importing.publish, project, prepared, sources))
-            except ApiProblem as error:
-                if error.status in REFUSED_ALTOGETHER:
-                    raise
-                refusal = Refusal(code=error.error_code, detail=error.detail)
-                entry = ImportEntry(name=planned.name, status="failed", error=refusal)
-        self.services.metrics.imports.labels(entry.status).inc()
-        return entry
 
     def on_finish(self) -> None:
         """Drop what was received."""
@@ -227,7 +212,7 @@ def _form_options(form: dict[str, bytearray]) -> ImportOptions:
 
 
 def _stored_files(tx: Transaction, request: ImportRequest) -> list[SourceFile]:
-    """Files named by digest. Raises `NotFoundProblem` where the caller may not read one."""
+    """Files named by digest. Raises `NotFound` where the caller may not read one."""
     return [SourceFile(file.name, file.blob, blobs.require_readable(tx, file.blob), None) for file in request.files]
 
 

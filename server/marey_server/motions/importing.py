@@ -1,33 +1,29 @@
-"""Uploaded files become items: read and encoded in a thread, then published in one transaction per file."""
+"""Import of uploaded files: read and encoded in threads, then stored, many files in one transaction."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from marey_schemas.documents.clips import Check
-from marey_schemas.documents.skeletons import SkeletonHierarchy
-from marey_schemas.imports import ImportEntry, Refusal
+from marey_schemas.imports import ImportEntry, Refusal, refused_entry
 from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
-from marey_server.errors import ApiProblem
-from marey_server.motions.importing_graphs import ImportedGraph, graph_draft, graph_to_import
+from marey_server.errors import ApiProblem, InvalidProblem
 from marey_server.store import blobs, items, projects
 from marey_server.store.blobs import Spool
 from marey_server.store.documents import prepare_document
-from marey_server.store.items import Draft, Published
+from marey_server.store.items import Draft, ItemFilters, Published
+from marey_server.store.projects import ProjectRow
 from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:  # numeric modules take a second to load: only who imports files pays for them
-    from marey_motion.errors import MotionError
-    from marey_motion.importing.files import ImportedDocuments, ImportRequest
+    from marey_motion.importing.files import GivenSkeleton, ImportedGraph, ImportedItem
     from marey_motion.importing.plan import PlannedFile
 
-log = logging.getLogger(__name__)
-
-SKELETON_COLLECTION = "skeletons"
+REFUSED_ALTOGETHER = (401, 403, 404, 503, 507)
+"""Refusals that concern the request, not one of its files."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,23 +43,15 @@ class SourceFile:
 
 @dataclass(frozen=True, slots=True)
 class PreparedImport:
-    """What a file becomes when it is published, or why it does not."""
+    """A file that was read and encoded, ready to be stored; or its entry, where there is nothing to store."""
 
     name: str
+    sources: tuple[SourceFile, ...] = ()
     drafts: tuple[Draft, ...] = ()
     checks: tuple[Check, ...] = ()
     frames: int | None = None
-    refusal: Refusal | None = None
     graph: ImportedGraph | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class GivenSkeleton:
-    """The skeleton that the caller wants the clips on."""
-
-    item: str
-    revision: int
-    hierarchy: dict[str, Any]
+    entry: ImportEntry | None = None
 
 
 def require_importer(tx: Transaction, project: str) -> None:
@@ -72,124 +60,114 @@ def require_importer(tx: Transaction, project: str) -> None:
 
 
 def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
-    """The skeleton that an import names. Raises `NotFoundProblem`."""
+    """Read the skeleton that an import names. Raises `NotFound`."""
+    from marey_motion.importing.files import GivenSkeleton
+
     part = items.read_part(tx, project, Kind.SKELETON, item_id, "hierarchy")
     return GivenSkeleton(item_id, part.revision, part.tree)
 
 
 def plan(names: Sequence[str]) -> list[PlannedFile]:
-    """What becomes of each file of a batch."""
+    """Plan each file of a batch."""
     from marey_motion.importing.plan import plan_imports
 
     return plan_imports(names)
 
 
-def motion_request(options: ImportOptions, skeleton: GivenSkeleton | None) -> ImportRequest:
-    """The options in the words of the readers."""
-    from marey_motion import documents
-    from marey_motion.importing import files
-
-    readers = files.import_options(options.model_dump())
-    own = None
-    if skeleton is not None:
-        own = documents.skeleton_from_document(SkeletonHierarchy.model_validate(skeleton.hierarchy))
-    ref = None if skeleton is None else {"item": skeleton.item, "revision": skeleton.revision}
-    return files.ImportRequest(readers, options.subject, options.licence, options.capture_system, own, ref)
-
-
 def prepare(
-    planned: PlannedFile,
-    file: SourceFile,
-    companion: SourceFile | None,
-    options: ImportOptions,
-    request: ImportRequest,
+    planned: PlannedFile, sources: Sequence[SourceFile], options: ImportOptions, skeleton: GivenSkeleton | None
 ) -> PreparedImport:
-    """Read one file and encode its documents: the slow part, which needs no database."""
-    from marey_motion.errors import MotionError
-    from marey_motion.importing.files import FileDigests, import_file
+    """Read one file, with its companion, and encode its documents: the slow part, which needs no database."""
+    from marey_motion.importing.files import FileToImport, import_file, planned_entry
 
-    digests = FileDigests(file.digest)
-    if companion is not None:
-        digests = FileDigests(file.digest, companion.digest, companion.name)
-    try:
-        found = import_file(planned, file.read(), digests, request, companion.read() if companion else None)
-        return PreparedImport(
-            planned.name,
-            _drafts(planned, found, options),
-            tuple(Check.model_validate(check) for check in found.checks),
-            None if found.motion is None else len(found.motion["poses"]),
-            graph=graph_to_import(found.modelled, _collection(planned, options), options.tags, file),
+    if (entry := planned_entry(planned)) is not None:
+        return PreparedImport(planned.name, entry=entry)
+    file, companion = sources[0], sources[1] if len(sources) > 1 else None
+    found = import_file(
+        FileToImport(
+            planned,
+            file.read(),
+            file.digest,
+            options,
+            companion=None if companion is None else companion.read(),
+            companion_digest=None if companion is None else companion.digest,
+            skeleton=skeleton,
         )
-    except MotionError as error:
-        return PreparedImport(planned.name, refusal=_refusal(error))
+    )
+    if found.refusal is not None:
+        return PreparedImport(planned.name, entry=refused_entry(planned.name, found.refusal))
+    try:
+        drafts = tuple(map(_draft, found.items))
     except ApiProblem as error:
-        return PreparedImport(planned.name, refusal=Refusal(code=error.error_code, detail=error.detail))
+        return PreparedImport(planned.name, entry=_refused(planned.name, error))
+    checks = tuple(map(Check.model_validate, found.checks))
+    return PreparedImport(planned.name, tuple(sources), drafts, checks, found.frames, graph=found.graph)
 
 
-def _refusal(error: MotionError) -> Refusal:
-    place = {name: value for name in ("line", "joint") if (value := getattr(error, name, None)) is not None}
-    return Refusal(code=error.code, detail=str(error), **place)
+def _draft(item: ImportedItem) -> Draft:
+    parts = {part: prepare_document(tree, schema=tree["schema"]) for part, tree in item.parts.items()}
+    return Draft(item.name, item.kind, item.item_name, parts, item.collection, item.tags, reuse=item.reuse)
 
 
-def _drafts(planned: PlannedFile, found: ImportedDocuments, options: ImportOptions) -> tuple[Draft, ...]:
-    drafts = []
-    if found.hierarchy is not None and found.mapping is not None:
-        parts = {"hierarchy": found.hierarchy, "mapping": found.mapping}
-        drafts.append(_draft("skeleton", Kind.SKELETON, found.skeleton_name, SKELETON_COLLECTION, parts, "by_content"))
-    if found.motion is not None and found.info is not None:
-        parts = {"motion": found.motion, "info": found.info}
-        place = _collection(planned, options)
-        drafts.append(_draft("clip", Kind.CLIP, planned.item_name, place, parts, "by_name", options.tags))
-    if found.modelled is not None and found.modelled.parts:
-        place = _collection(planned, options)
-        made = found.modelled
-        drafts.append(_draft("model", Kind.MODEL, made.name, place, made.parts, "by_name", options.tags))
-    return tuple(drafts)
+def _refused(name: str, error: ApiProblem) -> ImportEntry:
+    return refused_entry(name, Refusal(code=error.error_code, detail=error.detail))
 
 
-def _collection(planned: PlannedFile, options: ImportOptions) -> str:
-    return "/".join(part for part in (options.collection, planned.folder) if part)
+def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> list[ImportEntry]:
+    """Store the original files and the items that were read from them; one entry per file.
 
-
-def _draft(
-    name: str,
-    kind: Kind,
-    item_name: str,
-    collection: str,
-    parts: Mapping[str, dict[str, Any]],
-    reuse: Any,
-    tags: Sequence[str] = (),
-) -> Draft:
-    prepared = {part: prepare_document(tree, schema=tree["schema"]) for part, tree in parts.items()}
-    return Draft(name, kind, item_name, prepared, collection, tags, reuse=reuse)
-
-
-def publish(tx: Transaction, project: str, prepared: PreparedImport, sources: Sequence[SourceFile]) -> list[Published]:
-    """Store the original files and what was read from them, in one transaction."""
+    A file that cannot be stored is refused and harms no other.
+    """
     row = projects.require(tx, project)
-    for source in sources:
+    entries = []
+    for file in files:
+        if file.entry is not None:
+            entries.append(file.entry)
+            continue
+        try:
+            with tx.connection.begin_nested():
+                entries.append(_entry(file, _publish(tx, row, project, file)))
+        except ApiProblem as error:
+            if error.status in REFUSED_ALTOGETHER:
+                raise
+            entries.append(_refused(file.name, error))
+    return entries
+
+
+def _publish(tx: Transaction, row: ProjectRow, project: str, file: PreparedImport) -> list[Published]:
+    drafts = file.drafts if file.graph is None else (graph_draft(tx, project, file.graph),)
+    for source in file.sources:
         if source.content is not None:
             blobs.put_blob(tx, source.content, expected=source.digest)
-    author = tx.principal.user_id
-    published = items.publish(tx, row, prepared.drafts, author_id=author)
-    if prepared.graph is not None:
-        published += items.publish(tx, row, [graph_draft(tx, project, prepared.graph)], author_id=author)
-    return published
+    return items.publish(tx, row, drafts, author_id=tx.principal.user_id)
 
 
-def entry_of(prepared: PreparedImport, published: Sequence[Published]) -> ImportEntry:
-    """What the caller is told about a file."""
-    if prepared.refusal is not None:
-        return ImportEntry(name=prepared.name, status="failed", error=prepared.refusal)
+def graph_draft(tx: Transaction, project: str, graph: ImportedGraph) -> Draft:
+    """Make the draft of a graph with models of the project. Raises `InvalidProblem`."""
+    from marey_motion.errors import MotionError
+    from marey_motion.importing.graphs import FEW, NamedModel, graph_item
+
+    def find(name: str, collection: str | None) -> tuple[int, list[NamedModel]]:
+        named = ItemFilters(exact_name=name, directly_in=collection)
+        page = items.list_items(tx, project, Kind.MODEL, named, limit=FEW, count=True)
+        return page.count or 0, [NamedModel(one.path, {"item": one.id, "revision": one.revision}) for one in page.items]
+
+    try:
+        return _draft(graph_item(graph, find))
+    except MotionError as error:
+        raise InvalidProblem(str(error), code=error.code) from error
+
+
+def _entry(file: PreparedImport, published: Sequence[Published]) -> ImportEntry:
     made = {one.kind: one for one in published}
     main = next(made[kind] for kind in (Kind.CLIP, Kind.MODEL, Kind.GRAPH, Kind.SKELETON) if kind in made)
     skeleton = made.get(Kind.SKELETON)
     return ImportEntry(
-        name=prepared.name,
+        name=file.name,
         status="created" if any(one.created for one in published if one.kind is main.kind) else "unchanged",
         item=main.item,
         revision=main.revision,
         skeleton=skeleton.item if skeleton is not None else None,
-        frames=prepared.frames,
-        warnings=prepared.checks,
+        frames=file.frames,
+        warnings=file.checks,
     )

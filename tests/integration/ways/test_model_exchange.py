@@ -206,3 +206,31 @@ def test_models_of_a_large_upload_come_in_by_a_job_with_their_trees(
     assert model.part("tree")["model_digest"] == model.item.parts["model"].document
     with pytest.raises(RequestFailed, match="name its digest"):
         model.put_part("tree", {**model.part("tree"), "model_digest": {"digest_of": "model"}})
+
+
+def test_a_graph_that_a_job_imports_finds_models_of_the_job_and_of_the_project(
+    marey: Marey, lab: ProjectHandle, tmp_path: Path
+) -> None:
+    alone, whole = tmp_path / "alone", tmp_path / "whole"
+    for folder in (alone, whole):
+        folder.mkdir()
+        (folder / "zgraph.json").write_text(json.dumps(GRAPH))
+    for name, data in model_files().items():
+        (whole / name).write_bytes(data)
+
+    def imported(folder: Path) -> dict[str, ImportEntry]:
+        sent = lab.imports.send(find_files([folder]).files)
+        job = marey.jobs.wait(lab.submit(JobCreate(kind="import", params=ImportParams(files=sent).model_dump())).id)
+        assert job.result is not None
+        return {entry["name"]: ImportEntry.model_validate(entry) for entry in job.result["entries"]}
+
+    refused = imported(alone)["zgraph.json"].error
+    assert refused is not None
+    assert refused.code == "no-model"
+    assert imported(whole)["zgraph.json"].status == "created"
+    (graph,) = lab.items(Kind.GRAPH).list()
+    (stand,) = [one for one in lab.items(Kind.MODEL).list() if one.name == "stand"]
+    reference = {"item": stand.id, "revision": 1}
+    assert graph.part("graph")["actions"]["idle"]["primitives"]["stand"]["model"] == reference
+    # The same files again, now that the project has the models: the job is not answered with the earlier refusal.
+    assert imported(alone)["zgraph.json"].status == "created"

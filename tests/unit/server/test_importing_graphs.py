@@ -4,9 +4,10 @@ import pytest
 from tests.support.predecessor_models import imported
 
 from marey_motion.formats.predecessor.graph import GraphNode, PredecessorGraph
+from marey_motion.importing.files import ImportedGraph
 from marey_schemas.kinds import Kind
 from marey_server.errors import InvalidProblem
-from marey_server.motions.importing_graphs import ImportedGraph, graph_draft
+from marey_server.motions.importing import graph_draft
 from marey_server.store import items, projects
 from marey_server.store.items import Draft
 

@@ -73,7 +73,10 @@ def cache_key(
 def has_key(kind: KindDeclaration, params: Mapping[str, Any], inputs: Collection[str]) -> bool:
     """Whether a job with these parameters and with inputs of these names depends on nothing but its key."""
     in_place = kind.in_place is not None and params.get(kind.in_place)
-    return kind.deterministic and not in_place and set(kind.never_cached_without) <= set(inputs)
+    by_names = not set(kind.never_cached_without) <= set(inputs)
+    if kind.never_cached_for is not None:
+        by_names = by_names or kind.never_cached_for(params)
+    return kind.deterministic and not in_place and not by_names
 
 
 def named_items(kind: KindDeclaration, params: Mapping[str, Any]) -> list[str]:

@@ -1,0 +1,72 @@
+"""Graphs of the predecessor become graphs of models of the project, which are found by their names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import ValidationError
+
+from marey_motion.errors import FormatError
+from marey_motion.importing.files import ImportedGraph, ImportedItem
+from marey_schemas.documents.graphs import ModelGraph
+from marey_schemas.documents.originals import original_of
+from marey_schemas.kinds import Kind
+
+SCHEMA = "marey/model-graph@1"
+FEW = 3
+"""Models of one name that are listed where there are several."""
+
+
+@dataclass(frozen=True)
+class NamedModel:
+    """A model of the project, or one that is being imported: its path and the reference that documents hold."""
+
+    path: str
+    ref: dict[str, Any]
+
+
+FindModels = Callable[[str, str | None], tuple[int, Sequence[NamedModel]]]
+"""Counts the models of a name directly in a collection, or anywhere in the project, and gives the first `FEW`."""
+
+
+def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
+    """Make the item of a graph: each node gets the model of its name, best the one beside the graph.
+
+    Raises `FormatError` where there is none, or several in other collections, and where the graph is not consistent.
+    """
+    models = {name: _find_model(find, name, graph.collection) for _, name in graph.graph.nodes}
+    actions: dict[str, Any] = {}
+    for (action, name), node in graph.graph.nodes.items():
+        primitives = actions.setdefault(action, {"primitives": {}})["primitives"]
+        primitives[name] = {
+            "model": models[name],
+            "type": node.type,
+            "transitions": [{"action": other, "primitive": one} for other, one in node.transitions],
+            "source_id": node.model_id,
+        }
+    start = {"action": graph.graph.start[0], "primitive": graph.graph.start[1]}
+    document = {"schema": SCHEMA, "actions": actions, "start": start}
+    document["original"] = original_of("graph", document, graph.file, graph.digest)
+    try:
+        ModelGraph.model_validate(document)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        pointer = "".join(f"/{step}" for step in first["loc"])
+        detail = f"This is no valid {SCHEMA}: {pointer}: {first['msg'].removeprefix('Value error, ')}"
+        raise FormatError(detail, code="invalid") from error
+    return ImportedItem(graph.file, Kind.GRAPH, graph.name, graph.collection, {"graph": document}, graph.tags)
+
+
+def _find_model(find: FindModels, name: str, collection: str) -> dict[str, Any]:
+    """Find the model beside the graph, else the only one of that name."""
+    count, models = find(name, collection)
+    if count != 1:
+        count, models = find(name, None)
+    if count == 1:
+        return models[0].ref
+    places = ", ".join(one.path for one in models)
+    there = f"{count} models are called {name!r} ({places})" if count else f"no model is called {name!r}"
+    advice = "import the models of a graph first, beside it"
+    raise FormatError(f"The graph has a node {name!r}, but {there}; {advice}.", code="no-model")
