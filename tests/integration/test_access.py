@@ -155,6 +155,8 @@ def send(house: House, route, role: str) -> httpx.Response:
         variables["kind"] = "skeletons"
     if template.endswith("/commands"):
         variables |= {"kind": "annotations", "item": variables["annotation"]}
+    if template.endswith("/walk-graph"):
+        variables |= {"kind": "evaluations", "item": "evaluation_of_nobody"}
     if "/samples" in template or "/search" in template:
         variables |= {"kind": "models", "item": "model_of_nobody"}
     address = house.server.address + template.format(**variables)

@@ -2,10 +2,15 @@
 
 import base64
 import hashlib
+from xml.etree import ElementTree
 
 import httpx
 import pytest
+from tests.support.evaluation_results import made_up
 from tests.support.rest_server import Server
+
+from marey_motion.evaluation.result_documents import records_to_tree, result_to_tree
+from marey_schemas.encoding.codecs import encode_tree
 
 PAGE = b"<!doctype html><title>Report</title><p>All is well."
 SCRIPT = "sha256-" + base64.b64encode(hashlib.sha256(b"sort()").digest()).decode()
@@ -105,8 +110,81 @@ def test_other_items_have_no_report(owner: httpx.Client) -> None:
     assert answer.status_code == 404
 
 
+@pytest.fixture
+def walked(owner: httpx.Client) -> str:
+    """The path of an evaluation with the ticks of its trials."""
+    result = made_up()
+    trials = [each.trial for each in result.trials]
+    parts = {"evaluation": result_to_tree(result), "records": records_to_tree(trials, result.records)}
+    parts["evaluation"] |= {"verdict": "Good.", "headline": {}}
+    body = encode_tree({"name": "walked", "parts": parts}, "application/msgpack")
+    made = owner.post("/projects/lab/evaluations", content=body, headers={"Content-Type": "application/msgpack"})
+    assert made.status_code == 201, made.text
+    return f"/projects/lab/evaluations/{made.json()['id']}"
+
+
+def read_graphml(data: bytes) -> tuple[list, list, dict]:
+    """(clip, frame, ticks) of nodes, (source, target, count) of edges, walks by trial; read from the XML alone."""
+    space = {"g": "http://graphml.graphdrawing.org/xmlns"}
+    root = ElementTree.fromstring(data)
+    names = {key.get("id"): key.get("attr.name") for key in root.findall("g:key", space)}
+    graph = root.find("g:graph", space)
+
+    def values(element):
+        return {names[data.get("key")]: data.text for data in element.findall("g:data", space)}
+
+    nodes = {node.get("id"): values(node) for node in graph.findall("g:node", space)}
+    places = {name: place for place, name in enumerate(nodes)}
+    edges = [
+        (places[edge.get("source")], places[edge.get("target")], int(values(edge)["count"]))
+        for edge in graph.findall("g:edge", space)
+    ]
+    return [(one["clip"], int(one["frame"]), int(one["ticks"])) for one in nodes.values()], edges, values(graph)
+
+
+def test_a_walk_graph_is_the_same_in_json_and_in_graphml(owner: httpx.Client, walked: str) -> None:
+    in_json, in_graphml = owner.get(f"{walked}/walk-graph"), owner.get(f"{walked}/walk-graph?format=graphml")
+    assert in_json.headers["Content-Type"] == "application/json"
+    assert in_graphml.headers["Content-Type"] == "application/graphml+xml"
+    assert 'filename="walked-walks.graphml"' in in_graphml.headers["Content-Disposition"]
+    graph = in_json.json()
+    nodes, edges, walks = read_graphml(in_graphml.content)
+
+    uids = [graph["clips"][clip]["uid"] for clip in graph["nodes"]["clip"]]
+    assert nodes == list(zip(uids, graph["nodes"]["frame"], graph["nodes"]["ticks"], strict=True))
+    assert edges == list(zip(*(graph["edges"][name] for name in ("source", "target", "count")), strict=True))
+    assert list(walks) == graph["trials"]
+    for text, walk in zip(walks.values(), graph["walks"], strict=True):
+        assert [int(run.partition(":")[2]) for run in text.split()] == walk["frames"]
+    ticks = sum(len(record.rows) for record in made_up().records)
+    assert sum(graph["nodes"]["ticks"]) == ticks == sum(sum(walk["frames"]) for walk in graph["walks"])
+
+
+def test_a_walk_graph_of_one_trial_holds_its_walk_alone(owner: httpx.Client, walked: str) -> None:
+    trial = made_up().trials[0].trial.name
+    graph = owner.get(f"{walked}/walk-graph", params={"trial": trial}).json()
+    assert graph["trials"] == [trial]
+    assert sum(graph["nodes"]["ticks"]) == sum(graph["walks"][0]["frames"]) == len(made_up().records[0].rows)
+    unknown = owner.get(f"{walked}/walk-graph", params={"trial": "hop"}).json()
+    assert (unknown["code"], trial in unknown["detail"]) == ("no-trial", True)
+
+
+def test_documents_that_contradict_each_other_give_no_walk_graph(owner: httpx.Client, evaluation: str) -> None:
+    assert owner.get(f"{evaluation}/walk-graph").json()["status"] == 404
+    result = made_up()
+    trials = [each.trial for each in result.trials]
+    records = records_to_tree(trials, result.records)
+    records["rows"] = records["rows"] + 10**6
+    for number, tree in enumerate((result_to_tree(result), {"schema": "marey/evaluation@1"})):
+        parts = {"evaluation": tree | {"verdict": "Good.", "headline": {}}, "records": records}
+        body = encode_tree({"name": f"bad{number}", "parts": parts}, "application/msgpack")
+        made = owner.post("/projects/lab/evaluations", content=body, headers={"Content-Type": "application/msgpack"})
+        refused = owner.get(f"/projects/lab/evaluations/{made.json()['id']}/walk-graph")
+        assert (refused.status_code, refused.json()["code"]) == (422, "not-a-walk")
+
+
 def test_strangers_learn_nothing_of_an_evaluation(server: Server, evaluation: str) -> None:
     stranger = server.client(server.make_user("mallory"))
-    for path in ("report", "figures/offsets"):
+    for path in ("report", "figures/offsets", "walk-graph"):
         answer = stranger.get(f"{evaluation}/{path}")
         assert (answer.status_code, answer.json()["code"]) == (404, "no-project")

@@ -116,16 +116,29 @@ def report(
     figures: Annotated[
         Path | None, typer.Option(help="Write every figure to this folder: PNG, SVG, JSON, CSV.")
     ] = None,
+    walk_graph: Annotated[
+        Path | None, typer.Option(help="Write the walk graph of an evaluation to this file: .graphml or .json.")
+    ] = None,
+    trial: Annotated[str | None, typer.Option(help="The trial of the walk graph; default: all together.")] = None,
     open_it: Annotated[bool, typer.Option("--open", help="Show it in a browser.")] = False,
 ) -> None:
     """Write the report of an evaluation or a model to a file."""
     from marey_schemas.kinds import Kind
 
+    if walk_graph is not None and walk_graph.suffix.lower() not in (".graphml", ".json"):
+        raise WrongUsage(f"--walk-graph: {walk_graph} must end in .graphml or .json")
+    if trial is not None and walk_graph is None:
+        raise WrongUsage("--trial chooses the walks of --walk-graph; give that, too")
+    kinds = [Kind.EVALUATION, Kind.MODEL] if walk_graph is None else [Kind.EVALUATION]
     with connect(context) as marey:
-        found = require_item(marey, Address.parse(place), [Kind.EVALUATION, Kind.MODEL])
+        found = require_item(marey, Address.parse(place), kinds)
         found.save_report(out)
+        if walk_graph is not None:
+            found.save_walk_graph(walk_graph, trial=trial)
         drawn = found.save_figures(figures) if figures is not None else []
     typer.echo(out)
+    if walk_graph is not None:
+        tell(f"walk graph: {walk_graph}")
     if figures is not None:
         tell(f"{counted(len(drawn), 'file')} of figures in {figures}")
     if open_it:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,7 @@ from numpy.typing import NDArray
 
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.findings import Findings, OnProgress, find_out
-from marey_client.handles.reports import ReportedHandle
+from marey_client.handles.reports import ReportedHandle, saved
 from marey_client.places import Places, as_inputs
 from marey_schemas.base import Request
 from marey_schemas.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
@@ -46,6 +48,24 @@ class EvaluationHandle(ReportedHandle):
     def records(self) -> dict[str, dict[str, NDArray[Any]]]:
         """Every tick of every trial, by the trial's name: arrays by what they hold, see `record_arrays`."""
         return record_arrays(self.part("records"))
+
+    def walk_graph(self, *, trial: str | None = None) -> dict[str, Any]:
+        """Return the frames that the trials displayed, the jumps between them, and the order of each walk.
+
+        `nodes` are frames of clips with the ticks they were displayed for, `edges` jumps with their number, by index of
+        the nodes; `walks` are runs of frames, one list for each of `trials`. Without `trial`, all trials together.
+        """
+        return dict(json.loads(self._walk_graph("json", trial)))
+
+    def save_walk_graph(self, path: str | Path, *, trial: str | None = None) -> Path:
+        """Write the walk graph to a file, as GraphML or JSON by the ending of its name."""
+        form = Path(path).suffix.lower().removeprefix(".")
+        if form not in ("json", "graphml"):
+            raise ValueError(f"{path}: a walk graph is written as .json or .graphml")
+        return saved(path, self._walk_graph(form, trial))
+
+    def _walk_graph(self, form: str, trial: str | None) -> bytes:
+        return self._fetch(f"{self.url}/walk-graph", "*/*", {"format": form, "trial": trial})
 
     # -- what follows from it: each hands in a job, waits for it, and raises `JobUnsuccessful` where it is refused --
 

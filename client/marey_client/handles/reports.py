@@ -38,12 +38,12 @@ class ReportedHandle(ItemHandle):
 
     def save_report(self, path: str | Path) -> Path:
         """Write the report to a file."""
-        return _saved(path, self.report())
+        return saved(path, self.report())
 
     def save_figures(self, folder: str | Path) -> list[Path]:
         """Write every figure to a folder, in every form."""
         files = (file for figure in self.figures() for file in self._files_of(figure))
-        return [_saved(Path(folder) / safe_file_name(name), data) for name, data in files]
+        return [saved(Path(folder) / safe_file_name(name), data) for name, data in files]
 
     def _files_of(self, figure: StoredFigure) -> Iterator[tuple[str, bytes]]:
         name = figure.name if figure.trial is None else f"{figure.name} {figure.trial}"
@@ -57,7 +57,8 @@ class ReportedHandle(ItemHandle):
         return self.transport.send("GET", path, params=given, headers={"Accept": accept}).content
 
 
-def _saved(path: str | Path, data: bytes) -> Path:
+def saved(path: str | Path, data: bytes) -> Path:
+    """Write bytes to a file that appears whole or not at all."""
     with saved_atomically(path) as file:
         file.write(data)
     return Path(path)

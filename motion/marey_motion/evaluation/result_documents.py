@@ -59,8 +59,13 @@ def result_from_tree(tree: Mapping[str, Any], records: Sequence[TrialRecord] = (
     return _result(tree, records)
 
 
+def clips_from_tree(tree: Mapping[str, Any]) -> tuple[DatabaseClip, ...]:
+    """Read the clips of an evaluation's document, in the order of their rows."""
+    return tuple(DatabaseClip(**{**clip, "tags": tuple(clip["tags"])}) for clip in tree["clips"])
+
+
 def _result(tree: Mapping[str, Any], records: Sequence[TrialRecord]) -> EvaluationResult:
-    clips = tuple(DatabaseClip(**{**clip, "tags": tuple(clip["tags"])}) for clip in tree["clips"])
+    clips = clips_from_tree(tree)
     return EvaluationResult(
         options=options_from_tree(tree["options"]),
         provenance=Provenance(**tree["provenance"]),

@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
-from xml.sax.saxutils import escape
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
@@ -40,13 +40,11 @@ class WalkGraph:
 
 
 def walk_graph(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> WalkGraph:
-    """The graph of the walks of one or several trials."""
-    popularity = np.zeros(clip_starts(clips)[-1], dtype=np.int64)
-    for record in records:
-        popularity += np.bincount(record.rows, minlength=len(popularity))
-    rows = np.flatnonzero(popularity)
+    """Build the graph of the walks of one or several trials."""
+    shown = [record.rows.astype(np.int64) for record in records]
+    rows, ticks = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *shown]), return_counts=True)
     walks = tuple(_runs(clips, record) for record in records)
-    return WalkGraph(tuple(clips), rows, popularity[rows], count_switches(clips, records), walks)
+    return WalkGraph(tuple(clips), rows, ticks, count_switches(clips, records), walks)
 
 
 def _runs(clips: Sequence[DatabaseClip], record: TrialRecord) -> Ints:
@@ -90,22 +88,27 @@ _GRAPHML_KEYS = (
 )
 
 
-def graph_to_graphml(graph: WalkGraph) -> bytes:
-    """The graph as a GraphML document: nodes n<row> with clip, frame and ticks, edges with their count.
+def graph_to_graphml(graph: WalkGraph, trials: Sequence[str] = ()) -> bytes:
+    """Write the graph as a GraphML document: nodes n<row> with clip, frame and ticks, edges with their count.
 
-    The ordered walks are data of the graph, walk0 and so on: `n12:30 n140:6` is thirty frames from row 12 on, then six
-    from row 140.
+    The ordered walks are data of the graph, walk0 and so on, named after `trials` if these are given: `n12:30 n140:6`
+    is thirty frames from row 12 on, then six from row 140.
     """
     owners = clips_of_rows(graph.clips, graph.rows)
     frames = graph.rows - clip_starts(graph.clips)[owners]
-    names = [(_text(clip.uid), _text(clip.name)) for clip in graph.clips]
-    keys = [*_GRAPHML_KEYS, *(("graph", f"walk{index}", "string") for index in range(len(graph.walks)))]
+    names = [(escape(_readable(clip.uid)), escape(_readable(clip.name))) for clip in graph.clips]
+    walk_keys = [f"walk{index}" for index in range(len(graph.walks))]
+    keys = [(of, name, name, kind) for of, name, kind in _GRAPHML_KEYS]
+    keys += [("graph", key, name, "string") for key, name in zip(walk_keys, trials or walk_keys, strict=True)]
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         '<graphml xmlns="http://graphml.graphdrawing.org/xmlns">',
-        *(f'<key id="{name}" for="{of}" attr.name="{name}" attr.type="{kind}"/>' for of, name, kind in keys),
+        *(
+            f'<key id="{key}" for="{of}" attr.name={quoteattr(_readable(name))} attr.type="{kind}"/>'
+            for of, key, name, kind in keys
+        ),
         '<graph edgedefault="directed">',
-        *(f'<data key="walk{index}">{_walk_to_text(walk)}</data>' for index, walk in enumerate(graph.walks)),
+        *(f'<data key="{key}">{_walk_to_text(walk)}</data>' for key, walk in zip(walk_keys, graph.walks, strict=True)),
     ]
     for row, owner, frame, ticks in zip(
         graph.rows.tolist(), owners.tolist(), frames.tolist(), graph.ticks.tolist(), strict=True
@@ -130,10 +133,9 @@ def _walk_to_text(walk: Ints) -> str:
 _NOT_IN_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
-def _text(text: str) -> str:
-    """Text that may stand in XML 1.0, which has no control characters."""
-    allowed = _NOT_IN_XML.sub("\ufffd", text)
-    return escape(allowed)
+def _readable(text: str) -> str:
+    """Replace what XML 1.0 does not allow, such as control characters."""
+    return _NOT_IN_XML.sub("\ufffd", text)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,10 @@ from marey_reports.evaluation.words import find_holes
 Figures = Mapping[str, DrawnFigure]
 
 WORST_TRIALS = 10
+WALK_GRAPH = (
+    "The graph of single frames, with the order of every walk, is written as GraphML or JSON by "
+    "marey report project/name --walk-graph walks.graphml."
+)
 LOAD_CLIPS = 15
 MOST_HOLES = 15
 MOST_NAMES = 40  # more unused clips than this are folded away
@@ -97,7 +101,7 @@ def load_chapter(result: EvaluationResult, figures: Figures) -> Section:
     return Section(
         "load",
         "Which clips carry the load",
-        (element("p", text), listing, shown(figures, "usage", "frame-use", "clip-graph")),
+        (element("p", text), listing, shown(figures, "usage", "frame-use", "clip-graph"), element("p", WALK_GRAPH)),
     )
 
 

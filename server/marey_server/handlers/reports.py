@@ -14,9 +14,11 @@ from marey_server.errors import NotFoundProblem
 from marey_server.handlers.items import kind_of
 from marey_server.http.declarations import Access, Bytes, reads
 from marey_server.http.queries import MAX_INTEGER
-from marey_server.http.reply import Rendered
+from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
-from marey_server.http.streaming import IMMUTABLE, BlobSender
+from marey_server.http.streaming import IMMUTABLE, BlobSender, attachment
+from marey_server.motions import walk_graphs
+from marey_server.motions.walk_graphs import MEDIA_TYPES, WalkGraphFormat
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
 
@@ -142,4 +144,33 @@ def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:
     return figure.csv[table]
 
 
-RESOURCES: tuple[type[Resource], ...] = (ItemReport, Figure)
+class WalkGraphQuery(ReportQuery):
+    """Which walks, and in which form."""
+
+    format: WalkGraphFormat = Field("json", description="GraphML is read by networkx, Gephi, yEd and igraph.")
+    trial: str | None = Field(None, max_length=100, description="Name of a trial; absent: all trials together.")
+
+
+class EvaluationWalkGraph(Resource):
+    """The walk graph of an evaluation."""
+
+    path = "/projects/{project}/{kind}/{item}/walk-graph"
+    tag = "Reports"
+
+    @reads(access=Access.READER, query=WalkGraphQuery, answer=Bytes, answer_types=tuple(MEDIA_TYPES.values()))
+    async def get(self, project: str, kind: str, item: str, query: WalkGraphQuery) -> Reply:
+        """The frames that the trials of an evaluation (kind `evaluations`) displayed, and the jumps between them.
+
+        Nodes are frames of clips with the ticks that they were displayed for, edges are jumps with their number; the
+        walks say in which order each trial took them.
+        """
+        source = await self.look_up(walk_graphs.read_walks, project, kind_of(kind), item, query.revision)
+        data = await self.compute_long(walk_graphs.write_walk_graph, source, query.trial, query.format)
+        headers = {
+            "Content-Disposition": attachment(f"{source.name}-walks.{query.format}"),
+            "Cache-Control": IMMUTABLE if query.revision is not None else "private, no-cache",
+        }
+        return Reply(data, media_type=MEDIA_TYPES[query.format], headers=headers)
+
+
+RESOURCES: tuple[type[Resource], ...] = (ItemReport, Figure, EvaluationWalkGraph)

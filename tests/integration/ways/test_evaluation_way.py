@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -44,6 +45,15 @@ def test_from_a_folder_of_clips_to_a_verdict_and_a_report(lab: ProjectHandle, ru
     assert (tmp_path / "again.html").read_text(encoding="utf-8") == page
     assert (tmp_path / "figures" / "offsets.png").read_bytes().startswith(b"\x89PNG")
     assert "again.html" in {path.name for path in tmp_path.iterdir()}
+
+    run("report", "lab/walks-eval", "--walk-graph", "walks.graphml")
+    trial = found.trials()[0]["trial"]
+    run("report", "lab/walks-eval", "--walk-graph", "one.json", "--trial", trial)
+    nodes = ElementTree.parse(tmp_path / "walks.graphml").iter("{http://graphml.graphdrawing.org/xmlns}node")
+    assert len(list(nodes)) == len(found.walk_graph()["nodes"]["ticks"])
+    assert json.loads((tmp_path / "one.json").read_bytes()) == found.walk_graph(trial=trial)
+    with pytest.raises(ValueError, match=r"\.json or \.graphml"):
+        found.save_walk_graph(tmp_path / "walks.dot")
 
 
 def test_an_evaluation_holds_every_tick_and_knows_every_clip(lab: ProjectHandle) -> None:

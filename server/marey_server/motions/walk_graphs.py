@@ -1,0 +1,80 @@
+"""The walk graph of an evaluation: the frames that its trials displayed and the jumps between them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from marey_schemas.kinds import Kind
+from marey_server.errors import InvalidProblem, NotFoundProblem
+from marey_server.store import items
+from marey_server.store.transaction import Transaction
+
+if TYPE_CHECKING:
+    from marey_motion.matching.database import DatabaseClip
+    from marey_motion.matching.record import TrialRecord
+
+WalkGraphFormat = Literal["json", "graphml"]
+MEDIA_TYPES: Mapping[WalkGraphFormat, str] = {"json": "application/json", "graphml": "application/graphml+xml"}
+SCHEMA = "marey/walk-graph@1"
+NAMES_SHOWN = 5
+
+
+@dataclass(frozen=True, slots=True)
+class WalkSource:
+    """The documents of an evaluation that its walk graph is computed from."""
+
+    name: str
+    evaluation: Mapping[str, Any]
+    records: Mapping[str, Any]
+
+
+def read_walks(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> WalkSource:
+    """Read an evaluation and the ticks of its trials. Raises `NotFoundProblem`."""
+    if kind is not Kind.EVALUATION:
+        raise NotFoundProblem(f"A {kind} has no walk graph; evaluations have one.", code="not-an-evaluation")
+    name = items.read_item(tx, project, kind, item_id).name
+    evaluation, records = (
+        items.read_part(tx, project, kind, item_id, part, revision=revision, arrays="decoded").tree
+        for part in ("evaluation", "records")
+    )
+    return WalkSource(name, evaluation, records)
+
+
+def write_walk_graph(source: WalkSource, trial: str | None, form: WalkGraphFormat) -> bytes:
+    """Write the graph of one trial, or of all trials together.
+
+    Raises `NotFoundProblem` for an unknown trial, `InvalidProblem` if the documents contradict each other.
+    """
+    from marey_motion.errors import MotionError
+    from marey_motion.evaluation.result_documents import clips_from_tree, records_from_tree
+    from marey_motion.evaluation.walk_graph import graph_to_graphml, graph_to_tree, walk_graph
+
+    try:
+        clips, records = clips_from_tree(source.evaluation), records_from_tree(source.records)
+        _require_rows(clips, records.values())
+    except (MotionError, AttributeError, KeyError, TypeError, ValueError) as error:
+        detail = f"The documents of this evaluation give no walk graph: {error}."
+        raise InvalidProblem(detail, code="not-a-walk") from error
+    if trial is not None and trial not in records:
+        known = ", ".join([*list(records)[:NAMES_SHOWN], *(["..."] if len(records) > NAMES_SHOWN else [])])
+        raise NotFoundProblem(f"The evaluation has no trial {trial!r}; it has {known}.", code="no-trial")
+    trials = list(records) if trial is None else [trial]
+    graph = walk_graph(clips, [records[one] for one in trials])
+    if form == "graphml":
+        return graph_to_graphml(graph, trials)
+    return json.dumps({"schema": SCHEMA, "trials": trials, **graph_to_tree(graph)}).encode()
+
+
+def _require_rows(clips: Sequence[DatabaseClip], records: Iterable[TrialRecord]) -> None:
+    """Check that clips follow one another without gaps and that trials displayed no other rows. Raises `ValueError`."""
+    rows = 0
+    for clip in clips:
+        if clip.start != rows or clip.stop < rows:
+            raise ValueError(f"the clip {clip.name!r} has the rows {clip.start} to {clip.stop}, after row {rows}")
+        rows = clip.stop
+    for record in records:
+        if len(record.rows) and not 0 <= record.rows.min() <= record.rows.max() < rows:
+            raise ValueError(f"a trial displayed rows beyond the {rows} of the clips")
