@@ -33,13 +33,13 @@ SHOWN_ONLY = "default-src 'none'; base-uri 'none'; form-action 'none'; style-src
 
 
 class ReportQuery(Request):
-    """Of which revision."""
+    """The revision to read."""
 
     revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Absent: the newest.")
 
 
 class FigureQuery(ReportQuery):
-    """Which form of a figure."""
+    """The form of a figure to read."""
 
     format: Literal["png", "svg", "csv", "json"] = Field("png", description="Picture, drawing, or what is plotted.")
     trial: str | None = Field(None, max_length=100, description="Name of a trial, for figures of one trial.")
@@ -145,7 +145,7 @@ def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:
 
 
 class WalkGraphQuery(ReportQuery):
-    """Which walks, and in which form."""
+    """The walks to read and their form."""
 
     format: WalkGraphFormat = Field("json", description="GraphML is read by networkx, Gephi, yEd and igraph.")
     trial: str | None = Field(None, max_length=100, description="Name of a trial; absent: all trials together.")
