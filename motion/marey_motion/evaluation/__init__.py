@@ -1,4 +1,4 @@
-"""How good a set of locomotion clips is: accuracy, relevance and coverage measured by simulated motion matching.
+"""Evaluation of locomotion clips: accuracy, relevance and coverage, measured by simulated motion matching.
 
 After Abichequer Sangalli et al. (2022), "A new framework for the evaluation of locomotive motion datasets through
 motion matching techniques", with every ambiguity of its formulas named (docs/explanation/evaluation.md).

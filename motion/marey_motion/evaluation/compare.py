@@ -1,4 +1,4 @@
-"""Two evaluations of the same trials, trial by trial: what changed, by how much, and how sure that is."""
+"""Comparison of two evaluations of the same trials: changes with their confidence intervals."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class MetricChange:
 
     @property
     def verdict(self) -> str:
-        """same, better, worse, changed (a metric without direction) or unclear (the interval holds 0)."""
+        """One of: same, better, worse, changed (a metric without direction), unclear (the interval holds 0)."""
         if self.low == self.high == 0.0:
             return "same"
         if self.low <= 0.0 <= self.high or self.trials < 2:
@@ -112,7 +112,17 @@ class Comparison:
 def compare_results(before: EvaluationResult, after: EvaluationResult) -> Comparison:
     """Compare two evaluations with the same normaliser, options and scenarios.
 
-    Raises `MotionError` that names what differs, or when a side was read without its records.
+    Parameters
+    ----------
+    before, after : EvaluationResult    both with their records
+
+    Returns
+    -------
+    Comparison    changes of metrics, trials and coverage
+
+    Raises
+    ------
+    MotionError    naming the difference of conditions, or when a side was read without its records
     """
     require_comparable(before.provenance, after.provenance)
     if not (len(before.records) == len(before.trials) == len(after.trials) == len(after.records)):
@@ -134,9 +144,17 @@ def compare_results(before: EvaluationResult, after: EvaluationResult) -> Compar
 def under_one_normaliser(
     before: MatchingDatabase, after: MatchingDatabase, policy: Policy
 ) -> tuple[MatchingDatabase, MatchingDatabase]:
-    """Both databases with equal costs, so that evaluations of them can be compared.
+    """Give two databases equal costs, so that evaluations of them can be compared.
 
-    "pinned" gives the second one the first one's normaliser; "union" gives both one that is fitted to the rows of both.
+    Parameters
+    ----------
+    before, after : MatchingDatabase    the databases
+    policy : str    "pinned" gives the second one the first one's normaliser; "union" gives both one that is fitted to
+        the rows of both
+
+    Returns
+    -------
+    (MatchingDatabase, MatchingDatabase)    both under one normaliser
     """
     if policy == "pinned":
         return before, with_normaliser(after, before.normaliser)
@@ -145,7 +163,17 @@ def under_one_normaliser(
 
 
 def paired_change(metric: str, before: Sequence[float], after: Sequence[float]) -> MetricChange:
-    """The change of one metric over trials paired by index, with its bootstrap interval."""
+    """Compute the change of one metric over trials paired by index, with its bootstrap interval.
+
+    Parameters
+    ----------
+    metric : str    name of the metric
+    before, after : sequence of float    value of each trial, in the metric's unit
+
+    Returns
+    -------
+    MetricChange    mean change and its bounds
+    """
     first, second = np.asarray(before, dtype=np.float64), np.asarray(after, dtype=np.float64)
     change = second - first
     low, high = _interval(change)

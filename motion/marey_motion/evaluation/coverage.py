@@ -1,7 +1,7 @@
-"""What speeds and turn rates a set of clips holds: windows of one second, counted over the cells of the trial grid.
+"""Coverage of a set of clips: windows of one second, counted over cells of speed and turn rate.
 
-Windows lie within one clip. A cell reaches half-way to its neighbours on the grid, so every trial owns one; what is
-faster, slower or turns more than the outermost cells shows among the windows, not in the map.
+Windows lie within one clip. A cell reaches half-way to its neighbours on the grid, so every trial owns one; data that
+is faster, slower or turns more than the outermost cells is among the windows, not in the map.
 """
 
 from __future__ import annotations
@@ -36,17 +36,19 @@ class Windows(NamedTuple):
 
 
 def sliding_windows(positions: Floats, headings: Floats, rate_hz: float) -> Windows:
-    """Speed, turn rate and signed velocities of a root over every second of one clip.
+    """Compute speed, turn rate and signed velocities of a root over every second of one clip.
 
     Parameters
     ----------
-    positions : (F, 2) metres on the ground
-    headings : (F,) radians, continuous
+    positions : (F, 2) float64    (x, z) in metres
+    headings : (F,) float64    radians, continuous
+    rate_hz : float    frames per second
 
     Returns
     -------
-    F - rate_hz windows, none for a clip of a second or less. Speed is the path's length, whatever its direction;
-    forward and strafe (positive to the left) are means along the facing half-way through each step.
+    Windows    F - rate_hz windows, none for a clip of a second or less. Speed is the path's length per second,
+        whatever its direction; forward and strafe (positive to the left) are means along the facing half-way through
+        each step.
     """
     span = round(WINDOW_S * rate_hz)
     steps = np.diff(positions, axis=0)
@@ -66,9 +68,19 @@ def sliding_windows(positions: Floats, headings: Floats, rate_hz: float) -> Wind
 def measure_coverage(
     database: MatchingDatabase, options: EvaluationOptions, *, with_in_place: bool = False
 ) -> Coverage:
-    """Windows of all clips, and how long they cover each cell of the trial grid.
+    """Measure the windows of all clips, and the seconds they cover in each cell of the trial grid.
 
     Clips that walk in place, as on a treadmill, would count as standing still: they are left out unless asked for.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    options : EvaluationOptions    grid and least seconds per cell
+    with_in_place : bool    include clips that walk in place
+
+    Returns
+    -------
+    Coverage    windows and seconds per cell
     """
     rate = database.options.rate_hz
     parts = [Windows(*np.empty((4, 0)))]
@@ -96,7 +108,20 @@ def coverage_of(
     *,
     window_s: float,
 ) -> Coverage:
-    """The map of given windows, each of which stands for `window_s` seconds of data."""
+    """Make the map of given windows.
+
+    Parameters
+    ----------
+    windows : Windows    W windows
+    owners : (W,) int32    index of the clip of each window
+    too_short : tuple of int    indices of clips without a window
+    options : EvaluationOptions    grid and least seconds per cell
+    window_s : float    seconds of data that each window counts for
+
+    Returns
+    -------
+    Coverage    windows and seconds per cell
+    """
     grid = options.grid
     speed_edges = cell_edges(grid.speeds_m_s, SPEED_STEP_M_S)
     turn_edges = cell_edges(grid.turn_rates_deg_s, TURN_RATE_STEP_DEG_S)
@@ -120,14 +145,35 @@ def coverage_of(
 
 
 def cell_deficits(seconds: Floats, least_s: float, window_s: float) -> Floats:
-    """Seconds that cells lack of `least_s`, where each window stands for `window_s` of them."""
+    """Compute the seconds that cells lack.
+
+    Parameters
+    ----------
+    seconds : (V, O) float64    seconds in each cell
+    least_s : float    seconds wanted in each cell
+    window_s : float    seconds of data that each window counts for
+
+    Returns
+    -------
+    (V, O) float64    seconds
+    """
     deficits = np.maximum(least_s - seconds, 0.0)
     # A whole number of windows is meant, however its seconds are rounded.
     return np.where(deficits < 0.5 * window_s, 0.0, deficits)
 
 
 def cell_edges(values: Sequence[float], step: float) -> Floats:
-    """Edges half-way between the values of a grid, the outer cells as wide on both sides; `step` wide for one value."""
+    """Compute edges half-way between the values of a grid, the outer cells equally wide on both sides.
+
+    Parameters
+    ----------
+    values : sequence of float    n increasing values
+    step : float    width of the cell of a single value
+
+    Returns
+    -------
+    (n + 1,) float64    in the unit of the values
+    """
     centres = np.unique(np.asarray(values, dtype=np.float64))
     if not len(centres):
         raise MotionError("a grid needs at least one speed and one turn rate", where="grid")
@@ -138,9 +184,19 @@ def cell_edges(values: Sequence[float], step: float) -> Floats:
 
 
 def symmetry(speeds: Floats, turn_rates_deg_s: Floats, speed_edges: Floats, turn_edges: Floats) -> float:
-    """1 - ½ Σ|h(v, ω) - h(v, -ω)| / Σ h over cells that mirror each other exactly; 1 where there is no data.
+    """Compute 1 - ½ Σ|h(v, ω) - h(v, -ω)| / Σ h over cells that mirror each other exactly; 1 where there is no data.
 
     The cells are those of the map and, where the grid itself is one-sided, their mirror images.
+
+    Parameters
+    ----------
+    speeds : (W,) float64    metres per second
+    turn_rates_deg_s : (W,) float64    degrees per second
+    speed_edges, turn_edges : (V + 1,), (O + 1,) float64    edges of the cells, in the same units
+
+    Returns
+    -------
+    float    0 to 1
     """
     sizes: Floats = np.unique(np.round(np.abs(turn_edges), EDGE_DECIMALS))
     bounds = sizes if turn_edges[0] > 0.0 or turn_edges[-1] < 0.0 else np.concatenate(([0.0], sizes[sizes > 0.0]))
@@ -167,7 +223,17 @@ class Hole:
 
 
 def coverage_holes(coverage: Coverage, grid: Grid) -> tuple[Hole, ...]:
-    """The cells with too little data, the emptiest first, then by speed and turn rate."""
+    """List the cells with too little data, the emptiest first, then by speed and turn rate.
+
+    Parameters
+    ----------
+    coverage : Coverage    seconds per cell
+    grid : Grid    speeds and turn rates of the cells
+
+    Returns
+    -------
+    tuple of Hole    cells with their deficit in seconds
+    """
     speeds, turn_rates = np.unique(grid.speeds_m_s), np.unique(grid.turn_rates_deg_s)
     holes = [
         Hole(float(speeds[v]), float(turn_rates[w]), float(coverage.seconds[v, w]), float(coverage.deficit_s[v, w]))
@@ -192,9 +258,19 @@ class Density:
 
 
 def coverage_density(coverage: Coverage, rate_hz: float, *, resolution: int = 96) -> Density:
-    """Kernel density estimate of the windows, with a Gaussian kernel half as wide as a cell of the map.
+    """Estimate the density of the windows, with a Gaussian kernel half as wide as a cell of the map.
 
-    The raster holds all data and the whole map, has about `resolution` points a side and the same to left and right.
+    The raster holds all data and the whole map, and has the same number of points to left and right.
+
+    Parameters
+    ----------
+    coverage : Coverage    the windows
+    rate_hz : float    frames per second
+    resolution : int    points per side, about
+
+    Returns
+    -------
+    Density    seconds of data per m/s and degree/s
     """
     from scipy.ndimage import gaussian_filter
 
@@ -234,7 +310,17 @@ def _sums(values: Floats, span: int) -> Floats:
 
 
 def cell_counts(speeds: Floats, speed_edges: Floats, turn_rates: Floats, turn_edges: Floats) -> Floats:
-    """How many of some windows lie in each cell (V, O), half-open [lower, upper); turn rates and edges in one unit."""
+    """Count the windows in each cell, half-open [lower, upper).
+
+    Parameters
+    ----------
+    speeds, turn_rates : (W,) float64    of the windows
+    speed_edges, turn_edges : (V + 1,), (O + 1,) float64    edges of the cells, in the same units
+
+    Returns
+    -------
+    (V, O) float64    numbers of windows
+    """
     v = np.searchsorted(speed_edges, speeds, side="right") - 1
     w = np.searchsorted(turn_edges, turn_rates, side="right") - 1
     shape = len(speed_edges) - 1, len(turn_edges) - 1

@@ -1,10 +1,9 @@
-"""How good a dataset is, by rules that anybody can check.
+"""Verdict on a data set, by rules that anybody can check.
 
 A trial counts as followed when the character, on average over it,
 
-* is no farther from the wished place than it goes in half a second at the wished speed,
-* is no more than 15 % faster or slower than wished, and
-* turns no more than 10 degrees a second faster or slower than wished.
+* is no farther from the desired position than it travels in half a second at the desired speed, * is no more than 15 %
+faster or slower than desired, and * turns no more than 10 degrees a second faster or slower than desired.
 
 The share of followed trials gives the grade: from 90 % very good, from 70 % good, from 40 % usable in part, below that
 poor. Clips generated for every cell of the default grid follow 95 % of its trials, so the best grade is within reach.
@@ -40,13 +39,13 @@ class Strain(NamedTuple):
 
 @dataclass(frozen=True)
 class Judgement:
-    """What the verdict rests on.
+    """The facts behind the verdict.
 
     Parameters
     ----------
-    grade : one of `GRADES`
-    followed, trials : how many trials were followed, of how many
-    worst : the trial that goes farthest beyond its limits, or nearest to them; None without trials
+    grade : str    one of `GRADES`
+    followed, trials : int    number of followed trials, and of all trials
+    worst : TrialResult, optional    the trial farthest beyond its limits, or nearest to them; None without trials
     """
 
     grade: str
@@ -56,7 +55,16 @@ class Judgement:
 
 
 def judge(result: EvaluationResult) -> Judgement:
-    """Apply the rules to every trial."""
+    """Apply the rules to every trial.
+
+    Parameters
+    ----------
+    result : EvaluationResult    the evaluation
+
+    Returns
+    -------
+    Judgement    grade and numbers
+    """
     followed = sum(is_followed(each) for each in result.trials)
     share = followed / len(result.trials) if result.trials else 0.0
     grade = next(name for least, name in GRADES if share >= least - TOLERANCE)
@@ -65,12 +73,30 @@ def judge(result: EvaluationResult) -> Judgement:
 
 
 def is_followed(outcome: TrialResult) -> bool:
-    """Whether a trial keeps to the three limits."""
+    """Check whether a trial keeps the three limits.
+
+    Parameters
+    ----------
+    outcome : TrialResult    the trial
+
+    Returns
+    -------
+    bool    True where it does
+    """
     return strain(outcome).worst <= 1.0 + TOLERANCE
 
 
 def strain(outcome: TrialResult) -> Strain:
-    """How near a trial comes to each limit."""
+    """Compute the ratio of a trial's errors to each limit.
+
+    Parameters
+    ----------
+    outcome : TrialResult    the trial
+
+    Returns
+    -------
+    Strain    above 1 beyond a limit
+    """
     speed = max(mean_speed_m_s(outcome.trial), TOLERANCE)
     place, bias, turn = (outcome.metrics.get(name) for name in ("offset_mean", "se_v", "se_omega_deg"))
     return Strain(
@@ -81,7 +107,16 @@ def strain(outcome: TrialResult) -> Strain:
 
 
 def mean_speed_m_s(trial: Trial) -> float:
-    """The wished speed over the circle; a switching trial begins it with its own speed."""
+    """Compute the mean desired speed over the circle; a switching trial begins it with its own speed.
+
+    Parameters
+    ----------
+    trial : Trial    the trial
+
+    Returns
+    -------
+    float    metres per second
+    """
     if trial.family == "circle" or trial.duration_s <= 0.0:
         return trial.speed_m_s
     pieces = int(trial.duration_s // trial.switch_every_s)

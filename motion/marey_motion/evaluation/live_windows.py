@@ -1,8 +1,8 @@
-"""The windows of `coverage.sliding_windows` while the frames still come in, at a constant cost per frame.
+"""The windows of `coverage.sliding_windows` for frames that arrive one by one, at a constant cost per frame.
 
-A root is smoothed as `matching.simulation_root` smooths it. Its filters look half a second ahead, so what comes out is
-half a second late (`LiveWindows.delay_s`); when a take ends, its last frames are smoothed as those of a clip that ends
-there, and nothing is left out.
+A root is smoothed as `matching.simulation_root` smooths it. Its filters look half a second ahead, so results are half a
+second late (`LiveWindows.delay_s`); when a take ends, its last frames are smoothed as those of a clip that ends there,
+and nothing is left out.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class LiveWindows:
 
     @property
     def delay_s(self) -> float:
-        """How long a frame waits until it is part of a window: for the frames that smooth the direction."""
+        """Seconds until a frame becomes part of a window: those of the frames that smooth the direction."""
         return len(self._filters.directions) // 2 / self.rate_hz
 
     @property
@@ -86,12 +86,12 @@ class LiveWindows:
 
     @property
     def newest_frame(self) -> Floats | None:
-        """(4,) position and facing of the newest frame as it came, None at the beginning of a take."""
+        """Position (m) and unit facing (4,) of the newest frame, unsmoothed; None at the beginning of a take."""
         return self._take.raw[(self.frame_count - 1) % len(self._take.raw)].copy() if self.frame_count else None
 
     @property
     def newest_window(self) -> Windows | None:
-        """The last window of the take under way, its values as numbers."""
+        """The last window of the current take, with numbers as values."""
         from marey_motion.evaluation import live_kernels
 
         window = np.empty(4)
@@ -100,7 +100,16 @@ class LiveWindows:
         return Windows(*window)
 
     def receive(self, frames: Floats) -> Windows:
-        """Take in frames (n, 4) of ground position and unit facing; the windows that they complete."""
+        """Add frames.
+
+        Parameters
+        ----------
+        frames : (n, 4) float64    ground position (x, z) in metres and unit facing (x, z)
+
+        Returns
+        -------
+        Windows    the windows that these frames complete
+        """
         from marey_motion.evaluation import live_kernels
 
         windows = np.empty((len(frames) + len(self._take.raw), 4))
@@ -109,7 +118,12 @@ class LiveWindows:
         return Windows(*windows[:count].T)
 
     def end_take(self) -> Windows:
-        """The windows of the take's last frames. The next frame begins a new take."""
+        """End the take; the next frame begins a new one.
+
+        Returns
+        -------
+        Windows    the windows of the take's last frames
+        """
         from marey_motion.evaluation import live_kernels
 
         windows = np.empty((len(self._take.raw), 4))
@@ -119,12 +133,26 @@ class LiveWindows:
         return Windows(*windows[:count].T)
 
     def as_tree(self) -> dict[str, Any]:
-        """Everything that goes on from here."""
+        """Save the state for `from_tree`.
+
+        Returns
+        -------
+        dict    plain values and arrays
+        """
         return {"rate_hz": self.rate_hz, **{name: value.copy() for name, value in self._take._asdict().items()}}
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> LiveWindows:
-        """What `as_tree` wrote goes on, to the same bits."""
+        """Restore a state saved by `as_tree`, to the same bits.
+
+        Parameters
+        ----------
+        tree : mapping    plain values and arrays
+
+        Returns
+        -------
+        LiveWindows    continues with the next frame
+        """
         live = cls(tree["rate_hz"])
         for name, own in live._take._asdict().items():
             own[...] = tree[name]
@@ -147,10 +175,18 @@ class LiveWindows:
 
 @lru_cache(maxsize=32)
 def smoother(window: int) -> Floats:
-    """The matrix (window, window) of a Savitzky-Golay filter: row i estimates frame i of a window from all its frames.
+    """Make the matrix of a Savitzky-Golay filter: row i estimates frame i of a window from all its frames.
 
     The middle row is the filter; the rows above it belong to the beginning of a take and those below to its end, where
-    the polynomial of the outermost window goes on to the edge. A window too short for that leaves things as they are.
+    the polynomial of the outermost window continues to the edge. A window too short for that changes nothing.
+
+    Parameters
+    ----------
+    window : int    odd number of frames
+
+    Returns
+    -------
+    (window, window) float64    weights
     """
     if window < SHORTEST_WINDOW:
         basis = np.ones((1, 1))

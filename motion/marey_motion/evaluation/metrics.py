@@ -1,8 +1,8 @@
-"""How well a trial followed its reference: accuracy, responsiveness and costs, over the whole trial and per regime.
+"""Metrics of a trial: accuracy, responsiveness and costs, over the whole trial and per regime.
 
 Everything is measured on steps: step k leads from tick k - 1 to tick k. Its speed is the chord's length over its
-duration, its error is recorded minus reference, and its offset is the distance of the two positions at tick k.
-A regime is a stretch of constant demand: the approach, the trial's own speed ("base"), the other one ("switched").
+duration, its error is recorded minus reference, and its offset is the distance of the two positions at tick k. A regime
+is a stretch of constant demand: the approach, the trial's own speed ("base"), the other one ("switched").
 """
 
 from __future__ import annotations
@@ -61,7 +61,22 @@ class TrialSeries:
 
 
 def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> TrialSeries:
-    """What the character did at each step, beside what was asked. Raises `MotionError` for another trial's record."""
+    """Compute the speeds, turn rates and offsets of each step beside the reference.
+
+    Parameters
+    ----------
+    trial : Trial    the trial
+    reference : Reference    its trajectory
+    record : TrialRecord    T ticks
+
+    Returns
+    -------
+    TrialSeries    T - 1 steps
+
+    Raises
+    ------
+    MotionError    for another trial's record
+    """
     ticks, rate = len(record.rows), record.rate_hz
     if ticks != reference.tick_count or rate != reference.rate_hz:
         raise MotionError(
@@ -91,9 +106,22 @@ def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> Tri
 
 
 def measure_trial(trial: Trial, reference: Reference, record: TrialRecord, options: EvaluationOptions) -> TrialResult:
-    """Every metric of one trial (docs/explanation/evaluation.md), and those of its regimes where it has several.
+    """Compute every metric of one trial (docs/explanation/evaluation.md), and of its regimes where it has several.
 
-    Raises `MotionError` when record and reference are not of one trial.
+    Parameters
+    ----------
+    trial : Trial    the trial
+    reference : Reference    its trajectory
+    record : TrialRecord    T ticks
+    options : EvaluationOptions    options of the evaluation
+
+    Returns
+    -------
+    TrialResult    metrics by name
+
+    Raises
+    ------
+    MotionError    when record and reference belong to different trials
     """
     series = trial_series(trial, reference, record)
     window = np.full(len(series.times_s), True) if options.window == "all" else series.pieces >= 0
@@ -282,10 +310,18 @@ SUMMED = ("transitions", "clip_ends", "response_missed")
 
 
 def pooled_metrics(results: Sequence[TrialResult]) -> dict[str, float | None]:
-    """Metrics of several trials as one, and of their regimes under the regime's name.
+    """Pool the metrics of several trials, and of their regimes under the regime's name.
 
     A maximum is the largest, a root mean square that of all trials, a count the sum, and all others are means over the
     trials that define them. `dse_…_pooled` is the root mean square of the trials' spreads.
+
+    Parameters
+    ----------
+    results : sequence of TrialResult    the trials
+
+    Returns
+    -------
+    dict of str to float or None    metrics by name
     """
     pooled = _pooled([result.metrics for result in results])
     for regime in REGIMES:
@@ -307,7 +343,16 @@ def _pooled(several: Sequence[Metrics]) -> dict[str, float | None]:
 
 
 def offset_asymmetry(results: Sequence[TrialResult]) -> float | None:
-    """Mean difference of `offset_mean` between turning left and right at the same speed, metres; None without pairs."""
+    """Compute the mean difference of `offset_mean` between turning left and right at the same speed.
+
+    Parameters
+    ----------
+    results : sequence of TrialResult    the trials
+
+    Returns
+    -------
+    float or None    metres; None without pairs
+    """
     offsets = {
         (result.trial.family, result.trial.speed_m_s, round(result.trial.turn_rate_rad_s, 9)): offset
         for result in results

@@ -1,6 +1,6 @@
-"""Coverage while a performer records: what there is already, what is still missing, and where to go for it.
+"""Coverage during a recording: the data so far, the missing data, and paths that fill it.
 
-A performance comes in as frames, in pieces of any size. For a whole clip, the windows counted are those that
+A performance arrives as frames, in pieces of any size. For a whole clip, the windows counted are those that
 `coverage.measure_coverage` counts for it at the same frame rate.
 """
 
@@ -42,7 +42,7 @@ AWAY_DECIMALS = 1
 
 @dataclass(frozen=True)
 class PerformerState:
-    """Where the performer is in the newest frame, and how he moves by the newest window, which is None at first.
+    """Position of the performer in the newest frame, and motion by the newest window, which is None at first.
 
     Ground position in metres, heading in radians, strafe positive to the left.
     """
@@ -99,19 +99,42 @@ class OnlineCoverage:
     # -- what comes in -------------------------------------------------------------------------------------------------
 
     def add_frames(self, body: MatchingBody, clip: Clip) -> Windows:
-        """Take in the next frames, as a clip of the body's skeleton at this rate; the windows that they complete.
+        """Add the next frames.
 
-        A take begins with the first frame in which hips and shoulders tell a direction. Raises `MotionError` where the
-        frames lie too far away, and takes none of them.
+        A take begins with the first frame in which hips and shoulders give a direction.
+
+        Parameters
+        ----------
+        body : MatchingBody    joints of the clip's skeleton
+        clip : Clip    frames at this rate
+
+        Returns
+        -------
+        Windows    the windows that these frames complete
+
+        Raises
+        ------
+        MotionError    where the frames lie too far away; none of them is added
         """
         positions = Motion.of(clip).positions(body.skeleton)
         _require_near(positions)
         return self._add(positions[:, body.torso, ::2], forward_vectors(positions, body.lefts, body.rights))
 
     def add_roots(self, positions: Floats, headings: Floats) -> Windows:
-        """Take in ground positions (n, 2) of the torso and headings (n,) of the body, neither of them smoothed.
+        """Add unsmoothed positions of the torso and headings of the body.
 
-        Raises `MotionError` where they are no such places, and takes none of them.
+        Parameters
+        ----------
+        positions : (n, 2) float64    (x, z) in metres
+        headings : (n,) float64    radians
+
+        Returns
+        -------
+        Windows    the windows that these frames complete
+
+        Raises
+        ------
+        MotionError    where a value is invalid or too far away; none of them is added
         """
         if positions.shape != (len(headings), 2) or not np.all(np.isfinite(headings)):
             raise MotionError(f"{len(headings)} headings for positions of shape {positions.shape}", where="roots")
@@ -119,7 +142,12 @@ class OnlineCoverage:
         return self._add(positions, np.stack((np.sin(headings), np.cos(headings)), axis=-1))
 
     def end_take(self) -> Windows:
-        """The performance pauses, or frames were lost: no window goes on from here. The windows that were left."""
+        """End the take, as for a pause or lost frames: no window continues across it.
+
+        Returns
+        -------
+        Windows    the windows of the take's last frames
+        """
         return self._count(self._live.end_take())
 
     def _add(self, positions: Floats, facing: Floats) -> Windows:
@@ -140,27 +168,27 @@ class OnlineCoverage:
 
     @property
     def delay_s(self) -> float:
-        """How far windows lag behind the newest frame: half of the second over which directions are smoothed."""
+        """Delay of windows behind the newest frame: half of the second over which directions are smoothed."""
         return self._live.delay_s
 
     @property
     def seconds(self) -> Floats:
-        """(V, O) seconds of data in each cell."""
+        """Seconds of data in each cell, (V, O)."""
         return self._before + self.counts / self._live.rate_hz
 
     @property
     def deficit_s(self) -> Floats:
-        """(V, O) seconds that each cell lacks."""
+        """Seconds that each cell lacks, (V, O)."""
         return cell_deficits(self.seconds, self.least_s, 1.0 / self._live.rate_hz)
 
     @property
     def index(self) -> float:
-        """Share of the cells with enough."""
+        """Share of the cells with enough data."""
         return float(np.mean(self.deficit_s == 0.0))
 
     @property
     def performer(self) -> PerformerState | None:
-        """Where he is and how he moves; None where no take is under way."""
+        """Position and motion of the performer; None outside a take."""
         newest = self._live.newest_frame
         if newest is None:
             return None
@@ -168,9 +196,18 @@ class OnlineCoverage:
         return PerformerState(x, z, float(np.arctan2(facing_x, facing_z)), self._live.newest_window)
 
     def targets(self, count: int, *, path_s: float = 4.0) -> tuple[Target, ...]:
-        """The cells that lack data and are nearest to how the performer moves, or to standing still, nearest first.
+        """List the cells that lack data, nearest first to the performer's motion, or to standing still.
 
-        Distances are counted in cells. Each comes with a path of `path_s` seconds at its speed and turn rate.
+        Distances are counted in cells.
+
+        Parameters
+        ----------
+        count : int    number of cells, at most
+        path_s : float    seconds of the path of each
+
+        Returns
+        -------
+        tuple of Target    each with a path at its speed and turn rate
         """
         seconds, deficits = self.seconds, self.deficit_s
         speeds, turn_rates = np.unique(self.grid.speeds_m_s), np.unique(self.grid.turn_rates_deg_s)
@@ -190,7 +227,12 @@ class OnlineCoverage:
     # -- what is kept --------------------------------------------------------------------------------------------------
 
     def as_tree(self) -> dict[str, Any]:
-        """Everything that goes on from here: plain values and arrays, less than 64 kB."""
+        """Save the state for `from_tree`.
+
+        Returns
+        -------
+        dict    plain values and arrays, less than 64 kB
+        """
         return {
             "speeds_m_s": list(self.grid.speeds_m_s),
             "turn_rates_deg_s": list(self.grid.turn_rates_deg_s),
@@ -203,7 +245,16 @@ class OnlineCoverage:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> OnlineCoverage:
-        """What `as_tree` wrote goes on, to the same bits."""
+        """Restore a state saved by `as_tree`, to the same bits.
+
+        Parameters
+        ----------
+        tree : mapping    plain values and arrays
+
+        Returns
+        -------
+        OnlineCoverage    continues with the next frame
+        """
         grid = Grid(tuple(tree["speeds_m_s"]), tuple(tree["turn_rates_deg_s"]))
         online = cls(tree["live"]["rate_hz"], grid, least_s=tree["least_s"], seconds=tree["before_s"])
         online._live = LiveWindows.from_tree(tree["live"])

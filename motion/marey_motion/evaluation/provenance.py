@@ -1,4 +1,4 @@
-"""What an evaluation was made from and under which conditions, as digests of canonical content."""
+"""Origin and conditions of an evaluation, as digests of canonical content."""
 
 from __future__ import annotations
 
@@ -19,10 +19,20 @@ from marey_motion.version import code_version
 
 
 def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials: Sequence[Trial]) -> Provenance:
-    """Digests of the data, of what decides its costs and of what was asked of it.
+    """Compute the digests of the data, the cost function and the trials.
 
     `dataset` names the motion that was played, whatever its clips are called; `clips` the documents it came from, or
     the motion of a clip whose document is not known.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    options : EvaluationOptions    options of the evaluation
+    trials : sequence of Trial    the trials
+
+    Returns
+    -------
+    Provenance    digests "sha256:…"
     """
     rows = [_rows_digest(database, clip) for clip in database.clips]
     return Provenance(
@@ -36,7 +46,16 @@ def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials
 
 
 def require_comparable(before: Provenance, after: Provenance) -> None:
-    """Raise `MotionError`, naming all that differs, unless costs, options and scenarios of two evaluations agree."""
+    """Check that costs, options and scenarios of two evaluations agree.
+
+    Parameters
+    ----------
+    before, after : Provenance    of the evaluations
+
+    Raises
+    ------
+    MotionError    naming all differences
+    """
     different = {
         name: f"their {plural} differ ({_short(first)} and {_short(second)}): {remedy}"
         for name, (plural, remedy) in _CONDITIONS.items()

@@ -1,4 +1,4 @@
-"""Which clips and frames carry the load: use, popularity and the jumps between them."""
+"""Relevance of clips and frames: their use, popularity and the jumps between them."""
 
 from __future__ import annotations
 
@@ -34,18 +34,47 @@ class Jumps(NamedTuple):
 
 
 def clip_starts(clips: Sequence[DatabaseClip]) -> NDArray[np.int64]:
-    """(C + 1,) first row of each clip and the number of all rows."""
+    """Compute the first row of each clip.
+
+    Parameters
+    ----------
+    clips : sequence of DatabaseClip    C clips
+
+    Returns
+    -------
+    (C + 1,) int64    first rows, and the number of all rows
+    """
     return np.array([clip.start for clip in clips] + [clips[-1].stop if clips else 0], dtype=np.int64)
 
 
 def clips_of_rows(clips: Sequence[DatabaseClip], rows: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Index of the clip that each row belongs to."""
+    """Find the clip of each row.
+
+    Parameters
+    ----------
+    clips : sequence of DatabaseClip    the clips
+    rows : (n,) int    database rows
+
+    Returns
+    -------
+    (n,) int64    index of the clip
+    """
     found: NDArray[np.int64] = np.searchsorted(clip_starts(clips)[1:], rows, side="right")
     return found
 
 
 def find_jumps(clips: Sequence[DatabaseClip], record: TrialRecord) -> Jumps:
-    """Every jump of a trial, in its order. That a loop begins again is none."""
+    """Find every jump of a trial, in its order. A loop that begins again does not jump.
+
+    Parameters
+    ----------
+    clips : sequence of DatabaseClip    the clips
+    record : TrialRecord    T ticks
+
+    Returns
+    -------
+    Jumps    ticks and rows
+    """
     rows = record.rows.astype(np.int64)
     owners = clips_of_rows(clips, rows)
     left, entered = rows[:-1], rows[1:]
@@ -58,7 +87,17 @@ def find_jumps(clips: Sequence[DatabaseClip], record: TrialRecord) -> Jumps:
 
 
 def measure_usage(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> tuple[ClipUsage, ...]:
-    """How much each clip was displayed and jumped to, over all records; one per clip, in their order."""
+    """Measure the ticks and entries of each clip, over all records.
+
+    Parameters
+    ----------
+    clips : sequence of DatabaseClip    the clips
+    records : sequence of TrialRecord    the trials
+
+    Returns
+    -------
+    tuple of ClipUsage    one per clip, in their order
+    """
     starts = clip_starts(clips)
     popularity = np.zeros(starts[-1], dtype=np.int64)
     entries = np.zeros(len(clips), dtype=np.int64)
@@ -78,7 +117,17 @@ def measure_usage(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord])
 
 
 def count_switches(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> NDArray[np.int64]:
-    """(S, 3) row left, row entered and how often, over all records, ordered by the first two."""
+    """Count the jumps between each pair of rows, over all records.
+
+    Parameters
+    ----------
+    clips : sequence of DatabaseClip    the clips
+    records : sequence of TrialRecord    the trials
+
+    Returns
+    -------
+    (S, 3) int64    row left, row entered and count, ordered by the first two
+    """
     jumps = [find_jumps(clips, record) for record in records]
     left = np.concatenate([jump.left for jump in jumps] or [np.empty(0, np.int64)])
     entered = np.concatenate([jump.entered for jump in jumps] or [np.empty(0, np.int64)])
@@ -88,14 +137,14 @@ def count_switches(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]
 
 @dataclass(frozen=True, eq=False)
 class SourceUsage:
-    """How much a source clip and its mirrored twin were used together.
+    """Use of a source clip together with its mirrored copy.
 
     Parameters
     ----------
-    uid, name : of the source clip
-    clips : indices of the one or two clips made from it
-    ticks, share, entries : sums
-    popularity : (frames,) int64    summed frame by frame
+    uid, name : str    of the source clip
+    clips : tuple of int    indices of the one or two clips made from it
+    ticks, share, entries    sums
+    popularity : (frames,) int64    ticks of each frame, summed
     """
 
     uid: str
@@ -108,7 +157,17 @@ class SourceUsage:
 
 
 def sum_by_source(clips: Sequence[DatabaseClip], usage: Sequence[ClipUsage]) -> tuple[SourceUsage, ...]:
-    """The use of clips as recorded, whichever way round they were shown, in the order of their uids."""
+    """Sum the use of clips and their mirrored copies.
+
+    Parameters
+    ----------
+    clips : sequence of DatabaseClip    the clips
+    usage : sequence of ClipUsage    one per clip
+
+    Returns
+    -------
+    tuple of SourceUsage    in the order of their uids
+    """
     families: dict[str, list[int]] = {}
     for index, clip in enumerate(clips):
         families.setdefault(clip.mirrored_from or clip.uid, []).append(index)
@@ -127,19 +186,47 @@ def sum_by_source(clips: Sequence[DatabaseClip], usage: Sequence[ClipUsage]) -> 
 
 
 def recorded_rows(clips: Sequence[DatabaseClip], usage: Sequence[ClipUsage]) -> int:
-    """Rows of the clips as recorded: a mirrored twin adds none."""
+    """Count the rows of the clips as recorded; a mirrored copy adds none.
+
+    Parameters
+    ----------
+    clips : sequence of DatabaseClip    the clips
+    usage : sequence of ClipUsage    one per clip
+
+    Returns
+    -------
+    int    rows
+    """
     return sum(len(source.popularity) for source in sum_by_source(clips, usage))
 
 
 def unused_clips(usage: Sequence[ClipUsage]) -> tuple[int, ...]:
-    """Indices of the clips that were never displayed."""
+    """List the clips that were never displayed.
+
+    Parameters
+    ----------
+    usage : sequence of ClipUsage    one per clip
+
+    Returns
+    -------
+    tuple of int    indices of the clips
+    """
     return tuple(index for index, own in enumerate(usage) if own.ticks == 0)
 
 
 def treading_share(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> float | None:
-    """Share of the chosen jumps that land within `TREADING_S` of where they left, in the same clip; None without any.
+    """Compute the share of chosen jumps that land within `TREADING_S` of their start, in the same clip.
 
-    A character that finds nothing to go on with comes back to nearly the same frame at every search, and glides.
+    A character that finds nothing to continue with returns to nearly the same frame at every search, and glides.
+
+    Parameters
+    ----------
+    clips : sequence of DatabaseClip    the clips
+    records : sequence of TrialRecord    the trials
+
+    Returns
+    -------
+    float or None    0 to 1; None without jumps
     """
     made = back = 0
     for record in records:

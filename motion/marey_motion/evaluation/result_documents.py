@@ -1,4 +1,4 @@
-"""Evaluations and records to and from trees of plain values and arrays that travel and are kept."""
+"""Conversion of evaluations and records to and from plain values and arrays."""
 
 from __future__ import annotations
 
@@ -24,7 +24,16 @@ Tree = dict[str, Any]
 
 
 def result_to_tree(result: EvaluationResult) -> Tree:
-    """An evaluation without its records; they are a document of their own."""
+    """Convert an evaluation without its records, which are a document of their own.
+
+    Parameters
+    ----------
+    result : EvaluationResult    the evaluation
+
+    Returns
+    -------
+    dict    plain values and arrays
+    """
     return {"schema": EVALUATION_SCHEMA, **_result_body(result)}
 
 
@@ -54,7 +63,17 @@ def _result_body(result: EvaluationResult) -> Tree:
 
 
 def result_from_tree(tree: Mapping[str, Any], records: Sequence[TrialRecord] = ()) -> EvaluationResult:
-    """The evaluation of a tree, with its records where they are at hand."""
+    """Read an evaluation.
+
+    Parameters
+    ----------
+    tree : mapping    result of `result_to_tree`
+    records : sequence of TrialRecord    its records, where they are at hand
+
+    Returns
+    -------
+    EvaluationResult    the evaluation
+    """
     _require(tree, EVALUATION_SCHEMA)
     return _result(tree, records)
 
@@ -82,7 +101,16 @@ def _result(tree: Mapping[str, Any], records: Sequence[TrialRecord]) -> Evaluati
 
 
 def options_from_tree(tree: Mapping[str, Any]) -> EvaluationOptions:
-    """Options as `result_to_tree` wrote them."""
+    """Read the options written by `result_to_tree`.
+
+    Parameters
+    ----------
+    tree : mapping    plain values
+
+    Returns
+    -------
+    EvaluationOptions    the options
+    """
     database = dict(tree["database"])
     database["weights"] = FeatureWeights(**database["weights"])
     for name in ("horizons_s", "extra_joints"):
@@ -110,10 +138,19 @@ COSTS = ("match_cost", "continuing_cost", "pose_cost")
 
 
 def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> Tree:
-    """Records of all or some trials, joined to few large arrays.
+    """Join the records of all or some trials to few large arrays.
 
     `starts` (R + 1,) bounds each record's ticks. A cost that is not defined at every tick is kept as the ticks where it
     is, counted over all records, and its values.
+
+    Parameters
+    ----------
+    trials : sequence of Trial    R trials
+    records : sequence of TrialRecord    their records
+
+    Returns
+    -------
+    dict    plain values and arrays
     """
     rates = {record.rate_hz for record in records}
     if len(trials) != len(records) or len(rates) != 1:
@@ -132,7 +169,16 @@ def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> 
 
 
 def records_from_tree(tree: Mapping[str, Any]) -> dict[str, TrialRecord]:
-    """Records by the name of their trial, in the order they were written."""
+    """Read records.
+
+    Parameters
+    ----------
+    tree : mapping    result of `records_to_tree`
+
+    Returns
+    -------
+    dict of str to TrialRecord    by the name of their trial, in the order they were written
+    """
     _require(tree, RECORDS_SCHEMA)
     starts = tree["starts"].tolist()
     columns = {name: tree[name] for name in ("rows", "positions", "headings", "status")}

@@ -1,4 +1,4 @@
-"""The trials of an evaluation and the trajectories they ask for.
+"""The trials of an evaluation and their trajectories.
 
 A trial starts at the origin facing +z, goes straight for its approach and then turns at a constant rate. Its speed is
 constant, or switches between two values at fixed intervals; the turn rate stays: the path is a chain of tangent arcs.
@@ -41,12 +41,21 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """For example "circle v=1.25 w=-50": stable, and unique within a suite."""
+        """Name such as "circle v=1.25 w=-50": stable, and unique within a suite."""
         return f"{self.family} v={self.speed_m_s:g} w={np.degrees(self.turn_rate_rad_s):g}"
 
 
 def demand(trial: Trial) -> str:
-    """What a trial asks for, in words."""
+    """Describe the demand of a trial in words.
+
+    Parameters
+    ----------
+    trial : Trial    the trial
+
+    Returns
+    -------
+    str    for people
+    """
     turn = float(np.degrees(trial.turn_rate_rad_s))
     speed = f"{trial.speed_m_s:g} m/s"
     if trial.family == "switching":
@@ -76,9 +85,19 @@ class Reference:
 
 
 def suite_trials(options: EvaluationOptions) -> tuple[Trial, ...]:
-    """Every pair of the grid in every family, ordered by family, speed and turn rate as the options list them.
+    """List every pair of the grid in every family, ordered by family, speed and turn rate as the options list them.
 
-    Raises `MotionError` for two trials of one name, such as speeds that differ by less than a millionth.
+    Parameters
+    ----------
+    options : EvaluationOptions    grid and families
+
+    Returns
+    -------
+    tuple of Trial    the suite
+
+    Raises
+    ------
+    MotionError    for two trials of one name, such as speeds that differ by less than a millionth
     """
     trials = tuple(
         Trial(
@@ -99,7 +118,16 @@ def suite_trials(options: EvaluationOptions) -> tuple[Trial, ...]:
 
 
 def require_names(trials: Iterable[Trial]) -> None:
-    """Raise `MotionError` where two trials have one name: records are kept by it."""
+    """Check that trials have different names: records are kept by them.
+
+    Parameters
+    ----------
+    trials : iterable of Trial    the trials
+
+    Raises
+    ------
+    MotionError    where two have one name
+    """
     seen: set[str] = set()
     for trial in trials:
         if trial.name in seen:
@@ -110,9 +138,21 @@ def require_names(trials: Iterable[Trial]) -> None:
 
 
 def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float = LOOK_AHEAD_S) -> Reference:
-    """A trial's trajectory in closed form, sampled at t = tick / rate_hz.
+    """Compute a trial's trajectory in closed form, sampled at t = tick / rate_hz.
 
-    Raises `MotionError` for a trial without ticks, or whose speed switches without an interval.
+    Parameters
+    ----------
+    trial : Trial    the trial
+    rate_hz : float    ticks per second
+    look_ahead_s : float    seconds beyond its end
+
+    Returns
+    -------
+    Reference    positions in metres, headings in radians
+
+    Raises
+    ------
+    MotionError    for a trial without ticks, or one whose speed switches without an interval
     """
     tick_count = round((trial.approach_s + trial.duration_s) * rate_hz)
     if tick_count < 1 or trial.approach_s < 0.0 or trial.duration_s < 0.0:

@@ -1,7 +1,7 @@
-"""Can what covers a cell be blended? Poses of the frames that move alike, compared across clips.
+"""Similarity of the poses in each cell of the coverage map, across clips.
 
-A cell of the coverage map may be full and of no use for motion matching, when its clips never come near each other:
-data that is dense but not blendable. A frame belongs to the cell of the second that begins with it.
+A cell may be full and yet useless for motion matching, when its clips never come near each other: data that is dense
+but not blendable. A frame belongs to the cell of the second that begins with it.
 """
 
 from __future__ import annotations
@@ -50,7 +50,16 @@ class PoseSimilarity:
 
 
 def accepted_distance(records: Sequence[TrialRecord]) -> float | None:
-    """Median pose cost in metres of the transitions that motion matching made; None without any."""
+    """Compute the median pose cost of the transitions that motion matching made.
+
+    Parameters
+    ----------
+    records : sequence of TrialRecord    the trials
+
+    Returns
+    -------
+    float or None    metres; None without transitions
+    """
     costs = [record.pose_cost[:-1][record.status[1:] == Status.REPLACING] for record in records]
     joined = np.concatenate([np.empty(0), *costs])
     return float(np.median(joined)) if len(joined) else None
@@ -65,9 +74,22 @@ def measure_similarity(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> PoseSimilarity:
-    """Compare the frames of every cell of the database's coverage map. `accepted_distance` is the usual threshold.
+    """Compare the frames of every cell of the database's coverage map.
 
     Distances are exact. Progress counts cells with frames.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    coverage : Coverage    their coverage
+    threshold_m : float    distance up to which a frame can be blended, usually `accepted_distance`; metres
+    most_frames : int    frames compared per cell
+    progress : callable, optional    called as progress(done, total, name)
+    cancelled : callable, optional    returns True to stop
+
+    Returns
+    -------
+    PoseSimilarity    distances and shares per cell
     """
     if not (np.isfinite(threshold_m) and threshold_m > 0.0):
         raise MotionError("the threshold must be a distance in metres above 0", where="threshold_m")
@@ -95,12 +117,32 @@ def measure_similarity(
 
 
 def every_kth(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """Every k-th of the rows, k the least that leaves at most `most`."""
+    """Thin rows evenly.
+
+    Parameters
+    ----------
+    rows : (n,) int64    the rows
+    most : int    rows to keep, at most
+
+    Returns
+    -------
+    (m,) int64    every k-th row, with the least k that is enough
+    """
     return rows[:: max(1, -(-len(rows) // most))]
 
 
 def window_rows(database: MatchingDatabase, coverage: Coverage) -> NDArray[np.int64]:
-    """(W,) the row with which each window of the coverage begins."""
+    """Find the first row of each window of the coverage.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    coverage : Coverage    W windows
+
+    Returns
+    -------
+    (W,) int64    database rows
+    """
     clips = coverage.clip.astype(np.int64)
     firsts = np.concatenate(([True], np.diff(clips) != 0))[: len(clips)]
     numbers = np.arange(len(clips))
@@ -110,7 +152,16 @@ def window_rows(database: MatchingDatabase, coverage: Coverage) -> NDArray[np.in
 
 
 def window_cells(coverage: Coverage) -> NDArray[np.int64]:
-    """(W,) flat index of the cell of each window, -1 outside the map."""
+    """Find the cell of each window.
+
+    Parameters
+    ----------
+    coverage : Coverage    W windows
+
+    Returns
+    -------
+    (W,) int64    flat index of the cell, -1 outside the map
+    """
     shape = coverage.seconds.shape
     speeds = np.searchsorted(coverage.speed_edges_m_s, coverage.speed_m_s, side="right") - 1
     turns = np.searchsorted(coverage.turn_rate_edges_deg_s, np.degrees(coverage.turn_rate_rad_s), side="right") - 1
@@ -119,7 +170,16 @@ def window_cells(coverage: Coverage) -> NDArray[np.int64]:
 
 
 def source_of_rows(database: MatchingDatabase) -> NDArray[np.int64]:
-    """(N,) number of each row's source."""
+    """Number the source of each row.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    N rows
+
+    Returns
+    -------
+    (N,) int64    number of the source; a clip and its mirrored copy share one
+    """
     of_clip = np.empty(len(database.clips), dtype=np.int64)
     for number, own in enumerate(clips_by_source(database.clips).values()):
         of_clip[list(own)] = number
@@ -132,9 +192,18 @@ def nearest_poses(
     points: NDArray[np.float32],
     groups: NDArray[np.int64],
 ) -> Floats:
-    """Distance (Q,) of each query (Q, P, 3) from the nearest pose (N, P, 3) of another group; infinite without any.
+    """Compute the distance of each query from the nearest pose of another group.
 
-    Metres, summed over the points, as the pose cost of a transition.
+    Parameters
+    ----------
+    queries : (Q, P, 3) float32    points in metres
+    query_groups : (Q,) int64    group of each query
+    points : (N, P, 3) float32    points in metres
+    groups : (N,) int64    group of each pose
+
+    Returns
+    -------
+    (Q,) float64    metres, summed over the points, as the pose cost of a transition; infinite without another group
     """
     from marey_motion.evaluation import similarity_kernels as kernels
 

@@ -1,4 +1,4 @@
-"""A suite of trials over a database: run on several threads, measured, and put together.
+"""A suite of trials over a database: run on several threads, measured, and assembled.
 
 The result depends on the database, the options and the trials alone, not on threads or the order of work.
 """
@@ -43,7 +43,7 @@ BASELINE_CLIP_S = 8.0
 
 
 class EvaluationCancelled(MotionError):
-    """The evaluation was asked to stop; the trials that were finished were handed over."""
+    """The evaluation was cancelled; finished trials were reported to the caller."""
 
     default_code = "evaluation-cancelled"
 
@@ -60,20 +60,31 @@ def run_suite(
     finished: Callable[[Trial, TrialRecord], None] | None = None,
     cancelled: CancelCallback | None = None,
 ) -> list[TrialRecord]:
-    """Let motion matching follow each trial's reference; one record per trial, in the order of `trials`.
+    """Play motion matching along each trial's reference.
+
+    Callbacks run in the calling thread.
 
     Parameters
     ----------
-    trials : all of the suite's when None; any part of them can be run alone
-    done : records made before, by the name of their trial; these trials are not run again
-    index : of the database's normalised features, built when None
-    threads : at most so many trials at once, one per processor when None
-    progress : called as progress(trials done, of how many, name of the last one)
-    finished : called with each trial and its record as soon as it is made, to keep it
-    cancelled : asked before each trial is begun
+    database : MatchingDatabase    the clips
+    options : EvaluationOptions    options of the evaluation
+    trials : sequence of Trial, optional    all of the suite's when None; any part of them can be run alone
+    done : mapping of str to TrialRecord, optional    records made before, by the name of their trial; these trials are
+        not run again
+    index : SearchIndex, optional    index of the database's normalised features, built when None
+    threads : int, optional    trials at once, one per processor when None
+    progress : callable, optional    called as progress(trials done, total, name of the last one)
+    finished : callable, optional    called with each trial and its record as soon as it is made
+    cancelled : callable, optional    called before each trial; returns True to stop
 
-    Callbacks run in the calling thread. Raises `EvaluationCancelled` once trials already begun are finished, and
-    `MotionError` for two trials of one name, such as speeds that differ by less than a millionth.
+    Returns
+    -------
+    list of TrialRecord    one per trial, in the order of `trials`
+
+    Raises
+    ------
+    EvaluationCancelled    once trials already begun are finished
+    MotionError    for two trials of one name, such as speeds that differ by less than a millionth
     """
     wanted = suite_trials(options) if trials is None else tuple(trials)
     require_names(wanted)
@@ -103,7 +114,17 @@ def _runner(
 
 
 def guide_for(trial: Trial, database: MatchingDatabase) -> Reference:
-    """A trial's trajectory as far beyond its end as the database looks ahead."""
+    """Compute a trial's trajectory as far beyond its end as the database looks ahead.
+
+    Parameters
+    ----------
+    trial : Trial    the trial
+    database : MatchingDatabase    rate and horizons
+
+    Returns
+    -------
+    Reference    the trajectory
+    """
     horizon_s = max(LOOK_AHEAD_S, *database.options.horizons_s)
     return reference(trial, database.options.rate_hz, horizon_s)
 
@@ -139,7 +160,24 @@ def assemble(
     *,
     baseline: EvaluationResult | None = None,
 ) -> EvaluationResult:
-    """Measure finished trials and put everything together. Raises `MotionError` for other trials' records."""
+    """Measure finished trials and assemble the result.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    options : EvaluationOptions    options of the evaluation
+    trials : sequence of Trial    the trials
+    records : sequence of TrialRecord    their records
+    baseline : EvaluationResult, optional    the same suite over generated clips
+
+    Returns
+    -------
+    EvaluationResult    the evaluation
+
+    Raises
+    ------
+    MotionError    for other trials' records
+    """
     if len(trials) != len(records):
         raise MotionError(f"{len(records)} records for {len(trials)} trials")
     rate = database.options.rate_hz
@@ -188,7 +226,25 @@ def evaluate(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> EvaluationResult:
-    """Run the whole suite and measure it, beside the same suite over generated clips unless told not to."""
+    """Run the whole suite and measure it, by default beside the same suite over generated clips.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    options : EvaluationOptions    options of the evaluation
+    threads : int, optional    trials at once, one per processor when None
+    with_baseline : bool    evaluate generated clips, too
+    progress : callable, optional    called as progress(done, total, name)
+    cancelled : callable, optional    returns True to stop
+
+    Returns
+    -------
+    EvaluationResult    the evaluation
+
+    Raises
+    ------
+    EvaluationCancelled    when cancelled
+    """
     trials = suite_trials(options)
     records = run_suite(database, options, trials=trials, threads=threads, progress=progress, cancelled=cancelled)
     baseline = evaluate_baseline(options, threads=threads, cancelled=cancelled) if with_baseline else None
@@ -202,7 +258,23 @@ def evaluate_baseline(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> EvaluationResult:
-    """The suite over generated clips that own every cell, without its records; the last one is kept."""
+    """Evaluate generated clips that own every cell, without records; the last result is cached.
+
+    Parameters
+    ----------
+    options : EvaluationOptions    options of the evaluation
+    threads : int, optional    trials at once, one per processor when None
+    progress : callable, optional    called as progress(done, total, name)
+    cancelled : callable, optional    returns True to stop
+
+    Returns
+    -------
+    EvaluationResult    the evaluation
+
+    Raises
+    ------
+    EvaluationCancelled    when cancelled
+    """
     if options not in _baselines:
         trials = suite_trials(options)
         database, notes = baseline_database(options)
@@ -214,7 +286,17 @@ def evaluate_baseline(
 
 
 def baseline_clips(options: EvaluationOptions) -> tuple[list[SourceClip], list[str]]:
-    """A gait for each pair of the grid, and of the speed that trials switch to; and notes on those nobody can walk."""
+    """Generate a gait for each pair of the grid, and for the speed that trials switch to.
+
+    Parameters
+    ----------
+    options : EvaluationOptions    grid and rate
+
+    Returns
+    -------
+    clips : list of SourceClip    the gaits
+    notes : list of str    pairs that nobody can walk
+    """
     speeds = set(options.grid.speeds_m_s)
     if "switching" in options.families:
         speeds.add(options.switch_speed_m_s)
@@ -235,7 +317,17 @@ def baseline_clips(options: EvaluationOptions) -> tuple[list[SourceClip], list[s
 
 
 def baseline_database(options: EvaluationOptions) -> tuple[MatchingDatabase, list[str]]:
-    """The generated clips as a database, with a normaliser of their own."""
+    """Build a database of the generated clips, with a normaliser of their own.
+
+    Parameters
+    ----------
+    options : EvaluationOptions    grid and rate
+
+    Returns
+    -------
+    database : MatchingDatabase    the gaits
+    notes : list of str    pairs that nobody can walk
+    """
     clips, notes = baseline_clips(options)
     if not clips:
         raise MotionError("no generated clip can do what the grid asks", where="grid")

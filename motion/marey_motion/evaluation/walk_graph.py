@@ -1,7 +1,7 @@
-"""The walk that characters took through the frames of a set of clips, as a directed graph.
+"""The walk of characters through the frames of a set of clips, as a directed graph.
 
 After Kovar et al. (2002) for the vocabulary: clips that lead to each other and back form a strongly connected
-component; a dead end is a component that is not left again.
+component; a dead end is a component that is never left again.
 """
 
 from __future__ import annotations
@@ -40,7 +40,17 @@ class WalkGraph:
 
 
 def walk_graph(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> WalkGraph:
-    """Build the graph of the walks of one or several trials."""
+    """Build the graph of the walks of one or several trials.
+
+    Parameters
+    ----------
+    clips : sequence of DatabaseClip    the clips
+    records : sequence of TrialRecord    the trials
+
+    Returns
+    -------
+    WalkGraph    nodes are database rows
+    """
     shown = [record.rows.astype(np.int64) for record in records]
     rows, ticks = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *shown]), return_counts=True)
     walks = tuple(_runs(clips, record) for record in records)
@@ -57,7 +67,16 @@ def _runs(clips: Sequence[DatabaseClip], record: TrialRecord) -> Ints:
 
 
 def graph_to_tree(graph: WalkGraph) -> dict[str, Any]:
-    """The graph as plain values for JSON; edges name their nodes by index."""
+    """Convert a graph to plain values for JSON; edges name their nodes by index.
+
+    Parameters
+    ----------
+    graph : WalkGraph    the graph
+
+    Returns
+    -------
+    dict    plain values
+    """
     owners = clips_of_rows(graph.clips, graph.rows)
     frames = graph.rows - clip_starts(graph.clips)[owners]
     edges = np.column_stack((np.searchsorted(graph.rows, graph.edges[:, :2]), graph.edges[:, 2]))
@@ -89,10 +108,18 @@ _GRAPHML_KEYS = (
 
 
 def graph_to_graphml(graph: WalkGraph, trials: Sequence[str] = ()) -> bytes:
-    """Write the graph as a GraphML document: nodes n<row> with clip, frame and ticks, edges with their count.
+    """Write a graph as GraphML: nodes n<row> with clip, frame and ticks, edges with their count.
 
-    The ordered walks are data of the graph, walk0 and so on, named after `trials` if these are given: `n12:30 n140:6`
-    is thirty frames from row 12 on, then six from row 140.
+    The ordered walks are data of the graph, walk0 and so on: `n12:30 n140:6` is thirty frames from row 12 on, then six
+    from row 140.
+
+    Parameters
+    ----------
+    graph : WalkGraph    the graph
+
+    Returns
+    -------
+    bytes    the document
     """
     owners = clips_of_rows(graph.clips, graph.rows)
     frames = graph.rows - clip_starts(graph.clips)[owners]
@@ -155,7 +182,18 @@ class ClipGraph:
 
 
 def clip_graph(clips: Sequence[DatabaseClip], switches: Ints, used: Sequence[int]) -> ClipGraph:
-    """The clips' graph from the frames' edges (S, 3); `used` are the indices of the clips that were displayed."""
+    """Reduce the graph of frames to one of clips.
+
+    Parameters
+    ----------
+    clips : sequence of DatabaseClip    the clips
+    switches : (S, 3) int64    row left, row entered and count
+    used : sequence of int    indices of the clips that were displayed
+
+    Returns
+    -------
+    ClipGraph    nodes are clips
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

@@ -1,9 +1,9 @@
-"""Clips that show nearly the same motion: the same poses in the same order, led by a root that goes the same way.
+"""Near-duplicates: clips with the same poses in the same order, led by a root on the same course.
 
-A frame is its pose joints and where the root will be at each horizon, as points in the frame of the root: two walks
-whose poses agree but that turn differently are different. The distance of two clips is that of their best alignment in
-time (`alignment.dtw`): mean distance of the points per frame of the longer clip, in metres. It is 0 for the same frames
-of clips with equal content.
+A frame is its pose joints and the future root at each horizon, as points in the frame of the root: two walks whose
+poses agree but that turn differently are different. The distance of two clips is that of their best alignment in time
+(`alignment.dtw`): mean distance of the points per frame of the longer clip, in metres. It is 0 for the same frames of
+clips with equal content.
 """
 
 from __future__ import annotations
@@ -63,9 +63,21 @@ def find_near_duplicates(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> NearDuplicates:
-    """All pairs of sources whose distance is at most the threshold; exact, whatever is passed over.
+    """Find all pairs of sources whose distance is at most the threshold.
 
-    Most pairs are settled by bounds that are never above their distance. Progress counts sources.
+    The result is exact: most pairs are settled by lower bounds of their distance. Progress counts sources.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    threshold_cm : float    centimetres per frame
+    threads : int    threads to use
+    progress : callable, optional    called as progress(done, total, name)
+    cancelled : callable, optional    returns True to stop
+
+    Returns
+    -------
+    NearDuplicates    pairs, the nearest first
     """
     families = _Families(database)
     found: list[NearDuplicate] = []
@@ -133,7 +145,16 @@ class _Families:
 
 
 def frame_points(database: MatchingDatabase) -> NDArray[np.float64]:
-    """(N, P + H, 3) pose joints and the root at each horizon, metres in the frame of each row's root."""
+    """Compute the pose joints and the root at each horizon as points.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    N rows, P pose joints, H horizons
+
+    Returns
+    -------
+    (N, P + H, 3) float64    metres in the frame of each row's root
+    """
     horizons = len(database.options.horizons_s)
     first = database.features.shape[1] - 4 * horizons
     ahead = np.zeros((database.row_count, horizons, 3))
@@ -144,9 +165,19 @@ def frame_points(database: MatchingDatabase) -> NDArray[np.float64]:
 def spared_sources(
     database: MatchingDatabase, duplicates: NearDuplicates, ticks: dict[str, int]
 ) -> tuple[tuple[str, NearDuplicate], ...]:
-    """Sources to take away so that no pair is left, each with the pair whose other source stays.
+    """Choose sources to remove so that no pair is left.
 
-    Of a pair that one goes that is displayed less (`ticks` by source), then the shorter, then that of the higher uid.
+    Of a pair, the one that is displayed less goes, then the shorter, then that of the higher uid.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    duplicates : NearDuplicates    the pairs
+    ticks : mapping of str to int    ticks displayed, by source
+
+    Returns
+    -------
+    tuple of (str, NearDuplicate)    each source with the pair whose other source stays
     """
     families = clips_by_source(database.clips)
     frames = {source: database.clips[own[0]].frame_count for source, own in families.items()}

@@ -83,14 +83,22 @@ def rank_fillings(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> tuple[Filling, ...]:
-    """All sources of the collections that hold a second of what the set lacks, the best first.
+    """Rank the sources of other collections that hold data the set lacks, the best first.
 
     Parameters
     ----------
-    coverage : of the set
-    collections : by name; of any skeleton, at the set's rate
-    threshold_m : up to where a frame can be blended, as in `similarity`
-    progress : called as progress(sources done, of how many, name)
+    database : MatchingDatabase    the set
+    coverage : Coverage    its coverage
+    collections : mapping of str to MatchingDatabase    by name; of any skeleton, at the set's rate
+    options : EvaluationOptions    grid and least seconds per cell
+    threshold_m : float    distance up to which a frame can be blended, metres, as in `similarity`
+    most_frames : int    frames compared per source
+    progress : callable, optional    called as progress(sources done, total, name)
+    cancelled : callable, optional    returns True to stop
+
+    Returns
+    -------
+    tuple of Filling    the best first
     """
     seconds = {name: source_seconds(other, options) for name, other in collections.items()}
     total, done = sum(map(len, seconds.values())), 0
@@ -119,9 +127,20 @@ def plan_fillings(
     collections: Mapping[str, MatchingDatabase],
     options: EvaluationOptions,
 ) -> tuple[Addition, ...]:
-    """The order in which to add candidates: each the best for what the set and those before it lack, until none helps.
+    """Order the additions: each the best for the data that the set and those before it lack, until none helps.
 
     Candidates of another skeleton come after all others.
+
+    Parameters
+    ----------
+    fillings : sequence of Filling    result of `rank_fillings`
+    coverage : Coverage    coverage of the set
+    collections : mapping of str to MatchingDatabase    by name
+    options : EvaluationOptions    grid and least seconds per cell
+
+    Returns
+    -------
+    tuple of Addition    in order
     """
     seconds = {name: source_seconds(other, options) for name, other in collections.items()}
     missing = coverage.deficit_s.copy()
@@ -146,7 +165,17 @@ def plan_fillings(
 def source_seconds(
     database: MatchingDatabase, options: EvaluationOptions
 ) -> dict[str, tuple[Floats, NDArray[np.int64], NDArray[np.int64]]]:
-    """Per source seconds (V, O) in each cell of the trial grid, and its windows' rows and flat cells."""
+    """Compute the data of each source in each cell of the trial grid.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    options : EvaluationOptions    the grid
+
+    Returns
+    -------
+    dict of str to (seconds, rows, cells)    by source: seconds (V, O) in each cell, its windows' rows and flat cells
+    """
     coverage = measure_coverage(database, options)
     rows, cells = window_rows(database, coverage), window_cells(coverage)
     found = {}

@@ -1,4 +1,4 @@
-"""One number for how good a data set is: what an optimisation makes smaller."""
+"""The objective of an optimisation: one number for a data set, to be minimised."""
 
 from __future__ import annotations
 
@@ -39,7 +39,17 @@ class DataSetObjective:
                 raise MotionError("a weight is a finite number, 0 or more", where=name)
 
     def value(self, results: Sequence[TrialResult], seconds: float) -> float:
-        """The objective of these trials over `seconds` of data."""
+        """Compute the objective of trials.
+
+        Parameters
+        ----------
+        results : sequence of TrialResult    the trials
+        seconds : float    seconds of data
+
+        Returns
+        -------
+        float    metres
+        """
         means = headline_means(results)
         return (
             self.offset * means["offset_mean"]
@@ -51,7 +61,16 @@ class DataSetObjective:
 
 
 def headline_means(results: Sequence[TrialResult]) -> dict[str, float]:
-    """Mean of each headline over the trials that define it; 0 where none does."""
+    """Compute the mean of each headline over the trials that define it; 0 where none does.
+
+    Parameters
+    ----------
+    results : sequence of TrialResult    the trials
+
+    Returns
+    -------
+    dict of str to float    by metric, in its unit
+    """
     means = {}
     for name in HEADLINES:
         values = [value for result in results if (value := result.metrics.get(name)) is not None]
@@ -60,5 +79,14 @@ def headline_means(results: Sequence[TrialResult]) -> dict[str, float]:
 
 
 def headline_changes(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
-    """After minus before."""
+    """Subtract headlines: after minus before.
+
+    Parameters
+    ----------
+    before, after : mapping of str to float    by metric
+
+    Returns
+    -------
+    dict of str to float    by metric, in its unit
+    """
     return {name: after[name] - before[name] for name in HEADLINES}

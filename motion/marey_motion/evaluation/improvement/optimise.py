@@ -1,7 +1,7 @@
-"""A data set made better step by step: clips taken away or added while that lowers an objective.
+"""Optimisation of a data set: clips are removed or added one by one while that lowers an objective.
 
 Every step tries all candidates, each by simulating the trials that it can change, and takes the best one. The objective
-falls with every step, so no set comes twice and the loop ends. The log of the steps is all it takes to go on later.
+falls with every step, so no set comes twice and the loop ends. The log of the steps is enough to continue later.
 """
 
 from __future__ import annotations
@@ -90,13 +90,21 @@ def optimise(
 
     Parameters
     ----------
-    simulation : over a database with all clips of the set and all that may be added (`selection.joined`)
-    absent : sources that may be added; the others are the set
-    log : steps made before, to go on from; `absent` is that of its start then
-    made : called with every new step
-    progress : called as progress(candidates tried, of how many in this step, uid)
+    simulation : Resimulation    over a database with all clips of the set and all that may be added
+        (`selection.joined`)
+    options : OptimisationOptions    objective and budget
+    absent : collection of str    sources that may be added; the others are the set
+    log : sequence of OptimisationStep    earlier steps to continue from; `absent` is then that of their start
+    made : callable, optional    called with every new step
+    progress : callable, optional    called as progress(candidates tried, total of this step, uid)
 
-    Raises `MotionError` for a log that does not come from this database, these trials and this objective.
+    Returns
+    -------
+    Optimisation    the steps, and the reason why there are no more
+
+    Raises
+    ------
+    MotionError    for a log that does not come from this database, these trials and this objective
     """
     steps = list(log)
     if steps:

@@ -12,12 +12,32 @@ NOTICEABLE_M = 0.0005
 
 
 def why_unused_clip(clip: UnusedClip) -> str:
-    """Why a clip can go."""
+    """Explain why a clip can be removed.
+
+    Parameters
+    ----------
+    clip : UnusedClip    the clip
+
+    Returns
+    -------
+    str    a sentence
+    """
     return f"No trial ever needs “{clip.name}”: without its {clip.seconds:.1f} s every trial stays exactly the same."
 
 
 def why_unused_range(part: UnusedRange) -> str:
-    """Why a stretch of a clip can go; a recording that is cut there is filtered anew, so nothing exact is promised."""
+    """Explain why a range of a clip can be removed.
+
+    A recording that is cut there is filtered again, so nothing exact is promised.
+
+    Parameters
+    ----------
+    part : UnusedRange    the range
+
+    Returns
+    -------
+    str    a sentence
+    """
     return (
         f"“{part.name}” is never needed from {part.start_s:.2f} s to {part.stop_s:.2f} s: "
         f"when these {part.seconds:.1f} s are cut off, trials stay nearly the same."
@@ -25,7 +45,17 @@ def why_unused_range(part: UnusedRange) -> str:
 
 
 def why_redundant(removal: Removal, trials: int) -> str:
-    """What leaving a clip out does."""
+    """Explain the effect of leaving a clip out.
+
+    Parameters
+    ----------
+    removal : Removal    the clip and its effect
+    trials : int    number of trials of the suite
+
+    Returns
+    -------
+    str    a sentence
+    """
     change = removal.changes["offset_mean"]
     if abs(change) < NOTICEABLE_M:
         effect = "the mean distance from the path stays the same to the millimetre"
@@ -37,7 +67,17 @@ def why_redundant(removal: Removal, trials: int) -> str:
 
 
 def why_duplicate(source: str, pair: NearDuplicate) -> str:
-    """Why one clip of a pair is enough."""
+    """Explain why one clip of a pair is enough.
+
+    Parameters
+    ----------
+    source : str    uid of the clip to remove
+    pair : NearDuplicate    the pair
+
+    Returns
+    -------
+    str    a sentence
+    """
     gone, stays = (pair.first_name, pair.second_name) if source == pair.first else (pair.second_name, pair.first_name)
     if pair.same_content:
         return f"“{gone}” is “{stays}” once more: one of them is enough."
@@ -46,7 +86,16 @@ def why_duplicate(source: str, pair: NearDuplicate) -> str:
 
 
 def why_filling(filling: Filling) -> str:
-    """What a clip of another collection would bring."""
+    """Explain the gain of a clip from another collection.
+
+    Parameters
+    ----------
+    filling : Filling    the clip
+
+    Returns
+    -------
+    str    a sentence
+    """
     gain = f"“{filling.name}” from {filling.collection} has {filling.filled_s:.1f} s of what is missing"
     where = f"most of it at {_cell_in_words(filling.cells[0])}"
     if filling.needs_retarget:
@@ -55,7 +104,16 @@ def why_filling(filling: Filling) -> str:
 
 
 def why_addition(addition: Addition) -> str:
-    """What a clip brings beside those named before it."""
+    """Explain the gain of a clip beside those added before it.
+
+    Parameters
+    ----------
+    addition : Addition    the clip
+
+    Returns
+    -------
+    str    a sentence
+    """
     return (
         f"“{addition.filling.name}” from {addition.filling.collection} then adds {addition.filled_s:.1f} s of what is "
         f"still missing: {100 * addition.coverage_index:.0f} % of the grid would be covered."

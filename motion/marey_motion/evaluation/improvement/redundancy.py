@@ -1,4 +1,4 @@
-"""Which used clips a data set could do without: every one left out in turn, and a plan of several removals."""
+"""Redundant clips of a data set: every used one left out in turn, and a plan of several removals."""
 
 from __future__ import annotations
 
@@ -58,13 +58,19 @@ def leave_one_out(
     consider: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> tuple[Removal, ...]:
-    """The effect of leaving out each needed source, the least harm per second of data first.
+    """Measure the effect of leaving out each needed source, the least harm per second of data first.
 
     Parameters
     ----------
-    removed : sources that are gone already
-    consider : only so many sources, those that the fewest trials need, then by uid; all when None
-    progress : called as progress(sources done, of how many, uid)
+    simulation : Resimulation    the suite over the set
+    objective : DataSetObjective    measure of harm
+    removed : collection of str    sources that are removed already
+    consider : int, optional    only so many sources, those that the fewest trials need, then by uid; all when None
+    progress : callable, optional    called as progress(sources done, total, uid)
+
+    Returns
+    -------
+    tuple of Removal    one per source
     """
     gone = frozenset(removed)
     outcomes = simulation.outcomes(gone)
@@ -95,10 +101,23 @@ def plan_removals(
     consider: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> tuple[PlannedRemoval, ...]:
-    """Up to `count` removals, each the least harmful per second once the earlier ones are made.
+    """Plan removals, each the least harmful per second once the earlier ones are made.
 
     Every step is simulated, so that its metrics are those of an evaluation of the clips that are left. Stops early when
-    nothing more can go. Progress counts steps.
+    nothing more can be removed. Progress counts steps.
+
+    Parameters
+    ----------
+    simulation : Resimulation    the suite over the set
+    count : int    number of removals, at most
+    objective : DataSetObjective    measure of harm
+    removed : collection of str    sources that are removed already
+    consider : int, optional    as for `leave_one_out`
+    progress : callable, optional    called as progress(steps done, total, uid)
+
+    Returns
+    -------
+    tuple of PlannedRemoval    in order
     """
     gone = frozenset(removed)
     steps: list[PlannedRemoval] = []
@@ -115,6 +134,16 @@ def plan_removals(
 
 
 def name_of(simulation: Resimulation, source: str) -> str:
-    """What people call a source."""
+    """Look up the name of a source.
+
+    Parameters
+    ----------
+    simulation : Resimulation    the suite over the set
+    source : str    uid
+
+    Returns
+    -------
+    str    name for people
+    """
     clips = [simulation.database.clips[own] for own in simulation.sources[source]]
     return next((clip.name for clip in clips if clip.mirrored_from is None), clips[0].name)

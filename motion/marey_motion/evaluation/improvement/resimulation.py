@@ -36,7 +36,7 @@ NONE: Sources = frozenset()
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a trial measured over some clips, and the sources whose rows it displayed or chose."""
+    """Result of a trial over some clips, and the sources whose rows it displayed or chose."""
 
     result: TrialResult
     needed: Sources
@@ -76,10 +76,20 @@ class Resimulation:
             self._keep(NONE, range(len(self.trials)), records, self.index)
 
     def outcomes(self, removed: Collection[str] = NONE) -> tuple[Outcome, ...]:
-        """One per trial, in their order, without the clips of the sources `removed`.
+        """Simulate the trials without some sources.
 
-        Raises `MotionError` for an unknown source and when nothing that can be chosen is left, `EvaluationCancelled`
-        when asked to stop.
+        Parameters
+        ----------
+        removed : collection of str    uids of these sources
+
+        Returns
+        -------
+        tuple of Outcome    one per trial, in their order
+
+        Raises
+        ------
+        MotionError    for an unknown source and when no selectable row is left
+        EvaluationCancelled    when cancelled
         """
         gone = frozenset(removed)
         require_sources(self.sources, gone)
@@ -101,23 +111,68 @@ class Resimulation:
         return tuple(outcome for outcome in found if outcome is not None)
 
     def results(self, removed: Collection[str] = NONE) -> tuple[TrialResult, ...]:
-        """What the trials measured, as `outcomes`."""
+        """Measure the trials without some sources, as `outcomes`.
+
+        Parameters
+        ----------
+        removed : collection of str    uids of these sources
+
+        Returns
+        -------
+        tuple of TrialResult    one per trial, in their order
+        """
         return tuple(outcome.result for outcome in self.outcomes(removed))
 
     def needed(self, removed: Collection[str] = NONE) -> Sources:
-        """The sources that at least one trial needs."""
+        """Find the sources that at least one trial needs.
+
+        Parameters
+        ----------
+        removed : collection of str    uids of removed sources
+
+        Returns
+        -------
+        frozenset of str    uids
+        """
         return NONE.union(*(outcome.needed for outcome in self.outcomes(removed)))
 
     def leaves_rows(self, removed: Collection[str]) -> bool:
-        """Whether there is a row to choose without these sources."""
+        """Check whether a selectable row is left without some sources.
+
+        Parameters
+        ----------
+        removed : collection of str    uids of these sources
+
+        Returns
+        -------
+        bool    True where one is left
+        """
         return bool(np.any(self.database.selectable & ~rows_of_sources(self.database.clips, removed)))
 
     def seconds(self, removed: Collection[str] = NONE) -> float:
-        """Seconds of data that are left, mirrored twins not counted."""
+        """Compute the duration of the data that is left, mirrored copies not counted.
+
+        Parameters
+        ----------
+        removed : collection of str    uids of removed sources
+
+        Returns
+        -------
+        float    seconds
+        """
         return sum(self._frames(source) for source in self.sources if source not in removed) / self._rate_hz
 
     def seconds_of(self, source: str) -> float:
-        """Seconds of one source, whether or not it is there mirrored, too."""
+        """Compute the duration of one source, its mirrored copy not counted.
+
+        Parameters
+        ----------
+        source : str    uid
+
+        Returns
+        -------
+        float    seconds
+        """
         return self._frames(source) / self._rate_hz
 
     @property
@@ -160,7 +215,20 @@ class Resimulation:
 def needed_rows(
     database: MatchingDatabase, index: SearchIndex, trial: Trial, record: TrialRecord, options: EvaluationOptions
 ) -> NDArray[np.int64]:
-    """Rows that a trial displayed or chose. `index` is the one it was run with."""
+    """Find the rows that a trial displayed or chose.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    index : SearchIndex    the index that the trial was run with
+    trial : Trial    the trial
+    record : TrialRecord    its record
+    options : EvaluationOptions    options of the evaluation
+
+    Returns
+    -------
+    (n,) int64    rows, ascending
+    """
     from marey_motion.matching.explain import explain_choice
 
     chosen = switched_rows(database, record.rows)

@@ -1,6 +1,6 @@
 """Parts of a matching database: with fewer clips, with fewer frames, or joined with another one.
 
-Nothing is computed anew: rows keep their features, and the normaliser stays. Clips are taken with their mirrored twins;
+Nothing is recomputed: rows keep their features, and the normaliser stays. Clips are taken with their mirrored copies;
 both are named by the uid of the source.
 """
 
@@ -20,12 +20,30 @@ from marey_motion.skeleton import same_hierarchy
 
 
 def source_of(clip: DatabaseClip) -> str:
-    """The uid of the clip as recorded."""
+    """Look up the uid of the clip as recorded.
+
+    Parameters
+    ----------
+    clip : DatabaseClip    a clip or a mirrored copy
+
+    Returns
+    -------
+    str    uid of the source
+    """
     return clip.mirrored_from or clip.uid
 
 
 def clips_by_source(clips: Sequence[DatabaseClip]) -> dict[str, tuple[int, ...]]:
-    """Indices of the one or two clips of each source, in the order of the sources' uids."""
+    """Group clips by source.
+
+    Parameters
+    ----------
+    clips : sequence of DatabaseClip    the clips
+
+    Returns
+    -------
+    dict of str to tuple of int    indices of the one or two clips of each source, in the order of the uids
+    """
     families: dict[str, list[int]] = {}
     for index, clip in enumerate(clips):
         families.setdefault(source_of(clip), []).append(index)
@@ -33,14 +51,37 @@ def clips_by_source(clips: Sequence[DatabaseClip]) -> dict[str, tuple[int, ...]]
 
 
 def require_sources(known: Collection[str], wanted: Collection[str]) -> None:
-    """Raise `MotionError` naming the first wanted source that is not known."""
+    """Check that sources exist.
+
+    Parameters
+    ----------
+    known, wanted : collection of str    uids
+
+    Raises
+    ------
+    MotionError    naming the first wanted source that is not known
+    """
     unknown = sorted(set(wanted) - set(known))
     if unknown:
         raise MotionError(f"there is no clip {unknown[0]}", code="unknown-clip", where=unknown[0])
 
 
 def rows_of_sources(clips: Sequence[DatabaseClip], sources: Collection[str]) -> Flags:
-    """(N,) rows of the clips of these sources. Raises `MotionError` for a source that has no clip."""
+    """Mark the rows of some sources.
+
+    Parameters
+    ----------
+    clips : sequence of DatabaseClip    clips of N rows
+    sources : collection of str    uids
+
+    Returns
+    -------
+    (N,) bool    True for their rows
+
+    Raises
+    ------
+    MotionError    for a source that has no clip
+    """
     require_sources({source_of(clip) for clip in clips}, sources)
     rows = np.zeros(clips[-1].stop if clips else 0, dtype=np.bool_)
     for clip in clips:
@@ -50,16 +91,39 @@ def rows_of_sources(clips: Sequence[DatabaseClip], sources: Collection[str]) -> 
 
 
 def without_sources(database: MatchingDatabase, sources: Collection[str]) -> MatchingDatabase:
-    """The database without the clips of these sources. Raises `MotionError` for unknown ones, and when none is left."""
+    """Remove the clips of some sources.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    sources : collection of str    uids
+
+    Returns
+    -------
+    MatchingDatabase    the others
+
+    Raises
+    ------
+    MotionError    for unknown sources, and when none is left
+    """
     removed = rows_of_sources(database.clips, sources)
     return _gathered(database, [clip for clip in database.clips if not removed[clip.start]], ~removed)
 
 
 def without_rows(database: MatchingDatabase, removed: Flags) -> MatchingDatabase:
-    """The database without these rows (N,); where rows inside a clip go, what is left of it are clips of their own.
+    """Remove rows; where rows inside a clip are removed, its remaining parts become clips of their own.
 
     A part of a clip is named by its uid and its frames, as "walk#120-480". Its last row cannot be chosen, since nothing
     follows it.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    N rows
+    removed : (N,) bool    rows to remove
+
+    Returns
+    -------
+    MatchingDatabase    the other rows
     """
     selectable = database.selectable.copy()
     pieces = []
@@ -96,9 +160,19 @@ def _by_row(database: MatchingDatabase) -> dict[str, Any]:
 
 
 def joined(first: MatchingDatabase, second: MatchingDatabase) -> MatchingDatabase:
-    """The clips of two databases of one skeleton and the same options, under the first one's normaliser.
+    """Join two databases of one skeleton and the same options, under the first one's normaliser.
 
-    Raises `MotionError` where they differ, or share a clip.
+    Parameters
+    ----------
+    first, second : MatchingDatabase    the databases
+
+    Returns
+    -------
+    MatchingDatabase    all clips
+
+    Raises
+    ------
+    MotionError    where they differ, or share a clip
     """
     if first.options != second.options:
         raise MotionError("both databases must be made with the same options", where="options")
@@ -133,9 +207,18 @@ def _translating(database: MatchingDatabase, joints: tuple[int, ...]) -> Matchin
 
 
 def same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> bool:
-    """Whether clips of both can be mixed as they are: tips, and offsets that both replace by translations, may differ.
+    """Check whether clips of two databases can be mixed.
 
-    A database built with the other's body (`build_database`) is of its skeleton.
+    Tips, and offsets that both replace by translations, may differ. A database built with the other's body
+    (`build_database`) has its skeleton.
+
+    Parameters
+    ----------
+    first, second : MatchingDatabase    the databases
+
+    Returns
+    -------
+    bool    True where they can
     """
     one, other = first.body.skeleton, second.body.skeleton
     if first.body.pose_joints != second.body.pose_joints or one.joint_count != other.joint_count:
@@ -147,7 +230,16 @@ def same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> bool:
 
 
 def require_same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> None:
-    """Raise `MotionError` unless clips of both can be mixed as they are."""
+    """Check that clips of two databases can be mixed.
+
+    Parameters
+    ----------
+    first, second : MatchingDatabase    the databases
+
+    Raises
+    ------
+    MotionError    where they cannot
+    """
     if not same_skeleton(first, second):
         raise MotionError(
             "the clips are of another skeleton; retarget them first", code="skeleton-mismatch", where="skeleton"

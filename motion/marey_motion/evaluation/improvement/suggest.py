@@ -1,4 +1,4 @@
-"""What to do about a data set after an evaluation: what can go, what is there twice, and what would fill its holes.
+"""Suggestions after an evaluation: unused and redundant clips, duplicates, and clips that fill holes.
 
 Everything is a proposal with its predicted effect; nothing is changed.
 """
@@ -93,15 +93,26 @@ def suggest(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> Suggestions:
-    """Everything that an evaluation suggests about the set it was made of.
+    """Collect everything that an evaluation suggests about its data set.
 
     Parameters
     ----------
-    database, result : the set, and its evaluation with all records
-    collections : others to look for clips in, by name; of any skeleton
-    progress : called as progress(done, of how many, what)
+    database : MatchingDatabase    the set
+    result : EvaluationResult    its evaluation with all records
+    collections : mapping of str to MatchingDatabase, optional    others to search for clips, by name; of any skeleton
+    options : SuggestionOptions, optional    options
+    threads : int, optional    threads to use, one per processor when None
+    progress : callable, optional    called as progress(done, total, name)
+    cancelled : callable, optional    returns True to stop
 
-    Raises `MotionError` when the evaluation is not one of this database, `EvaluationCancelled` when asked to stop.
+    Returns
+    -------
+    Suggestions    proposals with their effects
+
+    Raises
+    ------
+    MotionError    when the evaluation does not belong to this database
+    EvaluationCancelled    when cancelled
     """
     how, others = options or SuggestionOptions(), dict(collections or {})
     _require_same(database, result)

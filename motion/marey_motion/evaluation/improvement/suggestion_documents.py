@@ -1,4 +1,4 @@
-"""Comparisons, suggestions and logs of optimisations as trees of plain values and arrays that travel and are kept."""
+"""Conversion of comparisons, suggestions and logs of optimisations to plain values and arrays."""
 
 from __future__ import annotations
 
@@ -24,7 +24,16 @@ Tree = dict[str, Any]
 
 
 def comparison_to_tree(comparison: Comparison) -> Tree:
-    """What changed between two evaluations, which it names by their data sets; they are documents of their own."""
+    """Convert a comparison, which names the two evaluations by their data sets.
+
+    Parameters
+    ----------
+    comparison : Comparison    the comparison
+
+    Returns
+    -------
+    dict    plain values and arrays
+    """
     sides = {"before": comparison.before, "after": comparison.after}
     return {
         "schema": COMPARISON_SCHEMA,
@@ -40,7 +49,16 @@ def comparison_to_tree(comparison: Comparison) -> Tree:
 
 
 def suggestions_to_tree(suggestions: Suggestions) -> Tree:
-    """All proposals with their reasons, in one document."""
+    """Convert all proposals with their reasons to one document.
+
+    Parameters
+    ----------
+    suggestions : Suggestions    the proposals
+
+    Returns
+    -------
+    dict    plain values and arrays
+    """
     found = suggestions
     return {
         "schema": SUGGESTIONS_SCHEMA,
@@ -99,7 +117,16 @@ def _similarity_to_tree(similarity: PoseSimilarity) -> Tree:
 
 
 def optimisation_to_tree(optimisation: Optimisation) -> Tree:
-    """The log, to keep and to go on from."""
+    """Convert a log, to store or to continue from.
+
+    Parameters
+    ----------
+    optimisation : Optimisation    the log
+
+    Returns
+    -------
+    dict    plain values and arrays
+    """
     return {
         "schema": OPTIMISATION_SCHEMA,
         "ended": optimisation.ended,
@@ -108,7 +135,16 @@ def optimisation_to_tree(optimisation: Optimisation) -> Tree:
 
 
 def steps_from_tree(tree: Mapping[str, Any]) -> tuple[OptimisationStep, ...]:
-    """The log of `optimisation_to_tree`."""
+    """Read the log written by `optimisation_to_tree`.
+
+    Parameters
+    ----------
+    tree : mapping    plain values and arrays
+
+    Returns
+    -------
+    tuple of OptimisationStep    the steps
+    """
     if tree.get("schema") != OPTIMISATION_SCHEMA:
         raise MotionError(
             f"a document of schema {OPTIMISATION_SCHEMA} is needed, not {tree.get('schema')}", where="schema"

@@ -1,4 +1,4 @@
-"""The same suite under other weights of the feature groups: which of them matter?"""
+"""The same suite under other weights of the feature groups, to find those that matter."""
 
 from __future__ import annotations
 
@@ -52,7 +52,17 @@ class Influence:
 
 
 def vary_each_group(options: DatabaseOptions, factors: Sequence[float] = (0.5, 2.0)) -> tuple[FeatureWeights, ...]:
-    """The options' weights, then each group's weight times each factor with all others as they are."""
+    """List the options' weights, then each group's weight times each factor with all others unchanged.
+
+    Parameters
+    ----------
+    options : DatabaseOptions    weights to start from
+    factors : sequence of float    factors
+
+    Returns
+    -------
+    tuple of FeatureWeights    the settings
+    """
     weights = options.weights
     groups = [group for group in GROUPS if group != "extra_joints" or options.extra_joints]
     return (
@@ -75,6 +85,21 @@ def sweep_weights(
     """Run the suite under each setting; features and the normaliser's spreads are those of the database.
 
     Progress counts trials over all settings.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    options : EvaluationOptions    options of the evaluation
+    settings : sequence of FeatureWeights    weights to try
+    objective : DataSetObjective    measure of the result
+    trials : sequence of Trial, optional    the suite's when None
+    threads : int, optional    trials at once
+    progress : callable, optional    called as progress(done, total, name)
+    cancelled : callable, optional    returns True to stop
+
+    Returns
+    -------
+    tuple of SweepRow    one per setting
     """
     wanted = suite_trials(options) if trials is None else tuple(trials)
     aim = objective or DataSetObjective()
@@ -98,7 +123,21 @@ def sweep_weights(
 
 
 def reweighted(database: MatchingDatabase, weights: FeatureWeights) -> MatchingDatabase:
-    """The database with other weights. Raises `MotionError` for a group whose weight was 0: its scale is not known."""
+    """Change the weights of a database.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    weights : FeatureWeights    the new weights
+
+    Returns
+    -------
+    MatchingDatabase    the same rows
+
+    Raises
+    ------
+    MotionError    for a group whose weight was 0: its scale is not known
+    """
     options = replace(database.options, weights=weights)
     scale = database.normaliser.scale.copy()
     pairs = zip(database.layout.groups, feature_layout(options, database.body).groups, strict=True)
@@ -113,7 +152,16 @@ def reweighted(database: MatchingDatabase, weights: FeatureWeights) -> MatchingD
 
 
 def group_influences(rows: Sequence[SweepRow]) -> tuple[Influence, ...]:
-    """For each group that was varied alone, how much that did; the most influential first."""
+    """Compute the influence of each group that was varied alone, the most influential first.
+
+    Parameters
+    ----------
+    rows : sequence of SweepRow    results of a sweep
+
+    Returns
+    -------
+    tuple of Influence    one per group
+    """
     base = asdict(rows[0].weights)
     found = []
     for group in GROUPS:

@@ -36,7 +36,7 @@ MARGIN_AFTER_S = MARGIN_BEFORE_S
 
 @dataclass(frozen=True)
 class UnusedClip:
-    """A source, with its mirrored twin, that no trial needs."""
+    """A source, with its mirrored copy, that no trial needs."""
 
     source: str
     name: str
@@ -60,13 +60,13 @@ class UnusedRange:
 
     @property
     def seconds(self) -> float:
-        """Of data saved."""
+        """Seconds of data saved."""
         return self.stop_s - self.start_s
 
 
 @dataclass(frozen=True, eq=False)
 class Unused:
-    """What can go without changing a trial: whole sources, frames of others, and the rows (N,) of both."""
+    """Data that can be removed without changing a trial: whole sources, frames of others, and the rows (N,) of both."""
 
     clips: tuple[UnusedClip, ...]
     ranges: tuple[UnusedRange, ...]
@@ -74,7 +74,7 @@ class Unused:
 
     @property
     def seconds(self) -> float:
-        """Of data saved by all of it, mirrored twins not counted."""
+        """Seconds of data saved by all of it, mirrored copies not counted."""
         return sum(clip.seconds for clip in self.clips) + sum(part.seconds for part in self.ranges)
 
 
@@ -86,9 +86,19 @@ def find_unused(
     *,
     index: SearchIndex | None = None,
 ) -> Unused:
-    """Sources and frames that none of these trials needs; the longest first. Loops that wrap are kept or go whole.
+    """Find the sources and frames that no trial needs, the longest first. Loops that wrap are kept or removed whole.
 
-    `index` is the one the trials were run with, built when None.
+    Parameters
+    ----------
+    database : MatchingDatabase    the clips
+    trials : sequence of Trial    the trials
+    records : sequence of TrialRecord    their records
+    options : EvaluationOptions    options of the evaluation
+    index : SearchIndex, optional    the index that the trials were run with, built when None
+
+    Returns
+    -------
+    Unused    sources, ranges and rows
     """
     needed = _needed(database, trials, records, options, index)
     rate = database.options.rate_hz
