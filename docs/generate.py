@@ -55,21 +55,19 @@ def _commands(group: Any, prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 def _parameters(command: Any) -> str:
+    context = typer.Context(command)
     rows = [
-        (
-            f"`{', '.join(one.opts + one.secondary_opts)}`" if one.param_type_name == "option" else f"`{one.name}`",
-            one.help,
-        )
-        for one in command.params
+        (f"`{one.name}`" if one.param_type_name == "argument" else _spelled(one, context), one.help)
+        for one in command.get_params(context)
         if one.name not in ("help", "install_completion", "show_completion", "version")
     ]
     return _table(("option or argument", "meaning"), rows)
 
 
-def _spelled(parameter: Any) -> str:
-    if parameter.param_type_name == "argument":
-        return f"`{parameter.name}`"
-    return f"`{', '.join(parameter.opts + parameter.secondary_opts)}`"
+def _spelled(option: Any, context: typer.Context) -> str:
+    """The spellings of an option and what it takes, as its help shows them."""
+    shown, _ = option.get_help_record(context)
+    return f"`{shown}`"
 
 
 def settings_page() -> str:

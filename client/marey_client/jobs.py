@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from marey_client.errors import JobUnsuccessful, WaitedTooLong
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport
-from marey_schemas.jobs import Attempt, Job, JobCreate, JobKind, JobOutput, JobState
+from marey_schemas.base import Request
+from marey_schemas.jobs import Attempt, Job, JobCreate, JobInput, JobKind, JobOutput, JobState
+
+OnProgress = Callable[[Job], None]
 
 LONGEST_WAIT_S = 20.0
 """How long one question may stay open at the server."""
 
 SHORTEST_PAUSE_S = 0.05
 FOLLOW_EVERY_S = 0.5
+
+
+def job_request(kind: str, inputs: Mapping[str, JobInput | Sequence[JobInput]], params: Request) -> JobCreate:
+    """Ask for a job with these parameters; those that were not given stay open for the server's defaults."""
+    given = {name: tuple(one) if isinstance(one, Sequence) else one for name, one in inputs.items()}
+    return JobCreate(kind=kind, inputs=given, params=params.model_dump(mode="json", exclude_unset=True))
 
 
 @dataclass(frozen=True)
@@ -29,8 +38,12 @@ class Jobs:
         return pages(self.transport, JobKind, "/job-kinds")
 
     def submit(self, project: str, job: JobCreate) -> Job:
-        """Hand in a job."""
+        """Submit a job."""
         return self.transport.post(Job, f"/projects/{project}/jobs", job)
+
+    def run(self, project: str, job: JobCreate, *, on_progress: OnProgress | None = None) -> Job:
+        """Submit a job and wait until it has ended. Raises `JobUnsuccessful`."""
+        return self.wait(self.submit(project, job).id, on_progress=on_progress)
 
     def list(self, project: str, *, limit: int = 100, filters: Params | None = None) -> Iterator[Job]:
         """Jobs of a project, newest first."""
@@ -50,7 +63,7 @@ class Jobs:
         job_id: str,
         *,
         timeout_s: float | None = None,
-        on_progress: Callable[[Job], None] | None = None,
+        on_progress: OnProgress | None = None,
         require_success: bool = True,
     ) -> Job:
         """Wait until a job has ended; `on_progress` sees it about once a second.

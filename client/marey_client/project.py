@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 from marey_client.access import Members
 from marey_client.handles.coverage_streams import CoverageStreams
@@ -12,7 +12,7 @@ from marey_client.handles.edits import Commands
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.handles.models import ModelHandle
 from marey_client.handles.pipelines import PipelineRun, submit_pipeline
-from marey_client.jobs import Jobs
+from marey_client.jobs import Jobs, OnProgress
 from marey_client.project_items import ProjectItems
 from marey_client.requests import (
     AlignedClips,
@@ -34,6 +34,8 @@ from marey_schemas.job_params import AlignParams, AnnotateParams, CutParams, Eva
 from marey_schemas.jobs import Job, JobCreate
 from marey_schemas.model_pipelines import model_pipeline
 from marey_schemas.pipelines import PipelineCreate
+
+Cache: TypeAlias = Literal["use", "refresh", "off"]
 
 
 class ProjectHandle(ProjectItems):
@@ -94,7 +96,7 @@ class ProjectHandle(ProjectItems):
         name: str,
         seed: int = 0,
         priority: int = 0,
-        cache: Literal["use", "refresh", "off"] = "use",
+        cache: Cache = "use",
         **choices: Any,
     ) -> PipelineRun:
         """Hand in all that leads from takes to a model: import, retarget, annotate, cut, align, model, tree.
@@ -114,13 +116,14 @@ class ProjectHandle(ProjectItems):
         into: str,
         params: RetargetParams | None = None,
         priority: int = 0,
+        cache: Cache = "use",
     ) -> Job:
         """Submit the retargeting of clips, a folder by its path, or folders and clips, to the skeleton with this id.
 
         Uses the newest joint mapping of each skeleton.
         """
         request = retarget_request(self, clips, skeleton, params or RetargetParams())
-        return self.submit(request.model_copy(update={"into": into, "priority": priority}))
+        return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
 
     def annotate(
         self,
@@ -129,6 +132,7 @@ class ProjectHandle(ProjectItems):
         proposal: str | Mapping[str, Any] = "steps",
         into: str = "",
         priority: int = 0,
+        cache: Cache = "use",
         **options: Any,
     ) -> Job:
         """Hand in the annotation of clips, by a method or a method with its options, below the folder `into`.
@@ -138,15 +142,17 @@ class ProjectHandle(ProjectItems):
         """
         method = {"method": proposal} if isinstance(proposal, str) else proposal
         request = annotate_request(self, clips, AnnotateParams.model_validate({"proposal": method, **options}))
-        return self.submit(request.model_copy(update={"into": into, "priority": priority}))
+        return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
 
-    def cut(self, annotations: Annotations, *, into: str, priority: int = 0, **options: Any) -> Job:
+    def cut(
+        self, annotations: Annotations, *, into: str, priority: int = 0, cache: Cache = "use", **options: Any
+    ) -> Job:
         """Hand in the cutting of clips along the segments of annotations, into folders below `into`.
 
         `options` are those of `CutParams`, for example `labels=("step_left", "step_right")` or `by_label=True`.
         """
         request = cut_request(self, annotations, CutParams.model_validate(options))
-        return self.submit(request.model_copy(update={"into": into, "priority": priority}))
+        return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
 
     def align(
         self,
@@ -155,7 +161,7 @@ class ProjectHandle(ProjectItems):
         into: str,
         annotations: Annotations | None = None,
         priority: int = 0,
-        cache: Literal["use", "refresh", "off"] = "use",
+        cache: Cache = "use",
         **options: Any,
     ) -> Job:
         """Hand in the alignment of clips of one skeleton, all of which show the same action.
@@ -166,14 +172,23 @@ class ProjectHandle(ProjectItems):
         request = align_request(self, clips, annotations, AlignParams.model_validate(options))
         return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
 
-    def edit(self, clips: Clips, commands: Commands, *, into: str = "", priority: int = 0, **options: Any) -> Job:
+    def edit(
+        self,
+        clips: Clips,
+        commands: Commands,
+        *,
+        into: str = "",
+        priority: int = 0,
+        cache: Cache = "use",
+        **options: Any,
+    ) -> Job:
         """Hand in the editing of clips, a folder by its path, or folders and clips, by commands or a stored edit.
 
         The results go to the folder `into`, or get a `suffix`, or with `in_place=True` are the next revisions of the
         clips themselves. `options` are those of `EditParams`.
         """
         request = edit_request(self, clips, commands, options)
-        return self.submit(request.model_copy(update={"into": into, "priority": priority}))
+        return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
 
     def evaluate(
         self,
@@ -182,7 +197,7 @@ class ProjectHandle(ProjectItems):
         into: str = "",
         normaliser: EvaluationHandle | str | None = None,
         priority: int = 0,
-        cache: Literal["use", "refresh", "off"] = "use",
+        cache: Cache = "use",
         **options: Any,
     ) -> Job:
         """Hand in the evaluation of clips of one skeleton: a folder by its path, or folders and clips.
@@ -193,12 +208,9 @@ class ProjectHandle(ProjectItems):
         request = evaluate_request(self, clips, EvaluateParams.model_validate(options), normaliser)
         return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
 
-    def evaluation(self, job: Job, *, on_progress: Callable[[Job], None] | None = None) -> EvaluationHandle:
-        """The evaluation that a job makes, once it is there. Raises `JobUnsuccessful`."""
-        jobs = Jobs(self.transport)
-        jobs.wait(job.id, on_progress=on_progress)
-        (made,) = jobs.outputs(job.id)
-        return self.evaluations.get(made.item)
+    def evaluation(self, job: Job, *, on_progress: OnProgress | None = None) -> EvaluationHandle:
+        """Return the evaluation that a job makes, when the job has ended. Raises `JobUnsuccessful`."""
+        return self.evaluations.get(self._made_by(job, on_progress))
 
     def train_model(
         self,
@@ -207,7 +219,7 @@ class ProjectHandle(ProjectItems):
         into: str = "",
         seed: int = 0,
         priority: int = 0,
-        cache: Literal["use", "refresh", "off"] = "use",
+        cache: Cache = "use",
         **options: Any,
     ) -> Job:
         """Hand in the training of a model on clips that were aligned with each other: a folder, or several of them.
@@ -218,13 +230,17 @@ class ProjectHandle(ProjectItems):
         update = {"into": into, "seed": seed, "priority": priority, "cache": cache}
         return self.submit(request.model_copy(update=update))
 
-    def model(self, job: Job, *, on_progress: Callable[[Job], None] | None = None) -> ModelHandle:
-        """The model that a job makes, once it is there. Raises `JobUnsuccessful`."""
-        jobs = Jobs(self.transport)
-        jobs.wait(job.id, on_progress=on_progress)
-        (made,) = jobs.outputs(job.id)
-        return self.models.get(made.item)
+    def model(self, job: Job, *, on_progress: OnProgress | None = None) -> ModelHandle:
+        """Return the model that a job makes, when the job has ended. Raises `JobUnsuccessful`."""
+        return self.models.get(self._made_by(job, on_progress))
 
     def jobs(self, *, filters: Params | None = None) -> Iterator[Job]:
         """Its jobs, newest first."""
         return Jobs(self.transport).list(self.name, filters=filters)
+
+    def _made_by(self, job: Job, on_progress: OnProgress | None) -> str:
+        """Wait for a job and return the id of the one item it makes."""
+        jobs = Jobs(self.transport)
+        jobs.wait(job.id, on_progress=on_progress)
+        (made,) = jobs.outputs(job.id)
+        return made.item

@@ -15,9 +15,9 @@ from marey_client.handles.edits import Commands, EditHandle, as_edit
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.handles.processed import ProcessedHandle
 from marey_client.imports import LocalFile, Notice
+from marey_client.jobs import job_request
 from marey_client.places import Places, as_inputs, items_at
 from marey_client.project_items import ProjectItems
-from marey_schemas.base import Request
 from marey_schemas.items import Item
 from marey_schemas.job_params import (
     AlignParams,
@@ -49,7 +49,7 @@ def retarget_request(project: ProjectItems, clips: Clips, skeleton: str, params:
     inputs: dict[str, Any] = {"clips": as_inputs(clips), "skeleton": ItemInput(item=skeleton)}
     if edited := project.edited_rigs(items_at(project.clips, clips)):
         inputs["rigs"] = edited
-    return JobCreate(kind="retarget", inputs=inputs, params=_given(params))
+    return job_request("retarget", inputs, params)
 
 
 def annotate_request(project: ProjectItems, clips: Clips, params: AnnotateParams) -> JobCreate:
@@ -57,7 +57,7 @@ def annotate_request(project: ProjectItems, clips: Clips, params: AnnotateParams
     inputs: dict[str, Any] = {"clips": as_inputs(clips)}
     if edited := project.edited_rigs(items_at(project.clips, clips)):
         inputs["rigs"] = edited
-    return JobCreate(kind="annotate", inputs=inputs, params=_given(params))
+    return job_request("annotate", inputs, params)
 
 
 def cut_request(project: ProjectItems, annotations: Annotations, params: CutParams) -> JobCreate:
@@ -72,7 +72,7 @@ def cut_request(project: ProjectItems, annotations: Annotations, params: CutPara
         "annotations": tuple(ItemInput(item=one.id, revision=one.revision) for one in found.values()),
         "clips": tuple(ItemInput(item=clip, revision=revision) for clip, revision in sorted(clips)),
     }
-    return JobCreate(kind="cut", inputs=inputs, params=_given(params))
+    return job_request("cut", inputs, params)
 
 
 def align_request(
@@ -90,7 +90,7 @@ def align_request(
         inputs["annotations"] = as_inputs(annotations)
     elif params.layer is not None or params.labels:
         inputs["annotations"] = _annotations_of(project, found, params.layer)
-    return JobCreate(kind="align", inputs=inputs, params=_changed(params))
+    return job_request("align", inputs, params)
 
 
 def edit_request(project: ProjectItems, clips: Clips, commands: Commands, options: Mapping[str, Any]) -> JobCreate:
@@ -107,7 +107,7 @@ def edit_request(project: ProjectItems, clips: Clips, commands: Commands, option
         inputs["sources"] = tuple(ItemInput(item=item) for item in edit.sources)
     if edited := project.edited_rigs(items_at(project.clips, clips)):
         inputs["rigs"] = edited
-    return JobCreate(kind="edit", inputs=inputs, params=_given(params))
+    return job_request("edit", inputs, params)
 
 
 def evaluate_request(
@@ -120,13 +120,14 @@ def evaluate_request(
         inputs["normaliser"] = ItemInput(item=normaliser) if isinstance(normaliser, str) else normaliser.as_input()
     if len(edited := project.edited_rigs(found)) == 1:
         (inputs["rig"],) = edited
-    loops = dict.fromkeys((*params.loops, *(item.id for item in found if LOOP_TAG in item.tags)))
-    return JobCreate(kind="evaluate", inputs=inputs, params=_changed(params.model_copy(update={"loops": tuple(loops)})))
+    if tagged := [item.id for item in found if LOOP_TAG in item.tags]:
+        params = params.model_copy(update={"loops": tuple(dict.fromkeys((*params.loops, *tagged)))})
+    return job_request("evaluate", inputs, params)
 
 
 def model_request(aligned: AlignedClips, params: ModelParams) -> JobCreate:
     """Ask for a model that is trained on aligned clips."""
-    return JobCreate(kind="model", inputs={"aligned": as_inputs(aligned)}, params=_changed(params))
+    return job_request("model", {"aligned": as_inputs(aligned)}, params)
 
 
 def plan_model(
@@ -175,11 +176,3 @@ def _annotations_of(project: ProjectItems, clips: Mapping[str, Item], layer: str
         for one in listed
         if one.item.summary["clip"] in clips and layer in (None, one.item.summary["layer"])
     )
-
-
-def _given(params: Request) -> dict[str, Any]:
-    return params.model_dump(mode="json", exclude_unset=True)
-
-
-def _changed(params: Request) -> dict[str, Any]:
-    return params.model_dump(mode="json", exclude_defaults=True)

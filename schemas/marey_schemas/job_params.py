@@ -87,7 +87,7 @@ _NAME_FIELD = re.compile(r"\{(clip|label|number)(?::([1-9]))?\}")
 class AnnotateParams(Request):
     """Parameters of `annotate`."""
 
-    proposal: Proposal
+    proposal: Proposal = Field(description="Method that proposes segments and keyframes, with its options.")
     layer: LayerName | None = Field(None, description="Name of the layer; default: that of the method.")
     tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the annotations.")
 

@@ -107,7 +107,7 @@ class JobCreate(Request):
     inputs: dict[str, JobInput | tuple[JobInput, ...]] = Field(default_factory=dict)
     params: dict[str, Any] = Field(default_factory=dict)
     into: CollectionPath = Field("", description="The collection the results go to.")
-    priority: int = Field(0, ge=-100, le=100)
+    priority: int = Field(0, ge=-100, le=100, description="Jobs of higher priority run first.")
     after: tuple[str, ...] = Field((), max_length=1000, description="Jobs that must succeed first.")
     on_failure: Literal["fail", "skip"] = Field(
         "fail", description="What to do when a job in `after` does not succeed."
@@ -115,8 +115,12 @@ class JobCreate(Request):
     concurrency_key: str | None = Field(
         None, max_length=255, description="At most one job of a project runs with this key."
     )
-    cache: Literal["use", "refresh", "off"] = "use"
-    seed: int = Field(0, ge=0, lt=2**63)
+    cache: Literal["use", "refresh", "off"] = Field(
+        "use",
+        description="use: take over the result of an identical job; refresh: compute it again and keep it for later "
+        "jobs; off: compute it again for this job alone.",
+    )
+    seed: int = Field(0, ge=0, lt=2**63, description="Seed of all random numbers: the same seed, the same result.")
     max_attempts: int = Field(3, ge=1, le=20)
     labels: dict[str, str] = Field(default_factory=dict, description="A worker must carry all of them.")
     resources: Resources = Resources()

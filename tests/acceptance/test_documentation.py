@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from docs.generate import REFERENCE, ROOT, pages
+from typer import Context
 from typer.main import get_command
 
 from marey_client.cli.app import app
@@ -51,6 +52,6 @@ def test_every_command_that_a_page_tells_exists_with_these_options(page: str, li
     while words and words[0] in getattr(command, "commands", {}):
         command = command.commands[words.pop(0)]
     assert not hasattr(command, "commands"), f"{page}: {line}"
-    known |= {option for one in command.params for option in (*one.opts, *one.secondary_opts)}
+    known |= {option for one in command.get_params(Context(command)) for option in (*one.opts, *one.secondary_opts)}
     given = {word.partition("=")[0] for word in words if re.match(r"--[a-z]|-[a-z]$", word)}
     assert given <= known, f"{page}: {line}"

@@ -1,19 +1,24 @@
-"""`lab/raw/walk`: a project, a folder in it, an item in that."""
+"""Addresses such as `lab/raw/walk`, a project, a folder and an item, and the things that are found there."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from marey_client.cli.failures import WrongUsage
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from marey_client.items import ItemHandle
     from marey_client.marey import Marey
+    from marey_client.project import ProjectHandle
+    from marey_schemas.items import Collection, Item
     from marey_schemas.kinds import Kind
+
+FOLDER = "collection"
+REQUESTS_AT_ONCE = 4
 
 _ID = re.compile(r"([a-z]+)_[0-9a-hjkmnp-tv-z]{26}")
 
@@ -73,6 +78,24 @@ def require_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> Any:
     return found
 
 
+def addresses_in_one_project(places: Sequence[str]) -> list[Address]:
+    """Read several addresses. Raises `WrongUsage` where they are not all in one project."""
+    addresses = [Address.parse(place) for place in places]
+    if len({address.project for address in addresses}) > 1:
+        raise WrongUsage(f"{', '.join(places)}: all of these must be in one project")
+    return addresses
+
+
+def kind_named(name: str) -> Kind:
+    """Return the kind of item with a name. Raises `WrongUsage`."""
+    from marey_schemas.kinds import Kind
+
+    try:
+        return Kind(name)
+    except ValueError:
+        raise WrongUsage(f"{name!r} is no kind; there are {', '.join(Kind)}") from None
+
+
 def _existing(items: Any, item_id: str) -> ItemHandle | None:
     from marey_client.errors import NotFound
 
@@ -81,3 +104,169 @@ def _existing(items: Any, item_id: str) -> ItemHandle | None:
     except NotFound:
         return None
     return found
+
+
+# -- folders and items alike --
+
+
+class Thing(Protocol):
+    """A folder or an item of a project."""
+
+    @property
+    def id(self) -> str: ...
+    @property
+    def kind(self) -> str: ...
+    @property
+    def place(self) -> str: ...
+
+    def count(self) -> int:
+        """How many items would go with it."""
+
+    def move(self, folder: str, name: str) -> Collection | Item:
+        """Put it into a folder under a name; what it is then."""
+
+    def delete(self) -> None:
+        """Hide it."""
+
+    def restore(self) -> Collection | Item:
+        """Bring it back."""
+
+
+@dataclass(frozen=True)
+class Folder:
+    """A folder, with all it holds."""
+
+    project: ProjectHandle
+    collection: Collection
+    kind = FOLDER
+
+    @property
+    def id(self) -> str:
+        """The folder's id."""
+        return self.collection.id
+
+    @property
+    def place(self) -> str:
+        """Project and path."""
+        return f"{self.project.name}/{self.collection.path}"
+
+    def count(self) -> int:
+        """How many items it holds, at any depth."""
+        from marey_schemas.kinds import Kind
+
+        with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
+            return sum(pool.map(lambda kind: self.project.items(kind).count(collection=self.collection.path), Kind))
+
+    def move(self, folder: str, name: str) -> Collection:
+        """Move and rename it."""
+        return self.project.collections.move(self.collection, f"{folder}/{name}".lstrip("/"))
+
+    def delete(self) -> None:
+        """Hide it with all it holds."""
+        self.project.collections.delete(self.collection)
+
+    def restore(self) -> Collection:
+        """Bring it back with what was deleted along with it."""
+        return self.project.collections.restore(self.collection)
+
+
+@dataclass(frozen=True)
+class SingleItem:
+    """An item."""
+
+    handle: ItemHandle
+
+    @property
+    def id(self) -> str:
+        """The item's id."""
+        return self.handle.id
+
+    @property
+    def kind(self) -> str:
+        """What it is."""
+        return self.handle.item.kind.value
+
+    @property
+    def place(self) -> str:
+        """Project and path."""
+        return f"{self.handle.project}/{self.handle.path}"
+
+    def count(self) -> int:
+        """Itself."""
+        return 1
+
+    def move(self, folder: str, name: str) -> Item:
+        """Move and rename it."""
+        from marey_schemas.items import ItemChange
+
+        return self.handle.change(ItemChange(collection=folder, name=name))
+
+    def delete(self) -> None:
+        """Hide it."""
+        self.handle.delete()
+
+    def restore(self) -> Item:
+        """Bring it back."""
+        return self.handle.restore()
+
+
+def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = False) -> Thing:
+    """The one thing an address names; a final `/` means a folder. Raises `WrongUsage` where there is none, or several.
+
+    Of several that were deleted at one place, one after the other, the last.
+    """
+    address = Address.parse(text)
+    if not address.path:
+        raise WrongUsage(f"{text!r} is a whole project; name a folder or an item in it, or see marey project --help")
+    wanted = FOLDER if text.endswith("/") else kind
+    found = list(_things(marey.project(address.project), address, wanted, deleted=deleted))
+    kinds = list(dict.fromkeys(one.kind for one in found))
+    if len(kinds) > 1:
+        raise WrongUsage(f"{address} is the name of a {' and of a '.join(kinds)}; say which with --kind")
+    if not found:
+        what, option = ("nothing deleted", " --deleted") if deleted else ("nothing", "")
+        raise WrongUsage(f"there is {what} at {address}; marey ls{option} {address.project} shows what there is")
+    return found[0]
+
+
+def require_apart(things: Sequence[Thing]) -> None:
+    """Raise `WrongUsage` where one thing is named twice, or lies in a folder that is named, too."""
+    for place, one in enumerate(things):
+        for other in (*things[:place], *things[place + 1 :]):
+            if other.id == one.id:
+                raise WrongUsage(f"{one.place} is named twice")
+            if other.kind == FOLDER and one.place.startswith(f"{other.place}/"):
+                raise WrongUsage(f"{one.place} is in {other.place}, which is named, too")
+
+
+def _things(project: ProjectHandle, address: Address, kind: str | None, *, deleted: bool) -> Iterator[Thing]:
+    """What is at an address: folders first, and of each kind the one that was deleted last."""
+    from marey_schemas.kinds import Kind
+
+    if kind in (None, FOLDER) and (folder := _folder(project, address, deleted=deleted)) is not None:
+        yield Folder(project, folder)
+    if kind == FOLDER:
+        return
+
+    def of_kind(one: Kind) -> list[ItemHandle]:
+        return _items(project, address, one, deleted=deleted)
+
+    with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
+        for items in pool.map(of_kind, [kind_named(kind)] if kind else list(Kind)):
+            yield from map(SingleItem, items)
+
+
+def _folder(project: ProjectHandle, address: Address, *, deleted: bool) -> Collection | None:
+    if address.name.startswith(f"{FOLDER}_") and address.has_id:
+        return next((one for one in project.collections.list(deleted=deleted) if one.id == address.name), None)
+    return project.collections.at(address.path, deleted=deleted)
+
+
+def _items(project: ProjectHandle, address: Address, kind: Kind, *, deleted: bool) -> list[ItemHandle]:
+    items = project.items(kind)
+    found: list[ItemHandle] = []
+    if not address.has_id:
+        found += items.list(path=address.path, deleted=deleted)
+    elif address.name.startswith(f"{kind.value}_"):
+        found += (one for one in items.list(deleted=deleted) if one.id == address.name)
+    return sorted(found, key=lambda one: one.item.deleted_at or one.item.created_at, reverse=True)

@@ -1,42 +1,36 @@
-"""`annotation` and `cut`."""
+"""`annotation`: segments and keyframes of clips."""
 
 from __future__ import annotations
 
-import json
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.addresses import Address, find_item, require_item
-from marey_client.cli.command_texts import is_frame
-from marey_client.cli.failures import Refused, WrongUsage
+from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
+from marey_client.cli.clip_jobs import print_labelled
+from marey_client.cli.failures import WrongUsage
+from marey_client.cli.following import JOB, Sources, Wait, clips_at, follow, print_ended
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.jobs import clips_at, follow
-from marey_client.cli.json_files import read_json
-from marey_client.cli.output import print_json, print_pairs, print_table, tell, tell_refused
+from marey_client.cli.output import print_json, print_pairs, print_table
+from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.typed_values import assignment, is_frame, json_or_text, read_json
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_client.handles.annotations import AnnotationHandle
     from marey_client.marey import Marey
-    from marey_schemas.jobs import Job
 
+
+ANNOTATE = OptionsOf("marey_schemas.job_params:AnnotateParams")
+DEFAULT_PROPOSAL = {"method": "steps"}
 
 annotation = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Segments and keyframes of clips.")
 
 Place = Annotated[str, typer.Argument(help="An annotation: project/folder/name, or project/id.")]
 At = Annotated[int, typer.Argument(min=0, help="Any frame of the segment.")]
 Label = Annotated[str, typer.Argument(help="The label.")]
-
-
-class Method(StrEnum):
-    """How annotations are proposed."""
-
-    STEPS = "steps"
-    VELOCITY_MINIMA = "velocity_minima"
-    WRIST_CONTACT = "wrist_contact"
 
 
 class Neighbour(StrEnum):
@@ -65,7 +59,7 @@ class Form(StrEnum):
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
     app.add_typer(annotation, name="annotation")
-    app.command()(cut)
+    add_command(annotation, propose, params=ANNOTATE, job=JOB)
 
 
 @annotation.command()
@@ -204,32 +198,29 @@ def clear(context: typer.Context, place: Place) -> None:
     _apply(context, place, command="clear")
 
 
-@annotation.command()
 def propose(
     context: typer.Context,
-    sources: Annotated[list[str], typer.Argument(help="Clips or folders of clips: project/folder[/name].")],
-    method: Annotated[Method, typer.Option(help="How.")] = Method.STEPS,
+    sources: Sources,
+    params: Chosen,
+    job: Chosen,
     option: Annotated[
         list[str] | None,
         typer.Option("--set", help="name=value of the method, as in most_turn_deg=30; may be repeated."),
     ] = None,
-    layer: Annotated[str | None, typer.Option(help="What the layer is called; default: as the method.")] = None,
-    into: Annotated[str, typer.Option(help="Above the clips' own folders; default: beside the clips.")] = "",
-    tag: Annotated[list[str] | None, typer.Option(help="Tag of the annotations; may be repeated.")] = None,
-    priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
-    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = True,
+    into: Annotated[str, typer.Option(help="Folder above the clips' own folders; default: beside the clips.")] = "",
+    wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Annotate clips by an algorithm: steps, pauses, or where a hand arrives."""
-    addresses = _of_one_project(sources)
-    given: dict[str, Any] = {"layer": layer} if layer else {}
-    proposal = {"method": method.value, **dict(map(_assignment, option or ()))}
+    """Annotate clips by an algorithm: steps (the default), pauses, or contacts of a hand."""
+    addresses = addresses_in_one_project(sources)
+    proposal = {**DEFAULT_PROPOSAL, **params.pop("proposal", {}), **dict(map(_option, option or ()))}
     with connect(context) as marey:
+        clips = [clips_at(marey, address) for address in addresses]
         project = marey.project(addresses[0].project)
-        places = [clips_at(marey, address) for address in addresses]
-        options = {"into": into.strip("/"), "priority": priority, "tags": tuple(tag or ()), **given}
-        job = project.annotate(places, proposal=proposal, **options)
-        _finish(marey, job, wait, as_json)
+        submitted = project.annotate(clips, proposal=proposal, into=into.strip("/"), **job, **params)
+        ended = follow(marey, submitted, wait=wait, as_json=as_json)
+    if ended is not None:
+        print_ended(ended, as_json, print_labelled)
 
 
 @annotation.command("import")
@@ -276,42 +267,6 @@ def export_annotation(
         typer.echo(found.export(output, format="predecessor", form=form.value, end_index=end_index.value))
 
 
-def cut(
-    context: typer.Context,
-    sources: Annotated[list[str], typer.Argument(help="Annotations or folders of them: project/folder[/name].")],
-    into: Annotated[str, typer.Option(help="The folder in the project that the pieces go to.")],
-    label: Annotated[list[str] | None, typer.Option(help="Only segments of this label; may be repeated.")] = None,
-    layer: Annotated[str | None, typer.Option(help="Only annotations of this layer.")] = None,
-    by_label: Annotated[bool, typer.Option("--by-label", help="A folder for each label.")] = False,
-    before: Annotated[float, typer.Option(min=0, help="Seconds before each segment that are taken along.")] = 0.0,
-    after: Annotated[float, typer.Option(min=0, help="Seconds after each segment that are taken along.")] = 0.0,
-    shortest: Annotated[float, typer.Option(min=0, help="Leave shorter segments out, seconds.")] = 0.0,
-    longest: Annotated[float | None, typer.Option(min=0, help="Leave longer segments out, seconds.")] = None,
-    name: Annotated[str | None, typer.Option(help="Names of the pieces; default {clip}_{label}_{number:2}.")] = None,
-    tag: Annotated[list[str] | None, typer.Option(help="Tag of the pieces; may be repeated.")] = None,
-    priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
-    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = True,
-    as_json: AsJson = False,
-) -> None:
-    """Cut clips along the segments of annotations; keyframes within stay with the pieces."""
-    from marey_schemas.jobs import CollectionInput
-    from marey_schemas.kinds import Kind
-
-    addresses = _of_one_project(sources)
-    given = {"layer": layer, "longest_s": longest, "name": name}
-    options = {
-        "labels": tuple(label or ()), "by_label": by_label, "margin_before_s": before, "margin_after_s": after,
-        "shortest_s": shortest, "tags": tuple(tag or ()), **{key: one for key, one in given.items() if one is not None},
-    }  # fmt: skip
-    with connect(context) as marey:
-        places: list[Any] = [
-            find_item(marey, address, [Kind.ANNOTATION]) or CollectionInput(collection=address.path)
-            for address in addresses
-        ]
-        job = marey.project(addresses[0].project).cut(places, into=into.strip("/"), priority=priority, **options)
-        _finish(marey, job, wait, as_json)
-
-
 def annotation_at(marey: Marey, place: str) -> AnnotationHandle:
     """The annotation at a place. Raises `WrongUsage` where there is none."""
     from marey_schemas.kinds import Kind
@@ -329,31 +284,6 @@ def _apply(context: typer.Context, place: str, **command: Any) -> None:
     typer.echo(f"{place}: revision {item.revision}, {held}")
 
 
-def _finish(marey: Marey, job: Job, wait: bool, as_json: bool) -> None:
-    if not wait:
-        return print_json(job) if as_json else typer.echo(job.id)
-    ended = follow(marey, job)
-    if as_json:
-        return print_json(ended)
-    result = ended.result or {}
-    counts = result.get("segments") or result.get("labels") or {}
-    made = counted(result["clips"], "clip") if "clips" in result else counted(result["annotations"], "annotation")
-    typer.echo(", ".join([made, *(f"{count} {label}" for label, count in counts.items())]))
-    tell_refused(result.get("refused", ()))
-    if empty := result.get("empty"):
-        tell(f"nothing was found in {counted(len(empty), 'clip')}, such as {empty[0]}")
-    if result.get("refused"):
-        raise Refused
-    return None
-
-
-def _of_one_project(sources: list[str]) -> list[Address]:
-    addresses = [Address.parse(source) for source in sources]
-    if len({address.project for address in addresses}) > 1:
-        raise WrongUsage("all must be in one project")
-    return addresses
-
-
 def _segment(text: str) -> tuple[str, int, int]:
     label, _, frames = text.rpartition("=")
     first, colon, end = frames.partition(":")
@@ -369,12 +299,8 @@ def _keyframe(text: str) -> tuple[str, int]:
     return label, int(frame)
 
 
-def _assignment(text: str) -> tuple[str, Any]:
-    """name=value, where the value is JSON or else text; values with commas are lists of texts."""
-    name, equals, value = text.partition("=")
-    if not (name and equals):
-        raise WrongUsage(f"{text!r}: write name=value, as in most_turn_deg=30")
-    try:
-        return name, json.loads(value)
-    except (ValueError, RecursionError):
-        return name, value.split(",") if "," in value or name == "joints" else value
+def _option(text: str) -> tuple[str, Any]:
+    """Return name and value of an option of a method; a value with commas is a list of texts."""
+    name, value = assignment(text)
+    read = json_or_text(value)
+    return name, value.split(",") if read == value and ("," in value or name == "joints") else read

@@ -9,8 +9,8 @@ import typer
 
 from marey_client.cli import (
     accounts,
-    alignments,
     annotating,
+    clip_jobs,
     edits,
     evaluations,
     files,
@@ -67,7 +67,7 @@ for register in (
     files,
     organise,
     skeletons,
-    alignments,
+    clip_jobs,
     annotating,
     edits,
     evaluations,

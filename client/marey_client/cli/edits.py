@@ -3,26 +3,32 @@
 from __future__ import annotations
 
 import json
+import shlex
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.addresses import Address, require_item
-from marey_client.cli.command_texts import is_frame, parameter_rows, parse_command
+from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
 from marey_client.cli.failures import WrongUsage
+from marey_client.cli.following import JOB, Into, Sources, Wait, clips_at, follow, print_ended
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.jobs import clips_at, follow, print_ended
-from marey_client.cli.json_files import read_json
 from marey_client.cli.output import print_json, print_pairs, print_table
+from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.typed_values import Schema, is_frame, parameters_of, read_json, read_value, type_text
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from marey_client.handles.edits import EditHandle
     from marey_client.marey import Marey
     from marey_schemas.editing.edits import EditDocument
     from marey_schemas.editing.previews import EditPreview
 
 edit = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Edits: commands on clips.")
+
+EDIT = OptionsOf("marey_schemas.job_params:EditParams", without=("commands",))
 
 Do = Annotated[
     list[str] | None,
@@ -37,43 +43,36 @@ With = Annotated[str | None, typer.Option("--with", help="The commands of a save
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
     app.add_typer(edit, name="edit")
+    add_command(edit, apply_edit, "apply", params=EDIT, job=JOB)
 
 
-@edit.command("apply")
 def apply_edit(
     context: typer.Context,
-    sources: Annotated[list[str], typer.Argument(help="Clips or folders of clips: project/folder[/name].")],
+    sources: Sources,
+    params: Chosen,
+    job: Chosen,
     do: Do = None,
     file: From = None,
     saved: With = None,
-    into: Annotated[str, typer.Option(help="The folder in the project that the results go to.")] = "",
-    suffix: Annotated[str, typer.Option(help="Appended to the names of the results.")] = "",
-    in_place: Annotated[bool, typer.Option("--in-place", help="Make the results new revisions of the clips.")] = False,
-    tag: Annotated[list[str] | None, typer.Option(help="Tag of the results; may be repeated.")] = None,
-    priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
-    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = True,
+    into: Into = "",
+    wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
     """Apply commands to clips, as a job."""
-    addresses = [Address.parse(source) for source in sources]
-    if len({address.project for address in addresses}) > 1:
-        raise WrongUsage("the clips must be in one project")
-    if not (into or suffix or in_place):
+    addresses = addresses_in_one_project(sources)
+    if not (into or params.get("suffix") or params.get("in_place")):
         raise WrongUsage("say where the results go: --into a folder, with a --suffix beside the clips, or --in-place")
     with connect(context) as marey:
         commands = _commands(marey, addresses[0].project, do, file, saved)
         clips = [clips_at(marey, address) for address in addresses]
-        options = {"suffix": suffix, "in_place": in_place, "tags": tuple(tag or ())}
-        given = {name: value for name, value in options.items() if value}
-        project = marey.project(addresses[0].project)
-        submitted = project.edit(clips, commands, into=into.strip("/"), priority=priority, **given)
-        if not wait:
-            return print_json(submitted) if as_json else typer.echo(submitted.id)
-        ended = follow(marey, submitted)
+        submitted = marey.project(addresses[0].project).edit(clips, commands, into=into.strip("/"), **job, **params)
+        ended = follow(marey, submitted, wait=wait, as_json=as_json)
+    if ended is None:
+        return
     if not as_json:
         for finding in (ended.result or {}).get("findings", ()):
             typer.echo(_finding(finding))
-    return print_ended(ended, as_json)
+    print_ended(ended, as_json)
 
 
 @edit.command("save")
@@ -223,6 +222,44 @@ def _range(text: str) -> slice:
     if not colon or not all(not bound or is_frame(bound) for bound in (start, stop)):
         raise WrongUsage(f"--frames {text!r}: write a range such as 100:200, 100: or :200")
     return slice(int(start or 0), int(stop) if stop else None)
+
+
+# -- commands as people type them --
+
+
+def parse_command(text: str) -> dict[str, Any]:
+    """A command with its parameters. Raises `WrongUsage`, and says what there is, for what no command has."""
+    from marey_schemas.editing.edits import COMMAND_MODELS
+
+    try:
+        name, *assigned = shlex.split(text) or [""]
+    except ValueError as error:
+        raise WrongUsage(f"{text!r}: {error}; write a command and its parameters, as in 'trim start=10'") from None
+    if name not in COMMAND_MODELS:
+        raise WrongUsage(f"there is no command {name!r}; there are {', '.join(COMMAND_MODELS)}")
+    parameters = _parameters(COMMAND_MODELS[name])
+    command: dict[str, Any] = {"command": name}
+    for assignment in assigned:
+        key, equals, value = assignment.partition("=")
+        if not equals:
+            raise WrongUsage(f"{name}: {assignment!r}: write parameter=value")
+        if key not in parameters:
+            raise WrongUsage(f"{name} has no parameter {key!r}; it has {', '.join(parameters) or 'none'}")
+        command[key] = read_value(value, parameters[key])
+    return command
+
+
+def parameter_rows(model: type[BaseModel]) -> Iterator[tuple[str, str, str, str]]:
+    """Name, type, default and meaning of each parameter of a command."""
+    required = model.model_json_schema().get("required", ())
+    for name, schema in _parameters(model).items():
+        default = "required" if name in required else json.dumps(schema.get("default"))
+        yield name, type_text(schema), default, schema.get("description", "")
+
+
+def _parameters(model: type[BaseModel]) -> dict[str, Schema]:
+    """Return the schemas of a command's parameters; its name is none."""
+    return {name: schema for name, schema in parameters_of(model).items() if name != "command"}
 
 
 # -- what is told --

@@ -2,111 +2,96 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.addresses import Address, find_item, require_item
-from marey_client.cli.command_texts import is_frame
+from marey_client.cli.addresses import Address, addresses_in_one_project, find_item, require_item
 from marey_client.cli.failures import WrongUsage
+from marey_client.cli.following import JOB, Sources, Wait, clips_at, follow
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.jobs import clips_at, follow
 from marey_client.cli.output import print_json, print_table, tell
+from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.typed_values import is_frame
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_client.handles.evaluations import EvaluationHandle
     from marey_client.marey import Marey
-    from marey_schemas.job_params import EvaluateParams
 
 WORST_SHOWN = 5
-MOST_VALUES = 200
+EVALUATE = OptionsOf(
+    "marey_schemas.job_params:EvaluateParams",
+    short={
+        "speeds_m_s": "--speeds",
+        "turn_rates_deg_s": "--turns",
+        "approach_s": "--approach",
+        "duration_s": "--duration",
+        "mirroring": "--mirror",
+    },
+    without=("loops", "trims"),
+)
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
-    app.command()(evaluate)
+    add_command(app, evaluate, params=EVALUATE, job=JOB)
     app.command()(report)
 
 
 def evaluate(
     context: typer.Context,
-    sources: Annotated[list[str], typer.Argument(help="Clips or folders of clips, of one skeleton: project/folder.")],
-    name: Annotated[str | None, typer.Option(help="Name of the result; default: that of the folder and -eval.")] = None,
-    into: Annotated[str | None, typer.Option(help="Its folder in the project; default: beside the clips'.")] = None,
-    speeds: Annotated[str | None, typer.Option(help="m/s: first:last:step or a,b,c; default 1:3:0.25.")] = None,
-    turns: Annotated[
-        str | None, typer.Option(help="degrees/s, positive to the left: first:last:step or a,b,c; default -100:100:25.")
-    ] = None,
-    families: Annotated[str | None, typer.Option(help="circle, switching, or both; default circle,switching.")] = None,
-    approach: Annotated[float | None, typer.Option(help="Seconds straight ahead before the circle; default 3.")] = None,
-    duration: Annotated[float | None, typer.Option(help="Seconds of the circle; default 30.")] = None,
-    mirror: Annotated[str | None, typer.Option(help="none, add (mirrored twins beside the clips) or only.")] = None,
-    follow_mode: Annotated[str | None, typer.Option("--follow", help="time, path or open_loop; default time.")] = None,
+    sources: Sources,
+    params: Chosen,
+    job: Chosen,
+    into: Annotated[str | None, typer.Option(help="Folder of the result; default: the folder of the clips.")] = None,
     loop: Annotated[
-        list[str] | None, typer.Option(help="A clip that is a loop, or a folder of such; may be repeated.")
+        list[str] | None, typer.Option(help="A clip that is a loop, or a folder of loops; may be repeated.")
     ] = None,
     trim: Annotated[
         list[str] | None, typer.Option(help="project/folder/clip=first:stop, the frames to use; may be repeated.")
     ] = None,
-    end_policy: Annotated[
-        str | None, typer.Option(help="What clips' ends look ahead to: clamp, trim, loop; default clamp, or loop.")
-    ] = None,
     normaliser: Annotated[
         str | None, typer.Option(help="Use the scales of this evaluation, to be comparable: project/folder/name.")
     ] = None,
-    baseline: Annotated[bool, typer.Option("--baseline/--no-baseline", help="Measure generated clips, too.")] = True,
-    tag: Annotated[list[str] | None, typer.Option(help="Tag of the result; may be repeated.")] = None,
     out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
-    priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
-    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = True,
+    wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
     """Measure how good locomotion clips are: accuracy, coverage and use, by simulated motion matching."""
-    addresses = [Address.parse(source) for source in sources]
-    if len({address.project for address in addresses}) > 1:
-        raise WrongUsage("the clips must be in one project")
+    from marey_schemas.job_params import EvaluateParams
+
+    addresses = addresses_in_one_project(sources)
     if out is not None and not wait:
         raise WrongUsage("--out needs the result; leave --no-wait out")
     folder, _, last = addresses[0].path.rpartition("/")
-    params = _params(
-        name=name or (f"{last}-eval" if last else "evaluation"),
-        tags=tuple(tag or ()) or None,
-        speeds_m_s=_values(speeds),
-        turn_rates_deg_s=_values(turns),
-        families=tuple(families.split(",")) if families else None,
-        approach_s=approach,
-        duration_s=duration,
-        baseline=baseline,
-        database={"mirroring": mirror, "end_policy": end_policy or ("loop" if loop else None)},
-        controller={"follow": follow_mode},
-    )
+    if loop:
+        params.setdefault("database", {}).setdefault("end_policy", "loop")
+    params.setdefault("name", f"{last}-eval" if last else "evaluation")
     with connect(context) as marey:
         project = marey.project(addresses[0].project)
-        loops = [one.id for place in loop or () for one in _clips_in(marey, Address.parse(place))]
-        trims = dict(_trim(marey, text) for text in trim or ())
-        pinned = evaluation_at(marey, normaliser).id if normaliser else None
+        if loop:
+            params["loops"] = [one.id for place in loop for one in _clips_in(marey, Address.parse(place))]
+        if trim:
+            params["trims"] = dict(_trim(marey, text) for text in trim)
         submitted = project.evaluate(
             [clips_at(marey, address) for address in addresses],
             into=folder if into is None else into.strip("/"),
-            normaliser=pinned,
-            priority=priority,
-            **params.model_dump(exclude_unset=True),
-            loops=loops,
-            trims=trims,
+            normaliser=evaluation_at(marey, normaliser).id if normaliser else None,
+            **job,
+            **params,
         )
-        if not wait:
-            return print_json(submitted) if as_json else typer.echo(submitted.id)
-        follow(marey, submitted, count=params.trial_count, unit="trials")
-        found = project.evaluation(submitted)
+        trials = EvaluateParams.model_validate(params).trial_count
+        ended = follow(marey, submitted, wait=wait, as_json=as_json, count=trials, unit="trials")
+        if ended is None:
+            return
+        found = project.evaluation(ended)
         if out is not None:
             found.save_report(out)
         _print_evaluation(found, as_json)
     if out is not None:
         tell(f"report: {out}")
-    return None
 
 
 def report(
@@ -175,39 +160,6 @@ def evaluation_at(marey: Marey, place: str) -> EvaluationHandle:
 
     found: EvaluationHandle = require_item(marey, Address.parse(place), [Kind.EVALUATION])
     return found
-
-
-def _params(**given: Any) -> EvaluateParams:
-    """The options that were given; defaults stay those of the declaration."""
-    from marey_schemas.job_params import EvaluateParams
-
-    for group in ("database", "controller"):
-        given[group] = {name: value for name, value in given[group].items() if value is not None} or None
-    return EvaluateParams.model_validate({name: value for name, value in given.items() if value is not None})
-
-
-def _values(text: str | None) -> tuple[float, ...] | None:
-    """`1:3:0.25` as all its values with the last one, or `1,2,3` as they stand."""
-    if text is None:
-        return None
-    try:
-        numbers = [float(part) for part in text.replace(",", ":").split(":")]
-    except ValueError:
-        raise WrongUsage(f"{text!r}: write first:last:step, as in 1:3:0.25, or values, as in 1,1.5,2") from None
-    if not all(map(math.isfinite, numbers)):
-        raise WrongUsage(f"{text!r}: all values must be finite")
-    if ":" not in text:
-        return tuple(numbers)
-    if "," in text or len(numbers) != 3:
-        raise WrongUsage(f"{text!r}: a range is first:last:step, as in 1:3:0.25")
-    first, last, step = numbers
-    if not (step > 0 and last >= first):
-        raise WrongUsage(f"{text!r}: a range goes up in steps above 0")
-    steps = (last - first) / step + 1e-9
-    if steps >= MOST_VALUES:
-        raise WrongUsage(f"{text!r}: these are over {MOST_VALUES} values; at most so many are possible")
-    count = int(steps) + 1
-    return tuple(first + index * step for index in range(count))
 
 
 def _print_evaluation(found: EvaluationHandle, as_json: bool) -> None:

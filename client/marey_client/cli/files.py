@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.addresses import Address, find_item, require_item
+from marey_client.cli.addresses import Address, find_item, kind_named, require_item
 from marey_client.cli.failures import Refused, WrongUsage
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.lookup import kind_named
 from marey_client.cli.output import print_json, print_pairs, print_table, progress, tell
 from marey_schemas.formats import EXPORT_FORMATS
 from marey_schemas.wording import counted, one_of

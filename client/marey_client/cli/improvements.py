@@ -10,9 +10,10 @@ import typer
 from marey_client.cli.addresses import Address
 from marey_client.cli.evaluations import evaluation_at
 from marey_client.cli.failures import WrongUsage
+from marey_client.cli.following import JOB, Wait, clips_at, follow
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.jobs import clips_at, watching
 from marey_client.cli.output import print_json, print_table, tell
+from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -21,7 +22,13 @@ if TYPE_CHECKING:
     from marey_client.handles.evaluations import EvaluationHandle
     from marey_client.handles.findings import Findings
     from marey_client.marey import Marey
-    from marey_schemas.jobs import CollectionInput, ItemInput, Job
+    from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
+
+WEIGHT = {"objective": "--weight"}
+COMPARE = OptionsOf("marey_schemas.job_params:CompareParams")
+SUGGEST = OptionsOf("marey_schemas.job_params:SuggestParams", short=WEIGHT)
+OPTIMISE = OptionsOf("marey_schemas.job_params:OptimiseParams", short=WEIGHT)
+SWEEP = OptionsOf("marey_schemas.job_params:SweepParams", short=WEIGHT)
 
 SHOWN = 10
 TOLD_FIRST = (
@@ -42,140 +49,112 @@ From = Annotated[
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
-    for command in (compare, suggest, optimise, sweep):
-        app.command()(command)
+    add_command(app, compare, params=COMPARE, job=JOB)
+    add_command(app, suggest, params=SUGGEST, job=JOB)
+    add_command(app, optimise, params=OPTIMISE, job=JOB)
+    add_command(app, sweep, params=SWEEP, job=JOB)
 
 
 def compare(
     context: typer.Context,
     before: Evaluation,
     after: Annotated[str, typer.Argument(help="One of the same trials, evaluated with --normaliser BEFORE.")],
+    params: Chosen,
+    job: Chosen,
     out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
+    wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Tell what changed between two evaluations, trial by trial."""
+    """Show what changed between two evaluations, trial by trial."""
+    if out is not None and not wait:
+        raise WrongUsage("--out needs the result; leave --no-wait out")
     with connect(context) as marey:
         first, second = evaluation_at(marey, before), evaluation_at(marey, after)
         if first.project != second.project:
             raise WrongUsage("both evaluations must be in one project")
-        with watching() as on_progress:
-            found = first.compare(second, on_progress=on_progress)
+        found = _found(marey, first, first.compare_request(second, **params), job, wait, as_json)
+        if found is None:
+            return
         document = found.document()
         if out is not None:
             found.save_report(out)
-    if as_json:
-        return print_json({"summary": found.summary, **_plain(document)})
-    _print_comparison(document)
-    if out is not None:
+    _print_found(found, document, as_json, _print_comparison)
+    if out is not None and not as_json:
         tell(f"report: {out}")
-    return None
 
 
 def suggest(
     context: typer.Context,
     evaluation: Evaluation,
+    params: Chosen,
+    job: Chosen,
     candidates: From = None,
-    removals: Annotated[int, typer.Option(min=0, help="How many removals of used clips to plan.")] = 10,
-    consider: Annotated[
-        int, typer.Option(min=0, help="Try only so many used clips, those that the fewest trials need.")
-    ] = 50,
-    duplicate_cm: Annotated[float, typer.Option(min=0, help="How far apart near-duplicates may be, per frame.")] = 3.0,
     remove_out: Annotated[
         Path | None, typer.Option(help="Write the clips that can go without any change to this file, a path a line.")
     ] = None,
+    wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Tell which clips of an evaluated set can go, and which others would fill its holes."""
+    """Find clips of an evaluated set that can go, and others that would fill its holes."""
+    if remove_out is not None and not wait:
+        raise WrongUsage("--remove-out needs the result; leave --no-wait out")
     with connect(context) as marey:
-        found = _found(
-            marey,
-            evaluation,
-            lambda handle, on_progress: handle.suggest(
-                _places(marey, handle, candidates),
-                on_progress=on_progress,
-                removals=removals,
-                consider=consider,
-                duplicate_cm=duplicate_cm,
-            ),
-        )
+        handle = evaluation_at(marey, evaluation)
+        request = handle.suggest_request(_places(marey, handle, candidates), **params)
+        found = _found(marey, handle, request, job, wait, as_json)
+        if found is None:
+            return
         document = found.document()
     if remove_out is not None:
         names = [f"{clip['name']}\n" for clip in document["unused"]["clips"]]
         remove_out.write_text("".join(names), encoding="utf-8")
         tell(f"{counted(len(names), 'clip')} that can go: {remove_out}")
-    if as_json:
-        return print_json({"summary": found.summary, **_plain(document)})
-    return _print_suggestions(document)
+    _print_found(found, document, as_json, _print_suggestions)
 
 
 def optimise(
     context: typer.Context,
     evaluation: Evaluation,
+    params: Chosen,
+    job: Chosen,
     candidates: From = None,
-    max_steps: Annotated[int, typer.Option(min=1, help="End after so many steps.")] = 50,
-    max_evaluations: Annotated[int | None, typer.Option(min=1, help="End after so many sets were tried.")] = None,
-    max_data_s: Annotated[float | None, typer.Option(help="Add nothing that makes the set longer, seconds.")] = None,
-    least_gain: Annotated[float, typer.Option(min=0, help="Metres that a step must gain.")] = 1e-4,
-    consider: Annotated[int, typer.Option(min=1, help="Try so many removals and additions in each step.")] = 20,
-    weight: Annotated[
-        list[str] | None, typer.Option(help="Of the objective: offset=1, seconds=0.0001, …; may be repeated.")
-    ] = None,
+    wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Take clips away and add others, one step after another, while that makes the set better."""
-    objective = _weights(weight)
+    """Remove clips and add others, one step after another, as long as that makes the set better."""
     with connect(context) as marey:
-        found = _found(
-            marey,
-            evaluation,
-            lambda handle, on_progress: handle.optimise(
-                _places(marey, handle, candidates),
-                on_progress=on_progress,
-                objective=objective,
-                max_steps=max_steps,
-                max_evaluations=max_evaluations,
-                max_data_s=max_data_s,
-                least_gain=least_gain,
-                consider=consider,
-            ),
-        )
-        document = found.document()
-    if as_json:
-        return print_json({"summary": found.summary, **_plain(document)})
-    return _print_steps(document)
+        handle = evaluation_at(marey, evaluation)
+        request = handle.optimise_request(_places(marey, handle, candidates), **params)
+        if (found := _found(marey, handle, request, job, wait, as_json)) is not None:
+            _print_found(found, found.document(), as_json, _print_steps)
 
 
 def sweep(
     context: typer.Context,
     evaluation: Evaluation,
-    factors: Annotated[str, typer.Option(help="Each weight times each of these: a,b,c.")] = "0.5,2",
-    weight: Annotated[
-        list[str] | None, typer.Option(help="Of the objective: offset=1, pose_cost=0.5, …; may be repeated.")
-    ] = None,
+    params: Chosen,
+    job: Chosen,
+    wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Evaluate again under other weights of the features, and tell which of them matter."""
-    objective = _weights(weight)
-    values = tuple(_value(text, factors) for text in factors.split(","))
+    """Evaluate again with other weights of the features, and show which of them matter."""
     with connect(context) as marey:
-        found = _found(
-            marey,
-            evaluation,
-            lambda handle, on_progress: handle.sweep(on_progress=on_progress, objective=objective, factors=values),
-        )
-        document = found.document()
-    if as_json:
-        return print_json({"summary": found.summary, **_plain(document)})
-    return _print_sweep(document)
+        handle = evaluation_at(marey, evaluation)
+        if (found := _found(marey, handle, handle.sweep_request(**params), job, wait, as_json)) is not None:
+            _print_found(found, found.document(), as_json, _print_sweep)
 
 
 # -- asking -----------------------------------------------------------------------------------------------------------
 
 
-def _found(marey: Marey, place: str, ask: Callable[[EvaluationHandle, Callable[[Job], None]], Findings]) -> Findings:
-    handle = evaluation_at(marey, place)
-    with watching() as on_progress:
-        return ask(handle, on_progress)
+def _found(
+    marey: Marey, handle: EvaluationHandle, request: JobCreate, job: Chosen, wait: bool, as_json: bool
+) -> Findings | None:
+    from marey_client.handles.findings import Findings
+
+    submitted = marey.project(handle.project).submit(request.model_copy(update=job))
+    ended = follow(marey, submitted, wait=wait, as_json=as_json)
+    return None if ended is None else Findings(marey.transport, ended)
 
 
 def _places(
@@ -188,25 +167,13 @@ def _places(
     return [clips_at(marey, address) for address in addresses]
 
 
-def _weights(given: Sequence[str] | None) -> dict[str, float]:
-    """`name=value` of the objective's weights."""
-    from marey_schemas.options.improvement import ObjectiveParams
-
-    weights = {}
-    for text in given or ():
-        name, _, value = text.partition("=")
-        if name not in ObjectiveParams.model_fields:
-            known = ", ".join(ObjectiveParams.model_fields)
-            raise WrongUsage(f"{text!r}: write name=value with one of {known}")
-        weights[name] = _value(value, text)
-    return weights
-
-
-def _value(number: str, text: str) -> float:
-    try:
-        return float(number)
-    except ValueError:
-        raise WrongUsage(f"{text!r}: {number!r} is no number") from None
+def _print_found(
+    found: Findings, document: Mapping[str, Any], as_json: bool, show: Callable[[Mapping[str, Any]], None]
+) -> None:
+    if as_json:
+        print_json({"summary": found.summary, **_plain(document)})
+    else:
+        show(document)
 
 
 # -- telling ----------------------------------------------------------------------------------------------------------

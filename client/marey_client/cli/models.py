@@ -3,82 +3,63 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.addresses import Address, find_item, require_item
+from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
 from marey_client.cli.failures import WrongUsage
+from marey_client.cli.following import SEEDED_JOB, Wait, follow, input_at
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.jobs import follow
 from marey_client.cli.output import print_json, print_table, tell
+from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.formats import SAMPLE_FORMATS
 from marey_schemas.wording import one_of
 
 if TYPE_CHECKING:
     from marey_client.handles.models import ModelHandle
     from marey_client.marey import Marey
-    from marey_schemas.jobs import CollectionInput, ItemInput
+
+
+MODEL = OptionsOf(
+    "marey_schemas.job_params:ModelParams",
+    short={
+        "spatial_share": "--share",
+        "spatial_components": "--components",
+        "most_temporal_components": "--time-components",
+        "mixture_components": "--mixture",
+    },
+)
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
-    app.command()(model)
+    add_command(app, model, params=MODEL, job=SEEDED_JOB)
     app.command()(sample)
 
 
 def model(
     context: typer.Context,
     sources: Annotated[list[str], typer.Argument(help="Aligned clips or folders of them: project/folder.")],
-    name: Annotated[str | None, typer.Option(help="Name of the model; default: that of the folder.")] = None,
-    into: Annotated[str | None, typer.Option(help="Its folder in the project; default: beside the clips'.")] = None,
-    scaling: Annotated[
-        str | None, typer.Option(help="jacobian (default), sfpca (slower, closer), root_max or none.")
-    ] = None,
-    share: Annotated[
-        float | None, typer.Option(help="Share of the variance that is kept, 0.01 to 1; default 0.95.")
-    ] = None,
-    components: Annotated[int | None, typer.Option(help="Keep exactly so many spatial components.")] = None,
-    time_components: Annotated[int | None, typer.Option(help="Keep at most so many of time; default 3.")] = None,
-    mixture: Annotated[int | None, typer.Option(help="Exactly so many kinds of motion; default: chosen.")] = None,
-    criterion: Annotated[str | None, typer.Option(help="What chooses how many kinds: bic (default) or aic.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything that is random in training.")] = 0,
-    report: Annotated[bool, typer.Option("--report/--no-report", help="Draw the figures of the report.")] = True,
-    tag: Annotated[list[str] | None, typer.Option(help="Tag of the result; may be repeated.")] = None,
-    priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
-    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = True,
+    params: Chosen,
+    job: Chosen,
+    into: Annotated[str | None, typer.Option(help="Folder of the model; default: the folder of the clips.")] = None,
+    wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Learn a generative model of one action from clips that were aligned with each other."""
-    addresses = [Address.parse(source) for source in sources]
-    if len({address.project for address in addresses}) > 1:
-        raise WrongUsage("the aligned clips must be in one project")
+    """Train a generative model of one action on clips that were aligned with each other."""
+    from marey_schemas.kinds import Kind
+
+    addresses = addresses_in_one_project(sources)
     folder, _, last = addresses[0].path.rpartition("/")
-    given: dict[str, Any] = {
-        "name": name or last or "model",
-        "scaling": scaling,
-        "spatial_share": share,
-        "spatial_components": components,
-        "most_temporal_components": time_components,
-        "mixture_components": mixture,
-        "criterion": criterion,
-        "report": None if report else False,
-        "tags": tuple(tag or ()) or None,
-    }
+    params.setdefault("name", last or "model")
     with connect(context) as marey:
         project = marey.project(addresses[0].project)
-        submitted = project.train_model(
-            [_aligned_at(marey, address) for address in addresses],
-            into=folder if into is None else into.strip("/"),
-            seed=seed,
-            priority=priority,
-            **{name: value for name, value in given.items() if value is not None},
-        )
-        if not wait:
-            return print_json(submitted) if as_json else typer.echo(submitted.id)
-        follow(marey, submitted)
-        found = project.model(submitted)
-        return _print_model(found, as_json)
+        aligned = [input_at(marey, address, Kind.PROCESSED) for address in addresses]
+        submitted = project.train_model(aligned, into=folder if into is None else into.strip("/"), **job, **params)
+        ended = follow(marey, submitted, wait=wait, as_json=as_json)
+        if ended is not None:
+            _print_model(project.model(ended), as_json)
 
 
 def sample(
@@ -118,14 +99,6 @@ def model_at(marey: Marey, place: str) -> ModelHandle:
 
     found: ModelHandle = require_item(marey, Address.parse(place), [Kind.MODEL])
     return found
-
-
-def _aligned_at(marey: Marey, address: Address) -> CollectionInput | ItemInput:
-    from marey_schemas.jobs import CollectionInput
-    from marey_schemas.kinds import Kind
-
-    found = find_item(marey, address, [Kind.PROCESSED])
-    return CollectionInput(collection=address.path) if found is None else found.as_input()
 
 
 def _print_model(found: ModelHandle, as_json: bool) -> None:

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.addresses import Address
+from marey_client.cli.addresses import FOLDER, Address, Thing, require_apart, the_thing
 from marey_client.cli.failures import Refused, WrongUsage, sentence
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.lookup import FOLDER, Thing, require_apart, the_thing
 from marey_client.cli.output import print_json, tell
 from marey_schemas.wording import counted
 

@@ -5,19 +5,18 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from marey_client.cli.addresses import Address, require_item
-from marey_client.cli.annotating import Method
 from marey_client.cli.failures import Refused, WrongUsage
+from marey_client.cli.following import SEEDED_JOB, clips_at
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.jobs import clips_at, json_or_text
-from marey_client.cli.json_files import read_json
 from marey_client.cli.output import print_json, print_table, progress, tell, tell_refused
+from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.typed_values import json_or_text, read_json
 
 if TYPE_CHECKING:
     from marey_client.handles.pipelines import PipelineRun
@@ -32,13 +31,7 @@ REFUSED_SHOWN = 3
 STEPS = ("import", "annotate", "cut", "align", "model", "tree")
 
 
-class Cache(StrEnum):
-    """What becomes of results that were computed before."""
-
-    USE = "use"
-    REFRESH = "refresh"
-    OFF = "off"
-
+PROPOSE = OptionsOf("marey_schemas.job_params:AnnotateParams", only=("proposal",), short={"method": "--propose"})
 
 Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until every job has ended.")]
 
@@ -46,7 +39,7 @@ Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until every j
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
     app.command()(pipeline)
-    app.command()(build_model)
+    add_command(app, build_model, propose=PROPOSE, job=SEEDED_JOB)
 
 
 def pipeline(
@@ -71,11 +64,12 @@ def build_model(
         list[str],
         typer.Argument(help="Clips or folders of clips, project/folder[/name]; with --project, files of this machine."),
     ],
-    name: Annotated[str, typer.Option(help="Of the model, and of the action.")],
+    name: Annotated[str, typer.Option(help="Name of the model, and of the action.")],
+    propose: Chosen,
+    job: Chosen,
     project: Annotated[str | None, typer.Option(help="The project that files of this machine go to.")] = None,
     to: Annotated[str | None, typer.Option(help="Skeleton to carry the takes over to: project/folder/name.")] = None,
     into: Annotated[str | None, typer.Option(help="Folder of the results; default: the model's name.")] = None,
-    propose: Annotated[Method | None, typer.Option(help="Propose annotations in this way, and go by them.")] = None,
     layer: Annotated[str | None, typer.Option(help="Annotations of this layer; with --propose, its name.")] = None,
     label: Annotated[list[str] | None, typer.Option(help="Only segments of this label; may be repeated.")] = None,
     whole: Annotated[bool, typer.Option("--whole", help="Cut nothing: annotations align whole takes.")] = False,
@@ -85,19 +79,17 @@ def build_model(
     choices: Annotated[
         list[str] | None, typer.Option("--set", help="step.parameter=value, such as align.window=5; may be repeated.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 0,
-    priority: Annotated[int, typer.Option(min=-100, max=100, help="Higher goes first.")] = 0,
-    cache: Annotated[Cache, typer.Option(help="What becomes of results that are there.")] = Cache.USE,
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """From takes to a model: import, retarget, annotate, cut, align, learn, make a tree.
+    """Make a model from takes: import, retarget, annotate, cut, align, train, make a tree.
 
     What was computed before is not computed again: after a take has changed, only what depends on it is.
     """
     plan: dict[str, Any] = _chosen(choices or ())
-    if propose is not None:
-        _choose(plan, ("annotate", "proposal", "method"), propose.value, f"--propose {propose.value}")
+    if propose:
+        method = propose["proposal"]["method"]
+        _choose(plan, ("annotate", "proposal", "method"), method, f"--propose {method}")
         plan["annotate"] |= {"layer": layer} if layer else {}
     elif layer is not None:
         plan["layer"] = layer
@@ -115,8 +107,7 @@ def build_model(
         if to is not None:
             plan["skeleton"] = {"item": _skeleton(marey, to, place)}
         with progress() as advance:
-            found |= {"name": name, "seed": seed, "priority": priority, "cache": cache.value, "notice": advance}
-            run = marey.project(place).build_model(**found, **plan)
+            run = marey.project(place).build_model(**found, **plan, **job, name=name, notice=advance)
         follow_run(run, place, wait=wait, as_json=as_json)
 
 

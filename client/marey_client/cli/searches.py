@@ -9,16 +9,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.failures import WrongUsage
+from marey_client.cli.following import SEEDED_JOB, Wait, follow, print_ended
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.jobs import watching
-from marey_client.cli.json_files import read_json
 from marey_client.cli.models import model_at
 from marey_client.cli.output import print_json, print_table, tell
+from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.typed_values import read_json
 from marey_schemas.formats import MOTION_FORMATS
 from marey_schemas.wording import counted, one_of
 
 if TYPE_CHECKING:
     from marey_schemas.search import SearchAnswer
+
+TREE = OptionsOf("marey_schemas.job_params:TreeParams")
+
+SEARCH = OptionsOf("marey_schemas.search:SearchRequest", without=("constraints", "steps", "start", "motion"))
 
 
 Many = list[str] | None
@@ -26,35 +31,35 @@ Many = list[str] | None
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
-    app.command()(tree)
-    app.command()(search)
+    add_command(app, tree, params=TREE, job=SEEDED_JOB)
+    add_command(app, search, params=SEARCH)
 
 
 def tree(
     context: typer.Context,
     place: Annotated[str, typer.Argument(help="A model: project/folder/name, or project/id.")],
-    samples: Annotated[int | None, typer.Option(help="Drawn from the model; default 10,000.")] = None,
-    features: Annotated[str | None, typer.Option(help="end_effectors (default) or latent.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the samples.")] = 0,
+    params: Chosen,
+    job: Chosen,
+    wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Group samples of a model, so that searches for motions that meet constraints are quick."""
-    given = {"samples": samples, "features": features}
-    with connect(context) as marey, watching() as show:
-        job = model_at(marey, place).make_tree(
-            seed=seed,
-            on_progress=show,
-            **{name: value for name, value in given.items() if value is not None},
-        )
-    if as_json:
-        return print_json(job)
-    made = job.result or {}
-    return typer.echo(f"{counted(made['samples'], 'sample')} in {counted(made['nodes'], 'node')}")
+    """Group samples of a model into a tree, which makes searches for motions that meet constraints quick."""
+    with connect(context) as marey:
+        found = model_at(marey, place)
+        submitted = marey.project(found.project).submit(found.tree_request(**params).model_copy(update=job))
+        ended = follow(marey, submitted, wait=wait, as_json=as_json)
+    if ended is not None:
+        print_ended(ended, as_json, _print_tree)
+
+
+def _print_tree(made: dict[str, Any]) -> None:
+    typer.echo(f"{counted(made['samples'], 'sample')} in {counted(made['nodes'], 'node')}")
 
 
 def search(
     context: typer.Context,
     place: Annotated[str, typer.Argument(help="A model: project/folder/name, or project/id.")],
+    params: Chosen,
     at: Annotated[
         Many, typer.Option(help="A joint is at a place: WHEN:JOINT=x,y,z in metres; _ leaves a coordinate free.")
     ] = None,
@@ -67,12 +72,6 @@ def search(
     start: Annotated[str | None, typer.Option(help="Where the motion begins: x,z,degrees.")] = None,
     tolerance_cm: Annotated[float | None, typer.Option(help="Of places; default 1.")] = None,
     tolerance_deg: Annotated[float | None, typer.Option(help="Of turns and directions; default 5.")] = None,
-    candidates: Annotated[int | None, typer.Option(help="Followed down the tree; default 8.")] = None,
-    likelihood: Annotated[
-        float | None, typer.Option("--lambda", help="What a likely motion is worth; the less, the nearer. Default 1.")
-    ] = None,
-    refine: Annotated[bool, typer.Option("--refine/--no-refine", help="Improve what the tree has.")] = True,
-    finish: Annotated[bool, typer.Option("--finish", help="Remove the rest by inverse kinematics.")] = False,
     request: Annotated[
         Path | None, typer.Option(help="File with the whole request as JSON, for several steps.")
     ] = None,
@@ -101,14 +100,9 @@ def search(
         asked["constraints"] = constraints
     if not (asked.get("constraints") or asked.get("steps")):
         raise WrongUsage("nothing is asked for; give --at WHEN:JOINT=x,y,z or another constraint")
-    given = {
-        "candidates": candidates,
-        "lambda": likelihood,
-        "refine": None if refine else False,
-        "finish": finish or None,
-        "start": None if start is None else _start(start),
-    }
-    asked |= {name: value for name, value in given.items() if value is not None}
+    asked |= params
+    if start is not None:
+        asked["start"] = _start(start)
     SearchRequest.model_validate(asked)
     with connect(context) as marey:
         found = model_at(marey, place)

@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_client.handles.clips import ClipHandle
-from marey_client.handles.findings import Findings, OnProgress, find_out
+from marey_client.handles.findings import Findings
 from marey_client.handles.reports import ReportedHandle, saved
+from marey_client.jobs import Jobs, OnProgress, job_request
 from marey_client.places import Places, as_inputs
-from marey_schemas.base import Request
 from marey_schemas.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
+from marey_schemas.jobs import JobCreate
 
 COSTS = ("match_cost", "continuing_cost", "pose_cost")
 
@@ -67,40 +68,55 @@ class EvaluationHandle(ReportedHandle):
     def _walk_graph(self, form: str, trial: str | None) -> bytes:
         return self._fetch(f"{self.url}/walk-graph", "*/*", {"format": form, "trial": trial})
 
-    # -- what follows from it: each hands in a job, waits for it, and raises `JobUnsuccessful` where it is refused --
+    # -- jobs on the evaluation: each method submits one and waits for it, or raises `JobUnsuccessful` --
 
     def compare(self, after: EvaluationHandle, *, on_progress: OnProgress | None = None, **options: Any) -> Findings:
-        """What changed from this evaluation to another one of the same trials, under the same normaliser.
+        """Compare with another evaluation of the same trials, under the same normaliser.
 
         `options` are those of `CompareParams`.
         """
-        inputs = {"before": self.as_input(), "after": after.as_input()}
-        return self._find_out("compare", inputs, CompareParams.model_validate(options), on_progress)
+        return self._run(self.compare_request(after, **options), on_progress)
 
     def suggest(
         self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
     ) -> Findings:
-        """Which clips can go, and which of the candidates, folders and clips, would fill holes.
+        """Find clips that can go, and those of the candidates, folders and clips, that fill holes.
 
         `options` are those of `SuggestParams`.
         """
-        params = SuggestParams.model_validate(options)
-        return self._find_out("suggest", self._with_candidates(candidates), params, on_progress)
+        return self._run(self.suggest_request(candidates, **options), on_progress)
 
     def optimise(
         self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
     ) -> Findings:
-        """Clips taken away and candidates added, one step after another, while that lowers the objective.
+        """Remove clips and add candidates, one step after another, as long as that lowers the objective.
 
         `options` are those of `OptimiseParams`.
         """
-        params = OptimiseParams.model_validate(options)
-        return self._find_out("optimise", self._with_candidates(candidates), params, on_progress)
+        return self._run(self.optimise_request(candidates, **options), on_progress)
 
     def sweep(self, *, on_progress: OnProgress | None = None, **options: Any) -> Findings:
-        """The same trials under other weights of the features; `options` are those of `SweepParams`."""
-        params = SweepParams.model_validate(options)
-        return self._find_out("sweep", {"evaluation": self.as_input()}, params, on_progress)
+        """Evaluate the same trials with other weights of the features; `options` are those of `SweepParams`."""
+        return self._run(self.sweep_request(**options), on_progress)
+
+    # -- requests for the same jobs --
+
+    def compare_request(self, after: EvaluationHandle, **options: Any) -> JobCreate:
+        """Ask for a comparison with another evaluation; `options` are those of `CompareParams`."""
+        inputs = {"before": self.as_input(), "after": after.as_input()}
+        return job_request("compare", inputs, CompareParams.model_validate(options))
+
+    def suggest_request(self, candidates: Places[ClipHandle] = (), **options: Any) -> JobCreate:
+        """Ask for suggestions; `options` are those of `SuggestParams`."""
+        return job_request("suggest", self._with_candidates(candidates), SuggestParams.model_validate(options))
+
+    def optimise_request(self, candidates: Places[ClipHandle] = (), **options: Any) -> JobCreate:
+        """Ask for an optimisation; `options` are those of `OptimiseParams`."""
+        return job_request("optimise", self._with_candidates(candidates), OptimiseParams.model_validate(options))
+
+    def sweep_request(self, **options: Any) -> JobCreate:
+        """Ask for a sweep of the weights; `options` are those of `SweepParams`."""
+        return job_request("sweep", {"evaluation": self.as_input()}, SweepParams.model_validate(options))
 
     def _with_candidates(self, candidates: Places[ClipHandle]) -> dict[str, Any]:
         inputs: dict[str, Any] = {"evaluation": self.as_input()}
@@ -108,10 +124,8 @@ class EvaluationHandle(ReportedHandle):
             inputs["candidates"] = places
         return inputs
 
-    def _find_out(
-        self, kind: str, inputs: Mapping[str, Any], params: Request, on_progress: OnProgress | None
-    ) -> Findings:
-        return find_out(self.transport, self.project, kind, inputs, params, on_progress)
+    def _run(self, request: JobCreate, on_progress: OnProgress | None) -> Findings:
+        return Findings(self.transport, Jobs(self.transport).run(self.project, request, on_progress=on_progress))
 
 
 # -- documents as tables -----------------------------------------------------------------------------------------------

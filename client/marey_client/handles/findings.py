@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from marey_client.blobs import Blobs
-from marey_client.jobs import Jobs
 from marey_client.transport import Transport
-from marey_schemas.base import Request
 from marey_schemas.encoding.codecs import JSON, decode_tree
-from marey_schemas.jobs import CollectionInput, ItemInput, Job, JobCreate
-
-OnProgress = Callable[[Job], None]
+from marey_schemas.jobs import Job
 
 
 @dataclass(frozen=True)
@@ -46,19 +41,3 @@ class Findings:
         if name not in result:
             raise LookupError(f"job {self.job.id} made no {name}")
         return str(result[name]["blob"])
-
-
-def find_out(
-    transport: Transport,
-    project: str,
-    kind: str,
-    inputs: Mapping[str, ItemInput | Sequence[ItemInput | CollectionInput]],
-    params: Request,
-    on_progress: OnProgress | None,
-) -> Findings:
-    """Hand in a job about an evaluation and wait until it has ended. Raises `JobUnsuccessful`."""
-    pinned = {name: one if isinstance(one, ItemInput) else tuple(one) for name, one in inputs.items()}
-    given = params.model_dump(mode="json", exclude_defaults=True)
-    jobs = Jobs(transport)
-    submitted = jobs.submit(project, JobCreate(kind=kind, inputs=pinned, params=given))
-    return Findings(transport, jobs.wait(submitted.id, on_progress=on_progress))

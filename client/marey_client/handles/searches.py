@@ -9,9 +9,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from marey_client.downloads import safe_file_name, saved_atomically
-from marey_client.handles.findings import OnProgress
 from marey_client.handles.reports import ReportedHandle
-from marey_client.jobs import Jobs
+from marey_client.jobs import Jobs, OnProgress, job_request
 from marey_client.one_or_several import several
 from marey_client.transport import BLOCKS, as_json, read_tree
 from marey_schemas.job_params import TreeParams
@@ -68,10 +67,12 @@ class SearchableHandle(ReportedHandle):
 
         `options` are those of `TreeParams`.
         """
-        params = TreeParams.model_validate(options).model_dump(mode="json", exclude_defaults=True)
-        request = JobCreate(kind="tree", inputs={"model": self.as_input()}, params=params, seed=seed)
-        jobs = Jobs(self.transport)
-        return jobs.wait(jobs.submit(self.project, request).id, on_progress=on_progress)
+        request = self.tree_request(**options).model_copy(update={"seed": seed})
+        return Jobs(self.transport).run(self.project, request, on_progress=on_progress)
+
+    def tree_request(self, **options: Any) -> JobCreate:
+        """Ask for the tree of samples; `options` are those of `TreeParams`."""
+        return job_request("tree", {"model": self.as_input()}, TreeParams.model_validate(options))
 
 
 def search_request(constraints: Constraints, **options: Any) -> SearchRequest:

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 from datetime import UTC, datetime
@@ -13,10 +14,11 @@ import typer
 from marey_client.cli import accounts, files, with_global_options_first
 from marey_client.cli.addresses import Address
 from marey_client.cli.app import app
-from marey_client.cli.failures import WrongUsage, sentence
+from marey_client.cli.clip_jobs import _print_aligned, print_labelled
+from marey_client.cli.failures import Refused, WrongUsage, sentence
 from marey_client.cli.files import _items_in
+from marey_client.cli.following import follow, print_ended
 from marey_client.cli.invocation import connect
-from marey_client.cli.jobs import watching
 from marey_client.cli.output import print_table
 from marey_client.cli.pipelines import _tell_shortfalls
 from marey_client.errors import Forbidden, Invalid, NotFound, Unauthenticated
@@ -273,15 +275,44 @@ def test_a_project_that_is_not_there_is_told_before_any_byte_is_sent(script, mak
     assert [request.method for request in script.requests] == ["GET"]
 
 
-def test_who_interrupts_the_wait_for_a_job_is_told_that_it_goes_on(capsys):
-    def wait():
-        with watching() as show:
-            show(Job.model_construct(id="job_1", kind="retarget", state=JobState.RUNNING, progress=None))
-            raise KeyboardInterrupt
+def test_who_interrupts_the_wait_for_a_job_is_told_that_it_goes_on(script, capsys):
+    def interrupt(_request):
+        raise KeyboardInterrupt
 
+    script.answers = [interrupt]
+    running = Job.model_construct(id="job_1", kind="retarget", state=JobState.RUNNING, progress=None)
     with pytest.raises(KeyboardInterrupt):
-        wait()
-    assert "job_1 goes on without you" in capsys.readouterr().err
+        follow(script.marey(), running)
+    told = capsys.readouterr().err
+    assert "job_1 goes on" in told
+    assert "marey job cancel job_1" in told
+
+
+def test_a_job_that_is_not_waited_for_is_named(script, capsys):
+    submitted = Job.model_construct(id="job_1", kind="retarget", state=JobState.QUEUED, progress=None)
+    assert follow(script.marey(), submitted, wait=False) is None
+    assert capsys.readouterr().out == "job_1\n"
+    assert script.requests == []
+
+
+def test_results_are_counted_as_people_count(capsys):
+    aligned = {
+        "name": "walk", "frames": 1, "cost": 0.0, "least_slope": 1.0, "greatest_slope": 1.0,
+    }  # fmt: skip
+    result = {
+        "clips": 1, "frames": 1, "frame_rate_hz": 30.0, "keyframes": {}, "reference": "walk", "aligned": [aligned],
+        "refused": [],
+    }  # fmt: skip
+    print_ended(Job.model_construct(id="job_1", result=result), False, _print_aligned)
+    assert capsys.readouterr().out.splitlines()[-1] == "1 clip of 1 frame at 30 Hz; 0 refused"
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_inputs_that_a_job_refused_give_status_1_however_it_is_printed(as_json, capsys):
+    result = {"clips": 0, "labels": {}, "refused": [{"name": "walk", "code": "no-feet", "detail": "it has no feet"}]}
+    with pytest.raises(Refused):
+        print_ended(Job.model_construct(id="job_1", result=result), as_json, print_labelled)
+    assert "it has no feet" in "".join(capsys.readouterr())
 
 
 def test_who_interrupts_an_upload_is_told_how_to_go_on(script, monkeypatch, tmp_path, capsys):
@@ -344,9 +375,11 @@ def test_what_a_step_found_nothing_in_is_counted_as_people_count(capsys):
         assert capsys.readouterr().err == f"annotate found nothing {told}\n"
 
 
-def test_completion_is_offered_for_the_users_shell(nowhere):
-    done = marey("--show-completion", "bash", env=nowhere)
+def test_completion_is_offered_for_the_shell_that_starts_the_command(nowhere):
+    script = f"{shlex.quote(sys.executable)} -m marey_client.cli --show-completion; exit $?"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, env={**os.environ, **nowhere})
     assert done.returncode == 0, done.stderr
+    assert "complete -o" in done.stdout
     assert "marey" in done.stdout
 
 

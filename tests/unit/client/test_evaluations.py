@@ -8,9 +8,9 @@ import httpx
 import numpy as np
 import pytest
 
-from marey_client.cli.evaluations import _params, _values
 from marey_client.cli.failures import WrongUsage
-from marey_client.cli.jobs import show_progress
+from marey_client.cli.following import show_progress
+from marey_client.cli.typed_values import read_numbers
 from marey_client.handles.evaluations import clip_rows, record_arrays, trial_rows
 from marey_schemas.jobs import CollectionInput, Job, Progress
 
@@ -138,22 +138,13 @@ def test_records_come_per_trial_with_gaps_where_a_cost_is_not_defined():
     ],
 )
 def test_ranges_hold_their_last_value_where_the_steps_meet_it(text, values):
-    assert _values(text) == pytest.approx(values)
+    assert read_numbers(text) == pytest.approx(values)
 
 
 @pytest.mark.parametrize("text", ["1:3", "3:1:1", "1:3:0", "fast", "1:3:0.25:2", "1:2,3:1", "0:1:0.0001", ""])
 def test_ranges_that_make_no_sense_are_refused_with_what_to_write(text):
     with pytest.raises(WrongUsage, match=r"write|range|values"):
-        _values(text)
-
-
-def test_only_options_that_were_given_are_sent():
-    params = _params(
-        name="x", speeds_m_s=None, duration_s=5.0, baseline=True, database={"mirroring": "add", "end_policy": None},
-        controller={"follow": None},
-    )  # fmt: skip
-    given = params.model_dump(exclude_unset=True)
-    assert given == {"name": "x", "duration_s": 5.0, "baseline": True, "database": {"mirroring": "add"}}
+        read_numbers(text)
 
 
 def test_progress_of_tasks_is_shown_in_trials():

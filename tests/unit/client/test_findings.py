@@ -7,7 +7,7 @@ import pytest
 
 from marey_client.blobs import digest_of
 from marey_client.cli.failures import WrongUsage
-from marey_client.cli.improvements import _print_comparison, _weights
+from marey_client.cli.improvements import OPTIMISE, _print_comparison
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_schemas.items import Item
 
@@ -65,8 +65,10 @@ def test_a_comparison_in_which_nothing_changed_says_so(capsys):
 
 
 def test_weights_of_the_objective_are_read_by_name():
-    assert _weights(["seconds=0.001", "offset=2"]) == {"seconds": 0.001, "offset": 2.0}
+    weight = next(one for one in OPTIMISE.options if one.path == ("objective",))
+    assert weight.spellings == ("--objective", "--weight")
+    assert weight.read(["seconds=0.001", "offset=2"]) == {"seconds": 0.001, "offset": 2.0}
     with pytest.raises(WrongUsage, match="with one of offset, "):
-        _weights(["length=1"])
-    with pytest.raises(WrongUsage, match="'much' is no number"):
-        _weights(["seconds=much"])
+        weight.read(["length=1"])
+    with pytest.raises(WrongUsage, match="'much' is not a number"):
+        weight.read(["seconds=much"])

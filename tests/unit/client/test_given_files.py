@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from marey_client.cli.failures import WrongUsage
-from marey_client.cli.json_files import read_json
+from marey_client.cli.typed_values import read_json
 
 
 @pytest.mark.parametrize(

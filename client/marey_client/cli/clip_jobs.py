@@ -1,0 +1,159 @@
+"""`retarget`, `align` and `cut`: jobs that make clips of clips."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
+from marey_client.cli.following import JOB, Into, Sources, Wait, clips_at, follow, input_at, print_ended
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.output import print_table, tell
+from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
+from marey_schemas.wording import counted
+
+if TYPE_CHECKING:
+    from marey_client.marey import Marey
+
+RETARGET = OptionsOf("marey_schemas.job_params:RetargetParams")
+ALIGN = OptionsOf(
+    "marey_schemas.job_params:AlignParams",
+    short={"rate_hz": "--rate", "mirroring": "--mirror"},
+    nulls={"slope_limit": "-1"},
+)
+CUT = OptionsOf(
+    "marey_schemas.job_params:CutParams",
+    short={
+        "margin_before_s": "--before",
+        "margin_after_s": "--after",
+        "shortest_s": "--shortest",
+        "longest_s": "--longest",
+    },
+)
+REFERENCES = ("medoid", "nearest_mean_length")
+ALIGNED_COLUMNS = ("clip", "frames", "cost, cm²", "slowest", "fastest", "")
+SQUARE_CM = 1e4  # in a square metre
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    add_command(app, retarget, params=RETARGET, job=JOB)
+    add_command(app, align, params=ALIGN, job=JOB)
+    add_command(app, cut, params=CUT, job=JOB)
+
+
+def retarget(
+    context: typer.Context,
+    sources: Sources,
+    to: Annotated[str, typer.Option(help="The skeleton: project/folder/name, or project/id.")],
+    into: Into,
+    params: Chosen,
+    job: Chosen,
+    wait: Wait = True,
+    as_json: AsJson = False,
+) -> None:
+    """Move clips to another skeleton, as a job."""
+    from marey_schemas.job_params import RetargetParams
+    from marey_schemas.kinds import Kind
+
+    *addresses, target = addresses_in_one_project([*sources, to])
+    with connect(context) as marey:
+        clips = [clips_at(marey, address) for address in addresses]
+        skeleton = require_item(marey, target, [Kind.SKELETON])
+        submitted = marey.project(target.project).retarget(
+            clips, skeleton.id, into=into.strip("/"), params=RetargetParams.model_validate(params), **job
+        )
+        ended = follow(marey, submitted, wait=wait, as_json=as_json)
+    if ended is not None:
+        print_ended(ended, as_json)
+
+
+def align(
+    context: typer.Context,
+    sources: Sources,
+    into: Into,
+    params: Chosen,
+    job: Chosen,
+    annotations: Annotated[
+        list[str] | None,
+        typer.Option(help="Annotations or folders of them to use; default: all of these clips; may be repeated."),
+    ] = None,
+    wait: Wait = True,
+    as_json: AsJson = False,
+) -> None:
+    """Align clips of one action with each other, as a job.
+
+    `--reference` takes the address of a clip, too.
+    """
+    from marey_schemas.kinds import Kind
+
+    addresses = addresses_in_one_project(sources)
+    with connect(context) as marey:
+        given = [input_at(marey, Address.parse(place), Kind.ANNOTATION) for place in annotations or ()]
+        if "reference" in params:
+            params["reference"] = _reference(marey, params["reference"])
+        clips = [clips_at(marey, address) for address in addresses]
+        project = marey.project(addresses[0].project)
+        submitted = project.align(clips, into=into.strip("/"), annotations=given or None, **job, **params)
+        ended = follow(marey, submitted, wait=wait, as_json=as_json)
+    if ended is not None:
+        print_ended(ended, as_json, _print_aligned)
+
+
+def cut(
+    context: typer.Context,
+    sources: Annotated[list[str], typer.Argument(help="Annotations or folders of them: project/folder[/name].")],
+    into: Into,
+    params: Chosen,
+    job: Chosen,
+    wait: Wait = True,
+    as_json: AsJson = False,
+) -> None:
+    """Cut clips along the segments of annotations; keyframes within stay with the pieces."""
+    from marey_schemas.kinds import Kind
+
+    addresses = addresses_in_one_project(sources)
+    with connect(context) as marey:
+        places = [input_at(marey, address, Kind.ANNOTATION) for address in addresses]
+        project = marey.project(addresses[0].project)
+        ended = follow(marey, project.cut(places, into=into.strip("/"), **job, **params), wait=wait, as_json=as_json)
+    if ended is not None:
+        print_ended(ended, as_json, print_labelled)
+
+
+def print_labelled(result: dict[str, Any]) -> None:
+    """Print how many clips or annotations a job made, how many there are of each label, and what gave none."""
+    made = counted(result["clips"], "clip") if "clips" in result else counted(result["annotations"], "annotation")
+    counts = result.get("segments") or result.get("labels") or {}
+    typer.echo(", ".join([made, *(f"{count} {label}" for label, count in counts.items())]))
+    if empty := result.get("empty"):
+        tell(f"nothing was found in {counted(len(empty), 'clip')}, such as {empty[0]}")
+
+
+def _reference(marey: Marey, text: str) -> str:
+    """Return a reference as the job takes it: a rule by its name, or the id of a clip."""
+    from marey_schemas.kinds import Kind
+
+    return text if text in REFERENCES else str(require_item(marey, Address.parse(text), [Kind.CLIP]).id)
+
+
+def _print_aligned(result: dict[str, Any]) -> None:
+    rows = [
+        (
+            one["name"],
+            one["frames"],
+            f"{one['cost'] * SQUARE_CM:.2f}",
+            f"{one['least_slope']:.2f}",
+            f"{one['greatest_slope']:.2f}",
+            "reference" if one["name"] == result["reference"] else "",
+        )
+        for one in result["aligned"]
+    ]
+    print_table(ALIGNED_COLUMNS, rows, right=ALIGNED_COLUMNS[1:5])
+    keyframes = ", ".join(f"{label} {frame}" for label, frame in result["keyframes"].items())
+    typer.echo(
+        f"{counted(result['clips'], 'clip')} of {counted(result['frames'], 'frame')} at {result['frame_rate_hz']:g} Hz"
+        + (f"; keyframes: {keyframes}" if keyframes else "")
+        + f"; {len(result['refused'])} refused"
+    )

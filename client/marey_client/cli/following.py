@@ -1,0 +1,101 @@
+"""Commands that submit jobs: the options they share, the bar that follows a job, and its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marey_client.cli.addresses import Address, find_item
+from marey_client.cli.failures import Refused
+from marey_client.cli.output import Advance, print_json, progress, tell, tell_refused
+from marey_client.cli.schema_options import OptionsOf
+
+if TYPE_CHECKING:
+    from marey_client.marey import Marey
+    from marey_schemas.jobs import CollectionInput, ItemInput, Job
+    from marey_schemas.kinds import Kind
+
+JOB = OptionsOf("marey_schemas.jobs:JobCreate", only=("priority", "cache"))
+SEEDED_JOB = OptionsOf("marey_schemas.jobs:JobCreate", only=("seed", "priority", "cache"))
+
+Sources = Annotated[list[str], typer.Argument(help="Clips or folders of clips of one project: project/folder[/name].")]
+Into = Annotated[str, typer.Option(help="Folder of the project that the results go to.")]
+Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the job has ended.")]
+
+
+def clips_at(marey: Marey, address: Address) -> ItemInput | CollectionInput:
+    """Return what an address names as the input of a job: a clip, else a folder."""
+    from marey_schemas.kinds import Kind
+
+    return input_at(marey, address, Kind.CLIP, pinned=False)
+
+
+def input_at(marey: Marey, address: Address, kind: Kind, *, pinned: bool = True) -> ItemInput | CollectionInput:
+    """Return the input of a job that an address names: an item of a kind, `pinned` to its revision, else a folder."""
+    from marey_schemas.jobs import CollectionInput, ItemInput
+
+    found = find_item(marey, address, [kind])
+    if found is None:
+        return CollectionInput(collection=address.path)
+    return found.as_input() if pinned else ItemInput(item=found.id)
+
+
+def follow(
+    marey: Marey, submitted: Job, *, wait: bool = True, as_json: bool = False, count: int | None = None, unit: str = ""
+) -> Job | None:
+    """Wait until a job has ended, with a bar; of `count` units if the job gathers tasks that work on them.
+
+    Without `wait`, print the job's id and return None. Raises `JobUnsuccessful`.
+    """
+    if not wait:
+        print_json(submitted) if as_json else typer.echo(submitted.id)
+        return None
+    seen = submitted
+    try:
+        with progress() as advance:
+
+            def show(now: Job) -> None:
+                nonlocal seen
+                seen = now
+                show_progress(now, advance, count, unit)
+
+            show(submitted)
+            return marey.jobs.wait(submitted.id, on_progress=show)
+    except KeyboardInterrupt:
+        tell(f"{seen.id} goes on; marey job show {seen.id} shows it, marey job cancel {seen.id} stops it")
+        raise
+
+
+def show_progress(now: Job, advance: Advance, count: int | None = None, unit: str = "") -> None:
+    """Show how far a job is; the progress of one that gathers tasks is counted in tasks, or in `count` units."""
+    what = f"{now.kind} {now.state}"
+    if now.progress is None:
+        return advance(what, 0, None)
+    if now.size is None or now.progress.total != now.size:
+        return advance(now.progress.note or what, now.progress.done, now.progress.total)
+    if count is None:
+        return advance(what, now.progress.done, now.size)
+    return advance(unit or what, round(now.progress.done / now.size * count), count)
+
+
+def print_ended(ended: Job, as_json: bool, show: Callable[[dict[str, Any]], None] | None = None) -> None:
+    """Print the result of a job by `show`, or its counts, and its refused inputs. Raises `Refused` for those."""
+    result = ended.result or {}
+    refused = result.get("refused", ())
+    if as_json:
+        print_json(ended)
+    else:
+        tell_refused(refused)
+        (show or _shown_counts(ended, refused))(result)
+    if refused:
+        raise Refused
+
+
+def _shown_counts(ended: Job, refused: Sequence[Any]) -> Callable[[dict[str, Any]], None]:
+    def show(result: dict[str, Any]) -> None:
+        counts = ", ".join(f"{value} {name}" for name, value in result.items() if isinstance(value, int))
+        typer.echo(f"{ended.id} {ended.state}" + (f": {counts}" if counts else "") + f"; {len(refused)} refused")
+
+    return show

@@ -1,0 +1,116 @@
+"""Options of commands that come from the models of jobs."""
+
+import re
+from typing import Any
+
+import pytest
+import typer
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from marey_client.cli.app import app
+from marey_client.cli.clip_jobs import ALIGN, CUT
+from marey_client.cli.evaluations import EVALUATE
+from marey_client.cli.failures import WrongUsage
+from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
+from marey_schemas.job_params import AlignParams, EvaluateParams
+
+COMMANDS: Any = get_command(app)
+
+
+def typed(arguments: str, options: OptionsOf) -> Chosen:
+    """Return what a command gets that has these options."""
+    got: list[Chosen] = []
+
+    def command(params: Chosen) -> None:
+        """Remember what was typed."""
+        got.append(params)
+
+    one = typer.Typer()
+    add_command(one, command, params=options)
+    done = CliRunner().invoke(one, arguments.split())
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    assert done.exit_code == 0, done.output
+    return got[0]
+
+
+def help_of(options: OptionsOf, field: str) -> str:
+    return next(one for one in options.options if one.path[-1] == field).help
+
+
+@pytest.mark.parametrize(
+    ("arguments", "chosen"),
+    [
+        ("", {}),
+        ("--rate 30", {"rate_hz": 30.0}),
+        ("--rate-hz 30", {"rate_hz": 30.0}),
+        ("--label a --label b,c", {"labels": ["a", "b,c"]}),
+        ("--weight Hips=2 --weight Head=0.5", {"weights": {"Hips": 2.0, "Head": 0.5}}),
+        ("--slope-limit -1", {"slope_limit": None}),
+        ("--slope-limit none", {"slope_limit": None}),
+        ("--slope-limit 5", {"slope_limit": 5}),
+        ("--no-keep-height", {"keep_height": False}),
+        ("--mirror add", {"mirroring": "add"}),
+    ],
+)
+def test_only_what_was_typed_is_given_in_the_types_of_the_model(arguments: str, chosen: Chosen) -> None:
+    assert typed(arguments, ALIGN) == chosen
+    AlignParams.model_validate(chosen)
+
+
+def test_fields_of_nested_models_are_options_too() -> None:
+    chosen = typed("--mirror add --follow path --weight hip_velocity=2 --speeds 1:2:0.5 --families circle", EVALUATE)
+    assert chosen == {
+        "speeds_m_s": [1.0, 1.5, 2.0],
+        "families": ["circle"],
+        "database": {"mirroring": "add", "weights": {"hip_velocity": 2.0}},
+        "controller": {"follow": "path"},
+    }
+    EvaluateParams.model_validate(chosen)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ("--rate-hz -1", "--rate-hz: Input should be greater than 0"),
+        ("--window 2", "--window: Value error, must be odd"),
+        ("--slope-limit many", "--slope-limit: 'many' is not a number"),
+        ("--weight Hips", "'Hips': write name=number"),
+    ],
+)
+def test_what_the_model_refuses_is_told_with_the_option(arguments: str, told: str) -> None:
+    with pytest.raises(WrongUsage) as refused:
+        typed(arguments, ALIGN)
+    assert str(refused.value).startswith(told)
+
+
+def test_help_tells_meaning_range_and_default_of_the_schema() -> None:
+    assert help_of(EVALUATE, "speeds_m_s").endswith("Above 0, at most 20; a,b,c or first:last:step; default 1:3:0.25.")
+    assert help_of(EVALUATE, "baseline").endswith("Default on.")
+    assert help_of(CUT, "margin_before_s").endswith("0 to 3600; default 0.")
+    assert help_of(ALIGN, "slope_limit").endswith("0 to 60; none or -1: no limit; default 3.")
+
+
+def test_every_command_can_make_its_options_and_explains_each() -> None:
+    def walk(command: Any, path: str) -> None:
+        context = typer.Context(command, info_name=path)
+        spelled = [one for option in command.get_params(context) for one in (*option.opts, *option.secondary_opts)]
+        assert sorted(spelled) == sorted(set(spelled)), path
+        unclear = [option.name for option in command.get_params(context) if not getattr(option, "help", "")]
+        assert unclear == [], path
+        for name, child in getattr(command, "commands", {}).items():
+            walk(child, f"{path} {name}")
+
+    walk(COMMANDS, "marey")
+
+
+def test_the_parameters_of_a_job_are_the_options_of_its_command() -> None:
+    """A field that is added to a model becomes an option without a change of the command."""
+    set_by_the_command = {"loops", "trims"}
+    context = typer.Context(COMMANDS.commands["evaluate"])
+    options = {one for option in COMMANDS.commands["evaluate"].get_params(context) for one in option.opts}
+    nested = {"database", "controller"}
+    for field in EvaluateParams.model_fields.keys() - set_by_the_command - nested:
+        name = field.replace("_", "-")
+        assert {f"--{name}", f"--{re.sub('s$', '', name)}"} & options, field
