@@ -5,9 +5,10 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 DATA   ?=
 PIP    := $(BIN)/python -m pip --disable-pip-version-check -q
+PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadgroup
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format dev bench fuzz docs clean
+.PHONY: help demo check test soak lint format dev bench docs clean
 
 help: ## Show what can be made
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -32,8 +33,15 @@ demo: $(VENV)/.installed-all ## From takes to an evaluated, reported dataset; DA
 dev: $(VENV)/.installed-dev ## A server and a worker on this machine, with data in ./marey-data
 	$(BIN)/marey serve
 
-test: $(VENV)/.installed-dev lint ## Everything a change can break, on SQLite and on Postgres
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal tests
+check: $(VENV)/.installed-dev lint ## In 4 minutes: lint, types, units, REST on SQLite, one whole way
+	$(PYTEST) --tier check tests
+
+test: $(VENV)/.installed-dev lint ## In 15 minutes: everything a change can break, on SQLite and on Postgres
+	$(PYTEST) --tier test tests
+
+soak: $(VENV)/.installed-dev lint ## Every fault on both databases, hours of generated files, requests and state machines
+	$(PYTEST) --tier soak -o timeout=7200 tests
+	$(BIN)/python -m tests.support.motion_fuzz 3600
 
 lint: $(VENV)/.installed-dev ## Style, types and the arrows between rooms
 	$(BIN)/ruff check .
@@ -52,10 +60,6 @@ $(VENV)/.installed-bench: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-bench ## Speed against peers, as ratios
 	$(BIN)/python -m benchmarks
-
-fuzz: $(VENV)/.installed-dev ## An hour of malformed motion files and twenty minutes of malformed requests
-	$(BIN)/python -m tests.support.motion_fuzz 3600
-	MAREY_FUZZ_EXAMPLES=200 $(BIN)/python -m pytest -q tests/integration/test_rest_fuzz.py -o timeout=3600
 
 docs: $(VENV)/.installed-dev ## Write the reference pages that come from the code
 	$(BIN)/python -m docs.generate

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from tests.support.tiers import examples
 
 from marey_schemas.encoding import codecs
 from marey_schemas.encoding.arrays import EncodedArray
@@ -91,23 +92,23 @@ CODECS = [
 @pytest.mark.parametrize("codec", CODECS, ids=str)
 class TestEveryCodec:
     @given(tree=objects)
-    @settings(max_examples=150, deadline=None)
+    @settings(max_examples=examples(150))
     def test_what_is_written_reads_back_equal_to_the_bit(self, codec: Codec, tree: Any) -> None:
         assert same(codec.decode(codec.encode(tree)), tree)
 
     @given(tree=objects)
-    @settings(max_examples=30, deadline=None)
+    @settings(max_examples=examples(30))
     def test_the_same_tree_always_gives_the_same_bytes(self, codec: Codec, tree: Any) -> None:
         assert codec.encode(tree) == codec.encode(tree)
 
     @given(data=st.binary(max_size=200))
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=examples(300))
     def test_rubbish_is_read_or_refused_and_never_crashes(self, codec: Codec, data: bytes) -> None:
         with suppress(CodecError):
             codec.decode(data)
 
     @given(tree=objects, position=st.integers(0), value=st.integers(0, 255))
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=examples(300))
     def test_changed_bytes_are_read_or_refused_and_never_crash(
         self, codec: Codec, tree: Any, position: int, value: int
     ) -> None:
@@ -117,7 +118,7 @@ class TestEveryCodec:
             codec.decode(bytes(data))
 
     @given(tree=objects, cut=st.integers(0))
-    @settings(max_examples=100, deadline=None)
+    @settings(max_examples=examples(100))
     def test_truncated_bytes_are_refused(self, codec: Codec, tree: Any, cut: int) -> None:
         data = codec.encode(tree)
         with pytest.raises(CodecError):
@@ -235,7 +236,7 @@ class TestEveryCodec:
 
 
 @given(tree=objects)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150))
 def test_all_media_types_decode_to_the_same_tree(tree: Any) -> None:
     decoded = [decode_tree(encode_tree(tree, media_type), media_type) for media_type in codecs.MEDIA_TYPES]
     assert same(decoded[0], decoded[1])
@@ -243,7 +244,7 @@ def test_all_media_types_decode_to_the_same_tree(tree: Any) -> None:
 
 
 @given(tree=values.filter(lambda tree: not isinstance(tree, dict)))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60))
 def test_lists_and_scalars_are_documents_in_json_and_messagepack(tree: Any) -> None:
     for media_type in (codecs.JSON, codecs.MSGPACK):
         assert same(decode_tree(encode_tree(tree, media_type), media_type), tree)

@@ -16,6 +16,8 @@ from marey_server.store.database.connections import Database
 from marey_server.store.items import ItemFilters
 from marey_server.store.transaction import Transaction
 
+pytestmark = pytest.mark.every_database
+
 Folders = dict[str, str]
 
 

@@ -15,6 +15,8 @@ from marey_server.store.database.connections import Database
 from marey_server.store.jobs import completion, reading, submission
 from marey_server.store.jobs.retrying import retry_job
 
+pytestmark = pytest.mark.every_database
+
 
 @pytest.fixture
 def other(open_database: Callable[[], Database]) -> Database:

@@ -170,6 +170,7 @@ def test_a_server_killed_among_200_uploads_keeps_what_it_acknowledged(
     server.check_database()
 
 
+@pytest.mark.every_database
 @pytest.mark.parametrize("place", ["publish.before_commit", "publish.after_commit", "blob.put.before_commit"])
 def test_a_server_killed_at_a_write_leaves_it_whole_or_not_at_all(
     server: ServerProcess, takes: list[LocalFile], place: str
@@ -192,6 +193,7 @@ def test_a_server_killed_at_a_write_leaves_it_whole_or_not_at_all(
     server.check_database()
 
 
+@pytest.mark.every_database
 @pytest.mark.parametrize("place", ["complete.before_commit@11", "complete.after_commit@17"])
 def test_a_server_killed_among_50_completes_publishes_each_result_once(
     server: ServerProcess,
@@ -232,6 +234,7 @@ def test_a_server_killed_among_50_completes_publishes_each_result_once(
 # -- the worker dies, sleeps, or is cut off ----------------------------------------------------------------------------
 
 
+@pytest.mark.every_database
 @pytest.mark.parametrize("place", ["after_claim", "after_blob", "before_complete", "after_complete"])
 def test_a_job_of_a_killed_worker_is_finished_by_another_with_one_result(
     server: ServerProcess,
@@ -344,6 +347,7 @@ def test_a_full_disk_is_a_507_and_leaves_nothing_behind(server: ServerProcess, t
     server.check_database()
 
 
+@pytest.mark.every_database
 def test_a_database_that_is_away_for_a_while_delays_work_and_loses_none(
     server: ServerProcess, database_url: str, takes: list[LocalFile]
 ) -> None:

@@ -16,6 +16,8 @@ from marey_server.store.database.connections import Database
 from marey_server.store.jobs.reaper import StartGrace, claim_after_reaping, correct_times, reap_page
 from marey_server.store.transaction import Transaction
 
+pytestmark = pytest.mark.every_database
+
 HOUR_S = 3600.0
 
 

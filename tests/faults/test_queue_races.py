@@ -24,6 +24,8 @@ from marey_server.store.jobs.reaper import reap_page
 from marey_server.store.tables import attempt, event, job
 from marey_server.store.transaction import Transaction
 
+pytestmark = pytest.mark.every_database
+
 TERMINAL = ("succeeded", "failed", "cancelled")
 
 

@@ -17,6 +17,8 @@ from marey_server.store.items import Draft
 from marey_server.store.items.publishing import publish
 from marey_server.store.transaction import Transaction
 
+pytestmark = pytest.mark.every_database
+
 Act = Callable[[Transaction], object]
 
 

@@ -113,6 +113,7 @@ def test_a_sender_that_dies_leaves_whole_blobs(lab, writer, fault, left, backing
     assert_sound(lab)
 
 
+@pytest.mark.every_database
 @pytest.mark.parametrize(("fault", "left"), [("publish.before_commit:kill", 0), ("publish.after_commit:kill", 3)])
 def test_a_publisher_that_dies_leaves_everything_or_nothing(lab, writer, fault, left):
     writer.run("send")

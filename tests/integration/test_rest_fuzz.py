@@ -1,9 +1,8 @@
 """The published OpenAPI document against the server, with whatever schemathesis thinks of.
 
-A bounded look by default; MAREY_FUZZ_EXAMPLES=500 looks longer.
+`--tier soak` searches longer.
 """
 
-import os
 from importlib.metadata import version
 from pathlib import Path
 from urllib.parse import quote
@@ -20,6 +19,7 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 from tests.support.rest_server import Server, running
+from tests.support.tiers import examples
 
 from marey_schemas.access import Role
 from marey_server.handlers.catalogue import RESOURCES
@@ -28,7 +28,6 @@ from marey_server.http.routes import RouteTable
 from marey_server.store.database.connections import Database
 from marey_server.store.database.schema import upgrade_schema
 
-EXAMPLES = int(os.environ.get("MAREY_FUZZ_EXAMPLES", "4"))
 CANARY = "canary-91ab"
 LONGEST_QUERY = 50_000
 """Of a longer head the server takes no notice but to close the connection."""
@@ -94,7 +93,7 @@ def test_every_answer_is_as_published_and_none_is_a_fault_of_ours(fuzzed, operat
 
         @seed(20261121)
         @settings(
-            max_examples=EXAMPLES,
+            max_examples=examples(4),
             deadline=None,
             database=None,
             phases=[Phase.generate],

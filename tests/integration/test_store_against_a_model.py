@@ -15,6 +15,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 from tests.support.store_fixtures import Lab
+from tests.support.tiers import examples, steps
 
 from marey_schemas.items import ItemChange, ItemCreate
 from marey_schemas.kinds import Kind
@@ -170,8 +171,8 @@ def test_items_are_what_the_model_says(database):
     run_state_machine_as_test(
         machine,
         settings=settings(
-            max_examples=25,
-            stateful_step_count=20,
+            max_examples=examples(25),
+            stateful_step_count=steps(20),
             deadline=None,
             suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
         ),

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import logging
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 from tests.support.server_process import ServerProcess
 
-TIME_S = 300.0
+from marey_client.cli import main
+
+WIDTH = "80"
+"""Columns of the terminal that help texts are wrapped for, whichever terminal runs the tests."""
 
 
 @dataclass(frozen=True)
 class CommandLine:
-    """`marey` in `folder`, where somebody has told it of `server`."""
+    """`marey` in `folder`, with `server` named by the environment."""
 
     server: ServerProcess
     folder: Path
@@ -24,32 +32,60 @@ class CommandLine:
     def __call__(
         self, *arguments: object, status: int = 0, stdin: str = "", **environment: str
     ) -> subprocess.CompletedProcess[str]:
-        """Run a command to its end, which must have this exit status."""
-        done = subprocess.run(
-            self._words(arguments),
-            capture_output=True, text=True, input=stdin, cwd=self.folder, timeout=TIME_S,
-            env=self._surroundings(environment),
-        )  # fmt: skip
+        """Run a command in this process to its end; fail unless it exits with `status`."""
+        words = list(map(str, arguments))
+        with mock.patch.dict(os.environ, self._environment(environment), clear=True), contextlib.chdir(self.folder):
+            done = run_here(words, stdin)
         assert done.returncode == status, done.stdout + done.stderr
         return done
 
     def start(self, *arguments: object) -> subprocess.Popen[str]:
-        """Start a command and go on; what it prints can be read, and it can be interrupted."""
+        """Start a command in a process of its own, whose output can be read and which can be interrupted."""
         return subprocess.Popen(
-            self._words(arguments),
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=self.folder, env=self._surroundings({}),
+            [sys.executable, "-m", "marey_client.cli", *map(str, arguments)],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=self.folder, env=self._environment({}),
             preexec_fn=_hear_interrupts,
         )  # fmt: skip
 
-    def _words(self, arguments: tuple[object, ...]) -> list[str]:
-        return [sys.executable, "-m", "marey_client.cli", *map(str, arguments)]
-
-    def _surroundings(self, more: dict[str, str]) -> dict[str, str]:
+    def _environment(self, more: dict[str, str]) -> dict[str, str]:
         others = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
-        known = {"MAREY_URL": self.server.url, "MAREY_DATA": str(self.server.data)}
+        known = {"MAREY_URL": self.server.url, "MAREY_DATA": str(self.server.data), "COLUMNS": WIDTH}
         return {**others, **known, "HOME": str(self.folder), "XDG_CONFIG_HOME": str(self.folder), **more}
 
 
+def run_here(arguments: list[str], stdin: str = "") -> subprocess.CompletedProcess[str]:
+    """Run `marey` in this process, with streams like those of a pipe."""
+    given, out, err = (io.TextIOWrapper(io.BytesIO(text), encoding="utf-8") for text in (stdin.encode(), b"", b""))
+    streams = mock.patch.multiple(sys, argv=["marey", *arguments], stdin=given, stdout=out, stderr=err)
+    status: object = 0
+    with streams, _logging_restored():
+        try:
+            main()
+        except SystemExit as ended:
+            status = ended.code or 0
+    assert isinstance(status, int), status
+    return subprocess.CompletedProcess(arguments, status, _written(out), _written(err))
+
+
+def _written(stream: io.TextIOWrapper) -> str:
+    stream.flush()
+    buffer = stream.buffer
+    assert isinstance(buffer, io.BytesIO)
+    return buffer.getvalue().decode()
+
+
+@contextlib.contextmanager
+def _logging_restored() -> Iterator[None]:
+    """Remove the handlers that `--verbose` adds."""
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    try:
+        yield
+    finally:
+        root.handlers[:] = handlers
+        root.setLevel(level)
+
+
 def _hear_interrupts() -> None:
-    """Whoever runs the tests in the background may have them ignore interrupts, which processes pass on."""
+    """Restore the default of Ctrl-C: processes inherit it from who runs the tests, who may ignore it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -1,7 +1,7 @@
-"""What everybody has who walks a way: a real server with a real worker, a client, a command line, a project.
+"""Fixtures of whole ways: a real server with a real worker, a client, a command line, a project.
 
-Starting them takes longer than most ways. So the tests of a module share them, and each begins with a project `lab` of
-its own: the one before it is deleted, which hides all it held and frees the name.
+Starting a server takes longer than most ways. So all ways share one server per database, and each begins with a project
+of its own: `lab` is deleted after the test, which hides all it held and frees the name.
 """
 
 import contextlib
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.command_line import CommandLine
-from tests.support.database_fixtures import BACKENDS, fresh_database
+from tests.support.database_fixtures import BACKENDS, copied_sqlite, database_address, new_postgres_database
 from tests.support.evaluation_takes import write_walks
 from tests.support.server_process import ServerProcess, serving
 
@@ -21,14 +21,20 @@ from marey_schemas.access import ProjectCreate
 from marey_schemas.options.imports import ImportOptions
 
 
-@pytest.fixture(scope="module", params=BACKENDS)
+@pytest.fixture(scope="session", params=BACKENDS)
 def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
+    """The server of all ways over one kind of database."""
     folder = tmp_path_factory.mktemp("server")
-    with fresh_database(request, folder) as database_url, serving(folder, database_url) as process:
-        yield process
+    with contextlib.ExitStack() as after:
+        if request.param == "sqlite":
+            url = copied_sqlite(request.getfixturevalue("sqlite_template"), folder)
+        else:
+            postgres = request.getfixturevalue("postgres_url")
+            url = database_address(after.enter_context(new_postgres_database(postgres, "ways")))
+        yield after.enter_context(serving(folder, url))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def marey(server: ServerProcess) -> Iterator[Marey]:
     """The first administrator's client."""
     with server.client() as client:

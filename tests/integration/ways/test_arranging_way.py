@@ -8,7 +8,6 @@ import sys
 from types import SimpleNamespace
 
 import pytest
-from tests.support.server_process import ServerProcess
 
 from marey_client.cli import main
 from marey_client.imports import find_files
@@ -21,17 +20,7 @@ from marey_schemas.options.imports import ImportOptions
 NAMES = (f"lab{number}" for number in itertools.count(1))
 
 
-@pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    process = ServerProcess(tmp_path_factory.mktemp("server")).start()
-    yield process
-    assert process.stop() == 0
-
-
-@pytest.fixture(scope="module")
-def marey(server):
-    with server.client() as client:
-        yield client
+pytestmark = pytest.mark.parametrize("server", ["sqlite"], indirect=True, scope="session")
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,6 @@ import zipfile
 
 import numpy as np
 import pytest
-from tests.support.command_line import CommandLine
-from tests.support.server_process import serving
 
 from marey_client import errors
 from marey_client.imports import FILES_PER_IMPORT, find_files
@@ -24,12 +22,7 @@ from marey_schemas.job_params import ImportParams
 from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
 from marey_schemas.options.imports import ImportOptions
 
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("server")
-    with serving(folder) as process:
-        yield process
+pytestmark = pytest.mark.parametrize("server", ["sqlite"], indirect=True, scope="session")
 
 
 @pytest.fixture(scope="module")
@@ -43,21 +36,10 @@ def takes(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module")
-def marey(server):
-    with server.client() as client:
-        yield client
-
-
 @pytest.fixture
 def project(marey, request):
     name = hashlib.sha1(request.node.name.encode()).hexdigest()[:12]
     return marey.create_project(ProjectCreate(name=name))
-
-
-@pytest.fixture(scope="module")
-def run(server, tmp_path_factory):
-    return CommandLine(server, tmp_path_factory.mktemp("shell"))
 
 
 def target_skeleton(project):
@@ -75,30 +57,31 @@ def target_skeleton(project):
     return project.skeletons.create("studio", trees)
 
 
+@pytest.mark.check
 def test_the_readme_told_in_a_shell(run, takes, tmp_path, marey):
-    run("project", "create", "lab")
-    upload = run("upload", takes, "--project", "lab", "--collection", "raw", "--json", status=1)
+    run("project", "create", "readme")
+    upload = run("upload", takes, "--project", "readme", "--collection", "raw", "--json", status=1)
     entries = {entry["name"]: entry for entry in json.loads(upload.stdout)}
     assert entries["walk.bvh"]["status"] == entries["turns/left.bvh"]["status"] == "created"
     assert entries["broken.bvh"]["error"]["line"] == 4
-    assert "walk" in run("ls", "lab/raw").stdout
-    assert "left" not in run("ls", "lab/raw").stdout
-    assert "raw/turns/left" in run("ls", "lab/raw", "-r").stdout
+    assert "walk" in run("ls", "readme/raw").stdout
+    assert "left" not in run("ls", "readme/raw").stdout
+    assert "raw/turns/left" in run("ls", "readme/raw", "-r").stdout
 
-    studio = target_skeleton(marey.project("lab"))
-    told = run("retarget", "lab/raw", "--to", f"lab/{studio.id}", "--into", "studio").stdout
+    studio = target_skeleton(marey.project("readme"))
+    told = run("retarget", "readme/raw", "--to", f"readme/{studio.id}", "--into", "studio").stdout
     assert "2 clips" in told
     assert "0 refused" in told
-    run("download", "lab/studio", "--format", "bvh", "-o", tmp_path / "out")
+    run("download", "readme/studio", "--format", "bvh", "-o", tmp_path / "out")
     files = sorted(path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.bvh"))
     assert files == ["raw/turns/left.bvh", "raw/walk.bvh"]
     back = read_motion((tmp_path / "out/raw/walk.bvh").read_bytes(), "walk.bvh").clip
     assert back.frame_count == 120
     assert back.skeleton.joint_names == game_skeleton().joint_names
 
-    history = json.loads(run("show", "lab/studio/raw/walk", "--history", "--json").stdout)
+    history = json.loads(run("show", "readme/studio/raw/walk", "--history", "--json").stdout)
     assert {edge["kind"] for edge in history["lineage"]["inputs"]} == {"clip", "skeleton"}
-    jobs = json.loads(run("job", "ls", "lab", "--json").stdout)
+    jobs = json.loads(run("job", "ls", "readme", "--json").stdout)
     assert "succeeded" in run("why", jobs[0]["id"]).stdout
     assert json.loads(run("job", "show", jobs[0]["id"], "--json").stdout)["result"]["clips"] == 2
 
@@ -348,7 +331,7 @@ def test_the_log_of_a_job_can_be_read_and_followed(project, marey, takes, run):
 
 
 def test_logging_in_stores_a_token_for_its_owner_alone(marey, server, tmp_path):
-    marey.users.create(UserCreate(name="ada", password="correct horse battery"))
+    marey.users.create(UserCreate(name="grace", password="correct horse battery"))
     surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
     environment = {**surroundings, "XDG_CONFIG_HOME": str(tmp_path), "HOME": str(tmp_path)}
 
@@ -359,13 +342,13 @@ def test_logging_in_stores_a_token_for_its_owner_alone(marey, server, tmp_path):
         )
 
     with server.client() as other:
-        token = other.sign_in(Login(name="ada", password="correct horse battery")).secret
+        token = other.sign_in(Login(name="grace", password="correct horse battery")).secret
     done = command("login", "--server", server.url, "--with-token", stdin=f"{token}\n")
     assert done.returncode == 0, done.stderr
     assert token not in done.stdout + done.stderr
     (stored,) = tmp_path.rglob("credentials.json")
     assert stored.stat().st_mode & 0o777 == 0o600
-    assert json.loads(command("user", "show", "--json").stdout)["user"]["name"] == "ada"
+    assert json.loads(command("user", "show", "--json").stdout)["user"]["name"] == "grace"
     assert command("logout").returncode == 0
     assert command("user", "show", "--server", server.url).returncode == 1
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from tests.support import motion_big_files as big
 from tests.support.motion_files import ARM, ZXY, bvh, nested
 from tests.support.motion_fuzz import read_broken, seeds
+from tests.support.tiers import examples
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
@@ -77,7 +78,7 @@ def test_lengths_beyond_any_unit_are_refused(value: str) -> None:
             read_motion(data, "far.bvh", options=CENTIMETRES)
 
 
-@settings(max_examples=400, deadline=10_000)
+@settings(max_examples=examples(400), deadline=10_000)
 @given(choice=st.integers(0, len(seeds()) - 1), source=st.randoms(use_true_random=False))
 def test_broken_files_are_read_or_refused_and_nothing_else(choice: int, source: random.Random) -> None:
     assert read_broken(seeds()[choice], source)
@@ -104,7 +105,7 @@ def clips(draw: st.DrawFn) -> Clip:
     return Clip(skeleton, draw(st.sampled_from([24.0, 30.0, 59.94, 120.0, 77.7])), poses, translations, moved)
 
 
-@settings(max_examples=100, deadline=10_000)
+@settings(max_examples=examples(100), deadline=10_000)
 @given(clips(), st.sampled_from(["xyz", "xzy", "yxz", "yzx", "zxy", "zyx"]))
 def test_any_clip_survives_being_written_as_bvh(clip: Clip, order: str) -> None:
     back = read_motion(write_bvh(clip, rotation_order=order), "back.bvh", options=CENTIMETRES).clip

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from tests.support.tiers import examples
 
 from marey_motion.errors import MotionError
 from marey_motion.matching.search import LARGEST, build_index, find_best, find_nearest
@@ -121,7 +122,7 @@ def test_ten_thousand_queries_of_a_walking_database_are_answered_exactly():
         assert (row, cost) == true_nearest(features, selectable, query)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150))
 @given(st.data())
 def test_differences_that_float32_cannot_show_still_decide(data):
     """Rows that are all the same in float32, a few units in the last place of float64 apart."""
@@ -152,7 +153,7 @@ def test_distances_whose_squares_float32_barely_holds_still_decide():
             assert (rows[0], costs[0]) == true_nearest(features, index.selectable, np.zeros(27))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100))
 @given(st.data())
 def test_any_numbers_in_range_are_searched_exactly(data):
     shape = (data.draw(st.integers(1, 40)), data.draw(st.integers(1, 6)))

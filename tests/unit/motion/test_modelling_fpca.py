@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.decomposition import PCA
 from tests.support.modelling_examples import bending_chains, chain, unit_poses, walks
+from tests.support.tiers import examples
 
 from marey_motion import quaternions
 from marey_motion.alignment.signs import consistent_signs
@@ -34,7 +35,7 @@ def all_of(coefficients, weights=None, inner_product="coefficients"):
     return find_components(BASIS, coefficients, weights, Keep(1.0), inner_product)
 
 
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(st.integers(2, 25), st.integers(0, 10_000), st.sampled_from(["coefficients", "l2"]))
 def test_all_components_together_reconstruct_the_examples(examples, seed, inner_product):
     coefficients = some(examples, seed)
@@ -94,7 +95,7 @@ def test_copies_of_one_example_have_no_components(examples):
     np.testing.assert_allclose(found.functions.coefficients(np.zeros((1, 0)))[0], coefficients[0], atol=1e-12)
 
 
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(st.integers(0, 10_000))
 def test_more_components_never_reconstruct_worse(seed):
     coefficients = some(12, seed)

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
+from tests.support.tiers import examples
 
 from marey_motion.errors import MotionError
 from marey_motion.modelling.mixture import LatentMixture
@@ -107,7 +108,7 @@ def test_identical_examples_give_identical_mixtures_every_time():
     assert first.candidates == second.candidates
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=examples(4))
 @given(st.sampled_from([1e-4, 0.03, 7.0, 1e4]), st.integers(0, 50))
 def test_the_choice_does_not_depend_on_the_unit(unit, seed):
     examples = two_kinds(80, 2, 5.0, seed)

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.modelling_examples import walks
 from tests.support.search_primitives import sliding, standard_joints, walking
+from tests.support.tiers import examples
 
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
@@ -58,7 +59,7 @@ def plain_beam(objective, tree, candidates):
     return min(found)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25))
 @given(target=TARGETS, candidates=st.integers(1, 20), leaf_size=st.sampled_from((1, 5, 30)))
 def test_the_beam_keeps_the_true_best_of_each_level(target, candidates, leaf_size):
     objective, tree = wrist_at(*target), grown(leaf_size)
@@ -67,7 +68,7 @@ def test_the_beam_keeps_the_true_best_of_each_level(target, candidates, leaf_siz
     assert (found.costs[0], found.samples[0]) == (cost, row)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25))
 @given(target=TARGETS, leaf_size=st.sampled_from((1, 5, 30)), top=st.integers(1, 50))
 def test_a_beam_of_all_nodes_is_an_exhaustive_search(target, leaf_size, top):
     objective, tree = wrist_at(*target), grown(leaf_size)

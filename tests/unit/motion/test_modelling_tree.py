@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.search_primitives import sliding, standard_joints, walking
+from tests.support.tiers import examples
 
 from marey_motion.errors import MotionError
 from marey_motion.modelling.mixture import LatentMixture
@@ -38,7 +39,7 @@ def test_a_tree_holds_each_sample_of_the_model_once():
     assert sorted(map(bytes, tree.samples)) == sorted(map(bytes, drawn))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30))
 @given(
     seed=st.integers(0, 2**63 - 1),
     samples=st.integers(1, 300),

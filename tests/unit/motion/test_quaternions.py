@@ -8,6 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation, Slerp
+from tests.support.tiers import examples
 
 from marey_motion import quaternions as q
 from marey_motion.errors import RotationError
@@ -184,7 +185,7 @@ def test_the_angle_between_rotations_is_that_of_the_shorter_way():
         assert q.angle_between(q.identity(), -turned) == pytest.approx(angle, rel=1e-6, abs=1e-15)
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(rotations, rotations, st.floats(0.0, 1.0))
 def test_slerp_agrees_with_scipy(a, b, t):
     assume(q.angle_between(a, b) < np.pi - 1e-3)

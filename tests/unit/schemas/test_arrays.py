@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
+from tests.support.tiers import examples
 
 from marey_schemas.encoding import blocks
 from marey_schemas.encoding.arrays import Array, ArrayError, ArrayOf, EncodedArray, array_from_leaf, nested_lists
@@ -124,7 +125,7 @@ def test_scalars_empty_arrays_and_extremes_are_arrays(data: Any, dtype: str, sha
 
 
 @given(bits=st.lists(st.integers(0, 2**32 - 1), min_size=1, max_size=50))
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=examples(500))
 def test_float32_written_as_json_reads_back_to_the_bit(bits: list[int]) -> None:
     array = np.array(bits, np.uint32).view(np.float32)
     array = array[np.isfinite(array)]

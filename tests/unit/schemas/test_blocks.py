@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
+from tests.support.tiers import examples
 
 from marey_schemas.encoding import blocks
 from marey_schemas.encoding.arrayspec import DTYPES, ArrayError, ArraySpec
@@ -45,7 +46,7 @@ def with_checksum(head: bytes) -> bytes:
 
 
 @given(array=any_bits())
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300))
 def test_every_array_comes_back_to_the_bit(array: NDArray[Any]) -> None:
     assert same_bits(blocks.decode(blocks.encode(array)), array)
 
@@ -156,7 +157,7 @@ def partial_reads(draw: st.DrawFn) -> tuple[NDArray[Any], slice, NDArray[np.intp
 
 
 @given(case=partial_reads())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200))
 def test_a_partial_read_equals_slicing_the_whole(case: tuple[NDArray[Any], slice, NDArray[np.intp] | None]) -> None:
     array, frames, columns = case
     expected = array[frames] if columns is None else array.reshape(len(array), -1)[frames][:, columns]
@@ -221,7 +222,7 @@ def test_every_truncation_and_extension_is_noticed(encoded: bytes) -> None:
 
 
 @given(data=st.data())
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=examples(400))
 def test_a_forged_header_is_decoded_or_refused_within_its_limit(encoded: bytes, data: st.DataObject) -> None:
     table = 16 + 8 * encoded[7]
     end = table + 4 * 3  # three blocks

@@ -7,6 +7,7 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from tests.support.tiers import examples
 
 from marey_schemas.encoding import tiles
 from marey_schemas.encoding.tiles import DIFFERENCES, QUATERNIONS, RAW, TileError
@@ -108,7 +109,7 @@ def test_bytes_behind_the_tile_are_refused() -> None:
     frames=st.integers(1, 5),
     columns=st.integers(1, 9),
 )
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=examples(600))
 def test_forged_content_is_decoded_or_refused(form: int, content: bytes, dtype: str, frames: int, columns: int) -> None:
     with suppress(TileError):
         tile = tiles.unpack(forged(bytes([form]) + content), np.dtype(dtype), frames, columns)
@@ -116,7 +117,7 @@ def test_forged_content_is_decoded_or_refused(form: int, content: bytes, dtype: 
 
 
 @given(data=st.data())
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300))
 def test_forged_predictions_are_decoded_or_refused(data: st.DataObject) -> None:
     content = bytearray(content_of(tiles.pack(rotations(6, 3), 0)))
     for _ in range(data.draw(st.integers(1, 5))):

@@ -5,6 +5,7 @@ from contextlib import suppress
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tests.support.tiers import examples
 
 from marey_schemas.kinds import Kind
 from marey_server.errors import BadRequestProblem, InvalidProblem
@@ -189,7 +190,7 @@ def test_cursors_of_one_server_are_worth_nothing_on_another(filled):
 
 
 @given(text=st.text(max_size=8), number=st.integers(-(2**70), 2**70))
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=examples(60), suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_no_filter_value_breaks_a_list(filled, text, number):
     texts = [{"q": text}, {"name": text}, {"name": f"{text}*"}, {"path": text}, {"tags": (text,)}]
     texts += [{"directly_in": text}]

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.predecessor_models import imported
 from tests.support.store_fixtures import motion_tree, skeleton_tree
+from tests.support.tiers import examples
 
 from marey_schemas.kinds import Kind
 from marey_server.errors import ConflictProblem, InvalidProblem
@@ -202,7 +203,7 @@ names = st.sampled_from("abcdef")
 
 
 @given(st.dictionaries(names, st.lists(names, max_size=3)))
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 def test_references_are_followed_before_what_refers(refers):
     try:
         order = references.in_order(refers)

@@ -12,6 +12,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from sqlalchemy import Connection, delete, func, select
 from tests.support.queue_desk import Desk
 from tests.support.queue_model import TERMINAL, ModelJob, ModelQueue
+from tests.support.tiers import examples, steps
 
 from marey_schemas.worker_protocol import Lease
 from marey_server.access.principal import SYSTEM
@@ -354,7 +355,7 @@ def _successes_told_twice(tx: Transaction) -> list[Any]:
     return list(tx.execute(statement).scalars())
 
 
-def run_machine(desk: Desk, monkeypatch: pytest.MonkeyPatch, *, examples: int = 30, steps: int = 40) -> None:
+def run_machine(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run the machine on a desk whose clock stands still and whose ids are numbers, so that runs can be repeated."""
     clock = StillClock()
     numbers = itertools.count(1)
@@ -365,8 +366,8 @@ def run_machine(desk: Desk, monkeypatch: pytest.MonkeyPatch, *, examples: int = 
     run_state_machine_as_test(
         lambda: QueueMachine(desk, clock),
         settings=settings(
-            max_examples=examples,
-            stateful_step_count=steps,
+            max_examples=examples(30),
+            stateful_step_count=steps(40),
             deadline=None,
             suppress_health_check=list(HealthCheck),
             print_blob=True,
@@ -375,6 +376,6 @@ def run_machine(desk: Desk, monkeypatch: pytest.MonkeyPatch, *, examples: int = 
     )
 
 
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(3600)
 def test_the_queue_behaves_as_its_model(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     run_machine(desk, monkeypatch)

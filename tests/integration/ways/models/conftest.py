@@ -1,5 +1,6 @@
 """A project that all tests of a module share, for what takes long to make."""
 
+from collections.abc import Iterator
 from math import radians
 from pathlib import Path
 
@@ -17,7 +18,7 @@ EXAMPLES = 12
 
 
 @pytest.fixture(scope="module")
-def lab(marey: Marey, tmp_path_factory: pytest.TempPathFactory) -> ProjectHandle:
+def lab(marey: Marey, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProjectHandle]:
     """A project with a dozen aligned walks of two steps, and two of another alignment."""
     project = marey.create_project(ProjectCreate(name="lab"))
     folder = tmp_path_factory.mktemp("takes")
@@ -26,7 +27,8 @@ def lab(marey: Marey, tmp_path_factory: pytest.TempPathFactory) -> ProjectHandle
     clips = list(project.clips.list(collection="walks", sort="name"))
     marey.jobs.wait(project.align(clips, into="aligned").id)
     marey.jobs.wait(project.align(clips[:2], into="others").id)
-    return project
+    yield project
+    project.delete()
 
 
 def write_steps(folder: Path) -> None:

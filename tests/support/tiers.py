@@ -1,0 +1,190 @@
+"""Tiers of tests: which tests `--tier` runs, how many examples property tests draw, and which tests share a process.
+
+`check` is for while you work, `test` for before a change lands, `soak` for before an issue is called resolved. Whatever
+a tier leaves out is counted, with the reason, at the end of the run.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import hypothesis
+import pytest
+from tests.support.database_fixtures import BACKENDS
+
+MOCAP_VARIABLE = "MAREY_TEST_MOCAP"
+"""Names the folder of real motion capture."""
+EXAMPLES, STEPS = 100, 50
+"""How many examples Hypothesis draws, and how many steps a state machine takes, in the tier `test`."""
+
+
+@dataclass(frozen=True)
+class Tier:
+    """What one tier leaves out, by reason, and how far generated tests search."""
+
+    examples: int
+    steps: int
+    leaves_out: dict[str, Callable[[pytest.Item], bool]]
+
+
+def _folder(item: pytest.Item) -> str:
+    return item.path.relative_to(item.config.rootpath / "tests").as_posix()
+
+
+def backend_of(item: pytest.Item) -> str | None:
+    """The database that a test runs on, or None."""
+    callspec = getattr(item, "callspec", None)
+    values = callspec.params.values() if callspec else ()
+    return next((value for value in values if isinstance(value, str) and value in BACKENDS), None)
+
+
+def _on_postgres(item: pytest.Item) -> bool:
+    return backend_of(item) == "postgres"
+
+
+def _fault(item: pytest.Item) -> bool:
+    return _folder(item).startswith("faults/")
+
+
+def _whole_way(item: pytest.Item) -> bool:
+    there = _folder(item).startswith(("acceptance/test_real_motion", "integration/ways/", "integration/test_demo"))
+    return there and not item.get_closest_marker("check")
+
+
+def _soak(item: pytest.Item) -> bool:
+    return item.get_closest_marker("soak") is not None
+
+
+def _needs_mocap(item: pytest.Item) -> bool:
+    return "mocap" in getattr(item, "fixturenames", ())
+
+
+def _slow(item: pytest.Item) -> bool:
+    return item.get_closest_marker("slow") is not None
+
+
+def _fault_on_other_database(item: pytest.Item) -> bool:
+    """Whether a fault case runs on the other database: its name decides, so that both get about half of the cases."""
+    backend = backend_of(item)
+    if not _fault(item) or backend is None or item.get_closest_marker("every_database"):
+        return False
+    name = item.nodeid.replace(backend, "")
+    return BACKENDS[zlib.crc32(name.encode()) % len(BACKENDS)] != backend
+
+
+TIERS = {
+    "check": Tier(
+        EXAMPLES // 5,
+        STEPS,
+        {
+            "on Postgres": _on_postgres,
+            "fault cases": _fault,
+            "whole ways": _whole_way,
+            "slow": _slow,
+            "for soak": _soak,
+        },
+    ),
+    "test": Tier(EXAMPLES, STEPS, {"for soak": _soak, "fault cases on the other database": _fault_on_other_database}),
+    "soak": Tier(20 * EXAMPLES, 5 * STEPS, {}),
+}
+
+
+LEFT_OUT: pytest.StashKey[Counter[str]] = pytest.StashKey()
+"""How many tests the tier left out, by reason."""
+
+
+def examples(count: int) -> int:
+    """How many examples a property test draws that draws `count` in the tier `test`."""
+    return max(1, count * hypothesis.settings.default.max_examples // EXAMPLES)
+
+
+def steps(count: int) -> int:
+    """How many steps a state machine takes that takes `count` in the tier `test`."""
+    return count * hypothesis.settings.default.stateful_step_count // STEPS
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--tier", choices=list(TIERS), default="test", help="Tier of tests to run (default: test).")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[LEFT_OUT] = Counter()
+    name = config.getoption("tier")
+    tier = TIERS[name]
+    # No deadline: how fast things are is for benchmarks to say, and machines do other things at the same time.
+    hypothesis.settings.register_profile(
+        name, deadline=None, max_examples=tier.examples, stateful_step_count=tier.steps
+    )
+    hypothesis.settings.load_profile(name)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Deselect the tests to which a reason applies, count them, and group the others by process."""
+    reasons = TIERS[config.getoption("tier")].leaves_out
+    if MOCAP_VARIABLE not in os.environ:
+        reasons = {"need real motion capture": _needs_mocap, **reasons}
+    kept, gone = [], []
+    for item in items:
+        reason = next((reason for reason, applies in reasons.items() if applies(item)), None)
+        if reason is None:
+            kept.append(item)
+            item.add_marker(pytest.mark.xdist_group(_group(item)))
+        else:
+            gone.append(item)
+            config.stash[LEFT_OUT][reason] += 1
+    config.hook.pytest_deselected(items=gone)
+    items[:] = kept
+
+
+def _group(item: pytest.Item) -> str:
+    """The tests that run in one process: those of a file, which share fixtures; all ways over one database.
+
+    Fault cases share nothing, take long and wait much, so each goes where there is room.
+    """
+    folder = _folder(item)
+    if folder.startswith("integration/ways/"):
+        return f"ways on {backend_of(item)}"
+    return item.nodeid if _fault(item) else folder
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Send the counts of a process of pytest-xdist to the one that prints."""
+    output = getattr(session.config, "workeroutput", None)
+    if output is not None:
+        output["left_out"] = dict(session.config.stash[LEFT_OUT])
+
+
+def pytest_report_header() -> str:
+    """Name the folder of real motion capture."""
+    folder = os.environ.get(MOCAP_VARIABLE)
+    if folder:
+        return f"real motion capture: {folder}"
+    return f"real motion capture: none ({MOCAP_VARIABLE} is unset; tests that need it are left out and counted)"
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: object) -> None:
+    """Take the counts of one process: each has collected all tests."""
+    config: pytest.Config = node.config  # type: ignore[attr-defined]
+    config.stash[LEFT_OUT] = Counter(getattr(node, "workeroutput", {}).get("left_out", {}))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Print what the tier left out, by reason."""
+    left_out = config.stash[LEFT_OUT]
+    terminalreporter.write_line(f"tier {config.getoption('tier')} left out {left_out.total()} tests")
+    for reason, count in left_out.items():
+        terminalreporter.write_line(f"  {count:5} {reason}")
+
+
+@pytest.fixture(scope="session")
+def mocap() -> Path:
+    """The folder of real motion capture named by MAREY_TEST_MOCAP."""
+    folder = Path(os.environ[MOCAP_VARIABLE])
+    assert (folder / "MANIFEST.csv").is_file(), f"{MOCAP_VARIABLE}={folder} holds no MANIFEST.csv"
+    return folder
