@@ -1,1 +1,1 @@
-"""Motion editing: lists of commands that make one or several clips of one, and leave the original as it was."""
+"""Motion editing: lists of commands that make one or several clips from one, and leave the original unchanged."""

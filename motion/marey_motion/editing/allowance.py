@@ -1,6 +1,6 @@
-"""How much work an edit may be: counted before it is done, so that the same edit is always made or always refused.
+"""Limit of the work of an edit: computed in advance, so that the same edit is always made or always refused.
 
-Work is about nanoseconds of one thread, weighed by what was measured.
+Work is about nanoseconds of one thread, with measured weights.
 """
 
 from __future__ import annotations
@@ -23,12 +23,26 @@ PER_MEETING, PER_MET_NUMBER = 1_000_000, 10
 
 @dataclass
 class Allowance:
-    """What is left of the work that an edit may be."""
+    """Remaining work that an edit may take.
+
+    Parameters
+    ----------
+    left : float    nanoseconds of one thread
+    """
 
     left: float = inf
 
     def spend(self, work: float) -> None:
-        """Take work away before it is done. Raises `EditError` where so much is not left."""
+        """Subtract work before it is done.
+
+        Parameters
+        ----------
+        work : float    nanoseconds of one thread
+
+        Raises
+        ------
+        EditError    where less is left
+        """
         self.left -= work
         if self.left < 0.0:
             raise EditError("the edit takes longer than it may", code="edit-too-long")

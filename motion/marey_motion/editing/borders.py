@@ -1,4 +1,4 @@
-"""How much each frame takes part in a change of a range: all of it inside, going over softly at the borders."""
+"""Weights of frames for a change of a range: full inside, with smooth transitions at the borders."""
 
 from __future__ import annotations
 
@@ -10,10 +10,25 @@ from marey_motion.editing.take import Take
 
 
 def range_weights(take: Take, frames: tuple[int, int | None] | None, border_s: float) -> tuple[slice, Floats]:
-    """The range as a slice of n frames, and the share (n,) that each takes of the change.
+    """Compute the weight of each frame of a range.
 
     Borders lie within the range and take up to half of it each. Where the range begins or ends with the motion there is
-    nothing to go over to, and no border. Raises `EditError` where the frames are not there.
+    no border.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    frames : (int, int or None) or None    half-open range, all frames when None
+    border_s : float    seconds of each border
+
+    Returns
+    -------
+    range : slice    n frames
+    weights : (n,) float64    0 to 1
+
+    Raises
+    ------
+    EditError    where the frames do not exist
     """
     start, stop = take.frames(frames)
     count = stop - start
@@ -28,12 +43,31 @@ def range_weights(take: Take, frames: tuple[int, int | None] | None, border_s: f
 
 
 def smooth_step(places: Floats) -> Floats:
-    """From 0 to 1, without velocity at both ends, as places (...) go from 0 to 1."""
+    """Ease from 0 to 1, without velocity at both ends.
+
+    Parameters
+    ----------
+    places : (...) float64    0 to 1
+
+    Returns
+    -------
+    (...) float64    0 to 1
+    """
     return np.asarray(places * places * (3.0 - 2.0 * places), dtype=np.float64)
 
 
 def blended(a: Floats, b: Floats, shares: Floats) -> Floats:
-    """Rotations (n, J, 4) from `a` at share 0 of (n,) to `b` at share 1, both of which are taken as they are."""
+    """Blend rotations; both ends are exact.
+
+    Parameters
+    ----------
+    a, b : (n, J, 4) float64    unit quaternions at share 0 and 1
+    shares : (n,) float64    0 to 1
+
+    Returns
+    -------
+    (n, J, 4) float64    unit quaternions
+    """
     if np.all(shares == 1.0):
         return b
     result = np.where((shares == 1.0)[:, None, None], b, a)

@@ -1,6 +1,6 @@
-"""Constraints on ranges of frames, met by inverse kinematics and blended into what is around them.
+"""Constraints on ranges of frames, met by inverse kinematics and blended into their surroundings.
 
-Constraints that move the same joints, or joints that carry each other's, are solved together; others apart.
+Constraints that move the same joints, or joints that carry each other's, are solved together; others separately.
 """
 
 from __future__ import annotations
@@ -85,13 +85,23 @@ def constrain_motion(
 
     Parameters
     ----------
-    motion : F frames
-    blend_frames : frames before the first and after the last constrained one that may change; 0 for none
-    freedom : limits, stiffness and whether the root moves; which joints turn is said by the constraints
-    solver : "auto" takes the two-bone solver for limbs and least squares for everything else
-    allowance : the work that this may be, spent as it goes
+    skeleton : Skeleton    J joints
+    motion : Motion    F frames
+    constraints : sequence of Constraint    C constraints
+    blend_frames : int    frames before the first and after the last constrained one that may change; 0 for none
+    freedom : Freedom, optional    limits, stiffness and whether the root moves; the constraints name the joints that
+        may turn
+    solver : str    "auto" takes the two-bone solver for limbs and least squares for everything else
+    options : SolverOptions, optional    tolerances and iterations
+    allowance : budget, optional    the work that this may take, spent as it goes
 
-    Raises `EditError` naming the constraint that cannot be asked for, and where the allowance does not suffice.
+    Returns
+    -------
+    ConstrainedMotion    F frames and the remaining errors
+
+    Raises
+    ------
+    EditError    naming the constraint that is invalid, and where the allowance is too small
     """
     freedom = freedom or Freedom()
     for number, constraint in enumerate(constraints):
@@ -106,7 +116,18 @@ def constrain_motion(
 
 
 def current_values(skeleton: Skeleton, motion: Motion, target: PositionTarget | OrientationTarget) -> Floats:
-    """The values (F, 3) or (F, 4) with which a position or an orientation is met already."""
+    """Compute the values with which a position or an orientation is met already.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    motion : Motion    F frames
+    target : PositionTarget or OrientationTarget    the target
+
+    Returns
+    -------
+    (F, 3) or (F, 4) float64    metres, or unit quaternions in the world
+    """
     spins = kinematics.as_global_rotations(skeleton, motion.rotations)[:, target.joint]
     if isinstance(target, OrientationTarget):
         return np.asarray(spins, dtype=np.float64)
@@ -247,7 +268,14 @@ def solving_work(
 
     Parameters
     ----------
-    limited : whether joints have limits, which take steps of their own
+    frames, joints, targets : int    numbers of each
+    method : str    "ccd", "two_bone" or "least_squares"
+    limited : bool    whether joints have limits, which take steps of their own
+    options : SolverOptions, optional    iterations
+
+    Returns
+    -------
+    float    nanoseconds of one thread
     """
     if method == "two_bone":
         return float(frames * _PER_FRAME)

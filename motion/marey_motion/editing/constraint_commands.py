@@ -44,17 +44,27 @@ def constrain(
     limits: Sequence[Tree] = (),
     stiffness: Mapping[str, float] | None = None,
 ) -> Take:
-    """Meet constraints in ranges of frames, and note what they are missed by before and after.
+    """Meet constraints in ranges of frames, and record their errors before and after.
 
     Parameters
     ----------
-    constraints, limits : trees as of `marey_schemas.editing.constraints`, with radians
+    take : Take    F frames
+    constraints : sequence of trees    as in `marey_schemas.editing.constraints`, with radians
+    solver : str    "auto", "ccd", "two_bone" or "least_squares"
+    blend_s : float    seconds before and after the constrained frames that may change
+    root_moves : bool    whether the root may move
+    limits : sequence of trees    limits of joints, with radians
+    stiffness : mapping of str to float, optional    by joint name, 0 (free) to below 1
+
+    Returns
+    -------
+    Take    F frames with a finding
 
     Raises
     ------
-    UnknownJoint    naming a joint that there is not
-    MappingError    where limits or a look need axes that the skeleton's joints do not tell
-    EditError    naming the constraint that cannot be asked for
+    UnknownJoint    naming a joint that does not exist
+    MappingError    where limits or a look need axes that cannot be determined
+    EditError    naming the constraint that is invalid
     """
     take.allowance.spend(PER_RIG)
     rig = _Rig(take)
@@ -85,13 +95,25 @@ def plant_feet(
     blend_s: float = PlantOptions.blend_s,
     knee_damping_rad: float = PlantOptions.knee_damping_rad,
 ) -> Take:
-    """Keep feet where they stand, and note how far they slid before and after.
+    """Fix planted feet to the ground, and record how far they slid before and after.
 
     Parameters
     ----------
-    contacts : {"foot": "left" or "right", "frames": (start, stop)}, when feet stand; None to find out by their speed
+    take : Take    F frames
+    contacts : sequence of trees, optional    {"foot": "left" or "right", "frames": (start, stop)}; detected by speed
+        when None
+    speed_m_s : float    joints slower than this touch the ground
+    blend_s : float    seconds before and after a contact
+    knee_damping_rad : float    radians before straight in which a stretching knee is damped
 
-    Raises `MappingError` where legs are not known, `EditError` where the frames are not there.
+    Returns
+    -------
+    Take    F frames with a finding
+
+    Raises
+    ------
+    MappingError    where legs are not known
+    EditError    where the frames do not exist
     """
     take.allowance.spend(PER_RIG + PER_PLANTED_NUMBER * take.size)
     rig = _Rig(take)

@@ -46,12 +46,17 @@ class Window(NamedTuple):
 
 
 def windows_around(frames: AnyInts, blend_frames: int, frame_count: int) -> tuple[Window, ...]:
-    """Windows that blend the given frames in and out over so many frames; those that would overlap become one.
+    """Make windows that blend given frames in and out; those that would overlap become one.
 
     Parameters
     ----------
-    frames : (n,) increasing
-    blend_frames : 0 changes nothing but the given frames
+    frames : (n,) int    increasing
+    blend_frames : int    frames on either side; 0 changes only the given frames
+    frame_count : int    frames of the motion
+
+    Returns
+    -------
+    tuple of Window    apart from each other
     """
     groups: list[list[int]] = []
     for frame in frames.tolist():
@@ -67,16 +72,22 @@ def windows_around(frames: AnyInts, blend_frames: int, frame_count: int) -> tupl
 
 
 def displace(motion: Motion, frames: AnyInts, changed: Motion, windows: Sequence[Window]) -> Motion:
-    """The motion with some frames changed and the change spread over windows; outside of them not a bit changes.
+    """Change some frames and spread the change over windows; outside of them not a bit changes.
 
     Parameters
     ----------
-    motion : F frames
-    frames : (n,) increasing indices of the frames that are given, each inside of a window
-    changed : those n frames, as they should become
-    windows : apart from each other
+    motion : Motion    F frames
+    frames : (n,) int    increasing indices of the given frames, each inside a window
+    changed : Motion    those n frames after the change
+    windows : sequence of Window    apart from each other
 
-    Raises `EditError` where a frame is not inside of a window, or a window holds none.
+    Returns
+    -------
+    Motion    F frames
+
+    Raises
+    ------
+    EditError    where a frame is not inside a window, or a window holds none
     """
     _check_windows(frames, windows)
     rotations, roots = motion.rotations.copy(), motion.root_translations.copy()
@@ -110,10 +121,20 @@ def _check_windows(frames: AnyInts, windows: Sequence[Window]) -> None:
 
 
 def spread_displacements(frames: AnyInts, values: Floats, window: Window) -> Floats:
-    """The displacement curve (stop - start, c) of a window through `values` (n, c) at `frames` (n,).
+    """Compute the displacement curve of a window through values at some frames.
 
-    It is the curve of least bending through values that are evened out along given frames in a row, and a tense one
-    through the rest.
+    It is the curve of least bending through values that are smoothed along consecutive frames, and a tense one through
+    the rest.
+
+    Parameters
+    ----------
+    frames : (n,) int    frames of the values
+    values : (n, c) float64    displacements: metres or rotation vectors
+    window : Window    frames [start, stop)
+
+    Returns
+    -------
+    (stop - start, c) float64    displacements in the same unit
     """
     swing = SWING_SHARE * (window.stop - window.start)
     blend = max(int(frames[0]) - window.start, window.stop - 1 - int(frames[-1]))

@@ -1,4 +1,4 @@
-"""The last step after a model's sample or a search: what constraints are still missed by, taken out of the motion."""
+"""The last step after a model's sample or a search: removes the remaining errors of constraints."""
 
 from __future__ import annotations
 
@@ -43,16 +43,26 @@ def finish(
     freedom: Freedom | None = None,
     options: SolverOptions | None = None,
 ) -> FinishedMotion:
-    """Bring constrained joints exactly to where they are wanted, blended over a window with a cubic spline (S2 4.1.1).
+    """Bring constrained joints exactly to their targets, blended over a window with a cubic spline (S2 4.1.1).
 
     Parameters
     ----------
-    motion : F frames, such as a sample brought close by search and refinement
-    constraints : what is wanted in which frames, and which joints may turn for it (`constraining.Constraint`;
-        `inverse_kinematics.limb_ending_at` and `inverse_kinematics_targets.chain_of` find these)
-    window_frames : frames before and after the constrained ones that may change
+    skeleton : Skeleton    J joints
+    motion : Motion    F frames, such as a sample brought close by search and refinement
+    constraints : sequence of Constraint    C constraints with their frames and the joints that may turn
+        (`constraining.Constraint`; `inverse_kinematics.limb_ending_at` and `inverse_kinematics_targets.chain_of` find
+        these)
+    window_frames : int    frames before and after the constrained ones that may change
+    freedom : Freedom, optional    limits and stiffness
+    options : SolverOptions, optional    tolerances and iterations
 
-    Raises `EditError` naming the constraint that cannot be asked for.
+    Returns
+    -------
+    FinishedMotion    F frames and the errors before and after
+
+    Raises
+    ------
+    EditError    naming the constraint that is invalid
     """
     made = constrain_motion(skeleton, motion, constraints, blend_frames=window_frames, freedom=freedom, options=options)
     before, after = (

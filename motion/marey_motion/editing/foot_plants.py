@@ -1,9 +1,9 @@
-"""Feet that stay where they stand.
+"""Foot plants: planted feet are fixed to the ground.
 
-A contact of the toe keeps the toe at one place and height; one of the heel keeps the ankle there, so that a foot with
-both lies still and one with a toe alone rolls about it. The corrections are blended in and out with B-splines. Legs
-follow in closed form, their knees damped near straight; where a leg is too short, the root comes down a little
-(Kovar, Schreiner and Gleicher 2002, Footskate cleanup for motion capture editing).
+A contact of the toe fixes the toe's position; one of the heel fixes the ankle, so that a foot with both is still and
+one with a toe alone rolls about it. The corrections are blended in and out with B-splines. Legs follow in closed form,
+their knees damped near straight; where a leg is too short, the root is lowered a little (Kovar, Schreiner and Gleicher
+2002, Footskate cleanup for motion capture editing).
 """
 
 from __future__ import annotations
@@ -107,14 +107,24 @@ def plant_feet(
     contacts: Sequence[FootContacts] | None = None,
     options: PlantOptions | None = None,
 ) -> PlantedMotion:
-    """Keep feet where they stand.
+    """Fix planted feet to the ground.
 
     Parameters
     ----------
-    motion : F frames
-    contacts : of each foot; found by speed when None
+    skeleton : Skeleton    J joints
+    motion : Motion    F frames
+    frame_rate_hz : float    frames per second
+    feet : sequence of Foot    leg and toe of each foot
+    contacts : sequence of FootContacts, optional    of each foot; detected by speed when None
+    options : PlantOptions, optional    limits and transitions
 
-    Raises `EditError` where the contacts are not as long as the motion.
+    Returns
+    -------
+    PlantedMotion    F frames, contacts and sliding distances in metres
+
+    Raises
+    ------
+    EditError    where the contacts are not as long as the motion
     """
     options = options or PlantOptions()
     positions = motion.positions(skeleton)
@@ -134,9 +144,20 @@ def plant_feet(
 
 
 def find_contacts(positions: Floats, foot: Foot, frame_rate_hz: float, options: PlantOptions) -> FootContacts:
-    """When toe and ankle of a foot are slow, from joint positions (F, J, 3) in metres.
+    """Find the frames in which toe and ankle of a foot are slow.
 
-    Contacts shorter than `shortest_s` are noise, and so are gaps in the contacts that are left.
+    Contacts shorter than `shortest_s` are noise, and so are gaps between the remaining contacts.
+
+    Parameters
+    ----------
+    positions : (F, J, 3) float64    joint positions, metres
+    foot : Foot    leg and toe
+    frame_rate_hz : float    frames per second
+    options : PlantOptions    limits
+
+    Returns
+    -------
+    FootContacts    flags (F,) of toe and heel
     """
     points = positions[:, (foot.toe, foot.leg.end)]
     touching = kinematics.foot_contacts(points, frame_rate_hz, speed_limit_m_s=options.speed_m_s)
@@ -150,7 +171,18 @@ def find_contacts(positions: Floats, foot: Foot, frame_rate_hz: float, options: 
 
 
 def foot_slide_m(positions: Floats, foot: Foot, contacts: FootContacts) -> Floats:
-    """Ground that the toe covers (n,) in metres during each of its n contacts, from joint positions (F, J, 3)."""
+    """Measure the distance on the ground that the toe covers during each contact.
+
+    Parameters
+    ----------
+    positions : (F, J, 3) float64    joint positions, metres
+    foot : Foot    leg and toe
+    contacts : FootContacts    n contacts
+
+    Returns
+    -------
+    (n,) float64    metres
+    """
     steps = np.linalg.norm(np.diff(positions[:, foot.toe][:, (0, 2)], axis=0), axis=1)
     return np.array([steps[start : stop - 1].sum() for start, stop in runs(contacts.toe)])
 

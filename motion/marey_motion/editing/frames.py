@@ -1,4 +1,4 @@
-"""Commands that change which frames a take has: cut, joined, resampled or retimed."""
+"""Commands that change the frames of a take: cut, joined, resampled or retimed."""
 
 from __future__ import annotations
 
@@ -23,15 +23,41 @@ from marey_motion.skeleton import same_hierarchy
 
 
 def trim(take: Take, *, start: int = 0, stop: int | None = None) -> Take:
-    """Keep the frames [start, stop); without `stop`, up to the end. Raises `EditError` where they are not there."""
+    """Keep a range of frames.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    start : int    first frame
+    stop : int, optional    one after the last frame; the end when None
+
+    Returns
+    -------
+    Take    the frames [start, stop)
+
+    Raises
+    ------
+    EditError    where they do not exist
+    """
     first, last = take.frames((start, stop))
     return take.moved(take.motion.sliced(first, last))
 
 
 def split(take: Take, *, at: Sequence[int]) -> tuple[Take, ...]:
-    """Cut before each of the frames `at`, in increasing order, into one piece more than these.
+    """Cut a take into pieces.
 
-    Raises `EditError` where a cut lies outside of the motion or would leave a piece without frames.
+    Parameters
+    ----------
+    take : Take    F frames
+    at : sequence of int    increasing; first frame of each piece but the first
+
+    Returns
+    -------
+    tuple of Take    one piece more than cuts
+
+    Raises
+    ------
+    EditError    where a cut lies outside the motion or would leave a piece without frames
     """
     bounds = [0, *at, take.frame_count]
     for before, after in pairwise(bounds):
@@ -61,21 +87,26 @@ def concatenate(
 ) -> Take:
     """Append a clip of the same skeleton, at this motion's frame rate.
 
-    Where hips are translated under a root that is a static reference, their travel goes into that of the root.
+    Where hips are translated under a root that is a static reference, their travel is merged into that of the root.
 
     Parameters
     ----------
-    source : the clip
-    place : seam, turned about the vertical and shifted on the ground so that the body goes on where it was and facing
-        where it faced; keep, as it is
-    blend : inertialise, all frames of both, and the difference at the seam dies away in the second; slerp, so many
-        frames of both overlap and are faded over
-    blend_s : how long that takes; 0 for a hard cut
+    take : Take    F frames
+    source : str    name of the clip
+    place : str    "seam": rotated about the vertical and shifted on the ground so that the body continues its position
+        and heading; "keep": unchanged
+    blend : str    "inertialise": all frames of both, and the difference at the seam decays in the second; "slerp": so
+        many frames of both overlap and are cross-faded
+    blend_s : float    seconds of the blend; 0 for a hard cut
+
+    Returns
+    -------
+    Take    frames of both
 
     Raises
     ------
     EditError    for an unknown source, another skeleton, and a result that is too long
-    MotionError    where the body faces no direction at the seam
+    MotionError    where the body has no facing direction at the seam
     """
     added = _same_rate(take, source)
     first, second = with_equal_joints(take.motion, added.motion, take.skeleton)
@@ -159,14 +190,42 @@ def _faded_over(first: Motion, second: Motion, overlap: int) -> Motion:
 
 
 def resample(take: Take, *, frame_rate_hz: float) -> Take:
-    """The same motion at another rate, first frames coinciding. Raises `EditError` where it gets too long."""
+    """Sample the motion at another rate, first frames coinciding.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    frame_rate_hz : float    frames per second
+
+    Returns
+    -------
+    Take    the same motion at that rate
+
+    Raises
+    ------
+    EditError    where it becomes too long
+    """
     take.require_room(count_samples(take.frame_count, take.frame_rate_hz, frame_rate_hz))
     motion = resample_motion(take.motion, take.frame_rate_hz, frame_rate_hz)
     return replace(take, motion=motion, frame_rate_hz=frame_rate_hz)
 
 
 def retime(take: Take, *, speed: float) -> Take:
-    """The motion so many times as fast, at the same frame rate. Raises `EditError` where it gets too long."""
+    """Play the motion faster or slower, at the same frame rate.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    speed : float    factor; 2 is twice as fast
+
+    Returns
+    -------
+    Take    about F / speed frames
+
+    Raises
+    ------
+    EditError    where it becomes too long
+    """
     slowed_hz = take.frame_rate_hz / speed
     take.require_room(count_samples(take.frame_count, take.frame_rate_hz, slowed_hz))
     return take.moved(resample_motion(take.motion, take.frame_rate_hz, slowed_hz))

@@ -1,4 +1,4 @@
-"""Where the ground is, and when the feet stand on it."""
+"""The height of the ground, and the contacts of the feet with it."""
 
 from __future__ import annotations
 
@@ -32,9 +32,20 @@ class Ground(NamedTuple):
 
 
 def move_to_ground(take: Take, *, height_m: float | None = None) -> Take:
-    """Shift everything up or down so that the ground, at `height_m` or where it is estimated, is at height zero.
+    """Shift the motion vertically so that the ground is at height zero.
 
-    Raises `MappingError` where the feet are not known.
+    Parameters
+    ----------
+    take : Take    F frames
+    height_m : float, optional    height of the ground, metres; estimated when None
+
+    Returns
+    -------
+    Take    F frames with a finding
+
+    Raises
+    ------
+    MappingError    where the feet are not known
     """
     ground = estimate_ground(take) if height_m is None else Ground(height_m, 0)
     moved = translate(take, shift_m=(0.0, -ground.height_m, 0.0))
@@ -42,7 +53,20 @@ def move_to_ground(take: Take, *, height_m: float | None = None) -> Take:
 
 
 def find_ground(take: Take) -> Take:
-    """Note the height of the ground. Raises `MappingError` where the feet are not known."""
+    """Record the height of the ground.
+
+    Parameters
+    ----------
+    take : Take    F frames
+
+    Returns
+    -------
+    Take    the same motion with a finding
+
+    Raises
+    ------
+    MappingError    where the feet are not known
+    """
     return take.with_finding(EditFinding("find_ground", estimate_ground(take)._asdict()))
 
 
@@ -54,12 +78,18 @@ def find_contacts(
     shortest_stance_s: float = 0.06,
     height_limit_m: float | None = 0.1,
 ) -> Take:
-    """Note for which frames each foot stands, as the segments of an annotation.
+    """Record the frames in which each foot is planted, as the segments of an annotation.
 
     Parameters
     ----------
-    speed_m_s, shortest_swing_s, shortest_stance_s : see `contacts.ContactOptions`
-    height_limit_m : a foot that is slow but so far above the ground does not stand; None to ask for its speed only
+    take : Take    F frames
+    speed_m_s, shortest_swing_s, shortest_stance_s : float    see `contacts.ContactOptions`
+    height_limit_m : float, optional    a slow foot higher than this above the ground is not planted, metres; None to
+        check only its speed
+
+    Returns
+    -------
+    Take    the same motion with a finding
 
     Raises
     ------
@@ -84,15 +114,40 @@ def find_contacts(
 
 
 def estimate_ground(take: Take) -> Ground:
-    """The median height of the lower foot's sole over the frames in which that foot stands.
+    """Estimate the ground as the median height of the lower foot's sole over the frames in which that foot is planted.
 
-    So neither a foot below the floor for some frames nor a kick that is held moves it. Raises `MappingError`.
+    Neither a foot below the floor for some frames nor a kick that is held changes it.
+
+    Parameters
+    ----------
+    take : Take    F frames
+
+    Returns
+    -------
+    Ground    height in metres
+
+    Raises
+    ------
+    MappingError    where the feet are not known
     """
     return _ground_of(sole_heights(take), _stances(take, ContactOptions()))
 
 
 def sole_heights(take: Take) -> Floats:
-    """(F, 2) height of the lowest point of the left and the right foot, metres. Raises `MappingError`."""
+    """Compute the height of the lowest point of each foot.
+
+    Parameters
+    ----------
+    take : Take    F frames
+
+    Returns
+    -------
+    (F, 2) float64    left and right, metres
+
+    Raises
+    ------
+    MappingError    where the feet are not known
+    """
     motion, skeleton = take.motion, take.skeleton
     positions = forward_kinematics(
         skeleton,

@@ -31,15 +31,28 @@ def paste(
     frames: tuple[int, int | None] | None = None,
     border_s: float = 0.2,
 ) -> Take:
-    """Put a stretch of another clip in place of these joints' own motion (Herrmann et al. 2019, section 4.1.4).
+    """Replace the motion of joints by a range of another clip (Herrmann et al. 2019, section 4.1.4).
 
-    The stretch is resampled with cubic splines to the frames it shall fill; equal lengths are copied exactly. Within
-    the borders rotations go over along the shorter arc, translations along straight lines.
+    The range is resampled with cubic splines to the frames it fills; equal lengths are copied exactly. Within the
+    borders rotations are blended along the shorter arc, translations along straight lines.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    source : str    name of the other clip
+    joints : sequence of str    names of the joints
+    source_frames : (int, int or None), optional    range of the other clip, all when None
+    frames : (int, int or None), optional    range to fill, all when None
+    border_s : float    seconds of each border
+
+    Returns
+    -------
+    Take    F frames
 
     Raises
     ------
-    UnknownJoint
-    EditError    for an unknown source, frames that are not there, and joints whose axes differ in the two skeletons
+    UnknownJoint    naming a joint that does not exist
+    EditError    for an unknown source, frames that do not exist, and joints whose axes differ in the two skeletons
     """
     clip = take.source(source)
     targets = sorted({take.joint(name) for name in joints})
@@ -106,9 +119,26 @@ def rotate_joint(
     frames: tuple[int, int | None] | None = None,
     border_s: float = 0.2,
 ) -> Take:
-    """Turn a joint by an angle about an axis in its own, its parent's or the world's axes, growing over the borders.
+    """Rotate a joint by an angle, growing over the borders.
 
-    Raises `UnknownJoint`, and `EditError` where the frames are not there.
+    Parameters
+    ----------
+    take : Take    F frames
+    joint : str    name of the joint
+    angle_rad : float    radians
+    axis : (3,)    direction of the axis, of any length but zero
+    space : str    "joint", "parent" or "world": the frame of the axis
+    frames : (int, int or None), optional    range, all when None
+    border_s : float    seconds of each border
+
+    Returns
+    -------
+    Take    F frames
+
+    Raises
+    ------
+    UnknownJoint    naming a joint that does not exist
+    EditError    where the frames do not exist
     """
     index = take.joint(joint)
     span, shares = range_weights(take, frames, border_s)

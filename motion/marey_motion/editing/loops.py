@@ -19,20 +19,24 @@ FEWEST_FRAMES = 4
 def close_loop(take: Take, *, in_place: bool = False, blend_s: float | None = None) -> Take:
     """Make the last frame lead into the first one, elsewhere on the ground where the clip travels.
 
-    Where hips are translated under a root that is a static reference, their travel goes into that of the root.
-
-    What is missing between the pose and velocity that the end runs towards and those of the start is shared: half dies
-    away from the start onwards, half from the end backwards.
+    Where hips are translated under a root that is a static reference, their travel is merged into that of the root. The
+    difference between the end and the start, in pose and velocity, is shared: half decays from the start onwards, half
+    from the end backwards.
 
     Parameters
     ----------
-    in_place : take travel and turn of the round out first, the same share per frame
-    blend_s : how far from the seam poses may change; None for up to the middle
+    take : Take    F frames
+    in_place : bool    remove travel and turn of the round first, the same share per frame
+    blend_s : float, optional    seconds from the seam in which poses may change; up to the middle when None
+
+    Returns
+    -------
+    Take    F frames
 
     Raises
     ------
     EditError    for fewer than four frames
-    MotionError    where the body never faces any direction
+    MotionError    where the body never has a facing direction
     """
     frames = take.frame_count
     if frames < FEWEST_FRAMES:

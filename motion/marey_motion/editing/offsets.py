@@ -1,4 +1,4 @@
-"""Differences between poses that die away over time: blending by inertialisation.
+"""Offsets between poses that decay over time: blending by inertialisation.
 
 An offset x with velocity v decays to nothing over T frames as the quintics that begin with position x, velocity v and
 no acceleration, and end without any of them (after Bollo 2018, "Inertialization", there with the acceleration of the
@@ -22,13 +22,13 @@ VELOCITY_S = 0.15
 
 
 class PoseOffset(NamedTuple):
-    """What takes a pose to another one of the same joints, or how fast that changes, per frame.
+    """Difference of two poses of the same joints, or its change per frame.
 
     Parameters
     ----------
-    root : (..., 3) metres
-    turns : (..., J, 3) rotation vectors in the parents' axes, radians
-    translations : (..., k, 3) metres
+    root : (..., 3) float64    metres
+    turns : (..., J, 3) float64    rotation vectors in the parents' axes, radians
+    translations : (..., k, 3) float64    metres
     """
 
     root: Floats
@@ -36,15 +36,42 @@ class PoseOffset(NamedTuple):
     translations: Floats
 
     def times(self, factor: float) -> PoseOffset:
-        """All of it so many times."""
+        """Multiply the offset.
+
+        Parameters
+        ----------
+        factor : float    factor
+
+        Returns
+        -------
+        PoseOffset    the product
+        """
         return PoseOffset(self.root * factor, self.turns * factor, self.translations * factor)
 
     def minus(self, other: PoseOffset) -> PoseOffset:
-        """The difference of both."""
+        """Subtract another offset.
+
+        Parameters
+        ----------
+        other : PoseOffset    of the same shapes
+
+        Returns
+        -------
+        PoseOffset    the difference
+        """
         return PoseOffset(self.root - other.root, self.turns - other.turns, self.translations - other.translations)
 
     def turned(self, angle_rad: float) -> PoseOffset:
-        """As it is in a world that is turned about the vertical: only the root's part is given in the world's axes."""
+        """Rotate the offset with the world about the vertical: only the root's part is given in the world's axes.
+
+        Parameters
+        ----------
+        angle_rad : float    radians, positive to the left
+
+        Returns
+        -------
+        PoseOffset    the rotated offset
+        """
         turn = about_vertical(np.asarray(angle_rad))
         turns = self.turns.copy()
         turns[..., 0, :] = quaternions.rotate_vectors(turn, turns[..., 0, :])
@@ -53,7 +80,19 @@ class PoseOffset(NamedTuple):
 
 
 def offset_to(motion: Motion, frame: int, other: Motion, other_frame: int) -> PoseOffset:
-    """What takes a frame of a motion to a frame of another one of the same joints."""
+    """Compute the offset from a frame of a motion to a frame of another one of the same joints.
+
+    Parameters
+    ----------
+    motion : Motion    the motion
+    frame : int    its frame
+    other : Motion    the other one
+    other_frame : int    its frame
+
+    Returns
+    -------
+    PoseOffset    of one pose
+    """
     back = quaternions.conjugate(motion.rotations[frame])
     turns = quaternions.as_rotation_vector(quaternions.multiply(other.rotations[other_frame], back))
     return PoseOffset(
@@ -64,15 +103,34 @@ def offset_to(motion: Motion, frame: int, other: Motion, other_frame: int) -> Po
 
 
 def step_of(motion: Motion, frame: int) -> PoseOffset:
-    """What takes a frame to the next one; nothing where there is no next."""
+    """Compute the offset from a frame to the next one; zero at the last frame.
+
+    Parameters
+    ----------
+    motion : Motion    F frames
+    frame : int    the frame
+
+    Returns
+    -------
+    PoseOffset    of one pose
+    """
     return offset_to(motion, frame, motion, min(frame + 1, motion.frame_count - 1))
 
 
 def seam_offset(before: Motion, after: Motion) -> tuple[PoseOffset, PoseOffset]:
-    """What the start of `after` lacks to go on where `before` ends, and how fast that changes per frame.
+    """Compute the offset that continues a motion in the start of another, and its change per frame.
 
     The step over the seam is in neither motion: it is taken as the mean of its neighbours, half of whose difference is
     left to the frames that follow.
+
+    Parameters
+    ----------
+    before, after : Motion    motions of the same joints
+
+    Returns
+    -------
+    offset : PoseOffset    at the first frame of `after`
+    velocity : PoseOffset    per frame
     """
     arrival, departure = step_of(before, max(0, before.frame_count - 2)), step_of(after, 0)
     velocity = arrival.minus(departure).times(0.5)
@@ -83,7 +141,18 @@ def seam_offset(before: Motion, after: Motion) -> tuple[PoseOffset, PoseOffset]:
 
 
 def add_offset(motion: Motion, frames: NDArray[np.int64], offset: PoseOffset) -> Motion:
-    """The motion with offsets (n, ...) added to its frames (n,)."""
+    """Add offsets to frames.
+
+    Parameters
+    ----------
+    motion : Motion    F frames
+    frames : (n,) int64    the frames
+    offset : PoseOffset    of n poses
+
+    Returns
+    -------
+    Motion    F frames
+    """
     root, rotations, translations = (
         motion.root_translations.copy(), motion.rotations.copy(), motion.translations.copy()
     )  # fmt: skip
@@ -94,9 +163,18 @@ def add_offset(motion: Motion, frames: NDArray[np.int64], offset: PoseOffset) ->
 
 
 def dying_away(offset: PoseOffset, velocity: PoseOffset, ages: Floats, life: float, velocity_life: float) -> PoseOffset:
-    """What is left of an offset, and of its velocity per frame, at `ages` (n,) in frames.
+    """Compute the decay of an offset and of its velocity.
 
-    `life` and `velocity_life` are the frames after which nothing is left of either.
+    Parameters
+    ----------
+    offset : PoseOffset    of one pose
+    velocity : PoseOffset    per frame
+    ages : (n,) float64    frames since the start
+    life, velocity_life : float    frames after which nothing is left of either
+
+    Returns
+    -------
+    PoseOffset    of n poses
     """
     s = np.clip(ages / life, 0.0, 1.0)
     places = (1.0 - s) ** 3 * (1.0 + 3.0 * s + 6.0 * s * s)

@@ -1,4 +1,4 @@
-"""Commands that move, turn, scale or mirror the whole body, and spread a correction of its path over frames."""
+"""Commands that move, rotate, scale or mirror the whole body, and spread a correction of its path over frames."""
 
 from __future__ import annotations
 
@@ -20,7 +20,17 @@ GROUND = np.array([1.0, 0.0, 1.0])
 
 
 def translate(take: Take, *, shift_m: Sequence[float]) -> Take:
-    """Shift everything by (x, y, z) metres."""
+    """Shift the motion.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    shift_m : (3,)    metres
+
+    Returns
+    -------
+    Take    F frames
+    """
     motion = take.motion
     return take.moved(motion._replace(root_translations=motion.root_translations + np.asarray(shift_m)))
 
@@ -32,30 +42,74 @@ def rotate(
     axis: Sequence[float] = (0.0, 1.0, 0.0),
     pivot: Literal["origin", "body"] = "origin",
 ) -> Take:
-    """Turn everything about an axis of the world through the origin, or through the ground under the first frame."""
+    """Rotate the motion about an axis of the world.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    angle_rad : float    radians
+    axis : (3,)    direction of the axis, of any length but zero
+    pivot : str    "origin", or "body": the ground under the first frame
+
+    Returns
+    -------
+    Take    F frames
+    """
     turn = np.asarray(quaternions.from_axis_angle(axis, angle_rad), dtype=np.float64)
     place = np.zeros(3) if pivot == "origin" else body_at(take, 0)[0] * GROUND
     return take.moved(carried(take.motion, turn, place))
 
 
 def face(take: Take, *, heading_rad: float = 0.0, frame: int = 0) -> Take:
-    """Turn everything about the vertical through the body at `frame`, so that it faces `heading_rad` there.
+    """Rotate the motion about the vertical through the body at a frame, so that it has a given heading there.
 
-    Raises `MotionError` where the body faces no direction in that frame, as when it lies on its side.
+    Parameters
+    ----------
+    take : Take    F frames
+    heading_rad : float    radians, 0 along +z, positive to the left
+    frame : int    the frame
+
+    Returns
+    -------
+    Take    F frames
+
+    Raises
+    ------
+    MotionError    where the body has no facing direction in that frame, as when it lies on its side
     """
     place, heading = body_at(take, frame)
     return take.moved(carried(take.motion, about_vertical(np.asarray(heading_rad - heading)), place))
 
 
 def move_to_origin(take: Take, *, frame: int = 0) -> Take:
-    """Shift everything on the ground, so that the pelvis is above the origin at `frame`. Heights stay."""
+    """Shift the motion on the ground, so that the pelvis is above the origin at a frame; heights stay.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    frame : int    the frame
+
+    Returns
+    -------
+    Take    F frames
+    """
     return translate(take, shift_m=-pelvis_track(take, frame, frame + 1)[0] * GROUND)
 
 
 def scale(take: Take, *, factor: float, translations: bool = False) -> Take:
-    """Scale the path of the body about the origin, heights too, and with `translations` what other joints move.
+    """Scale the path of the body about the origin, heights too.
 
-    The skeleton is another item and stays as it is, so that the strides of a scaled path fit another body's legs.
+    The skeleton is another item and does not change, so that the strides of a scaled path fit another body's legs.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    factor : float    factor
+    translations : bool    scale the translations of other joints, too
+
+    Returns
+    -------
+    Take    F frames
     """
     motion = take.motion
     scaled = motion.translations.copy()
@@ -66,10 +120,23 @@ def scale(take: Take, *, factor: float, translations: bool = False) -> Take:
 
 
 def flip_axes(take: Take, *, up: str = "+z", forward: str = "-y") -> Take:
-    """Turn the world so that its axis `up`, one of +x to -z, becomes +y, and `forward` becomes +z.
+    """Rotate the world so that one axis becomes +y and another +z.
 
-    Only rotations: a world of the other hand is a mirror image, which `mirror` makes. Raises `EditError` where both
-    lie on one axis.
+    Only rotations: a world of the other hand is a mirror image, which `mirror` makes.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    up : str    axis that becomes +y, one of +x to -z
+    forward : str    axis that becomes +z
+
+    Returns
+    -------
+    Take    F frames
+
+    Raises
+    ------
+    EditError    where both lie on one axis
     """
     y, z = _direction(up), _direction(forward)
     if np.any(np.abs(y + z) != np.abs(y) + np.abs(z)) or up[1] == forward[1]:
@@ -79,7 +146,19 @@ def flip_axes(take: Take, *, up: str = "+z", forward: str = "-y") -> Take:
 
 
 def carried(motion: Motion, turns: Floats, pivots: Floats, shifts: Floats | None = None) -> Motion:
-    """Turned by rotations (4,) or (F, 4) about points (3,) or (F, 3), then shifted by (F, 3) or (3,)."""
+    """Rotate a motion about points, then shift it.
+
+    Parameters
+    ----------
+    motion : Motion    F frames
+    turns : (4,) or (F, 4) float64    rotations in the world
+    pivots : (3,) or (F, 3) float64    metres
+    shifts : (3,) or (F, 3) float64, optional    metres
+
+    Returns
+    -------
+    Motion    F frames
+    """
     arms = motion.root_translations - pivots
     places = pivots + quaternions.rotate_vectors(turns, arms)
     rotations = motion.rotations.copy()
@@ -88,24 +167,78 @@ def carried(motion: Motion, turns: Floats, pivots: Floats, shifts: Floats | None
 
 
 def moved_over(motion: Motion, seam: LoopSeam) -> Motion:
-    """Turned about the origin and shifted on the ground."""
+    """Rotate a motion about the origin and shift it on the ground.
+
+    Parameters
+    ----------
+    motion : Motion    F frames
+    seam : LoopSeam    turn and shift
+
+    Returns
+    -------
+    Motion    F frames
+    """
     shift = np.array([seam.shift_m[0], 0.0, seam.shift_m[1]])
     return carried(motion, about_vertical(np.asarray(seam.turn_rad)), np.zeros(3), shift)
 
 
 def pelvis_track(take: Take, start: int, stop: int) -> Floats:
-    """Positions (n, 3) of the pelvis in the frames [start, stop). Raises `EditError` where they are not there."""
+    """Compute the positions of the pelvis.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    start, stop : int    frames [start, stop)
+
+    Returns
+    -------
+    (n, 3) float64    metres
+
+    Raises
+    ------
+    EditError    where the frames do not exist
+    """
     return _positions(take, start, stop)[:, take.body.pelvis]
 
 
 def body_at(take: Take, frame: int) -> tuple[Floats, float]:
-    """Where the pelvis is (3,) and where the body faces at a frame. Raises `MotionError`."""
+    """Compute the position of the pelvis and the heading of the body at a frame.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    frame : int    the frame
+
+    Returns
+    -------
+    position : (3,) float64    metres
+    heading : float    radians
+
+    Raises
+    ------
+    MotionError    where the body has no facing direction
+    """
     places, headings = body_track(take, frame, frame + 1)
     return places[0], float(headings[0])
 
 
 def body_track(take: Take, start: int, stop: int) -> tuple[Floats, Floats]:
-    """Positions (n, 3) of the pelvis and continuous headings (n,) in the frames [start, stop). Raises `MotionError`."""
+    """Compute the positions of the pelvis and the continuous headings of the body.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    start, stop : int    frames [start, stop)
+
+    Returns
+    -------
+    positions : (n, 3) float64    metres
+    headings : (n,) float64    radians
+
+    Raises
+    ------
+    MotionError    where the body has no facing direction
+    """
     positions = _positions(take, start, stop)
     directions = kinematics.forward_directions(positions, take.body.matching.lefts, take.body.matching.rights)
     return positions[:, take.body.pelvis], kinematics.headings(directions)
@@ -124,7 +257,16 @@ def _direction(axis: str) -> Floats:
 
 
 def mirror(take: Take) -> Take:
-    """The motion seen in a mirror, by the skeleton's own pairs of joints, whatever their names and axes."""
+    """Reflect the motion in x, by the skeleton's own pairs of joints, whatever their names and axes.
+
+    Parameters
+    ----------
+    take : Take    F frames
+
+    Returns
+    -------
+    Take    the mirrored copy
+    """
     return take.moved(mirror_motion(take.skeleton, take.body.partners, take.motion))
 
 
@@ -138,8 +280,23 @@ def fix_drift(
 ) -> Take:
     """Spread a shift and a turn about the vertical over a range: none of it in its first frame, all in its last.
 
-    Within the range each frame turns about its own pelvis; the frames after it follow the last one rigidly. Raises
-    `EditError` where the frames are not there or there is but one.
+    Within the range each frame turns about its own pelvis; the frames after it follow the last one rigidly.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    shift_m : (3,)    metres
+    turn_rad : float    radians, positive to the left
+    frames : (int, int or None), optional    range, all when None
+    profile : str    "linear" or "smooth"
+
+    Returns
+    -------
+    Take    F frames
+
+    Raises
+    ------
+    EditError    where the frames do not exist or are only one
     """
     start, stop = take.frames(frames)
     if stop - start < 2:

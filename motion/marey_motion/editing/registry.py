@@ -1,9 +1,8 @@
 """Every command by its name, and lists of commands applied to clips.
 
-A command is a function of a take and its parameters by name, and gives the take that comes of it, or several. It is
-pure: the same take and parameters give the same bytes. Its parameters are plain trees in SI units, as
-`documents.commands_of_edit` makes them of a document's; the schemas have the same names and defaults, with degrees
-(`_deg`) for radians (`_rad`).
+A command is a function of a take and named parameters, and returns one take or several. It is pure: the same take and
+parameters give the same bytes. Its parameters are plain trees in SI units, as `documents.commands_of_edit` makes them
+from a document's; the schemas have the same names and defaults, with degrees (`_deg`) for radians (`_rad`).
 """
 
 from __future__ import annotations
@@ -87,22 +86,27 @@ def edit_clip(
     most_numbers: int = MOST_NUMBERS,
     most_work: float = inf,
 ) -> tuple[EditedClip, ...]:
-    """Everything that comes of a clip: one, or several where it was split.
+    """Apply commands to a clip.
 
     Computed in double precision throughout and rounded once, at the end.
 
     Parameters
     ----------
-    clip : stays as it is
-    commands : names and parameters, in order; after a split, the rest applies to each piece
-    body : which joints are which; by default as their names and build suggest
-    sources : other clips by the names that the commands call them
-    most_numbers : size that the motion may grow to
-    most_work : about nanoseconds of one thread that all commands together may take (`allowance`)
+    clip : Clip    F frames; stays unchanged
+    commands : sequence of (str, mapping)    names and parameters, in order; after a split, the rest applies to each
+        piece
+    body : EditedBody, optional    joints of the skeleton; by default inferred from names and build
+    sources : mapping of str to Clip, optional    other clips by the names that the commands use
+    most_numbers : int    largest size of the motion
+    most_work : float    largest work of all commands together, in nanoseconds of one thread (`allowance`)
+
+    Returns
+    -------
+    tuple of EditedClip    one, or several where it was split
 
     Raises
     ------
-    MotionError    where a command cannot be applied; `where` tells which and what of it
+    MotionError    where a command cannot be applied; `where` names the command and the parameter
     """
     body = body or EditedBody(clip.skeleton)
     first = Take(
@@ -123,7 +127,22 @@ def edit_clip(
 
 
 def apply_edit(clip: Clip, commands: Sequence[NamedCommand], **given: Any) -> Clip:
-    """The one clip that comes of it; as `edit_clip`. Raises `EditError` where there are several."""
+    """Apply commands that return a single clip, as `edit_clip`.
+
+    Parameters
+    ----------
+    clip : Clip    F frames
+    commands : sequence of (str, mapping)    names and parameters
+    given    further arguments of `edit_clip`
+
+    Returns
+    -------
+    Clip    the edited clip
+
+    Raises
+    ------
+    EditError    where there are several
+    """
     edited = edit_clip(clip, commands, **given)
     if len(edited) > 1:
         raise EditError(f"the commands make {len(edited)} clips of one", code="several-clips")
@@ -131,7 +150,22 @@ def apply_edit(clip: Clip, commands: Sequence[NamedCommand], **given: Any) -> Cl
 
 
 def apply_command(take: Take, name: str, parameters: Mapping[str, Any]) -> tuple[Take, ...]:
-    """What one command makes of a take, with rotations of unit length and continuous signs. Raises `MotionError`."""
+    """Apply one command to a take.
+
+    Parameters
+    ----------
+    take : Take    F frames
+    name : str    name of the command
+    parameters : mapping    its parameters
+
+    Returns
+    -------
+    tuple of Take    with rotations of unit length and continuous signs
+
+    Raises
+    ------
+    MotionError    where it cannot be applied
+    """
     command = COMMANDS.get(name)
     if command is None:
         raise EditError(f"no command is called {name!r}; there are {', '.join(COMMANDS)}", code="command-unknown")

@@ -1,4 +1,4 @@
-"""Noise taken out of rotations and translations."""
+"""Removal of noise from rotations and translations."""
 
 from __future__ import annotations
 
@@ -34,23 +34,31 @@ def smooth(
     frames: tuple[int, int | None] | None = None,
     border_s: float = 0.2,
 ) -> Take:
-    """Weighted means over time of the joints' rotations and translations, and of the root's path.
+    """Average the joints' rotations and translations and the root's path over time, with weights.
 
-    No frame is lost: beyond its ends a motion goes on as its own reflection through its end poses, which leaves the
+    No frame is lost: beyond its ends a motion continues as its own reflection through its end poses, which leaves the
     first and the last frame, and straight paths, exactly as they are. Rotations are averaged as quaternions of
     continuous sign and brought back to unit length.
 
     Parameters
     ----------
-    window_s : full width of the mean; for a gaussian, six standard deviations
-    order : degree of the polynomials of savitzky_golay
-    joints : which; None for all
-    root_translation : smooth the path of the root, and of the joints between root and pelvis where those move
+    take : Take    F frames
+    method : str    "savitzky_golay" or "gaussian"
+    window_s : float    full width of the mean; for a gaussian, six standard deviations
+    order : int    degree of the polynomials of savitzky_golay
+    joints : sequence of str, optional    names of the joints; None for all
+    root_translation : bool    smooth the path of the root, and of the joints between root and pelvis where those move
+    frames : (int, int or None), optional    range, all when None
+    border_s : float    seconds of each border
+
+    Returns
+    -------
+    Take    F frames
 
     Raises
     ------
-    UnknownJoint
-    EditError    where the frames are not there, where the window is too short for the polynomials, and where a joint
+    UnknownJoint    naming a joint that does not exist
+    EditError    where the frames do not exist, where the window is too short for the polynomials, and where a joint
         spins so fast that its rotations have no mean
     """
     motion = take.motion

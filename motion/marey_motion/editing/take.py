@@ -1,4 +1,4 @@
-"""What the commands of an edit work on."""
+"""The input and output of the commands of an edit."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ UNIT_IN_SINGLE = 3e-7
 
 @dataclass(frozen=True, eq=False)
 class EditedBody:
-    """A skeleton and which of its joints are which, found out when a command first asks.
+    """A skeleton with its standard joints, which are determined when a command first needs them.
 
     Parameters
     ----------
-    skeleton : what the motion moves
-    find_mapping : gives the standard joints; may raise `MappingError`
+    skeleton : Skeleton    skeleton of the motion
+    find_mapping : callable    returns the standard joints; may raise `MappingError`
     """
 
     skeleton: Skeleton
@@ -72,12 +72,12 @@ class EditedBody:
 
 @dataclass(frozen=True)
 class EditFinding:
-    """What a command found out about the motion as it was when its turn came.
+    """A finding of a command about the motion before it.
 
     Parameters
     ----------
-    command : name of the command
-    values : plain tree of text and numbers
+    command : str    name of the command
+    values : mapping    plain tree of text and numbers
     """
 
     command: str
@@ -126,24 +126,65 @@ class Take:
         return int(motion.root_translations.size + motion.rotations.size + motion.translations.size)
 
     def moved(self, motion: Motion) -> Take:
-        """With another motion of the same body and frame rate."""
+        """Replace the motion by another one of the same body and frame rate.
+
+        Parameters
+        ----------
+        motion : Motion    the new motion
+
+        Returns
+        -------
+        Take    with that motion
+        """
         return replace(self, motion=motion)
 
     def with_finding(self, finding: EditFinding) -> Take:
-        """With one finding more."""
+        """Add a finding.
+
+        Parameters
+        ----------
+        finding : EditFinding    the finding
+
+        Returns
+        -------
+        Take    with one finding more
+        """
         return replace(self, findings=(*self.findings, finding))
 
     def source(self, name: str) -> Clip:
-        """Another clip, by the name that a command calls it. Raises `EditError`."""
+        """Look up another clip, by the name that a command uses.
+
+        Parameters
+        ----------
+        name : str    the name
+
+        Returns
+        -------
+        Clip    the clip
+
+        Raises
+        ------
+        EditError    where there is none
+        """
         if name not in self.sources:
             known = ", ".join(sorted(self.sources)) or "none"
             raise EditError(f"no source is called {name!r}; there is {known}", code="source-missing", where="source")
         return self.sources[name]
 
     def frames(self, bounds: tuple[int, int | None] | None) -> tuple[int, int]:
-        """Start and stop of a half-open range of frames; None is all of them, and as a stop the end.
+        """Resolve a half-open range of frames.
 
-        Raises `EditError` where the take has no such frames.
+        Parameters
+        ----------
+        bounds : (int, int or None) or None    None is all frames, and as a stop the end
+
+        Returns
+        -------
+        (int, int)    start and stop
+
+        Raises
+        ------
+        EditError    where the take has no such frames
         """
         start, stop = bounds or (0, None)
         stop = self.frame_count if stop is None else stop
@@ -154,15 +195,46 @@ class Take:
         return start, stop
 
     def joint(self, name: str) -> int:
-        """Index of a joint by its name; `UnknownJoint` with the nearest names."""
+        """Find a joint by name.
+
+        Parameters
+        ----------
+        name : str    name of the joint
+
+        Returns
+        -------
+        int    its index
+
+        Raises
+        ------
+        UnknownJoint    with the nearest names
+        """
         return self.skeleton.index_of(name)
 
     def count_frames(self, seconds: float) -> int:
-        """The frames nearest to a time."""
+        """Convert a time to the nearest number of frames.
+
+        Parameters
+        ----------
+        seconds : float    seconds
+
+        Returns
+        -------
+        int    frames
+        """
         return round(seconds * self.frame_rate_hz)
 
     def require_room(self, frames: int) -> None:
-        """Refuse to grow to so many frames where that is over the limit. Raises `EditError`."""
+        """Check that the motion may grow to so many frames.
+
+        Parameters
+        ----------
+        frames : int    number of frames
+
+        Raises
+        ------
+        EditError    where that exceeds the limit
+        """
         width = 3 + 4 * self.skeleton.joint_count + 3 * len(self.motion.translated_joints)
         most = self.most_numbers // width
         if frames > most:
@@ -174,7 +246,16 @@ class Take:
 
 
 def motion_of(clip: Clip) -> Motion:
-    """A clip's own numbers in double precision; frames that no command touches keep their bytes."""
+    """Convert a clip to double precision; frames that no command changes keep their bytes.
+
+    Parameters
+    ----------
+    clip : Clip    F frames
+
+    Returns
+    -------
+    Motion    F frames
+    """
     nothing = np.zeros((clip.frame_count, 0, 3))
     return settled(
         Motion(
@@ -187,9 +268,21 @@ def motion_of(clip: Clip) -> Motion:
 
 
 def settled(motion: Motion) -> Motion:
-    """The motion with rotations of unit length and of continuous sign.
+    """Bring rotations to unit length and continuous sign.
 
-    What is of unit length in single precision stays as it is. Raises `EditError` for rotations that are not finite.
+    Rotations of unit length in single precision stay unchanged.
+
+    Parameters
+    ----------
+    motion : Motion    F frames
+
+    Returns
+    -------
+    Motion    F frames
+
+    Raises
+    ------
+    EditError    for rotations that are not finite
     """
     rotations = motion.rotations
     squares = np.einsum("fjc,fjc->fj", rotations, rotations)
@@ -205,7 +298,16 @@ def settled(motion: Motion) -> Motion:
 
 
 def require_finite(numbers: Floats) -> None:
-    """Refuse frames (F, ...) with a number that is not finite. Raises `EditError`."""
+    """Check that all numbers are finite.
+
+    Parameters
+    ----------
+    numbers : (F, ...) float64    numbers of each frame
+
+    Raises
+    ------
+    EditError    naming the first frame with another one
+    """
     if not np.isfinite(numbers).all():
         frame = int(np.argmin(np.isfinite(numbers.reshape(len(numbers), -1)).all(axis=1)))
         raise EditError(f"frame {frame} gets a number that is not finite", code="edit-not-finite")

@@ -9,7 +9,18 @@ from marey_motion.skeleton import Skeleton
 
 
 def translated(motion: Motion, skeleton: Skeleton, joints: tuple[int, ...]) -> Motion:
-    """The same motion with translations of `joints`, increasing and at least those it has: offsets for the others."""
+    """Add translations for more joints, from their offsets.
+
+    Parameters
+    ----------
+    motion : Motion    F frames
+    skeleton : Skeleton    its skeleton
+    joints : tuple of int    increasing indices, at least those of the joints with translations
+
+    Returns
+    -------
+    Motion    the same motion with translations (F, k, 3) of these joints
+    """
     if joints == motion.translated_joints:
         return motion
     translations = np.empty((motion.frame_count, len(joints), 3))
@@ -19,6 +30,16 @@ def translated(motion: Motion, skeleton: Skeleton, joints: tuple[int, ...]) -> M
 
 
 def with_equal_joints(a: Motion, b: Motion, skeleton: Skeleton) -> tuple[Motion, Motion]:
-    """Two motions of one skeleton, with translations of the same joints."""
+    """Give two motions of one skeleton translations of the same joints.
+
+    Parameters
+    ----------
+    a, b : Motion    the motions
+    skeleton : Skeleton    their skeleton
+
+    Returns
+    -------
+    (Motion, Motion)    the same motions
+    """
     joints = tuple(sorted({*a.translated_joints, *b.translated_joints}))
     return translated(a, skeleton, joints), translated(b, skeleton, joints)

@@ -79,7 +79,16 @@ def result_from_tree(tree: Mapping[str, Any], records: Sequence[TrialRecord] = (
 
 
 def clips_from_tree(tree: Mapping[str, Any]) -> tuple[DatabaseClip, ...]:
-    """Read the clips of an evaluation's document, in the order of their rows."""
+    """Read the clips of an evaluation's document, in the order of their rows.
+
+    Parameters
+    ----------
+    tree : mapping    result of `result_to_tree`
+
+    Returns
+    -------
+    tuple of DatabaseClip    the clips
+    """
     return tuple(DatabaseClip(**{**clip, "tags": tuple(clip["tags"])}) for clip in tree["clips"])
 
 

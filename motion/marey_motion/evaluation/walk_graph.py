@@ -116,6 +116,7 @@ def graph_to_graphml(graph: WalkGraph, trials: Sequence[str] = ()) -> bytes:
     Parameters
     ----------
     graph : WalkGraph    the graph
+    trials : sequence of str    names of the walks; walk0 and so on when empty
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""When feet stand, found so that neither noise nor the rolling of the foot makes them flicker."""
+"""Foot contacts that neither noise nor the rolling of the foot makes flicker."""
 
 from __future__ import annotations
 
@@ -47,7 +47,18 @@ class Stance(NamedTuple):
 
 
 def find_stances(clip: Clip, body: MatchingBody, options: ContactOptions | None = None) -> tuple[list[Stance], ...]:
-    """When the left and when the right foot of a clip stands, in order; a stance may begin or end with the clip."""
+    """Find the stances of the left and the right foot of a clip.
+
+    Parameters
+    ----------
+    clip : Clip    F frames
+    body : MatchingBody    joints of its skeleton
+    options : ContactOptions, optional    limits of speed and duration
+
+    Returns
+    -------
+    (list of Stance, list of Stance)    of each foot, in order; a stance may begin or end with the clip
+    """
     positions = kinematics.global_positions(clip)
     feet = [positions[:, list(pair)] for pair in zip(body.feet, body.toes, strict=True)]
     rate = clip.frame_rate_hz
@@ -55,10 +66,19 @@ def find_stances(clip: Clip, body: MatchingBody, options: ContactOptions | None 
 
 
 def foot_speed(points: NDArray[np.floating], frame_rate_hz: float) -> Floats:
-    """Speed (F,) in m/s of the slowest of a foot's points (F, k, 3), freed of outliers.
+    """Compute the speed of the slowest of a foot's points, without outliers.
 
-    While a foot rolls, its heel turns about the point that stands and its toe lies still, or the other way round: the
-    slower of ankle and toe stays slow from the strike of the heel until the toe leaves the ground.
+    While a foot rolls, its heel turns about the planted point and its toe is still, or the other way round: the slower
+    of ankle and toe stays slow from the strike of the heel until the toe leaves the ground.
+
+    Parameters
+    ----------
+    points : (F, k, 3)    positions of the points, metres
+    frame_rate_hz : float    frames per second
+
+    Returns
+    -------
+    (F,) float64    metres per second
     """
     speed = np.linalg.norm(kinematics.velocities(points, frame_rate_hz), axis=-1).min(axis=1)
     width = 2 * int(0.5 * SMOOTHING_S * frame_rate_hz) + 1
@@ -79,7 +99,17 @@ def _with_hysteresis(values: Floats, low: float, high: float) -> NDArray[np.bool
 
 
 def without_short(states: NDArray[np.bool_], shortest: float) -> NDArray[np.bool_]:
-    """The states (F,) without runs shorter than so many frames; those at the ends may go on outside, and stay."""
+    """Remove short runs; those at the ends may continue outside, and stay.
+
+    Parameters
+    ----------
+    states : (F,) bool    states
+    shortest : float    frames; shorter runs are inverted
+
+    Returns
+    -------
+    (F,) bool    states
+    """
     kept = states.copy()
     for start, end in runs(states):
         if end - start < shortest and start > 0 and end < len(states):
@@ -88,7 +118,16 @@ def without_short(states: NDArray[np.bool_], shortest: float) -> NDArray[np.bool
 
 
 def runs(states: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """The ranges [start, end) in which states (F,) are true."""
+    """List the ranges in which states are true.
+
+    Parameters
+    ----------
+    states : (F,) bool    states
+
+    Returns
+    -------
+    list of (int, int)    ranges [start, end)
+    """
     padded = np.concatenate(([False], states, [False]))
     starts, ends = np.flatnonzero(~padded[:-1] & padded[1:]), np.flatnonzero(padded[:-1] & ~padded[1:])
     return list(zip(starts.tolist(), ends.tolist(), strict=True))

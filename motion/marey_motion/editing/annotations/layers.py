@@ -1,9 +1,9 @@
 """One layer of annotation over a clip, and the commands that change it.
 
-Frames are counted from 0; a segment [start, end) is half open, so its last frame is `end - 1` and segments that follow
-each other share a number: where one ends, the next starts. Segments of a layer do not overlap. Each command answers
-with a new layer or raises `AnnotationError`; segments are named by any frame in them. A command looks only at what it
-changes and at what stands beside that: the rest of a layer is in order already.
+Frames are counted from 0; a segment [start, end) is half open, so its last frame is `end - 1` and adjacent segments
+share a number: where one ends, the next starts. Segments of a layer do not overlap. Each command returns a new layer or
+raises `AnnotationError`; segments are named by any frame in them. A command checks only its changes and their
+neighbours: the rest of a layer is valid already.
 """
 
 from __future__ import annotations
@@ -64,7 +64,20 @@ class Layer:
         _require_keyframes(self.keyframes, self.frame_count)
 
     def segment_at(self, frame: int) -> Segment:
-        """The segment that holds a frame. Raises `AnnotationError` where none does."""
+        """Find the segment that holds a frame.
+
+        Parameters
+        ----------
+        frame : int    frame of the clip
+
+        Returns
+        -------
+        Segment    the segment
+
+        Raises
+        ------
+        AnnotationError    where none does
+        """
         return self.segments[self._index_at(frame)]
 
     def _index_at(self, frame: int) -> int:
@@ -108,7 +121,23 @@ class Layer:
 
 
 def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite: bool = False) -> Layer:
-    """Put [start, end) under a label. With `overwrite` the segments that are there give way, else they forbid it."""
+    """Add the segment [start, end).
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    label : str    its label
+    start, end : int    its frames
+    overwrite : bool    shorten or remove existing segments in its place, else they are an error
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    where it is invalid or overlaps
+    """
     made = Segment(label, start, end)
     first, stop = layer._among(start, end)
     covered = layer.segments[first:stop]
@@ -121,13 +150,42 @@ def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite:
 
 
 def remove_segment(layer: Layer, at: int) -> Layer:
-    """Leave the frames of the segment that holds frame `at` without a label."""
+    """Remove the segment that holds a frame.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    at : int    a frame of the segment
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    where no segment holds the frame
+    """
     index = layer._index_at(at)
     return layer._with(index, index + 1)
 
 
 def split_segment(layer: Layer, at: int, label: str | None = None) -> Layer:
-    """Cut the segment that holds frame `at` in two, of which the second starts there, under `label` if one is given."""
+    """Cut the segment that holds a frame in two, of which the second starts there.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    at : int    first frame of the second part
+    label : str, optional    label of the second part; the same when None
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    where no segment can be split there
+    """
     index = layer._index_at(at)
     segment = layer.segments[index]
     if at == segment.start:
@@ -137,9 +195,23 @@ def split_segment(layer: Layer, at: int, label: str | None = None) -> Layer:
 
 
 def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", "nearest"] = "next") -> Layer:
-    """Make one of the segment that holds frame `at` and its neighbour, under its own label and with the gap between.
+    """Merge the segment that holds a frame with a neighbour, under its own label and with the gap between.
 
-    The nearest neighbour is the one with the smaller gap, the next one where both are as near.
+    The nearest neighbour is the one with the smaller gap, the next one where both are equal.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    at : int    a frame of the segment
+    neighbour : str    "next", "previous" or "nearest"
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    where there is no such segment or neighbour
     """
     index = layer._index_at(at)
     segment = layer.segments[index]
@@ -158,9 +230,24 @@ def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", 
 
 
 def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int) -> Layer:
-    """Let the segment that holds frame `at` start, or end, at another frame.
+    """Move the start or the end of the segment that holds a frame.
 
-    A neighbour that touches this edge follows it, and one that stands in the way gives way, but neither disappears.
+    An adjacent segment follows this edge, and one in its place is shortened, but neither disappears.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    at : int    a frame of the segment
+    edge : str    "start" or "end"
+    to : int    new frame of the edge
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    where a segment would become empty
     """
     index = layer._index_at(at)
     segment = layer.segments[index]
@@ -182,7 +269,22 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
 
 
 def relabel_segment(layer: Layer, at: int, label: str) -> Layer:
-    """Give the segment that holds frame `at` another label."""
+    """Change the label of the segment that holds a frame.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    at : int    a frame of the segment
+    label : str    its new label
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    where no segment holds the frame
+    """
     index = layer._index_at(at)
     return layer._with(index, index + 1, layer.segments[index]._replace(label=label))
 
@@ -191,19 +293,65 @@ def relabel_segment(layer: Layer, at: int, label: str) -> Layer:
 
 
 def add_keyframe(layer: Layer, label: str, frame: int) -> Layer:
-    """Mark a frame."""
+    """Add a keyframe.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    label : str    its label
+    frame : int    its frame
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    where it is invalid or exists
+    """
     made = Keyframe(label, frame)
     place = layer._place_of(made)
     return layer._with_keyframes(place, place, made)
 
 
 def move_keyframe(layer: Layer, label: str, frame: int, to: int) -> Layer:
-    """Mark another frame instead."""
+    """Move a keyframe to another frame.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    label : str    its label
+    frame : int    its frame
+    to : int    its new frame
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    where it does not exist or cannot be there
+    """
     return add_keyframe(remove_keyframe(layer, label, frame), label, to)
 
 
 def remove_keyframe(layer: Layer, label: str, frame: int) -> Layer:
-    """Take a mark away."""
+    """Remove a keyframe.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    label : str    its label
+    frame : int    its frame
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    where it does not exist
+    """
     gone = Keyframe(label, frame)
     place = layer._place_of(gone)
     if gone not in layer.keyframes[place : place + 1]:
@@ -212,7 +360,16 @@ def remove_keyframe(layer: Layer, label: str, frame: int) -> Layer:
 
 
 def clear(layer: Layer) -> Layer:
-    """Take every segment and keyframe away."""
+    """Remove all segments and keyframes.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+
+    Returns
+    -------
+    Layer    an empty layer
+    """
     return Layer(layer.frame_count)
 
 
@@ -235,7 +392,18 @@ COMMANDS: Mapping[str, Callable[..., Layer]] = {
 
 
 def piece_of(layer: Layer, segment: Segment, start: int, end: int) -> Layer:
-    """What the layer says of one of its segments, in a clip of the frames [start, end) that hold it."""
+    """Cut the layer of one segment, for a clip of the frames [start, end) that hold it.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    segment : Segment    one of its segments
+    start, end : int    frames of the clip
+
+    Returns
+    -------
+    Layer    with frames counted from `start`
+    """
     if not 0 <= start <= segment.start < segment.end <= end <= layer.frame_count:
         raise _wrong(segment, "outside-clip", f"the frames {start}:{end} of {layer.frame_count} do not hold it")
     return Layer(

@@ -1,4 +1,4 @@
-"""Where motion pauses, and where a hand arrives: proposals of segments and keyframes, for people to look over."""
+"""Proposals of segments and keyframes where motion pauses and where a hand arrives, for people to review."""
 
 from __future__ import annotations
 
@@ -48,9 +48,19 @@ class PauseOptions:
 
 
 def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: PauseOptions | None = None) -> Layer:
-    """A keyframe `pause` at each minimum of the joints' mean speed, and a segment `movement` from one to the next.
+    """Propose a keyframe `pause` at each minimum of the joints' mean speed, and segments `movement` between them.
 
-    The first segment starts and the last ends with the clip. Without `joints`, the speed of the whole body counts.
+    The first segment starts and the last ends with the clip.
+
+    Parameters
+    ----------
+    clip : Clip    F frames
+    joints : sequence of int    indices of the joints; all when empty
+    options : PauseOptions, optional    limits
+
+    Returns
+    -------
+    Layer    the proposal
     """
     from scipy.signal import find_peaks  # brings all of scipy's signals and statistics: only who needs it shall wait
 
@@ -98,11 +108,26 @@ class ReachOptions:
 
 
 def propose_reaches(clip: Clip, body: MatchingBody, options: ReachOptions | None = None) -> Layer:
-    """A segment `reach_left` or `reach_right` each time a wrist goes far from its place of rest and comes back.
+    """Propose a segment `reach_left` or `reach_right` each time a wrist goes far from its place of rest and returns.
 
-    The place of rest is where the wrist is when the clip begins, as seen from the hips in the direction that the body
-    faces, with height above the ground. A segment lasts from the nearest frame to rest before to the nearest one after.
-    The keyframe `contact` marks the frame at which the hand arrives at its far place, `release` the last one there.
+    The place of rest is the position of the wrist at the start of the clip, as seen from the hips in the direction of
+    the body, with height above the ground. A segment lasts from the nearest frame to rest before to the nearest one
+    after. The keyframe `contact` marks the frame at which the hand arrives at its far place, `release` the last one
+    there.
+
+    Parameters
+    ----------
+    clip : Clip    F frames
+    body : MatchingBody    joints of its skeleton
+    options : ReachOptions, optional    limits
+
+    Returns
+    -------
+    Layer    the proposal
+
+    Raises
+    ------
+    MotionError    where the body has no facing direction or lacks the wrist
     """
     options = options or ReachOptions()
     distances = {side: _distance_from_rest(clip, body, side) for side in SIDES if options.hand in (side, "either")}

@@ -1,4 +1,4 @@
-"""A walk or run cut into its steps: proposals of segments, for people to look over."""
+"""Proposals of segments for the steps of a walk or run, for people to review."""
 
 from __future__ import annotations
 
@@ -58,13 +58,23 @@ class StepOptions:
 
 
 def propose_steps(clip: Clip, body: MatchingBody, options: StepOptions | None = None) -> Layer:
-    """Segments from the contact of one foot to the next contact of the other, named after the foot that swings.
+    """Propose segments from the contact of one foot to the next contact of the other, named after the foot that swings.
 
     `step_left` and `step_right` are steps of a walk, `run_left` and `run_right` those in which no foot touches the
     ground for a time. A step out of standing is a `start_`, which begins where the foot leaves the ground, one into
-    standing a `stop_`, and one that is both a `single_`. `standing` is its own label. Steps that the clip does not hold
-    whole, turns on the spot, jumps, and steps aside and backward get none. The keyframe `passing` marks the frame of
-    each step at which the swinging foot passes the other, where it does.
+    standing a `stop_`, and one that is both a `single_`. `standing` is its own label. Incomplete steps, turns on the
+    spot, jumps, and steps aside and backward get none. The keyframe `passing` marks the frame of each step at which the
+    swinging foot passes the other, where it does.
+
+    Parameters
+    ----------
+    clip : Clip    F frames
+    body : MatchingBody    joints of its skeleton
+    options : StepOptions, optional    limits
+
+    Returns
+    -------
+    Layer    the proposal
     """
     options = options or StepOptions()
     stances = find_stances(clip, body, options.contacts)

@@ -1,1 +1,1 @@
-"""Poses that meet what is asked of joints: by coordinate descent, two bones, or damped least squares."""
+"""Inverse kinematics: poses that meet targets of joints, by coordinate descent, two bones, or damped least squares."""

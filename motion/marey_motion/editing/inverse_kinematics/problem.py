@@ -116,7 +116,7 @@ class IkProblem(NamedTuple):
 
     @property
     def found(self) -> SolverResult:
-        """Empty room for what the solver tells."""
+        """Empty arrays for the results of a solver."""
         frames, count = len(self.roots), len(self.targets.kinds)
         return SolverResult(
             np.zeros((frames, count)), np.zeros((frames, count)), np.zeros(frames, np.int64), np.zeros(frames, np.bool_)
@@ -124,12 +124,21 @@ class IkProblem(NamedTuple):
 
     @property
     def placing(self) -> Placing:
-        """Room for cyclic coordinate descent."""
+        """Scratch arrays for cyclic coordinate descent."""
         room = self._pose_room()
         return Placing(**room, matrix=np.zeros((3, 3)), form=np.zeros((4, 4)), vectors=np.zeros((4, 4)))
 
     def stepping(self, regularisation_m: float) -> Stepping:
-        """Room for least squares."""
+        """Make scratch arrays for least squares.
+
+        Parameters
+        ----------
+        regularisation_m : float    metres that a displacement of one radian counts for
+
+        Returns
+        -------
+        named tuple    scratch arrays
+        """
         movable = int(self.body.movable.sum())
         joints, unknowns, errors = len(self.joints), 3 * movable + 3, 3 * len(self.targets.kinds)
         holding = np.full(unknowns, regularisation_m**2)
@@ -160,7 +169,16 @@ class IkProblem(NamedTuple):
         return {name: np.zeros(shape) for name, shape in (shapes | {"errors": (count, 3)}).items()}
 
     def put_back(self, motion: Motion) -> Motion:
-        """The motion with the poses of this problem."""
+        """Write the poses of this problem into a motion.
+
+        Parameters
+        ----------
+        motion : Motion    F frames
+
+        Returns
+        -------
+        Motion    F frames with the solved joints
+        """
         rotations = motion.rotations.copy()
         rotations[:, self.joints] = self.rotations
         return motion._replace(root_translations=self.roots, rotations=rotations)
@@ -169,9 +187,20 @@ class IkProblem(NamedTuple):
 def pose_problem(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], freedom: Freedom) -> IkProblem:
     """Pack targets for the frames of a motion.
 
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    motion : Motion    F frames
+    targets : sequence of targets    C targets
+    freedom : Freedom    joints that may turn
+
+    Returns
+    -------
+    IkProblem    arrays for the kernels
+
     Raises
     ------
-    EditError    naming the target and what is wrong with it
+    EditError    naming the target and its defect
     """
     for number, target in enumerate(targets):
         if not 0 <= target.joint < skeleton.joint_count:

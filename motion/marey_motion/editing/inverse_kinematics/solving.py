@@ -1,8 +1,8 @@
-"""Inverse kinematics: rotations of joints that bring points, orientations and looks to where they are wanted.
+"""Inverse kinematics: rotations of joints that bring points, orientations and looks to their targets.
 
 Three solvers, each for one frame or many, which are solved one by one: the same frame has the same result alone and
-among others. None returns a pose that misses its targets by more than the one it was given (weighted squares of
-metres, where `ANGLE_LENGTH_M` is a radian); where that pose is outside of limits, than that pose within them.
+among others. None returns a pose that misses its targets by more than the given one (weighted squares of metres, where
+`ANGLE_LENGTH_M` is a radian); where that pose is outside limits, than that pose within them.
 """
 
 from __future__ import annotations
@@ -92,11 +92,19 @@ class _LimbKernel(NamedTuple):
 def limb_ending_at(
     skeleton: Skeleton, mapping: JointMapping, joint: int, axes: Mapping[str, JointAxes] | None = None
 ) -> TwoBoneLimb | None:
-    """The arm or leg whose wrist or ankle the joint is, None for other joints.
+    """Find the arm or leg whose wrist or ankle a joint is.
 
     Parameters
     ----------
-    axes : the joints' axes by name (`rigs.guess_axes`); without them straight limbs do not know where to bend
+    skeleton : Skeleton    J joints
+    mapping : JointMapping    its standard joints
+    joint : int    index of the joint
+    axes : mapping of str to JointAxes, optional    axes by joint name (`rigs.guess_axes`); without them the bending
+        direction of straight limbs is unknown
+
+    Returns
+    -------
+    TwoBoneLimb or None    None for other joints
     """
     for side in ("left", "right"):
         for root, middle, end in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")):
@@ -121,19 +129,27 @@ def solve(
     solver: Solver = "auto",
     options: SolverOptions = _OPTIONS,
 ) -> SolvedPoses:
-    """Bring targets to where they are wanted, by the solver that fits or by the one named.
+    """Bring targets to their values, by the solver that fits or by the one named.
 
     Parameters
     ----------
-    motion : F frames, which stay as they are
-    freedom : what may turn
-    limb : a limb that is to turn. "auto" takes the two-bone solver where there is one, all targets are the position (in
-        all axes) and the orientation of its end, and no limits are asked for; else, and where the limb is too short in
-        any of the frames and more may turn, least squares.
+    skeleton : Skeleton    J joints
+    motion : Motion    F frames, which stay unchanged
+    targets : sequence of targets    C targets
+    freedom : Freedom    joints that may turn
+    limb : TwoBoneLimb, optional    a limb that may turn. "auto" takes the two-bone solver where there is one, all
+        targets are the position (in all axes) and the orientation of its end, and there are no limits; else, and where
+        the limb is too short in any of the frames and more may turn, least squares.
+    solver : str    "auto", "ccd", "two_bone" or "least_squares"
+    options : SolverOptions    tolerances and iterations
+
+    Returns
+    -------
+    SolvedPoses    F frames and the errors before and after
 
     Raises
     ------
-    EditError    naming the target that cannot be asked for, or why the solver does not fit
+    EditError    naming the target that is invalid, or why the solver does not fit
     """
     asked = limb_targets(targets, limb)
     if solver == "two_bone" or (solver == "auto" and asked is not None and not freedom.limits):
@@ -164,13 +180,27 @@ def solve_ccd(
     freedom: Freedom = _ANYWHERE,
     options: SolverOptions = _OPTIONS,
 ) -> SolvedPoses:
-    """Cyclic coordinate descent: joint after joint, from the targets to the root, takes the rotation that is best.
+    """Solve by cyclic coordinate descent: joint after joint, from the targets to the root, takes the best rotation.
 
     For one target that is the shortest rotation that aims at it (Wright 2015); for several, the rotation that solves
-    Wahba's problem for all of them at once (Davenport's q-method); for a hinge, the best angle within its limits.
-    The best pose of all sweeps is returned.
+    Wahba's problem for all of them at once (Davenport's q-method); for a hinge, the best angle within its limits. The
+    best pose of all sweeps is returned.
 
-    Raises `EditError` naming the target that cannot be asked for.
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    motion : Motion    F frames
+    targets : sequence of targets    C targets
+    freedom : Freedom    joints that may turn
+    options : SolverOptions    tolerances and iterations
+
+    Returns
+    -------
+    SolvedPoses    F frames and the errors before and after
+
+    Raises
+    ------
+    EditError    naming the target that is invalid
     """
     from marey_motion.editing.inverse_kinematics import ccd_kernels
 
@@ -191,12 +221,26 @@ def solve_least_squares(
     freedom: Freedom = _ANYWHERE,
     options: SolverOptions = _OPTIONS,
 ) -> SolvedPoses:
-    """Damped least squares over all targets at once, with the analytic Jacobian of rotation-vector displacements.
+    """Solve by damped least squares over all targets, with the analytic Jacobian of rotation-vector displacements.
 
-    Minimises the weighted squares of the errors plus those of the displacements, `regularisation_m` per radian, so
-    that what targets leave open stays as it was. Joints at a limit slide along it.
+    Minimises the weighted squares of the errors plus those of the displacements, `regularisation_m` per radian, so that
+    directions without a target stay unchanged. Joints at a limit slide along it.
 
-    Raises `EditError` naming the target that cannot be asked for.
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    motion : Motion    F frames
+    targets : sequence of targets    C targets
+    freedom : Freedom    joints that may turn
+    options : SolverOptions    tolerances and iterations
+
+    Returns
+    -------
+    SolvedPoses    F frames and the errors before and after
+
+    Raises
+    ------
+    EditError    naming the target that is invalid
     """
     from marey_motion.editing.inverse_kinematics import least_squares_kernels
 
@@ -220,18 +264,30 @@ def solve_two_bone(
     damping_zone_rad: float = 0.0,
     options: SolverOptions = _OPTIONS,
 ) -> SolvedPoses:
-    """The limb's tip brought to `position` in closed form: exact where it can be reached, else stretched towards it.
+    """Bring a limb's tip to a position in closed form: exact where it can be reached, else stretched towards it.
 
     The middle joint opens or closes in the plane of the limb; then the limb is aimed (Lee and Shin 1999, 5.3).
 
     Parameters
     ----------
-    orientation : how the end is to be turned; without it, "carried" leaves its local rotation and "held" its
-        orientation in the world
-    damping_zone_rad : the middle joint's change is damped in so many radians before straight, so that it does not snap
-        (Kovar, Schreiner and Gleicher 2002); a target there is missed by a little
+    skeleton : Skeleton    J joints
+    motion : Motion    F frames
+    limb : TwoBoneLimb    the limb
+    position : PositionTarget    target of its end
+    orientation : OrientationTarget, optional    orientation of the end
+    ending : str    without an orientation, "carried" keeps the end's local rotation and "held" its orientation in the
+        world
+    damping_zone_rad : float    radians before straight in which the middle joint's change is damped, so that it does
+        not snap (Kovar, Schreiner and Gleicher 2002); a target there is missed by a little
+    options : SolverOptions    tolerances
 
-    Raises `EditError` where the joints are no limb or the targets are not of its end.
+    Returns
+    -------
+    SolvedPoses    F frames and the errors before and after
+
+    Raises
+    ------
+    EditError    where the joints form no limb or the targets do not belong to its end
     """
     from marey_motion.editing.inverse_kinematics import two_bone_kernels
 
@@ -301,7 +357,18 @@ def _measure(problem: IkProblem, options: SolverOptions, residuals: Floats, foun
 
 
 def measure_residuals(skeleton: Skeleton, motion: Motion, targets: Sequence[Target]) -> Floats:
-    """What each of C targets is missed by in each of F frames (F, C): metres, or radians."""
+    """Compute the error of each target in each frame.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    motion : Motion    F frames
+    targets : sequence of targets    C targets
+
+    Returns
+    -------
+    (F, C) float64    metres or radians
+    """
     problem = pose_problem(skeleton, motion, targets, _ANYWHERE)
     found = problem.found
     _measure(problem, _OPTIONS, found.before, found)
@@ -311,10 +378,23 @@ def measure_residuals(skeleton: Skeleton, motion: Motion, targets: Sequence[Targ
 def constraint_jacobian(
     skeleton: Skeleton, motion: Motion, targets: Sequence[Target], freedom: Freedom = _ANYWHERE
 ) -> tuple[Floats, Floats, tuple[int, ...]]:
-    """Scaled errors (3·C,) of the first frame, their derivatives (3·C, 3·V + 3) and the V joints these are by.
+    """Compute the scaled errors of the first frame and their derivatives.
 
     Columns are displacements of local rotations, q·exp(d), joint by joint in the order returned, then the root's
     translation, which is left out (zeros) where the root does not move.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    motion : Motion    F frames
+    targets : sequence of targets    C targets
+    freedom : Freedom    joints that may turn
+
+    Returns
+    -------
+    errors : (3·C,) float64    scaled errors
+    derivatives : (3·C, 3·V + 3) float64    by the displacements
+    joints : tuple of int    indices of the V joints
     """
     from marey_motion.editing.inverse_kinematics import least_squares_kernels
 
@@ -327,7 +407,17 @@ def constraint_jacobian(
 def limb_targets(
     targets: Sequence[Target], limb: TwoBoneLimb | None
 ) -> tuple[PositionTarget, OrientationTarget | None] | None:
-    """The position and the orientation asked of a limb's end, None where something else is asked."""
+    """Select the position and the orientation of a limb's end.
+
+    Parameters
+    ----------
+    targets : sequence of targets    the targets
+    limb : TwoBoneLimb or None    the limb
+
+    Returns
+    -------
+    (PositionTarget, OrientationTarget or None) or None    None where there are other targets
+    """
     positions = [target for target in targets if isinstance(target, PositionTarget)]
     orientations = [target for target in targets if isinstance(target, OrientationTarget)]
     fits = len(positions) == 1 and len(orientations) <= 1 and len(positions) + len(orientations) == len(targets)

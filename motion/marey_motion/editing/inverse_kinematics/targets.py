@@ -1,4 +1,4 @@
-"""What inverse kinematics is asked for: targets of joints, limits of joints, and the joints that may turn.
+"""Inputs of inverse kinematics: targets of joints, limits of joints, and the joints that may turn.
 
 Right-handed, Y up, metres, radians; quaternions (w, x, y, z). Targets are in the world, tips and limits in a joint's
 own frame.
@@ -132,7 +132,18 @@ class JointLimit:
     def hinge(
         cls, axes: JointAxes, least_rad: float, greatest_rad: float, reference: ArrayLike = (1.0, 0.0, 0.0, 0.0)
     ) -> JointLimit:
-        """A joint that turns about its swing axis alone, as knees and elbows do."""
+        """Make the limit of a joint that turns only about its swing axis, as knees and elbows do.
+
+        Parameters
+        ----------
+        axes : JointAxes    axes of the joint
+        least_rad, greatest_rad : float    bounds of the angle
+        reference : (4,)    local rotation at angle 0
+
+        Returns
+        -------
+        JointLimit    the limit
+        """
         return cls(axes.swing, axes.twist, (least_rad, greatest_rad), (0.0, 0.0), reference)
 
     @classmethod
@@ -143,7 +154,19 @@ class JointLimit:
         twist_rad: tuple[float, float] = (-math.pi, math.pi),
         reference: ArrayLike = (1.0, 0.0, 0.0, 0.0),
     ) -> JointLimit:
-        """A joint whose bone stays within a cone, round or elliptical, as shoulders and hips do."""
+        """Make the limit of a joint whose bone stays within a cone, round or elliptical, as shoulders and hips do.
+
+        Parameters
+        ----------
+        axes : JointAxes    axes of the joint
+        swing_rad : float or (float, float)    half angle of the cone, or of its two axes
+        twist_rad : (float, float)    bounds of the twist
+        reference : (4,)    local rotation in the middle of the cone
+
+        Returns
+        -------
+        JointLimit    the limit
+        """
         halves = swing_rad if isinstance(swing_rad, tuple) else (swing_rad, swing_rad)
         return cls(axes.twist, axes.swing, twist_rad, halves, reference)
 
@@ -202,7 +225,21 @@ class Freedom:
 
 
 def chain_of(skeleton: Skeleton, effector: int, top: int) -> tuple[int, ...]:
-    """Indices of the joints from `effector` up to `top`, both included. Raises `EditError` where it hangs elsewhere."""
+    """List the joints from one joint up to another.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    effector, top : int    indices of the lower and the upper joint
+
+    Returns
+    -------
+    tuple of int    indices from `effector` to `top`, both included
+
+    Raises
+    ------
+    EditError    where `top` is not above `effector`
+    """
     path = skeleton.path_to_root(effector)
     if top not in path:
         names = skeleton.joint_names
