@@ -15,10 +15,10 @@ from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.modelling.fpca import Keep, find_components
 from marey_motion.modelling.mixture_fitting import fit_mixture, one_thread
-from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.modelling.training import train_primitive
 from marey_motion.rigs import map_joints
+from marey_schemas.options.modelling import ModelOptions
 
 Floats = NDArray[np.float64]
 

@@ -16,18 +16,18 @@ from marey_motion.alignment.aligning import SourceExample, align_clips
 from marey_motion.gait import GaitStyle, generate_gait
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.matching.body import MatchingBody
-from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search.constraints import JointPosition
 from marey_motion.modelling.search.objective import build_objective
 from marey_motion.modelling.search.optimise import RefineOptions, refine
 from marey_motion.modelling.search.samples import search_closely
 from marey_motion.modelling.search.steps import SeveralSteps, Step
-from marey_motion.modelling.search.tree import END_EFFECTORS, SampleTree, TreeOptions, build_tree
+from marey_motion.modelling.search.tree import END_EFFECTORS, SampleTree, build_tree
 from marey_motion.modelling.search.tree_documents import sample_tree_to_tree
 from marey_motion.modelling.training import train_primitive
 from marey_motion.rigs import map_joints
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
+from marey_schemas.options.modelling import ModelOptions, TreeOptions
 
 Floats = NDArray[np.float64]
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from benchmarks.material import real_folder
 from marey_motion.clip import Clip
-from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.suite import assemble, run_suite
 from marey_motion.formats import read_motion
 from marey_motion.gait import generate_dataset
@@ -23,6 +22,7 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.rigs import map_joints
+from marey_schemas.options.evaluation import EvaluationOptions
 
 ONE_SKELETON = ("bandai-namco-1/*.bvh", "bandai-namco-2/*.bvh")
 LEAST_ROWS = 30
@@ -35,7 +35,7 @@ def main(row_count: int, threads: int) -> dict[str, float | str]:
     sources = list(_sources(row_count))
     options = EvaluationOptions()
     # Kernels load and the machine's caches warm up on something small.
-    _evaluate(_database(sources[:3]), replace(options, duration_s=2.0), threads)
+    _evaluate(_database(sources[:3]), options.replace(duration_s=2.0), threads)
     started = time.perf_counter()
     database = _database(sources)
     built = time.perf_counter()

@@ -151,9 +151,9 @@ def _match(clip: Clip) -> None:
     from marey_motion.matching.database import SourceClip
     from marey_motion.matching.display import displayed_clip
     from marey_motion.matching.explain import explain_choice
-    from marey_motion.matching.options import ControllerOptions
     from marey_motion.matching.search import build_index, find_best
     from marey_motion.rigs import map_joints
+    from marey_schemas.options.matching import ControllerOptions
 
     body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
     database = build_database([SourceClip("walk", "walk", clip)], body)
@@ -228,10 +228,11 @@ def _search(clip: Clip) -> None:
     from marey_motion.modelling.search.constraints import RootPosition
     from marey_motion.modelling.search.step_search import search_steps
     from marey_motion.modelling.search.steps import Step
-    from marey_motion.modelling.search.tree import END_EFFECTORS, TreeOptions, build_tree
+    from marey_motion.modelling.search.tree import END_EFFECTORS, build_tree
     from marey_motion.modelling.splines import SplineBasis
     from marey_motion.motion import Motion
     from marey_motion.rigs import map_joints
+    from marey_schemas.options.modelling import TreeOptions
 
     def alone(values: NDArray[np.float64]) -> FunctionalComponents:
         basis = SplineBasis.clamped(len(values), 7)
@@ -244,7 +245,7 @@ def _search(clip: Clip) -> None:
     space, time = alone(poses), alone(np.zeros((len(poses) - 1, 1)))
     primitive = MotionPrimitive("walk", clip.skeleton, clip.frame_rate_hz, space, time, 1.0, mixture)
     joints = {name: clip.skeleton.index_of(joint) for name, joint in map_joints(clip.skeleton).joints.items()}
-    tree = build_tree(primitive, 0, TreeOptions(64), end_effectors=[joints[name] for name in END_EFFECTORS])
+    tree = build_tree(primitive, 0, TreeOptions(samples=64), end_effectors=[joints[name] for name in END_EFFECTORS])
     step = Step(primitive, (RootPosition("end", (0.0, None)),), joints)
     search_steps([step, step], [tree, tree])
 

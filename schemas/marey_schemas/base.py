@@ -1,4 +1,6 @@
-"""The two bases of every document that travels."""
+"""The bases of every document that travels, and of the options of computations."""
+
+from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict
 
@@ -17,3 +19,20 @@ class Answer(BaseModel):
     model_config = ConfigDict(
         extra="ignore", frozen=True, arbitrary_types_allowed=True, populate_by_name=True, serialize_by_alias=True
     )
+
+
+class Options(Request):
+    """Choices that a computation takes: each with its type, range, default and meaning, declared here alone.
+
+    Parameters of jobs embed or extend them, and `marey_motion` takes them as they are. A value out of range raises
+    `pydantic.ValidationError`, which names the field. Instances are frozen, and hashable where their values are.
+    """
+
+    @classmethod
+    def of(cls, extended: BaseModel) -> Self:
+        """Take these options alone out of a model that extends them."""
+        return cls(**{name: getattr(extended, name) for name in cls.model_fields})
+
+    def replace(self, **changes: Any) -> Self:
+        """Copy with other values, which are checked."""
+        return type(self)(**{**dict(self), **changes})

@@ -17,7 +17,7 @@ from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import MAX_JOINTS
 from marey_schemas.encoding.arrays import ArrayOf
 from marey_schemas.names import ItemId, JointName
-from marey_schemas.options.evaluation import Speed, TurnRate
+from marey_schemas.options.evaluation import Grid, Speed, TurnRate
 
 LEAST_FRAME_RATE_HZ, MOST_FRAME_RATE_HZ = 10.0, 240.0
 MOST_CELLS = 2000
@@ -182,17 +182,10 @@ class CoverageStreamState(CoverageStream, CoverageNow):
 # --- what a stream takes of an evaluation's document -----------------------------------------------------------------
 
 
-class MeasuredGrid(Answer):
-    """The speeds and turn rates of an evaluation."""
-
-    speeds_m_s: tuple[Speed, ...] = Field(min_length=1)
-    turn_rates_deg_s: tuple[TurnRate, ...] = Field(min_length=1)
-
-
 class MeasuredOptions(Answer):
     """The options of an evaluation that its coverage depends on."""
 
-    grid: MeasuredGrid
+    grid: Grid
     coverage_least_s: float = Field(gt=0, le=3600)
 
 

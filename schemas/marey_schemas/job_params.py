@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, StringConstraints, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from marey_schemas.base import Request
 from marey_schemas.editing.edits import MOST_COMMANDS, EditCommand
@@ -15,84 +15,60 @@ from marey_schemas.names import (
     MAX_NAME_LENGTH,
     ItemId,
     ItemName,
-    JointName,
     Label,
     LayerName,
     NameSuffix,
     Tag,
     TrialName,
 )
+from marey_schemas.options.alignment import AlignOptions
 from marey_schemas.options.annotations import Proposal, Seconds
-from marey_schemas.options.evaluation import DEFAULT_SPEEDS_M_S, DEFAULT_TURN_RATES_DEG_S, Speed, TurnRate
+from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.options.imports import ImportOptions
-from marey_schemas.options.improvement import ObjectiveParams
-from marey_schemas.options.matching import ControllerParams, DatabaseParams, FeatureWeightParams
+from marey_schemas.options.improvement import OptimisationOptions, SuggestionOptions, SweepOptions
+from marey_schemas.options.matching import FeatureWeights
+from marey_schemas.options.modelling import ModelOptions, TreeOptions
+
+
+class TaggedResults(Request):
+    """Tags of what a job makes."""
+
+    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the results.")
+
+
+class SuffixedResults(TaggedResults):
+    """Names and tags of what a job makes of the items that it takes."""
+
+    suffix: NameSuffix = Field("", description="Appended to the names of the results.")
+
 
 MOST_EXAMPLES = 2000
 """That are all compared with each other, mirrored ones counted."""
-Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
-ReferenceChoice = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 
 
-class AlignParams(Request):
+class AlignParams(AlignOptions, SuffixedResults):
     """Parameters of `align`."""
 
-    suffix: NameSuffix = Field("", description="Appended to the names of the results.")
-    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the results.")
-    reference: ReferenceChoice = Field(
-        "medoid",
-        description="Whose time is the canonical time: medoid (the clip nearest to all others), nearest_mean_length, "
-        "or the id of a clip.",
-    )
-    rate_hz: float | None = Field(
-        None,
-        gt=0,
-        le=1000,
-        allow_inf_nan=False,
-        description="Of canonical frames; default: that of the reference where it is named, else the commonest one.",
-    )
     layer: LayerName | None = Field(
-        None, description="Layer of the annotations to go by; default: the only one that a clip has among the input."
+        None, description="Layer of the annotations to use; absent: the only one that a clip has among the input."
     )
     labels: tuple[Label, ...] = Field(
         (), max_length=1000, description="Labels whose segments and keyframes cut the clips; none: all of them."
     )
-    slope_limit: int | None = Field(
-        3, ge=0, le=60, description="So many frames in a row of one clip may belong to one of the other; null: any."
-    )
-    cost: Literal["turned", "plain"] = Field(
-        "turned",
-        description="turned: poses are compared after the best turn and shift on the ground; plain: as they are.",
-    )
-    window: int = Field(1, ge=1, le=61, description="Odd number of frames that are compared at once.")
-    weights: dict[JointName, Weight] = Field(
-        default_factory=dict,
-        max_length=4096,
-        description="Weight in the cost by joint, under its own or its standard name; others count 1.",
-    )
-    mirroring: Literal["none", "add"] = Field("none", description="add: a mirrored twin of every clip beside it.")
-    keep_height: bool = Field(True, description="Leave heights above the floor as they are.")
-
-    @field_validator("window")
-    @classmethod
-    def _check_window(cls, window: int) -> int:
-        if window % 2 == 0:
-            raise ValueError("must be odd: as many frames before as after")
-        return window
+    mirroring: Literal["none", "add"] = Field("none", description="add: a mirrored copy of every clip beside it.")
 
 
 _NAME_FIELD = re.compile(r"\{(clip|label|number)(?::([1-9]))?\}")
 
 
-class AnnotateParams(Request):
+class AnnotateParams(TaggedResults):
     """Parameters of `annotate`."""
 
     proposal: Proposal = Field(description="Method that proposes segments and keyframes, with its options.")
     layer: LayerName | None = Field(None, description="Name of the layer; default: that of the method.")
-    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the annotations.")
 
 
-class CutParams(Request):
+class CutParams(TaggedResults):
     """Parameters of `cut`."""
 
     layer: LayerName | None = Field(None, description="Only annotations of this layer.")
@@ -110,7 +86,6 @@ class CutParams(Request):
         description="Names of the pieces; {number:2} counts the segments of a label in a clip from 1, in two digits.",
     )
     by_label: bool = Field(False, description="Put the pieces of each label into a folder of its own.")
-    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the pieces.")
 
     @field_validator("name")
     @classmethod
@@ -146,31 +121,10 @@ TRIALS_PER_TASK = 8
 MOST_EVALUATION_TASKS = 64
 
 
-class EvaluateParams(Request):
+class EvaluateParams(EvaluationOptions, TaggedResults):
     """Parameters of `evaluate`."""
 
     name: ItemName = Field("evaluation", description="Name of the result.")
-    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the result.")
-    speeds_m_s: tuple[Speed, ...] = Field(
-        DEFAULT_SPEEDS_M_S, min_length=1, max_length=200, description="Speeds of the trials, each with each turn rate."
-    )
-    turn_rates_deg_s: tuple[TurnRate, ...] = Field(
-        DEFAULT_TURN_RATES_DEG_S, min_length=1, max_length=200, description="Turn rates, positive to the left."
-    )
-    families: tuple[Literal["circle", "switching"], ...] = Field(
-        ("circle", "switching"), min_length=1, max_length=2, description="switching: the speed changes on the circle."
-    )
-    approach_s: float = Field(3.0, ge=0, le=60, allow_inf_nan=False, description="Straight ahead before the circle.")
-    duration_s: float = Field(30.0, ge=1, le=600, allow_inf_nan=False, description="Of the circle.")
-    switch_speed_m_s: Speed = Field(4.0, description="The other speed of switching trials.")
-    switch_every_s: float = Field(5.0, ge=0.5, le=600, allow_inf_nan=False, description="How long each speed lasts.")
-    window: Literal["circle", "all"] = Field("circle", description="all: the approach is measured, too.")
-    coverage_least_s: float = Field(
-        1.0, gt=0, le=3600, allow_inf_nan=False, description="Seconds of data that a cell needs to count as covered."
-    )
-    literal_formulas: bool = Field(False, description="Add what the published formulas say to the letter.")
-    database: DatabaseParams = DatabaseParams()
-    controller: ControllerParams = ControllerParams()
     loops: tuple[ItemId, ...] = Field(
         (), max_length=100_000, description="Clips that are loops, besides those whose info has the tag `loop`."
     )
@@ -190,10 +144,6 @@ class EvaluateParams(Request):
 
     @model_validator(mode="after")
     def _check_size(self) -> Self:
-        for name in ("speeds_m_s", "turn_rates_deg_s", "families"):
-            values = getattr(self, name)
-            if len(set(values)) != len(values):
-                raise ValueError(f"{name}: the same value stands twice")
         if self.trial_count > MOST_TRIALS:
             raise ValueError(
                 f"these speeds, turn rates and families make {self.trial_count} trials, over {MOST_TRIALS}"
@@ -215,8 +165,8 @@ def count_evaluation_tasks(params: EvaluateParams) -> int:
     return -(-params.trial_count // per_task)
 
 
-WEIGHT_GROUPS = len(FeatureWeightParams.model_fields)
-Factor = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
+WEIGHT_GROUPS = len(FeatureWeights.model_fields.keys() - {"extra_joints"})
+"""Groups of every database; the settings of extra joints, where there are any, are spread over the same tasks."""
 
 
 class CompareParams(Request):
@@ -226,60 +176,16 @@ class CompareParams(Request):
     report: bool = Field(True, description="Write the report, a page of HTML that needs nothing else.")
 
 
-class SuggestParams(Request):
+class SuggestParams(SuggestionOptions):
     """Parameters of `suggest`."""
 
-    objective: ObjectiveParams = ObjectiveParams()
-    removals: int = Field(
-        10,
-        ge=0,
-        le=1000,
-        description="How many removals to plan after one another, once unused clips are gone; 0: none.",
-    )
-    consider: int | None = Field(
-        50, ge=0, le=100_000, description="Leave out in turn only so many clips, those that fewest trials need."
-    )
-    duplicate_cm: float = Field(
-        3.0, ge=0, le=100, allow_inf_nan=False, description="Clips up to so far apart per frame are near-duplicates."
-    )
-    blendable_m: float | None = Field(
-        None,
-        gt=0,
-        le=100,
-        allow_inf_nan=False,
-        description="Poses up to so far apart, summed over joints, blend; default: the median of the trials' switches.",
-    )
 
-
-class OptimiseParams(Request):
+class OptimiseParams(OptimisationOptions):
     """Parameters of `optimise`."""
 
-    objective: ObjectiveParams = ObjectiveParams()
-    least_gain: float = Field(
-        1e-4, ge=0, le=1000, allow_inf_nan=False, description="End when no step lowers the objective by so many metres."
-    )
-    max_steps: int = Field(50, ge=1, le=10_000, description="End after so many steps.")
-    max_evaluations: int | None = Field(
-        None, ge=1, le=1_000_000, description="End after so many sets of clips were tried."
-    )
-    max_data_s: float | None = Field(
-        None, gt=0, le=1e7, allow_inf_nan=False, description="Add nothing that makes the set longer, in seconds."
-    )
-    consider: int | None = Field(
-        20, ge=1, le=100_000, description="Try only so many removals and so many additions in each step."
-    )
 
-
-class SweepParams(Request):
+class SweepParams(SweepOptions):
     """Parameters of `sweep`."""
-
-    objective: ObjectiveParams = ObjectiveParams()
-    factors: tuple[Factor, ...] = Field(
-        (0.5, 2.0),
-        min_length=1,
-        max_length=20,
-        description="Each group of features is matched with its weight times each of these, all others as they are.",
-    )
 
 
 def count_sweep_tasks(params: SweepParams) -> int:
@@ -287,69 +193,25 @@ def count_sweep_tasks(params: SweepParams) -> int:
     return 1 + WEIGHT_GROUPS * len(params.factors)
 
 
-Share = Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)]
-
-
-class ModelParams(Request):
+class ModelParams(ModelOptions, TaggedResults):
     """Parameters of `model`."""
 
     name: ItemName = Field("model", description="Name of the result, and of the action.")
-    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the result.")
-    scaling: Literal["jacobian", "root_max", "sfpca", "none"] = Field(
-        "jacobian",
-        description="How channels are weighed. jacobian: by how far they move the body; sfpca: optimised for the "
-        "positions of joints; root_max: root axes to a maximum of 1; none: as they are.",
-    )
-    inner_product: Literal["coefficients", "l2"] = Field(
-        "coefficients", description="l2: integrals of products of functions, which do not depend on the knots."
-    )
-    spatial_share: Share = Field(0.95, description="Share of the variance that the spatial components hold.")
-    spatial_components: int | None = Field(None, ge=0, le=1000, description="Exactly so many, in place of the share.")
-    spatial_coefficients: int | None = Field(
-        None, ge=4, le=10_000, description="Of each channel's spline; default: a fifth of the frames, at least 7."
-    )
-    temporal_share: Share = Field(0.99, description="Share of the variance that the time components hold.")
-    most_temporal_components: int = Field(3, ge=0, le=1000, description="The time components are at most so many.")
-    temporal_coefficients: int = Field(8, ge=4, le=1000, description="Of the spline of the time function.")
-    temporal_weight: float | None = Field(
-        None, ge=1e-3, le=1e3, allow_inf_nan=False, description="Of time in latent vectors; default: as much as space."
-    )
-    criterion: Literal["bic", "aic"] = Field("bic", description="What chooses the number of mixture components.")
-    most_mixture_components: int = Field(10, ge=1, le=100, description="Tried at most.")
-    mixture_components: int | None = Field(None, ge=1, le=100, description="Exactly so many, in place of a choice.")
-    regularisation: float = Field(
-        1e-4, ge=1e-12, le=1, allow_inf_nan=False, description="Added to variances, as a share of the mean variance."
-    )
-    starts: int = Field(5, ge=1, le=100, description="Of expectation maximisation; the best counts.")
-    leave_one_out: bool = Field(True, description="Measure how well each example is reconstructed by the others.")
-    folds: int = Field(5, ge=0, le=100, description="Parts held out in turn for likelihoods; 0: none.")
-    report_samples: int = Field(200, ge=0, le=10_000, description="Drawn to measure feet and durations.")
     report: bool = Field(True, description="Write the report and its figures.")
     search_check: bool = Field(
         True, description="For the report: search for places that examples reached, by a model without them."
     )
 
 
-MOST_TREE_SAMPLES = 100_000
-
-
-class TreeParams(Request):
+class TreeParams(TreeOptions):
     """Parameters of `tree`."""
-
-    samples: int = Field(10_000, ge=1, le=MOST_TREE_SAMPLES, description="Drawn from the model.")
-    branching: int = Field(4, ge=2, le=64, description="Children of a node, at most.")
-    leaf_size: int = Field(1, ge=1, le=MOST_TREE_SAMPLES, description="Nodes of so few samples are not split.")
-    depth: int = Field(64, ge=1, le=64, description="Levels below the root, at most.")
-    features: Literal["end_effectors", "latent"] = Field(
-        "end_effectors", description="What is grouped: where hands, feet and head are, or the spatial scores."
-    )
 
     def unclear_place(self, into: str) -> str | None:
         """Why the tree cannot go into this collection."""
         return f"a tree becomes a part of its model and cannot go to {into}; leave `into` empty" if into else None
 
 
-class EditParams(Request):
+class EditParams(SuffixedResults):
     """Parameters of `edit`."""
 
     commands: tuple[EditCommand, ...] = Field(
@@ -358,8 +220,6 @@ class EditParams(Request):
     in_place: bool = Field(
         False, description="Make each result the next revision of its clip; otherwise it is a clip of its own."
     )
-    suffix: NameSuffix = Field("", description="Appended to the names.")
-    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the results.")
 
     @model_validator(mode="after")
     def _check_place(self) -> Self:
@@ -382,12 +242,10 @@ class ImportParams(ImportOptions):
     files: tuple[ImportFile, ...] = Field(min_length=1, max_length=10_000, description="Names and digests.")
 
 
-class RetargetParams(Request):
+class RetargetParams(SuffixedResults):
     """Parameters of `retarget`."""
 
     scale: float | None = Field(None, gt=0, lt=1000, description="Root scale; absent: ratio of the hip heights.")
-    suffix: NameSuffix = Field("", description="Appended to the names of the results.")
-    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the results.")
 
 
 class ExportParams(Request):

@@ -14,8 +14,8 @@ from marey_motion.looping import rotated
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase, SourceClip
-from marey_motion.matching.options import DatabaseOptions
 from marey_motion.rigs import map_joints
+from marey_schemas.options.matching import DatabaseOptions
 
 SUBJECTS = ("02", "05", "07", "09", "16")
 SWAY_DEG = 50.0  # by which a trunk turns to and fro in a dash: takes begin and end within a stride

@@ -13,10 +13,11 @@ from marey_motion.documents import skeleton_to_document
 from marey_motion.modelling.primitive_documents import primitive_to_tree
 from marey_motion.modelling.search.constraints import JointPosition
 from marey_motion.modelling.search.steps import SeveralSteps, Step
-from marey_motion.modelling.search.tree import END_EFFECTORS, TreeOptions, build_tree
+from marey_motion.modelling.search.tree import END_EFFECTORS, build_tree
 from marey_motion.modelling.search.tree_documents import sample_tree_to_tree
 from marey_motion.modelling.search.work import drawing_work, searching_work
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
+from marey_schemas.options.modelling import TreeOptions
 from marey_server.motions import search_answers, searching
 
 MODELS = "/projects/lab/models"

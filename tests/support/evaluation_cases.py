@@ -11,9 +11,9 @@ from marey_motion.gait import studio_skeleton
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 from marey_motion.matching.normaliser import Normaliser
-from marey_motion.matching.options import DatabaseOptions
 from marey_motion.matching.record import Status, TrialRecord
 from marey_motion.rigs import map_joints
+from marey_schemas.options.matching import DatabaseOptions
 
 RATE_HZ = 60.0
 

@@ -6,15 +6,17 @@ import numpy as np
 
 from marey_motion.evaluation.coverage import Windows, coverage_of
 from marey_motion.evaluation.metrics import measure_trial, pooled_metrics
-from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.relevance import count_switches, measure_usage
 from marey_motion.evaluation.result import EvaluationResult, Provenance
 from marey_motion.evaluation.scenario import reference, suite_trials
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import Status, TrialRecord
+from marey_schemas.options.evaluation import EvaluationOptions
 
 RATE_HZ = 60.0
-SMALL = EvaluationOptions(grid=Grid((1.0, 2.0, 3.0), (-100.0, -50.0, 0.0, 50.0, 100.0)), duration_s=12.0)
+SMALL = EvaluationOptions(
+    speeds_m_s=(1.0, 2.0, 3.0), turn_rates_deg_s=(-100.0, -50.0, 0.0, 50.0, 100.0), duration_s=12.0
+)
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.controller import run_trial
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 from marey_motion.matching.normaliser import Normaliser
-from marey_motion.matching.options import ControllerOptions, DatabaseOptions
 from marey_motion.matching.record import Status, TrialRecord
 from marey_motion.matching.search import SearchIndex, build_index
 from marey_motion.rigs import map_joints
+from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
 
 FOLLOWS = ("time", "path", "open_loop")
 EXACT = ControllerOptions(root_inertialisation=False)

@@ -12,7 +12,7 @@ import numpy as np
 
 from marey_motion.evaluation.scenario import Reference
 from marey_motion.matching.database import MatchingDatabase
-from marey_motion.matching.options import ControllerOptions
+from marey_schemas.options.matching import ControllerOptions
 
 
 @dataclass

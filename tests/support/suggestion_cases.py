@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 from tests.support.made_databases import arc_track, made_database, mirrored_track, random_tracks
 
-from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.evaluation.suite import assemble, run_suite
+from marey_schemas.options.evaluation import EvaluationOptions
 
 OPTIONS = EvaluationOptions(
-    grid=Grid((1.0, 2.0), (-50.0, 0.0, 50.0)), approach_s=2.0, duration_s=6.0, families=("circle",)
+    speeds_m_s=(1.0, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), approach_s=2.0, duration_s=6.0, families=("circle",)
 )
 UNWANTED = ("fast_000", "fast_001")
 

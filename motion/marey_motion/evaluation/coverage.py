@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.result import Coverage
 from marey_motion.matching.database import MatchingDatabase
+from marey_schemas.options.evaluation import EvaluationOptions, Grid
 
 WINDOW_S = 1.0
 SPEED_STEP_M_S, TURN_RATE_STEP_DEG_S = 0.25, 25.0
@@ -122,9 +122,8 @@ def coverage_of(
     -------
     Coverage    windows and seconds per cell
     """
-    grid = options.grid
-    speed_edges = cell_edges(grid.speeds_m_s, SPEED_STEP_M_S)
-    turn_edges = cell_edges(grid.turn_rates_deg_s, TURN_RATE_STEP_DEG_S)
+    speed_edges = cell_edges(options.speeds_m_s, SPEED_STEP_M_S)
+    turn_edges = cell_edges(options.turn_rates_deg_s, TURN_RATE_STEP_DEG_S)
     turn_rates = np.degrees(windows.turn_rate_rad_s)
     seconds = window_s * cell_counts(windows.speed_m_s, speed_edges, turn_rates, turn_edges)
     deficit = cell_deficits(seconds, options.coverage_least_s, window_s)

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from marey_motion.arrays import Flags, Floats
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.result import Metrics, TrialResult
 from marey_motion.evaluation.scenario import TIME_TOLERANCE_S, Reference, Trial
 from marey_motion.matching.record import Status, TrialRecord
+from marey_schemas.options.evaluation import EvaluationOptions, Grid
 
 REGIMES = ("approach", "base", "switched")
 RESPONSE_SHARE = 0.1
@@ -127,7 +127,7 @@ def measure_trial(trial: Trial, reference: Reference, record: TrialRecord, optio
     window = np.full(len(series.times_s), True) if options.window == "all" else series.pieces >= 0
     metrics = _metrics(series, record, window)
     if options.literal_formulas:
-        metrics |= _literal_metrics(series, window, options.grid)
+        metrics |= _literal_metrics(series, window, options)
     regimes = {}
     present = np.unique(series.regimes[window]).tolist()
     for regime in present if len(present) > 1 else ():

@@ -25,11 +25,11 @@ from marey_motion.evaluation.coverage import (
     cell_edges,
 )
 from marey_motion.evaluation.live_windows import LiveWindows
-from marey_motion.evaluation.options import Grid
 from marey_motion.evaluation.scenario import Reference, Trial, reference
 from marey_motion.kinematics import SHORTEST_LATERAL_M, forward_vectors
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
+from marey_schemas.options.evaluation import Grid
 
 MOST_CELLS = 2000
 FARTHEST_M = 1e6
@@ -255,7 +255,7 @@ class OnlineCoverage:
         -------
         OnlineCoverage    continues with the next frame
         """
-        grid = Grid(tuple(tree["speeds_m_s"]), tuple(tree["turn_rates_deg_s"]))
+        grid = Grid(speeds_m_s=tree["speeds_m_s"], turn_rates_deg_s=tree["turn_rates_deg_s"])
         online = cls(tree["live"]["rate_hz"], grid, least_s=tree["least_s"], seconds=tree["before_s"])
         online._live = LiveWindows.from_tree(tree["live"])
         online.counts[...] = tree["counts"]

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.result import Provenance
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 from marey_motion.version import code_version
+from marey_schemas.base import Options
+from marey_schemas.options.evaluation import EvaluationOptions
 
 
 def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials: Sequence[Trial]) -> Provenance:
@@ -99,6 +100,8 @@ def _digest(value: Any) -> str:
 
 def _canonical(value: Any) -> Any:
     """Plain values with one spelling per number: 3 and 3.0 are the same option, and -0.0 is 0.0."""
+    if isinstance(value, Options):
+        return _canonical(value.model_dump())
     if is_dataclass(value) and not isinstance(value, type):
         return _canonical(asdict(value))
     if isinstance(value, Mapping):

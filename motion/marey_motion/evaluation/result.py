@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import TrialRecord
+from marey_schemas.options.evaluation import EvaluationOptions
 
 Metrics = Mapping[str, float | None]
 """Value by name, in the unit the name ends with; None where it is not defined, as a response time that never came."""

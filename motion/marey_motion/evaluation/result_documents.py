@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.result import ClipUsage, Coverage, EvaluationResult, Provenance, TrialResult
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import DatabaseClip
-from marey_motion.matching.options import ControllerOptions, DatabaseOptions, FeatureWeights
 from marey_motion.matching.record import TrialRecord
+from marey_schemas.options.evaluation import EvaluationOptions, Grid
 
 EVALUATION_SCHEMA = "marey/evaluation@1"
 RECORDS_SCHEMA = "marey/evaluation-records@1"
@@ -39,7 +38,7 @@ def result_to_tree(result: EvaluationResult) -> Tree:
 
 def _result_body(result: EvaluationResult) -> Tree:
     return {
-        "options": _plain(asdict(result.options)),
+        "options": _options_to_tree(result.options),
         "provenance": _plain(asdict(result.provenance)),
         "clips": [_plain(asdict(clip)) for clip in result.clips],
         "trials": [
@@ -119,20 +118,19 @@ def options_from_tree(tree: Mapping[str, Any]) -> EvaluationOptions:
     Returns
     -------
     EvaluationOptions    the options
+
+    Raises
+    ------
+    ValidationError    for values out of range
     """
-    database = dict(tree["database"])
-    database["weights"] = FeatureWeights(**database["weights"])
-    for name in ("horizons_s", "extra_joints"):
-        database[name] = tuple(database[name])
-    return EvaluationOptions(
-        **{
-            **tree,
-            "grid": Grid(**{name: tuple(values) for name, values in tree["grid"].items()}),
-            "families": tuple(tree["families"]),
-            "database": DatabaseOptions(**database),
-            "controller": ControllerOptions(**tree["controller"]),
-        }
-    )
+    flat = {**tree, **tree["grid"]}
+    return EvaluationOptions.model_validate({name: flat[name] for name in EvaluationOptions.model_fields})
+
+
+def _options_to_tree(options: EvaluationOptions) -> Tree:
+    """Options with the speeds and turn rates of the trials under `grid`."""
+    tree = _plain(options.model_dump())
+    return {"grid": {name: tree.pop(name) for name in Grid.model_fields}, **tree}
 
 
 def _usage(tree: Mapping[str, Any], clips: Sequence[DatabaseClip]) -> tuple[ClipUsage, ...]:

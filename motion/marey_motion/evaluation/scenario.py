@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.options import EvaluationOptions, Family
-from marey_motion.matching.options import TICK_RATE_HZ
+from marey_schemas.options.evaluation import EvaluationOptions, Family
+from marey_schemas.options.matching import TICK_RATE_HZ
 
 LOOK_AHEAD_S = 1.0
 # A boundary belongs to the tick that it falls on, however its time in seconds is rounded.
@@ -110,8 +110,8 @@ def suite_trials(options: EvaluationOptions) -> tuple[Trial, ...]:
             switch_every_s=options.switch_every_s,
         )
         for family in options.families
-        for speed in options.grid.speeds_m_s
-        for turn_rate in options.grid.turn_rates_deg_s
+        for speed in options.speeds_m_s
+        for turn_rate in options.turn_rates_deg_s
     )
     require_names(trials)
     return trials

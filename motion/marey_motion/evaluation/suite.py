@@ -15,7 +15,6 @@ from math import radians
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.metrics import measure_trial, offset_asymmetry, pooled_metrics
-from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.provenance import provenance_of
 from marey_motion.evaluation.relevance import count_switches, measure_usage, treading_share, unused_clips
 from marey_motion.evaluation.result import EvaluationResult, TrialResult
@@ -35,6 +34,7 @@ from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.record import TrialRecord
 from marey_motion.matching.search import SearchIndex, build_index
 from marey_motion.rigs import map_joints
+from marey_schemas.options.evaluation import EvaluationOptions
 
 ProgressCallback = Callable[[int, int, str], None]
 CancelCallback = Callable[[], bool]
@@ -297,13 +297,13 @@ def baseline_clips(options: EvaluationOptions) -> tuple[list[SourceClip], list[s
     clips : list of SourceClip    the gaits
     notes : list of str    pairs that nobody can walk
     """
-    speeds = set(options.grid.speeds_m_s)
+    speeds = set(options.speeds_m_s)
     if "switching" in options.families:
         speeds.add(options.switch_speed_m_s)
     clips: list[SourceClip] = []
     notes: list[str] = []
     for speed in sorted(speeds):
-        for turn_rate in sorted(set(options.grid.turn_rates_deg_s)):
+        for turn_rate in sorted(set(options.turn_rates_deg_s)):
             name = f"v={speed:g} w={turn_rate:g}"
             try:
                 clip = generate_gait(speed, radians(turn_rate), BASELINE_CLIP_S, options.database.rate_hz)
@@ -333,4 +333,4 @@ def baseline_database(options: EvaluationOptions) -> tuple[MatchingDatabase, lis
         raise MotionError("no generated clip can do what the grid asks", where="grid")
     skeleton = clips[0].clip.skeleton
     body = MatchingBody.from_mapping(skeleton, map_joints(skeleton))
-    return build_database(clips, body, replace(options.database, mirroring="none")), notes
+    return build_database(clips, body, options.database.replace(mirroring="none")), notes

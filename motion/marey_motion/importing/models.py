@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from pydantic import ValidationError
+
 from marey_motion.errors import FormatError
 from marey_motion.formats.predecessor.documents import model_name
 from marey_motion.formats.predecessor.graph import graph_of_document
@@ -22,13 +24,13 @@ from marey_motion.importing.files import (
 from marey_motion.importing.source import SourceDocument
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.primitive_documents import primitive_to_tree
-from marey_motion.modelling.search.tree import TreeOptions
 from marey_motion.modelling.search.tree_documents import sample_tree_to_tree
 from marey_motion.skeleton import same_hierarchy
 from marey_schemas.documents.originals import original_of
 from marey_schemas.documents.references import PartDigestRef
 from marey_schemas.imports import skeleton_output
 from marey_schemas.kinds import Kind
+from marey_schemas.options.modelling import TreeOptions
 
 
 def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
@@ -78,10 +80,13 @@ def _imported_tree(data: bytes, file: FileToImport, primitive: MotionPrimitive) 
     if tree.dimensions != primitive.dimensions:
         message = f"its samples have {tree.dimensions} numbers, those of {file.planned.name} {primitive.dimensions}"
         raise FormatError(message, code="tree-of-another-model", file=name)
-    options = TreeOptions(
-        samples=len(tree.samples),
-        branching=max(2, int(tree.children.max())),
-        leaf_size=int(tree.sizes[tree.children == 0].max()),
-        features="latent",
-    )
+    try:
+        options = TreeOptions(
+            samples=len(tree.samples),
+            branching=max(2, int(tree.children.max())),
+            leaf_size=int(tree.sizes[tree.children == 0].max()),
+            features="latent",
+        )
+    except ValidationError as error:
+        raise FormatError(f"the tree is too large: {error}", code="tree-options", file=name) from error
     return sample_tree_to_tree(tree, model_digest=PartDigestRef(digest_of="model"), seed=0, options=options)

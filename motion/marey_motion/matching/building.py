@@ -18,9 +18,9 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.database import DatabaseClip, DatabaseNote, MatchingDatabase, SourceClip
 from marey_motion.matching.features import FeatureLayout, feature_layout
 from marey_motion.matching.normaliser import Normaliser, fit_normaliser
-from marey_motion.matching.options import DatabaseOptions
 from marey_motion.matching.preparing import PreparedClip, mirror_prepared, prepare_clip
 from marey_motion.matching.rows import ClipRows, clip_rows
+from marey_schemas.options.matching import DatabaseOptions
 from marey_schemas.wording import counted
 
 MOST_MATCHED_JOINTS = 5

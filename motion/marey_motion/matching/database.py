@@ -13,7 +13,7 @@ from marey_motion.clip import Clip
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.features import FeatureLayout, feature_layout
 from marey_motion.matching.normaliser import Normaliser
-from marey_motion.matching.options import DatabaseOptions
+from marey_schemas.options.matching import DatabaseOptions
 
 NOTES = {
     "rest-pose-dropped": "The clip begins or ends with a rest pose, which was left out.",

@@ -11,8 +11,8 @@ from marey_motion.clip import Clip
 from marey_motion.kinematics import as_kernel_input, forward_kinematics
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.inertialisation import decay_matrix
-from marey_motion.matching.options import ControllerOptions
 from marey_motion.matching.record import TrialRecord
+from marey_schemas.options.matching import ControllerOptions
 
 
 def displayed_clip(database: MatchingDatabase, record: TrialRecord, options: ControllerOptions) -> Clip:

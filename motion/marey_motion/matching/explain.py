@@ -12,9 +12,9 @@ from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.matching.controller import Guide, Playback, Rules, Wish, playback_of, rules_of, wish_of
 from marey_motion.matching.database import MatchingDatabase
-from marey_motion.matching.options import ControllerOptions
 from marey_motion.matching.record import TrialRecord
 from marey_motion.matching.search import SearchIndex
+from marey_schemas.options.matching import ControllerOptions
 
 Reason = Literal["started", "not_searched", "continued", "switched", "clip_ended"]
 

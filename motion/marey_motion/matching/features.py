@@ -13,8 +13,8 @@ from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.looping import loop_seam, moves_of_rounds, rotated
 from marey_motion.matching.body import MatchingBody
-from marey_motion.matching.options import DatabaseOptions
 from marey_motion.matching.simulation_root import SimulationRoot
+from marey_schemas.options.matching import DatabaseOptions
 
 
 class FeatureGroup(NamedTuple):
@@ -69,10 +69,9 @@ def feature_layout(options: DatabaseOptions, body: MatchingBody) -> FeatureLayou
 
     Raises
     ------
-    MotionError    for a joint that the body lacks, a weight below 0, and horizons that are less than a frame ahead or
-        apart
+    MotionError    for a joint that the body lacks
     """
-    _check(options, body)
+    _require_joints(options, body)
     weights = options.weights
     left, right = body.feet
     blocks: list[tuple[str, Sequence[str], float, int | None]] = [
@@ -96,20 +95,7 @@ def feature_layout(options: DatabaseOptions, body: MatchingBody) -> FeatureLayou
     return FeatureLayout(tuple(groups), tuple(names), tuple(options.horizons_s))
 
 
-def _check(options: DatabaseOptions, body: MatchingBody) -> None:
-    for field, weight in vars(options.weights).items():
-        if not (np.isfinite(weight) and weight >= 0.0):
-            raise MotionError(f"a weight of {weight} must be 0 or more", where=f"weights.{field}")
-    horizons = np.asarray(options.horizons_s, dtype=np.float64)
-    if not (np.isfinite(options.rate_hz) and options.rate_hz > 0):
-        raise MotionError(f"a rate of {options.rate_hz} must be a positive number", where="rate_hz")
-    if not horizons.size or not np.all(np.isfinite(horizons)) or np.any(np.diff(horizons, prepend=0.0) <= 0.0):
-        raise MotionError("horizons must be seconds ahead, in increasing order", where="horizons_s")
-    if np.any(np.diff(np.round(horizons * options.rate_hz), prepend=0.0) < 1.0):
-        raise MotionError(
-            f"horizons must be a frame (1/{options.rate_hz:g} s) or more ahead and apart, or they see the same",
-            where="horizons_s",
-        )
+def _require_joints(options: DatabaseOptions, body: MatchingBody) -> None:
     missing = [name for name in options.extra_joints if name not in body.standard_joints]
     if missing:
         raise MotionError(
@@ -117,8 +103,6 @@ def _check(options: DatabaseOptions, body: MatchingBody) -> None:
             code="unknown-joint",
             where="extra_joints",
         )
-    if len(set(options.extra_joints)) < len(options.extra_joints):
-        raise MotionError("a joint is named twice", where="extra_joints")
 
 
 def in_root_frame(points: Floats, root: SimulationRoot) -> Floats:

@@ -15,12 +15,12 @@ from marey_motion.importing.landmarks import Landmarks
 from marey_motion.looping import LoopSeam, loop_seam
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.database import DatabaseNote, SourceClip
-from marey_motion.matching.options import DatabaseOptions
 from marey_motion.matching.simulation_root import bone_root, raw_root
 from marey_motion.mirroring import mirror_motion
 from marey_motion.motion import Motion
 from marey_motion.resampling import resample_motion
 from marey_motion.skeleton import Skeleton, same_hierarchy
+from marey_schemas.options.matching import DatabaseOptions
 from marey_schemas.wording import counted
 
 SAME_OFFSET_M = 1e-3

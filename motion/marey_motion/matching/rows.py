@@ -12,7 +12,6 @@ from marey_motion.arrays import Floats
 from marey_motion.looping import LoopSeam, about_vertical, continue_motion
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.features import FeatureLayout, extract_features, in_root_frame, look_ahead
-from marey_motion.matching.options import DatabaseOptions
 from marey_motion.matching.simulation_root import (
     DIRECTION_WINDOW_S,
     SimulationRoot,
@@ -22,6 +21,7 @@ from marey_motion.matching.simulation_root import (
     window_frames,
 )
 from marey_motion.motion import Motion
+from marey_schemas.options.matching import DatabaseOptions
 
 CLAMPED_S = 1 / 3
 """Of a clip's end, whose futures clamp to the last frame, are not selectable."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
@@ -12,8 +11,7 @@ from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.modelling.primitive import FunctionalComponents
 from marey_motion.modelling.splines import SplineBasis
-
-InnerProduct = Literal["coefficients", "l2"]
+from marey_schemas.options.modelling import InnerProduct
 
 SMALLEST_RELATIVE_DEVIATION = 2e-7
 """Singular values below this share of the largest one are rounding: the Gram matrix holds their squares."""

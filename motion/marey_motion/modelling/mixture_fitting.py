@@ -14,38 +14,17 @@ import numpy as np
 from marey_motion.arrays import Floats
 from marey_motion.errors import ModelError
 from marey_motion.modelling.mixture import LatentMixture
+from marey_schemas.options.modelling import MixtureOptions
 
 Refusal = Literal["", "small-component", "held-out"]
 
 LEAST_EXAMPLES_PER_COMPONENT = 5
 LEAST_FOLDS = 2
 SEEDS = 2**32
+MOST_ITERATIONS = 500
+"""Of each start of expectation maximisation."""
 TOLERANCE = 1e-3
 """Of the mean log-likelihood of an example, from one iteration to the next; it has no unit."""
-
-
-@dataclass(frozen=True)
-class MixtureOptions:
-    """How a mixture is fitted.
-
-    Parameters
-    ----------
-    criterion : bic or aic: what chooses the number of components
-    most_components : tried at most; n examples in d dimensions also allow no more than n / 2d
-    components : exactly so many, in place of a choice
-    regularisation : added to the variances, as a share of the mean variance
-    starts : of expectation maximisation, the best of which counts
-    folds : parts that are held out in turn, under 2 for none
-    iterations : at most, of each start
-    """
-
-    criterion: Literal["bic", "aic"] = "bic"
-    most_components: int = 10
-    components: int | None = None
-    regularisation: float = 1e-4
-    starts: int = 5
-    folds: int = 5
-    iterations: int = 500
 
 
 @dataclass(frozen=True)
@@ -160,9 +139,9 @@ class _Fitting:
         examples, dimensions = self.latents.shape
         if examples <= dimensions + 1:
             return _fitted(self.latents, 1, self.options, self.seed)[0], [], self._held_out(1)
-        counts = range(1, max(1, min(self.options.most_components, examples // (2 * dimensions))) + 1)
-        if self.options.components is not None:
-            counts = range(self.options.components, self.options.components + 1)
+        counts = range(1, max(1, min(self.options.most_mixture_components, examples // (2 * dimensions))) + 1)
+        if self.options.mixture_components is not None:
+            counts = range(self.options.mixture_components, self.options.mixture_components + 1)
         fits = {count: _fitted(self.latents, count, self.options, self.seed) for count in counts}
         candidates = {count: self._judged(count, *fit) for count, fit in fits.items()}
         chosen, held_out = self._best(candidates)
@@ -190,7 +169,7 @@ class _Fitting:
         falling = sorted(candidates.values(), key=lambda one: getattr(one, self.options.criterion))
         for candidate in falling:
             count = candidate.components
-            if count == 1 or self.options.components is not None:
+            if count == 1 or self.options.mixture_components is not None:
                 return count, single if count == 1 else self._held_out(count)
             if candidate.refusal:
                 continue
@@ -227,7 +206,7 @@ def _fitted(latents: Floats, count: int, options: MixtureOptions, seed: int) -> 
         covariance_type="full",
         reg_covar=options.regularisation,
         n_init=options.starts,
-        max_iter=options.iterations,
+        max_iter=MOST_ITERATIONS,
         tol=TOLERANCE,
         random_state=seed % SEEDS,
     )

@@ -77,7 +77,7 @@ def trained_to_tree(trained: TrainedPrimitive, skeleton: Mapping[str, Any], prov
         "verdict": verdict_of(trained),
         "headline": headline_of(trained),
         "scaling": {"method": trained.options.scaling, "weights": _leaf(trained.weights)},
-        "options": trained.options.as_tree(),
+        "options": trained.options.model_dump(),
         "provenance": dict(provenance),
         "training": {
             **_report_to_tree(trained.report),

@@ -10,10 +10,11 @@ import numpy as np
 
 from marey_motion import kinematics
 from marey_motion.arrays import Floats
-from marey_motion.modelling.fpca import InnerProduct, Keep, dual_coefficients, find_components
+from marey_motion.modelling.fpca import Keep, dual_coefficients, find_components
 from marey_motion.modelling.reconstruction import comparison_frames
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.skeleton import Skeleton
+from marey_schemas.options.modelling import InnerProduct
 
 SMALLEST_WEIGHT = 1e-2
 LARGEST_WEIGHT = 1e3

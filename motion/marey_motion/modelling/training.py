@@ -12,8 +12,7 @@ from marey_motion.alignment.signs import consistent_poses
 from marey_motion.arrays import Floats
 from marey_motion.errors import ModelError
 from marey_motion.modelling.fpca import Keep, PrincipalExamples, find_components
-from marey_motion.modelling.mixture_fitting import FittedMixture, MixtureOptions, fit_mixture, one_thread
-from marey_motion.modelling.options import DEFAULT_OPTIONS, ModelOptions
+from marey_motion.modelling.mixture_fitting import FittedMixture, fit_mixture, one_thread
 from marey_motion.modelling.primitive import MOST_LOG_SLOPE, MotionPrimitive
 from marey_motion.modelling.scaled_fpca import optimised_weights
 from marey_motion.modelling.scaling import jacobian_weights, root_max_weights
@@ -21,6 +20,7 @@ from marey_motion.modelling.splines import SplineBasis, coefficient_count
 from marey_motion.modelling.time_model import equalising_weight, fit_log_slopes
 from marey_motion.modelling.training_report import TrainingReport, report_on
 from marey_motion.modelling.training_warnings import Warned, warnings_of
+from marey_schemas.options.modelling import ModelOptions
 
 Progress = Callable[[int, int | None, str], None]
 
@@ -62,7 +62,7 @@ def _silent(_done: int, _total: int | None, _doing: str) -> None:
 
 def train_primitive(
     aligned: AlignedSet,
-    options: ModelOptions = DEFAULT_OPTIONS,
+    options: ModelOptions = ModelOptions(),  # noqa: B008 - frozen
     *,
     name: str = "primitive",
     seed: int = 0,
@@ -97,7 +97,7 @@ def train_primitive(
         )
         latents = np.concatenate((_kept_scores(fitted.spatial), weight * _kept_scores(fitted.temporal)), axis=1)
         progress(0, None, "fitting the mixture")
-        mixture = fit_mixture(latents, _mixture_options(options), seed=seed)
+        mixture = fit_mixture(latents, options, seed=seed)
         primitive = _assemble(name, aligned, fitted, weight, mixture)
         report = report_on(primitive, aligned, fitted.poses, fitted.spatial, fitted.temporal, latents, mixture, options,
                            seed=seed, threads=threads, progress=progress)  # fmt: skip
@@ -205,17 +205,6 @@ def channel_weights(
 
 def _kept_scores(principal: PrincipalExamples) -> Floats:
     return principal.scores[:, : principal.functions.count]
-
-
-def _mixture_options(options: ModelOptions) -> MixtureOptions:
-    return MixtureOptions(
-        criterion=options.criterion,
-        most_components=options.most_mixture_components,
-        components=options.mixture_components,
-        regularisation=options.regularisation,
-        starts=options.starts,
-        folds=options.folds,
-    )
 
 
 def _assemble(

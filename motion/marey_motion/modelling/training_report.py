@@ -12,10 +12,10 @@ from marey_motion.arrays import Floats
 from marey_motion.importing.landmarks import find_landmarks
 from marey_motion.modelling.fpca import PrincipalExamples
 from marey_motion.modelling.mixture_fitting import FittedMixture, MixtureCandidate
-from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.reconstruction import ReconstructionErrors, reconstruction_errors
 from marey_motion.modelling.sample_quality import FootQuality, foot_quality, standing_steps, toe_positions
+from marey_schemas.options.modelling import ModelOptions
 
 Progress = Callable[[int, int | None, str], None]
 

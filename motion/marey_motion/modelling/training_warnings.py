@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.sample_quality import FootQuality
 from marey_motion.modelling.training_report import ExampleReport, TrainingReport
+from marey_schemas.options.modelling import ModelOptions
 
 FEW_EXAMPLES_PER_DIMENSION = 2
 NAMES_SHOWN = 5

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, is_dataclass
 
 from marey_motion.evaluation.result import EvaluationResult
 from marey_reports.drawing.markup import Html, element, joined
 from marey_reports.drawing.tables import Cell, folded, table
+from marey_schemas.base import Options
 
 DIGESTS = ("dataset", "normaliser", "options", "scenarios")
 
@@ -49,9 +49,9 @@ def _row(name: str, values: Sequence[str], *, code: bool) -> list[Cell]:
 
 def _flat(prefix: str, value: object) -> Iterator[tuple[str, str]]:
     """Options as names with dots and texts."""
-    if is_dataclass(value):
-        for field in fields(value):
-            yield from _flat(f"{prefix}.{field.name}" if prefix else field.name, getattr(value, field.name))
+    if isinstance(value, Options):
+        for name, member in value:
+            yield from _flat(f"{prefix}.{name}" if prefix else name, member)
     elif isinstance(value, tuple):
         yield prefix, ", ".join(f"{entry:g}" if isinstance(entry, float) else str(entry) for entry in value) or "none"
     elif isinstance(value, float):

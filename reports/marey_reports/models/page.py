@@ -66,7 +66,7 @@ def provenance(trained: TrainedPrimitive, origin: Mapping[str, Any]) -> Html:
         (label, element("code", str(origin[name]))) for name, label in _ORIGINS.items() if origin.get(name) is not None
     ]
     known.append(("version of the code", element("code", code_version())))
-    options = [(name, _written(value)) for name, value in trained.options.as_tree().items()]
+    options = [(name, _written(value)) for name, value in trained.options]
     clips = [
         (element("code", f"{clip['item']}@{clip['revision']}"), str(clip["name"])) for clip in origin.get("aligned", ())
     ]

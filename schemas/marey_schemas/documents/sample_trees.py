@@ -11,8 +11,8 @@ from pydantic import Field, model_validator
 from marey_schemas.base import Request
 from marey_schemas.documents.references import PartDigestRef
 from marey_schemas.encoding.arrays import ArrayOf
-from marey_schemas.job_params import MOST_TREE_SAMPLES, TreeParams
 from marey_schemas.names import Digest
+from marey_schemas.options.modelling import MOST_TREE_SAMPLES, TreeOptions
 
 
 class SampleTreeDocument(Request):
@@ -27,7 +27,7 @@ class SampleTreeDocument(Request):
         description="The part `model` that the samples are of; the tree is of use to no other."
     )
     seed: int = Field(ge=0, lt=2**63, description="That they were drawn with.")
-    options: TreeParams
+    options: TreeOptions
     samples: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=2)] = Field(description="[n, L] latent vectors.")
     sizes: Annotated[NDArray[np.int32], ArrayOf("<i4", ndim=1)] = Field(description="[M] samples of each node.")
     children: Annotated[NDArray[np.int32], ArrayOf("<i4", ndim=1)] = Field(description="[M] children of each node.")

@@ -1,12 +1,75 @@
-"""Options of evaluations: the trials and what is measured."""
+"""Options of evaluations: the trials, what is measured, and the database and controller that are tried."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from marey_schemas.base import Options
+from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
+
+Family = Literal["circle", "switching"]
 Speed = Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)]
 TurnRate = Annotated[float, Field(ge=-720, le=720, allow_inf_nan=False)]
-DEFAULT_SPEEDS_M_S = tuple(1.0 + 0.25 * step for step in range(9))
-DEFAULT_TURN_RATES_DEG_S = tuple(-100.0 + 25.0 * step for step in range(9))
+
+
+class Grid(Options):
+    """Speeds and turn rates of a suite of trials, each with each; the defaults are the published ones."""
+
+    speeds_m_s: tuple[Speed, ...] = Field(
+        tuple(1.0 + 0.25 * step for step in range(9)),
+        min_length=1,
+        max_length=200,
+        description="Speeds of the trials in metres per second, each with each turn rate.",
+    )
+    turn_rates_deg_s: tuple[TurnRate, ...] = Field(
+        tuple(-100.0 + 25.0 * step for step in range(9)),
+        min_length=1,
+        max_length=200,
+        description="Turn rates of the trials in degrees per second, positive to the left.",
+    )
+
+    @model_validator(mode="after")
+    def _check_grid(self) -> Self:
+        for name in ("speeds_m_s", "turn_rates_deg_s"):
+            _require_different(name, getattr(self, name))
+        return self
+
+
+class EvaluationOptions(Grid):
+    """Everything that decides the result of an evaluation beside the clips."""
+
+    families: tuple[Family, ...] = Field(
+        ("circle", "switching"),
+        min_length=1,
+        max_length=2,
+        description="Kinds of trials. circle: a circle at constant speed; switching: the speed changes on the circle.",
+    )
+    approach_s: float = Field(
+        3.0, ge=0, le=60, allow_inf_nan=False, description="Seconds straight ahead before the circle."
+    )
+    duration_s: float = Field(30.0, ge=1, le=600, allow_inf_nan=False, description="Seconds on the circle.")
+    switch_speed_m_s: Speed = Field(4.0, description="The other speed of switching trials, in metres per second.")
+    switch_every_s: float = Field(
+        5.0, ge=0.5, le=600, allow_inf_nan=False, description="Seconds that each speed of a switching trial lasts."
+    )
+    window: Literal["circle", "all"] = Field(
+        "circle", description="What is measured. circle: the circle alone; all: the approach, too."
+    )
+    coverage_least_s: float = Field(
+        1.0, gt=0, le=3600, allow_inf_nan=False, description="Seconds of data that a cell needs to count as covered."
+    )
+    literal_formulas: bool = Field(False, description="Add the values of the published formulas taken literally.")
+    database: DatabaseOptions = Field(DatabaseOptions(), description="How the clips become a database.")
+    controller: ControllerOptions = Field(ControllerOptions(), description="How motion matching plays the database.")
+
+    @model_validator(mode="after")
+    def _check_families(self) -> Self:
+        _require_different("families", self.families)
+        return self
+
+
+def _require_different(name: str, values: tuple[object, ...]) -> None:
+    if len(set(values)) != len(values):
+        raise ValueError(f"{name}: the same value stands twice")

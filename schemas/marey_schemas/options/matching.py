@@ -2,75 +2,149 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from itertools import pairwise
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, StringConstraints
+from pydantic import Field, StringConstraints, field_validator, model_validator
 
-from marey_schemas.base import Request
+from marey_schemas.base import Options
 
-Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False, description="Weight of these features.")]
+EndPolicy = Literal["clamp", "trim", "loop"]
+Mirroring = Literal["none", "add", "only"]
+RootMode = Literal["simulated", "bone"]
+Selection = Literal["features", "pose_distance"]
+Follow = Literal["time", "path", "open_loop"]
 
+TICK_RATE_HZ = 60.0
+"""Rate of features and simulation unless another one is chosen."""
 
-class FeatureWeightParams(Request):
-    """How much each group of features counts in the cost of a match."""
-
-    left_foot_position: Weight = 0.75
-    right_foot_position: Weight = 0.75
-    left_foot_velocity: Weight = 1.0
-    right_foot_velocity: Weight = 1.0
-    hip_velocity: Weight = 1.0
-    trajectory_positions: Weight = 1.0
-    trajectory_directions: Weight = 1.5
+_Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
+_OF_GROUP = "Weight of the {} in the cost of a match; 0 leaves it out."
 
 
-class DatabaseParams(Request):
+class FeatureWeights(Options):
+    """Weight of each group of features in the cost of a match, in the order of the features."""
+
+    left_foot_position: _Weight = Field(0.75, description=_OF_GROUP.format("position of the left foot"))
+    right_foot_position: _Weight = Field(0.75, description=_OF_GROUP.format("position of the right foot"))
+    left_foot_velocity: _Weight = Field(1.0, description=_OF_GROUP.format("velocity of the left foot"))
+    right_foot_velocity: _Weight = Field(1.0, description=_OF_GROUP.format("velocity of the right foot"))
+    hip_velocity: _Weight = Field(1.0, description=_OF_GROUP.format("velocity of the hips"))
+    trajectory_positions: _Weight = Field(1.0, description=_OF_GROUP.format("positions of the trajectory ahead"))
+    trajectory_directions: _Weight = Field(1.5, description=_OF_GROUP.format("directions of the trajectory ahead"))
+    extra_joints: _Weight = Field(
+        1.0, description=_OF_GROUP.format("position, and of the velocity, of each of `extra_joints`")
+    )
+
+
+class DatabaseOptions(Options):
     """How clips become a database for motion matching."""
 
-    mirroring: Literal["none", "add", "only"] = Field(
-        "none", description="add: a mirrored twin of every clip beside it; only: the twins alone."
+    mirroring: Mirroring = Field(
+        "none", description="add: a mirrored copy of every clip beside it; only: the mirrored copies alone."
     )
-    end_policy: Literal["clamp", "trim", "loop"] = Field(
-        "clamp", description="What rows near a clip's end look ahead to: its last frame, nothing, or its beginning."
+    end_policy: EndPolicy = Field(
+        "clamp",
+        description="What rows near a clip's end look ahead to. clamp: its last frame, and the last 1/3 s is not "
+        "selected; trim: nothing, and the last second is not selected; loop: its beginning, for clips marked as loops.",
     )
-    root_mode: Literal["simulated", "bone"] = Field(
+    root_mode: RootMode = Field(
         "simulated", description="bone: the root joint moves as the character does, in data made so."
     )
-    weights: FeatureWeightParams = FeatureWeightParams()
+    weights: FeatureWeights = Field(FeatureWeights(), description="Weight of each group of features.")
     horizons_s: tuple[Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)], ...] = Field(
-        (1 / 3, 2 / 3, 1.0), min_length=1, max_length=8, description="How far ahead the trajectory is looked at."
+        (1 / 3, 2 / 3, 1.0),
+        min_length=1,
+        max_length=8,
+        description="Times ahead at which the trajectory is compared, in seconds, increasing.",
     )
     extra_joints: tuple[Annotated[str, StringConstraints(min_length=1, max_length=64)], ...] = Field(
-        (), max_length=16, description="Standard joints matched beside feet and hips; many drown the trajectory."
+        (),
+        max_length=16,
+        description="Standard joints matched beside feet and hips; with many of them the trajectory counts too little.",
     )
-    keep_rest_poses: bool = Field(False, description="Keep frames that look like calibration or a T-pose.")
+    rate_hz: float = Field(
+        TICK_RATE_HZ, ge=10, le=240, allow_inf_nan=False, description="Rate of features and simulation, in hertz."
+    )
+    keep_rest_poses: bool = Field(
+        False, description="Keep frames at a clip's beginning and end that look like calibration or a T-pose."
+    )
+
+    @field_validator("horizons_s")
+    @classmethod
+    def _check_order(cls, horizons_s: tuple[float, ...]) -> tuple[float, ...]:
+        if any(after <= before for before, after in pairwise(horizons_s)):
+            raise ValueError("must be in increasing order")
+        return horizons_s
+
+    @field_validator("extra_joints")
+    @classmethod
+    def _check_names(cls, extra_joints: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(extra_joints)) < len(extra_joints):
+            raise ValueError("a joint is named twice")
+        return extra_joints
+
+    @model_validator(mode="after")
+    def _check_horizons(self) -> Self:
+        ticks = [0, *(round(horizon_s * self.rate_hz) for horizon_s in self.horizons_s)]
+        if any(after <= before for before, after in pairwise(ticks)):
+            raise ValueError(
+                f"horizons_s: must be a frame (1/{self.rate_hz:g} s) or more ahead and apart, or they see the same"
+            )
+        return self
 
 
-class ControllerParams(Request):
-    """How motion matching plays the database."""
+class ControllerOptions(Options):
+    """How motion matching plays a database."""
 
-    follow: Literal["time", "path", "open_loop"] = Field(
+    follow: Follow = Field(
         "time",
-        description="What is asked for: the trajectory at the same time, from its nearest point, or only its speed and "
-        "turn rate.",
+        description="What the character is asked for. time: the trajectory at the same time; path: the trajectory from "
+        "its nearest point; open_loop: only its speed and turn rate.",
     )
-    search_every_s: float = Field(0.1, gt=0, le=2, allow_inf_nan=False, description="Period of the search.")
+    search_every_s: float = Field(0.1, gt=0, le=2, allow_inf_nan=False, description="Search period, in seconds.")
     continuing_bias: float = Field(
-        0.0, ge=-1000, le=1000, allow_inf_nan=False, description="Added to the cost of going on; negative favours it."
+        0.0,
+        ge=-1000,
+        le=1000,
+        allow_inf_nan=False,
+        description="Added to the cost of going on with the current clip; negative values favour it.",
     )
     switch_margin: float = Field(
         1e-4, ge=0, le=1000, allow_inf_nan=False, description="A switch must be cheaper by more than this."
     )
     reselect_window_s: float = Field(
-        0.0, ge=0, le=10, allow_inf_nan=False, description="Frames so near the current one are not chosen."
+        0.0,
+        ge=0,
+        le=10,
+        allow_inf_nan=False,
+        description="A search does not choose frames within so many seconds of the current one.",
     )
-    half_life_s: float = Field(0.1, gt=0, le=5, allow_inf_nan=False, description="Of what is blended at a switch.")
+    half_life_s: float = Field(
+        0.1,
+        gt=0,
+        le=5,
+        allow_inf_nan=False,
+        description="Seconds after a switch in which half of the offset from the old motion is blended out.",
+    )
     root_inertialisation: bool = Field(True, description="Blend the root's velocity, too.")
-    selection: Literal["features", "pose_distance"] = Field(
-        "features", description="pose_distance: the published cost, the summed distance of joints in metres."
+    selection: Selection = Field(
+        "features",
+        description="features: the weighted features choose; pose_distance: the published cost, the summed distance of "
+        "joints in metres, chooses.",
     )
     root_adjustment: float = Field(
-        0.0, ge=0, le=1, allow_inf_nan=False, description="Pulls towards the reference; hides what is measured."
+        0.0,
+        ge=0,
+        le=1,
+        allow_inf_nan=False,
+        description="Share of its distance per second by which the character is pulled to the reference; hides what is "
+        "measured.",
     )
     root_clamp_m: float | None = Field(
-        None, gt=0, le=100, allow_inf_nan=False, description="Holds the character so near; hides what is measured."
+        None,
+        gt=0,
+        le=100,
+        allow_inf_nan=False,
+        description="Greatest distance of the character from the reference, in metres; hides what is measured.",
     )

@@ -78,15 +78,15 @@ def _mapping(tx: Transaction, project: str, skeleton: str, revision: int) -> Tre
 def begin(request: CoverageStreamCreate, given: Given) -> tuple[NewStream, Tree]:
     """A new stream, and the members of `CoverageStreamState` that are computed."""
     from marey_motion.evaluation.online import OnlineCoverage
-    from marey_motion.evaluation.options import Grid
+    from marey_schemas.options.evaluation import Grid
 
-    grid = Grid()
-    grid = Grid(request.speeds_m_s or grid.speeds_m_s, request.turn_rates_deg_s or grid.turn_rates_deg_s)
+    asked = request.model_dump(include={"speeds_m_s", "turn_rates_deg_s"}, exclude_none=True)
+    grid = Grid(**asked)
     least_s, seconds = request.least_s or 1.0, None
     if given.evaluation is not None:
         with refusing("evaluation"):
             found = MeasuredCoverage.model_validate(given.measured)
-        grid = Grid(found.options.grid.speeds_m_s, found.options.grid.turn_rates_deg_s)
+        grid = found.options.grid
         least_s, seconds = found.options.coverage_least_s, found.coverage.seconds
     with refusing("evaluation"):  # a grid that the request gives has been checked
         online = OnlineCoverage(request.frame_rate_hz, grid, least_s=least_s, seconds=seconds)

@@ -15,10 +15,10 @@ from marey_motion.matching.controller import run_trial
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.display import displayed_clip, pose_costs, switched_rows
 from marey_motion.matching.inertialisation import decay_matrix
-from marey_motion.matching.options import ControllerOptions, DatabaseOptions
 from marey_motion.matching.record import Status, TrialRecord
 from marey_motion.matching.search import build_index
 from marey_motion.rigs import map_joints
+from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
 
 OPTIONS = ControllerOptions()
 

@@ -160,11 +160,11 @@ def test_evaluations_under_other_conditions_are_refused_by_name(database, result
     fitted_anew = made_database(wandering_tracks()[:5])
     with pytest.raises(MotionError, match="normaliser"):
         compare_results(result, evaluated(fitted_anew))
-    other = replace(OPTIONS, controller=replace(OPTIONS.controller, follow="path"))
+    other = OPTIONS.replace(controller=OPTIONS.controller.replace(follow="path"))
     with pytest.raises(MotionError, match="options"):
         compare_results(result, evaluated(database, other))
     with pytest.raises(MotionError, match="scenarios"):
-        compare_results(result, evaluated(database, replace(OPTIONS, duration_s=5.0)))
+        compare_results(result, evaluated(database, OPTIONS.replace(duration_s=5.0)))
     with pytest.raises(MotionError, match="records"):
         compare_results(result, replace(result, records=()))
 

@@ -12,7 +12,7 @@ from marey_motion.evaluation.coverage import (
     measure_coverage,
     sliding_windows,
 )
-from marey_motion.evaluation.options import EvaluationOptions, Grid
+from marey_schemas.options.evaluation import EvaluationOptions
 
 OPTIONS = EvaluationOptions()
 
@@ -79,13 +79,13 @@ def test_a_database_without_a_second_of_motion_covers_nothing():
 
 
 def test_every_trial_owns_the_cell_around_it():
-    clips = [arc(v, w, 3.0) for v in OPTIONS.grid.speeds_m_s for w in OPTIONS.grid.turn_rates_deg_s]
+    clips = [arc(v, w, 3.0) for v in OPTIONS.speeds_m_s for w in OPTIONS.turn_rates_deg_s]
     coverage = measure_coverage(root_database(*clips), OPTIONS)
 
     assert coverage.seconds.shape == (9, 9)
     assert coverage.seconds == pytest.approx(121 / RATE_HZ)
     assert coverage.index == 1.0
-    assert coverage_holes(coverage, OPTIONS.grid) == ()
+    assert coverage_holes(coverage, OPTIONS) == ()
     assert coverage.speed_edges_m_s[[0, 1, -1]] == pytest.approx([0.875, 1.125, 3.125])
     assert coverage.turn_rate_edges_deg_s[[0, 1, -1]] == pytest.approx([-112.5, -87.5, 112.5])
 
@@ -98,12 +98,11 @@ def test_what_is_faster_than_any_trial_is_a_window_without_a_cell():
 
 
 def test_holes_say_how_much_is_missing_the_emptiest_first():
-    grid = Grid((1.0, 2.0), (-50.0, 0.0))
-    options = EvaluationOptions(grid=grid, coverage_least_s=2.0)
+    options = EvaluationOptions(speeds_m_s=(1.0, 2.0), turn_rates_deg_s=(-50.0, 0.0), coverage_least_s=2.0)
     half = 0.5 * RATE_HZ - 1  # windows besides the first, for half a second in all
     root = root_database(arc(1.0, 0.0, 3.0 - 1 / RATE_HZ), arc(2.0, -50.0, 1.0 + half / RATE_HZ))
     coverage = measure_coverage(root, options)
-    holes = coverage_holes(coverage, grid)
+    holes = coverage_holes(coverage, options)
 
     assert [(hole.speed_m_s, hole.turn_rate_deg_s) for hole in holes] == [(1.0, -50.0), (2.0, 0.0), (2.0, -50.0)]
     assert [hole.deficit_s for hole in holes] == pytest.approx([2.0, 2.0, 1.5])
@@ -126,11 +125,11 @@ def test_symmetry_lies_between_for_a_set_that_turns_more_to_one_side():
 
 
 def test_seconds_that_are_enough_to_the_frame_leave_no_hole():
-    enough = replace(OPTIONS, grid=Grid((1.0,), (0.0,)), coverage_least_s=1.85)
+    enough = OPTIONS.replace(speeds_m_s=(1.0,), turn_rates_deg_s=(0.0,), coverage_least_s=1.85)
     for windows, holes in ((110, 1), (111, 0)):
         coverage = measure_coverage(root_database(arc(1.0, 0.0, (windows + 59) / RATE_HZ)), enough)
         assert len(coverage.speed_m_s) == windows
-        assert len(coverage_holes(coverage, enough.grid)) == holes
+        assert len(coverage_holes(coverage, enough)) == holes
 
 
 def test_what_goes_straight_or_nearly_so_counts_as_alike_on_both_sides():
@@ -152,7 +151,7 @@ def test_going_straight_is_symmetric():
 
 @pytest.mark.parametrize("turn_rates", [(0.0, 50.0, 100.0), (50.0, 100.0), (-100.0, -50.0), (-50.0, 50.0)])
 def test_symmetry_does_not_depend_on_a_grid_that_looks_to_one_side(turn_rates):
-    options = EvaluationOptions(grid=Grid((1.0, 2.0), turn_rates))
+    options = EvaluationOptions(speeds_m_s=(1.0, 2.0), turn_rates_deg_s=turn_rates)
     left = arc(1.0, 50.0, 4.0)
 
     assert measure_coverage(root_database(left, mirrored(left)), options).symmetry == 1.0

@@ -5,7 +5,6 @@ import pytest
 from tests.support.evaluation_cases import arc, clips_of, record_of, root_database
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.result_documents import (
     records_from_tree,
     records_to_tree,
@@ -14,12 +13,14 @@ from marey_motion.evaluation.result_documents import (
 )
 from marey_motion.evaluation.scenario import reference, suite_trials
 from marey_motion.evaluation.suite import assemble
-from marey_motion.matching.options import ControllerOptions, DatabaseOptions
 from marey_motion.matching.record import Status
 from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree, encode_tree
+from marey_schemas.options.evaluation import EvaluationOptions
+from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
 
 OPTIONS = EvaluationOptions(
-    grid=Grid((1.0, 2.0), (-50.0, 0.0, 50.0)),
+    speeds_m_s=(1.0, 2.0),
+    turn_rates_deg_s=(-50.0, 0.0, 50.0),
     duration_s=12.0,
     literal_formulas=True,
     database=DatabaseOptions(mirroring="add", extra_joints=("head",)),

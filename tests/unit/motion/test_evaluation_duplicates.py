@@ -16,9 +16,9 @@ from marey_motion.gait.style import GaitStyle
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import SourceClip
-from marey_motion.matching.options import DatabaseOptions
 from marey_motion.mirroring import mirror_clip
 from marey_motion.rigs import map_joints
+from marey_schemas.options.matching import DatabaseOptions
 
 
 def gaits(mirroring="none", **clips):
@@ -32,8 +32,9 @@ def walk(speed=1.3, turn_deg=0.0, seconds=4.0, seed=None):
     return generate_gait(speed, radians(turn_deg), seconds, style=None if seed is None else GaitStyle.varied(seed))
 
 
-def pairs_of(database, **options):
-    return {(pair.first, pair.second) for pair in find_near_duplicates(database, **options).pairs}
+def pairs_of(database, threshold_cm=3.0):
+    found = find_near_duplicates(database, threshold_cm=threshold_cm)
+    return {(pair.first, pair.second) for pair in found.pairs}
 
 
 def test_the_same_walk_at_nearly_the_same_speed_is_a_near_duplicate_and_other_walks_are_not():
@@ -60,7 +61,7 @@ def test_a_mirror_image_counts_only_where_clips_are_mirrored():
     skeleton = left.skeleton
     image = mirror_clip(left, MatchingBody.from_mapping(skeleton, map_joints(skeleton)).partners)
     assert pairs_of(gaits(left=left, right=image)) == set()
-    (pair,) = find_near_duplicates(gaits("add", left=left, right=image)).pairs
+    (pair,) = find_near_duplicates(gaits("add", left=left, right=image), threshold_cm=3.0).pairs
     assert pair.mirrored
     assert pair.distance_cm < 0.01
 
@@ -115,7 +116,7 @@ def test_of_two_clips_used_alike_the_shorter_goes_and_of_two_as_long_that_of_the
 def test_the_search_can_be_stopped_and_tells_its_progress():
     database = made_database(named(wandering_tracks()[:4]))
     told = []
-    find_near_duplicates(database, progress=lambda *step: told.append(step))
+    find_near_duplicates(database, threshold_cm=3.0, progress=lambda *step: told.append(step))
     assert [step[:2] for step in told] == [(1, 4), (2, 4), (3, 4), (4, 4)]
     with pytest.raises(EvaluationCancelled):
-        find_near_duplicates(database, cancelled=lambda: True)
+        find_near_duplicates(database, threshold_cm=3.0, cancelled=lambda: True)

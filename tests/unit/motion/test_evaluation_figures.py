@@ -16,7 +16,6 @@ from tests.support.evaluation_results import SMALL, evaluated, made_up, some_cov
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import Windows, coverage_of
-from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.scenario import demand, suite_trials
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import Status
@@ -24,6 +23,7 @@ from marey_reports.drawing.paper import labels_of, nice_levels, shortened, witho
 from marey_reports.evaluation.figures import FIGURES, FigureOptions, draw_figure, draw_figures
 from marey_reports.evaluation.figures.clip_graph_layout import MOST_DOTS, arrange
 from marey_reports.evaluation.figures.mixtures import fit_one, fit_two
+from marey_schemas.options.evaluation import EvaluationOptions
 
 ONE_TRIAL = [name for name, kind in FIGURES.items() if kind.trials == "one"]
 SWITCHING = "switching v=2 w=50"
@@ -83,7 +83,7 @@ def test_the_files_of_a_figure_are_its_pictures_and_its_data(result):
 def test_all_figures_of_a_result_are_drawn_but_those_it_has_no_trials_or_records_for(result):
     assert list(draw_figures(result)) == list(FIGURES)
     assert not set(draw_figures(replace(result, records=()))) & set(ONE_TRIAL)
-    circles = made_up(replace(SMALL, families=("circle",)))
+    circles = made_up(SMALL.replace(families=("circle",)))
     assert set(FIGURES) - set(draw_figures(circles)) == {"scenario-switching"}
 
 
@@ -385,8 +385,10 @@ LITTLE = {
     "clips of one frame": lambda: tiny(tuple(DatabaseClip(f"c{i}", f"c{i}", "", i, i + 1) for i in range(3))),
     "no transitions": lambda: without_transitions(made_up(clips=1, unused=0)),
     "no windows": lambda: tiny((DatabaseClip("short", "short", "", 0, 30),), covered=False),
-    "one trial": lambda: made_up(EvaluationOptions(grid=Grid((1.5,), (0.0,)), duration_s=3.0, families=("circle",))),
-    "one speed": lambda: made_up(EvaluationOptions(grid=Grid((1.5,), (-50.0, 50.0)), duration_s=6.0)),
+    "one trial": lambda: made_up(
+        EvaluationOptions(speeds_m_s=(1.5,), turn_rates_deg_s=(0.0,), duration_s=3.0, families=("circle",))
+    ),
+    "one speed": lambda: made_up(EvaluationOptions(speeds_m_s=(1.5,), turn_rates_deg_s=(-50.0, 50.0), duration_s=6.0)),
     "no tick moved": lambda: replace(
         (still := made_up()), records=tuple(replace(r, positions=0.0 * r.positions) for r in still.records)
     ),
@@ -418,7 +420,8 @@ def test_evaluations_of_little_are_compared(little, other):
 def standing():
     """A clip that stands but for rounding: its windows and what the trials recorded."""
     made = tiny(
-        (DatabaseClip("only", "only", "", 0, 900),), EvaluationOptions(grid=Grid((1.0,), (0.0,)), duration_s=6.0)
+        (DatabaseClip("only", "only", "", 0, 900),),
+        EvaluationOptions(speeds_m_s=(1.0,), turn_rates_deg_s=(0.0,), duration_s=6.0),
     )
     sway, count = 1e-7 * np.random.default_rng(7).normal(size=(2, 840)), 840
     windows = Windows(np.hypot(*sway), np.zeros(count), *sway)

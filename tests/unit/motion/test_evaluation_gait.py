@@ -1,6 +1,5 @@
 """Whole suites over generated walks and runs: from clips through database and controller to what is measured."""
 
-from dataclasses import replace
 from itertools import product
 from math import radians
 
@@ -9,7 +8,6 @@ import pytest
 
 from marey_motion.evaluation import suite as suites
 from marey_motion.evaluation.coverage import coverage_holes, measure_coverage
-from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.scenario import reference, suite_trials
 from marey_motion.evaluation.suite import assemble, evaluate, evaluate_baseline, run_suite
 from marey_motion.gait import GaitStyle, generate_gait
@@ -17,16 +15,18 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.controller import run_trial
 from marey_motion.matching.database import SourceClip
-from marey_motion.matching.options import DatabaseOptions
 from marey_motion.matching.search import build_index
 from marey_motion.rigs import map_joints
+from marey_schemas.options.evaluation import EvaluationOptions
+from marey_schemas.options.matching import DatabaseOptions
 
 TURN_RATES = (-100.0, -75.0, -50.0, -25.0, 0.0, 25.0, 50.0, 75.0, 100.0)
-GRID = Grid((1.0, 2.0, 3.0), TURN_RATES)
-CIRCLES = EvaluationOptions(grid=GRID, families=("circle",))
-IMPOSSIBLE_M_S = 50.0
+CIRCLES = EvaluationOptions(speeds_m_s=(1.0, 2.0, 3.0), turn_rates_deg_s=TURN_RATES, families=("circle",))
+IMPOSSIBLE_M_S = 20.0
 RIGID = GaitStyle(bounce=0.0, lean=0.0, sway=0.0, arm_swing=0.0)
-SMALL = EvaluationOptions(grid=Grid((1.0, 2.0), (-50.0, 0.0, 50.0)), duration_s=6.0, switch_every_s=2.0)
+SMALL = EvaluationOptions(
+    speeds_m_s=(1.0, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=6.0, switch_every_s=2.0
+)
 
 
 def gait_clips(cells, seconds, *, varied=False):
@@ -53,14 +53,14 @@ def evaluated(database, options):
 
 @pytest.fixture(scope="module")
 def grid_clips():
-    return gait_clips(product(GRID.speeds_m_s, GRID.turn_rates_deg_s), 10.0)
+    return gait_clips(product(CIRCLES.speeds_m_s, CIRCLES.turn_rates_deg_s), 10.0)
 
 
 def test_a_mirror_closed_data_set_turns_alike_to_both_sides():
-    clips = gait_clips(((v, w) for v in GRID.speeds_m_s for w in GRID.turn_rates_deg_s if w >= 0.0), 10.0)
+    clips = gait_clips(((v, w) for v in CIRCLES.speeds_m_s for w in CIRCLES.turn_rates_deg_s if w >= 0.0), 10.0)
     mirrored = DatabaseOptions(mirroring="add")
     # From the first tick on the circle: the way straight ahead has no side, and begins on the same foot for both.
-    options = replace(CIRCLES, approach_s=0.0, database=mirrored)
+    options = CIRCLES.replace(approach_s=0.0, database=mirrored)
     result = evaluated(database_of(clips, mirrored), options)
 
     assert result.suite["offset_asymmetry"] < 1e-12
@@ -73,8 +73,10 @@ def test_a_mirrored_data_set_does_to_the_right_what_the_original_does_to_the_lef
     generator = np.random.default_rng(7)
     cells = np.stack((generator.uniform(0.8, 3.2, 25), generator.uniform(-30.0, 110.0, 25)), axis=1).tolist()
     clips = gait_clips(cells, 6.0, varied=True)
-    options = replace(CIRCLES, families=(family,), grid=Grid((1.0, 2.0, 3.0), (25.0, -50.0, 75.0, -100.0)))
-    opposite = replace(options, grid=Grid((1.0, 2.0, 3.0), (-25.0, 50.0, -75.0, 100.0)))
+    options = CIRCLES.replace(
+        families=(family,), speeds_m_s=(1.0, 2.0, 3.0), turn_rates_deg_s=(25.0, -50.0, 75.0, -100.0)
+    )
+    opposite = options.replace(speeds_m_s=(1.0, 2.0, 3.0), turn_rates_deg_s=(-25.0, 50.0, -75.0, 100.0))
     plain = evaluated(database_of(clips), options)
     mirrored = evaluated(database_of(clips, DatabaseOptions(mirroring="only")), opposite)
 
@@ -94,11 +96,11 @@ def test_clips_that_own_every_cell_follow_every_circle(grid_clips):
     assert max(one.metrics["offset_mean"] for one in result.trials) < 0.8
     assert max(one.metrics["abs_se_v"] for one in result.trials) < 0.2
     assert max(one.metrics["abs_se_omega_deg"] for one in result.trials) < 3.0
-    assert coverage_holes(result.coverage, GRID) == ()
+    assert coverage_holes(result.coverage, CIRCLES) == ()
 
 
 def test_without_tight_turns_the_tight_circles_are_missed_and_the_others_are_not(grid_clips):
-    options = replace(CIRCLES, grid=GRID)
+    options = CIRCLES
     wide = [clip for clip in grid_clips if abs(float(clip.name.split("w=")[1])) <= 70.0]
     result = evaluated(database_of(wide), options)
     offsets = np.array([one.metrics["offset_mean"] for one in result.trials]).reshape(3, 9)
@@ -106,8 +108,8 @@ def test_without_tight_turns_the_tight_circles_are_missed_and_the_others_are_not
     assert offsets[:, [0, 1, 7, 8]].min() > 1.2
     assert offsets[:, [0, 8]].min() > 2.0
     assert offsets[:, 2:7].max() < 1.0
-    holes = {(hole.speed_m_s, hole.turn_rate_deg_s) for hole in coverage_holes(result.coverage, GRID)}
-    assert holes == set(product(GRID.speeds_m_s, (-100.0, -75.0, 75.0, 100.0)))
+    holes = {(hole.speed_m_s, hole.turn_rate_deg_s) for hole in coverage_holes(result.coverage, CIRCLES)}
+    assert holes == set(product(CIRCLES.speeds_m_s, (-100.0, -75.0, 75.0, 100.0)))
     assert result.coverage.index == pytest.approx(5 / 9)
 
 
@@ -142,7 +144,7 @@ def test_removing_what_no_trial_used_changes_no_bit_with_a_pinned_normaliser():
 def test_a_database_that_looks_farther_than_a_second_ahead_sees_every_switch_that_comes():
     looking_far = DatabaseOptions(horizons_s=(1.0, 2.0, 3.0))
     database = database_of(gait_clips(product((1.0, 2.0, 4.0), (0.0, 50.0)), 6.0), looking_far)
-    options = replace(SMALL, grid=Grid((1.0,), (50.0,)), families=("switching",), switch_every_s=1.0)
+    options = SMALL.replace(speeds_m_s=(1.0,), turn_rates_deg_s=(50.0,), families=("switching",), switch_every_s=1.0)
     (trial,) = suite_trials(options)
     index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
 
@@ -179,7 +181,7 @@ def test_the_baseline_is_the_same_whenever_it_is_made(monkeypatch):
 
 
 def test_cells_that_nobody_can_walk_are_left_out_of_the_baseline_and_named():
-    options = replace(SMALL, grid=Grid((2.0, IMPOSSIBLE_M_S), (0.0,)), families=("circle",))
+    options = SMALL.replace(speeds_m_s=(2.0, IMPOSSIBLE_M_S), turn_rates_deg_s=(0.0,), families=("circle",))
     baseline = evaluate_baseline(options)
 
     assert [clip.name for clip in baseline.clips] == ["v=2 w=0"]

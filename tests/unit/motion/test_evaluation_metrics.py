@@ -4,10 +4,10 @@ from tests.support.evaluation_cases import RATE_HZ, closed_reference, record_of,
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.metrics import measure_trial, offset_asymmetry, pooled_metrics, trial_series
-from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.result import TrialResult
 from marey_motion.evaluation.scenario import Trial, reference
 from marey_motion.matching.record import Status
+from marey_schemas.options.evaluation import EvaluationOptions
 
 OPTIONS = EvaluationOptions()
 STRAIGHT = Trial("circle", 1.5, 0.0)

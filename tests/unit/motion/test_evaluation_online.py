@@ -10,13 +10,13 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import Windows, cell_counts, cell_edges, sliding_windows
 from marey_motion.evaluation.live_windows import LiveWindows, smoother
 from marey_motion.evaluation.online import FARTHEST_M, OnlineCoverage
-from marey_motion.evaluation.options import Grid
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.simulation_root import simulation_root
 from marey_motion.motion import Motion
 from marey_motion.rigs import map_joints
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
+from marey_schemas.options.evaluation import Grid
 
 RATE_HZ = 60.0
 TOLERANCE = 1e-10
@@ -152,7 +152,7 @@ def test_what_was_kept_goes_on_to_the_same_bits(walk):
 
 
 def test_what_is_kept_of_the_largest_grid_at_the_highest_rate_is_small():
-    grid = Grid(tuple(0.1 * step for step in range(1, 41)), tuple(range(-75, 75, 3)))
+    grid = Grid(speeds_m_s=tuple(0.1 * step for step in range(1, 41)), turn_rates_deg_s=tuple(range(-75, 75, 3)))
     online = OnlineCoverage(240.0, grid, seconds=np.full((40, 50), 0.123))
     online.add_roots(*circling(1.0, 10.0, 5.0, 240.0))
     assert len(encode_tree(online.as_tree(), MSGPACK)) < 64 * 1024
@@ -238,13 +238,15 @@ def test_the_cell_that_the_performer_is_filling_comes_first_until_it_is_full():
 
 
 def test_nothing_is_asked_for_once_every_cell_has_enough():
-    online = OnlineCoverage(RATE_HZ, Grid((1.0, 2.0), (0.0,)), seconds=np.array([[5.0], [1.0]]))
+    online = OnlineCoverage(
+        RATE_HZ, Grid(speeds_m_s=(1.0, 2.0), turn_rates_deg_s=(0.0,)), seconds=np.array([[5.0], [1.0]])
+    )
     assert online.targets(3) == ()
     assert online.index == 1.0
 
 
 def test_who_walks_a_targets_path_fills_its_cell():
-    online = OnlineCoverage(RATE_HZ, Grid((1.5,), (-40.0,)))
+    online = OnlineCoverage(RATE_HZ, Grid(speeds_m_s=(1.5,), turn_rates_deg_s=(-40.0,)))
     (target,) = online.targets(1, path_s=4.0)
     path = target.path
     assert path.positions[0].tolist() == [0.0, 0.0]
@@ -315,7 +317,9 @@ def test_rates_beyond_those_of_recordings_are_refused(rate_hz):
 
 def test_grids_that_do_not_fit_are_refused():
     with pytest.raises(MotionError, match="over 2000"):
-        OnlineCoverage(RATE_HZ, Grid(tuple(range(1, 102)), tuple(range(20))))
+        OnlineCoverage(
+            RATE_HZ, Grid(speeds_m_s=tuple(0.1 * n for n in range(1, 102)), turn_rates_deg_s=tuple(range(20)))
+        )
     with pytest.raises(MotionError, match="cells"):
         OnlineCoverage(RATE_HZ, seconds=np.zeros((9, 8)))
 
@@ -329,7 +333,7 @@ def test_the_smoother_is_the_filter_of_the_simulation_root(window):
 
 
 def test_cells_are_those_of_evaluations():
-    grid = Grid((2.0, 1.0), (10.0, -30.0, 0.0))
+    grid = Grid(speeds_m_s=(2.0, 1.0), turn_rates_deg_s=(10.0, -30.0, 0.0))
     online = OnlineCoverage(RATE_HZ, grid)
     assert online.speed_edges_m_s.tolist() == cell_edges(grid.speeds_m_s, 0.25).tolist()
     assert online.counts.shape == (2, 3)

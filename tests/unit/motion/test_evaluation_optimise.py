@@ -9,15 +9,16 @@ from tests.support.made_databases import arc_track, made_database
 from tests.support.suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.improvement.objective import DataSetObjective, headline_means
-from marey_motion.evaluation.improvement.optimise import OptimisationOptions, optimise
+from marey_motion.evaluation.improvement.objective import headline_means, objective_value
+from marey_motion.evaluation.improvement.optimise import optimise
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.selection import without_sources
 from marey_motion.evaluation.improvement.suggestion_documents import optimisation_to_tree, steps_from_tree
 from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_schemas.options.improvement import ObjectiveOptions, OptimisationOptions
 
 TURNS = ("turn_left", "turn_right")
-AIM = OptimisationOptions(objective=DataSetObjective(seconds=0.002), max_steps=6)
+AIM = OptimisationOptions(objective=ObjectiveOptions(seconds=0.002), max_steps=6)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +50,7 @@ def test_every_step_can_be_evaluated_again(pool, found):
         seconds = sum(clip.frame_count for clip in again.clips) / 60
         assert step.metrics == headline_means(again.trials)
         assert step.data_s == seconds
-        assert step.objective == AIM.objective.value(again.trials, seconds)
+        assert step.objective == objective_value(AIM.objective, again.trials, seconds)
 
 
 def test_the_log_says_what_each_step_did(found):
@@ -69,30 +70,32 @@ def test_what_nothing_needs_goes_at_once_and_changes_no_trial(found):
 
 def test_no_candidate_would_have_been_better_at_any_step(pool):
     simulation = Resimulation(pool, OPTIONS)
-    aim = replace(AIM, consider=None, max_steps=2)
+    aim = AIM.replace(consider=None, max_steps=2)
     found = optimise(simulation, aim, absent=TURNS)
     for before, after in pairwise(found.steps):
         absent = frozenset(before.absent)
         for source in simulation.sources:
             other = absent ^ {source}
-            assert aim.objective.value(simulation.results(other), simulation.seconds(other)) >= after.objective
+            assert (
+                objective_value(aim.objective, simulation.results(other), simulation.seconds(other)) >= after.objective
+            )
 
 
 def test_a_clip_that_helps_is_added_where_the_budget_of_data_allows(pool):
     straight = made_database(named([arc_track(1.0, 0.0, 6.0), arc_track(2.0, 0.0, 6.0), arc_track(2.0, 50.0, 6.0)]))
-    aim = OptimisationOptions(objective=DataSetObjective(seconds=0.0))
+    aim = OptimisationOptions(objective=ObjectiveOptions(seconds=0.0))
     free = optimise(Resimulation(straight, OPTIONS), aim, absent=["clip_002"])
     assert ("add", ("clip_002",)) in [(step.action, step.sources) for step in free.steps]
-    tight = optimise(Resimulation(straight, OPTIONS), replace(aim, max_data_s=15.0), absent=["clip_002"])
+    tight = optimise(Resimulation(straight, OPTIONS), aim.replace(max_data_s=15.0), absent=["clip_002"])
     assert all(step.action != "add" for step in tight.steps if step.data_s > 15.0)
     assert all(step.data_s <= 15.0 for step in tight.steps)
 
 
 def test_it_ends_when_nothing_gains_or_the_budget_is_spent(simulation):
-    greedy = optimise(simulation, replace(AIM, least_gain=1e6))
+    greedy = optimise(simulation, AIM.replace(least_gain=1000.0))
     assert (greedy.ended, len(greedy.steps)) == ("no gain", 1)
-    assert optimise(simulation, replace(AIM, max_steps=1)).ended == "steps"
-    spent = optimise(simulation, replace(AIM, max_evaluations=3))
+    assert optimise(simulation, AIM.replace(max_steps=1)).ended == "steps"
+    spent = optimise(simulation, AIM.replace(max_evaluations=3))
     assert spent.ended == "evaluations"
     assert spent.steps[-1].evaluations <= 3
 
@@ -106,13 +109,13 @@ def test_an_optimisation_goes_on_from_its_log_as_if_it_had_not_stopped(pool, fou
 
 def test_each_step_is_handed_over_as_soon_as_it_is_made(simulation):
     made = []
-    found = optimise(simulation, replace(AIM, max_steps=2), absent=TURNS, made=made.append)
+    found = optimise(simulation, AIM.replace(max_steps=2), absent=TURNS, made=made.append)
     assert tuple(made) == found.steps
 
 
 def test_a_log_of_something_else_is_refused(pool, found):
     with pytest.raises(MotionError, match="step"):
-        optimise(Resimulation(pool, replace(OPTIONS, duration_s=4.0)), AIM, log=found.steps)
+        optimise(Resimulation(pool, OPTIONS.replace(duration_s=4.0)), AIM, log=found.steps)
     smaller = without_sources(pool, TURNS)
     with pytest.raises(MotionError, match="turn_left"):
         optimise(Resimulation(smaller, OPTIONS), AIM, log=found.steps[:1])

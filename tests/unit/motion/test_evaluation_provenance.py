@@ -5,12 +5,12 @@ import pytest
 from tests.support.evaluation_cases import arc, root_database
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.provenance import provenance_of, require_comparable
 from marey_motion.evaluation.scenario import suite_trials
-from marey_motion.matching.options import ControllerOptions, DatabaseOptions, FeatureWeights
+from marey_schemas.options.evaluation import EvaluationOptions
+from marey_schemas.options.matching import ControllerOptions, DatabaseOptions, FeatureWeights
 
-OPTIONS = EvaluationOptions(grid=Grid((1.0, 2.0), (-50.0, 50.0)))
+OPTIONS = EvaluationOptions(speeds_m_s=(1.0, 2.0), turn_rates_deg_s=(-50.0, 50.0))
 LEFT, RIGHT = arc(1.0, 50.0, 2.0), arc(2.0, -50.0, 2.0)
 
 
@@ -45,8 +45,10 @@ def test_clips_are_traced_to_the_documents_they_came_from_where_these_are_known(
 
 
 def test_a_whole_number_is_the_same_option_however_it_is_written():
-    whole = replace(OPTIONS, approach_s=3, grid=Grid((1, 2), (-50, 50)), controller=ControllerOptions(switch_margin=0))
-    decimal = replace(OPTIONS, controller=ControllerOptions(switch_margin=-0.0))
+    whole = OPTIONS.replace(
+        approach_s=3, speeds_m_s=(1, 2), turn_rates_deg_s=(-50, 50), controller=ControllerOptions(switch_margin=0)
+    )
+    decimal = OPTIONS.replace(controller=ControllerOptions(switch_margin=-0.0))
 
     assert traced(LEFT, options=whole) == traced(LEFT, options=decimal)
 
@@ -54,12 +56,12 @@ def test_a_whole_number_is_the_same_option_however_it_is_written():
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        (replace(OPTIONS, controller=ControllerOptions(follow="path")), "options"),
-        (replace(OPTIONS, database=DatabaseOptions(weights=FeatureWeights(hip_velocity=2.0))), "options"),
-        (replace(OPTIONS, window="all"), "options"),
-        (replace(OPTIONS, duration_s=10.0), "scenarios"),
-        (replace(OPTIONS, grid=Grid((1.0,), (50.0,))), "scenarios"),
-        (replace(OPTIONS, families=("circle",)), "scenarios"),
+        (OPTIONS.replace(controller=ControllerOptions(follow="path")), "options"),
+        (OPTIONS.replace(database=DatabaseOptions(weights=FeatureWeights(hip_velocity=2.0))), "options"),
+        (OPTIONS.replace(window="all"), "options"),
+        (OPTIONS.replace(duration_s=10.0), "scenarios"),
+        (OPTIONS.replace(speeds_m_s=(1.0,), turn_rates_deg_s=(50.0,)), "scenarios"),
+        (OPTIONS.replace(families=("circle",)), "scenarios"),
     ],
 )
 def test_evaluations_under_other_conditions_are_not_compared(options, named):
@@ -78,9 +80,9 @@ def test_evaluations_with_other_normalisers_are_not_compared_and_the_message_say
 
 def test_all_that_differs_is_named_at_once():
     with pytest.raises(MotionError, match=r"options differ.*scenarios differ"):
-        require_comparable(traced(LEFT), traced(LEFT, options=replace(OPTIONS, window="all", duration_s=10.0)))
+        require_comparable(traced(LEFT), traced(LEFT, options=OPTIONS.replace(window="all", duration_s=10.0)))
 
 
-@pytest.mark.parametrize("options", [replace(OPTIONS, coverage_least_s=5.0), replace(OPTIONS, literal_formulas=True)])
+@pytest.mark.parametrize("options", [OPTIONS.replace(coverage_least_s=5.0), OPTIONS.replace(literal_formulas=True)])
 def test_other_data_and_what_no_trial_depends_on_may_differ(options):
     require_comparable(traced(LEFT), traced(RIGHT, options=options))

@@ -1,15 +1,17 @@
 """Leaving clips out: what is predicted is what an evaluation of the clips that are left finds."""
 
 import pytest
+from pydantic import ValidationError
 from tests.support.made_databases import made_database
 from tests.support.suggestion_cases import OPTIONS, evaluated, named, wandering_tracks, with_mirrored
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.improvement.objective import HEADLINES, DataSetObjective, headline_means
+from marey_motion.evaluation.improvement.objective import HEADLINES, headline_means, objective_value
 from marey_motion.evaluation.improvement.redundancy import leave_one_out, plan_removals
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.selection import without_sources
 from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_schemas.options.improvement import ObjectiveOptions
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +53,7 @@ def test_trials_that_do_not_need_a_clip_are_not_run_again(database, simulation):
 
 
 def test_every_removal_is_told_with_the_change_that_an_evaluation_finds(database, result, simulation):
-    objective = DataSetObjective()
+    objective = ObjectiveOptions()
     removals = leave_one_out(simulation, objective)
     assert {removal.source for removal in removals} == simulation.needed()
     before = headline_means(result.trials)
@@ -59,12 +61,14 @@ def test_every_removal_is_told_with_the_change_that_an_evaluation_finds(database
         again = evaluated(without_sources(database, [removal.source]))
         after = headline_means(again.trials)
         assert removal.changes == {name: after[name] - before[name] for name in HEADLINES}
-        assert removal.harm == objective.value(again.trials, 0.0) - objective.value(result.trials, 0.0)
+        assert removal.harm == objective_value(objective, again.trials, 0.0) - objective_value(
+            objective, result.trials, 0.0
+        )
     assert [removal.harm_per_s for removal in removals] == sorted(removal.harm_per_s for removal in removals)
 
 
 def test_a_plan_predicts_every_step_exactly(database, simulation):
-    plan = plan_removals(simulation, 4, DataSetObjective(), removed=["fast_000", "fast_001"])
+    plan = plan_removals(simulation, 4, ObjectiveOptions(), removed=["fast_000", "fast_001"])
     gone = ["fast_000", "fast_001"]
     for step in plan:
         gone.append(step.removal.source)
@@ -75,16 +79,16 @@ def test_a_plan_predicts_every_step_exactly(database, simulation):
 
 
 def test_a_plan_takes_the_least_harmful_removal_at_each_step(simulation):
-    plan = plan_removals(simulation, 3, DataSetObjective())
+    plan = plan_removals(simulation, 3, ObjectiveOptions())
     gone = []
     for step in plan:
-        assert step.removal == leave_one_out(simulation, DataSetObjective(), removed=gone)[0]
+        assert step.removal == leave_one_out(simulation, ObjectiveOptions(), removed=gone)[0]
         gone.append(step.removal.source)
 
 
 def test_only_as_many_clips_are_tried_as_asked_for_those_first_that_few_trials_need(simulation):
-    few = leave_one_out(simulation, DataSetObjective(), consider=2)
-    everything = leave_one_out(simulation, DataSetObjective())
+    few = leave_one_out(simulation, ObjectiveOptions(), consider=2)
+    everything = leave_one_out(simulation, ObjectiveOptions())
     assert len(few) == 2
     assert max(removal.trials for removal in few) <= sorted(removal.trials for removal in everything)[1]
 
@@ -99,7 +103,7 @@ def test_a_clip_and_its_mirrored_twin_go_together():
 
 def test_the_last_clip_is_never_taken():
     simulation = Resimulation(made_database(named(wandering_tracks(2)[:2])), OPTIONS)
-    assert len(plan_removals(simulation, 5, DataSetObjective())) <= 1
+    assert len(plan_removals(simulation, 5, ObjectiveOptions())) <= 1
 
 
 def test_a_clip_that_is_not_there_cannot_be_left_out(simulation):
@@ -110,16 +114,16 @@ def test_a_clip_that_is_not_there_cannot_be_left_out(simulation):
 def test_the_work_can_be_stopped(database):
     stopped = Resimulation(database, OPTIONS, cancelled=lambda: True)
     with pytest.raises(EvaluationCancelled):
-        leave_one_out(stopped, DataSetObjective())
+        leave_one_out(stopped, ObjectiveOptions())
 
 
 def test_progress_is_told_clip_by_clip(simulation):
     told = []
-    leave_one_out(simulation, DataSetObjective(), progress=lambda *step: told.append(step))
+    leave_one_out(simulation, ObjectiveOptions(), progress=lambda *step: told.append(step))
     assert [step[0] for step in told] == list(range(1, len(told) + 1))
     assert {step[1] for step in told} == {len(told)}
 
 
 def test_weights_that_make_no_sense_are_refused():
-    with pytest.raises(MotionError, match="pose_cost"):
-        DataSetObjective(pose_cost=-1.0)
+    with pytest.raises(ValidationError, match="pose_cost"):
+        ObjectiveOptions(pose_cost=-1.0)

@@ -11,7 +11,6 @@ from tests.support.report_pages import HOSTILE, is_sound
 
 from marey_motion.evaluation.compare import compare_results
 from marey_motion.evaluation.judgement import is_followed, judge, mean_speed_m_s
-from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.result import TrialResult
 from marey_motion.evaluation.scenario import Trial, demand
 from marey_motion.evaluation.suite import evaluate
@@ -26,6 +25,7 @@ from marey_reports.evaluation.definitions import METRICS
 from marey_reports.evaluation.figures import FIGURES, draw_figures
 from marey_reports.evaluation.page import compared, render_comparison, render_report, verdict
 from marey_reports.evaluation.words import find_holes
+from marey_schemas.options.evaluation import EvaluationOptions
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +170,7 @@ def test_reports_are_made_of_little(change, result):
 
 
 def test_a_real_evaluation_is_reported():
-    options = EvaluationOptions(grid=Grid((1.25, 2.0), (-50.0, 0.0, 50.0)), duration_s=6.0)
+    options = EvaluationOptions(speeds_m_s=(1.25, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=6.0)
     clips = [
         SourceClip(f"gait{index}", f"gait {index}", generate_gait(speed, turn_rate, 4.0))
         for index, (speed, turn_rate) in enumerate(((1.25, 0.0), (1.25, 0.9), (2.0, 0.0)))
@@ -352,7 +352,7 @@ def test_a_comparison_counts_mirrored_twins_once_and_says_when_coverage_is_asked
     first, second, *rest = result.clips
     twin = replace(second, mirrored_from=first.uid)
     usage = tuple(replace(one, popularity=np.ones(9)) if one.clip < 2 else one for one in result.usage)
-    options = replace(result.options, coverage_least_s=0.25)
+    options = result.options.replace(coverage_least_s=0.25)
     after = replace(result, clips=(first, twin, *rest), usage=usage, options=options)
     page = is_sound(render_comparison(result, after, title="Change", figures={}))
     assert f"of {len(result.clips)} and {len(result.clips) - 1}" in page.text

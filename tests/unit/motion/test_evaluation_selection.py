@@ -93,7 +93,7 @@ def test_what_does_not_belong_together_is_refused():
     with pytest.raises(MotionError, match="both databases have the clip clip_000"):
         joined(database, made_database(tracks[:1]))
     with pytest.raises(MotionError, match="same options"):
-        joined(database, replace(database, options=replace(database.options, end_policy="trim")))
+        joined(database, replace(database, options=database.options.replace(end_policy="trim")))
     skeleton = replace(database.body.skeleton, offsets=database.body.skeleton.offsets * 1.1)
     other = replace(database, body=replace(database.body, skeleton=skeleton))
     assert same_skeleton(database, database)

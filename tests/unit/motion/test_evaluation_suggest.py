@@ -22,9 +22,8 @@ from marey_motion.evaluation.improvement.objective import headline_means
 from marey_motion.evaluation.improvement.reasons import why_filling, why_redundant
 from marey_motion.evaluation.improvement.redundancy import Removal
 from marey_motion.evaluation.improvement.selection import joined, without_rows, without_sources
-from marey_motion.evaluation.improvement.suggest import SuggestionOptions, suggest
+from marey_motion.evaluation.improvement.suggest import suggest
 from marey_motion.evaluation.improvement.suggestion_documents import comparison_to_tree, suggestions_to_tree
-from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.similarity import accepted_distance
 from marey_motion.evaluation.suite import EvaluationCancelled
 from marey_motion.formats import read_motion
@@ -32,6 +31,8 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import SourceClip
 from marey_motion.rigs import map_joints
+from marey_schemas.options.evaluation import EvaluationOptions
+from marey_schemas.options.improvement import SuggestionOptions
 
 
 @pytest.fixture(scope="module")

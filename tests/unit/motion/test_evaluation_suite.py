@@ -1,5 +1,4 @@
 import threading
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -7,14 +6,16 @@ import pytest
 from tests.support.evaluation_cases import arc, trajectory_database
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.result_documents import records_to_tree
 from marey_motion.evaluation.scenario import reference, suite_trials
 from marey_motion.evaluation.suite import EvaluationCancelled, assemble, run_suite
-from marey_motion.matching.options import ControllerOptions
 from marey_schemas.encoding.codecs import encode_tree
+from marey_schemas.options.evaluation import EvaluationOptions
+from marey_schemas.options.matching import ControllerOptions
 
-OPTIONS = EvaluationOptions(grid=Grid((1.0, 2.0), (-50.0, 0.0, 50.0)), duration_s=6.0, switch_every_s=2.0)
+OPTIONS = EvaluationOptions(
+    speeds_m_s=(1.0, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=6.0, switch_every_s=2.0
+)
 TRIALS = suite_trials(OPTIONS)
 
 
@@ -125,13 +126,13 @@ def test_a_suite_cancelled_at_once_runs_nothing(database):
 
 
 def test_an_option_that_makes_no_sense_ends_the_suite_with_its_name(database):
-    options = replace(OPTIONS, controller=ControllerOptions(half_life_s=0.0))
-    with pytest.raises(MotionError, match="half_life_s"):
+    options = OPTIONS.replace(controller=ControllerOptions(search_every_s=0.004))
+    with pytest.raises(MotionError, match="search_every_s"):
         run_suite(database, options, threads=2)
 
 
 def test_trials_that_cannot_be_told_apart_are_refused(database):
-    options = replace(OPTIONS, grid=Grid((1.0, 1.0 + 1e-9), (0.0,)), families=("circle",))
+    options = OPTIONS.replace(speeds_m_s=(1.0, 1.0 + 1e-9), turn_rates_deg_s=(0.0,), families=("circle",))
     with pytest.raises(MotionError, match="two trials are called circle v=1 w=0"):
         run_suite(database, options)
 
@@ -194,12 +195,12 @@ def test_the_unused_clips_can_go_without_changing_a_trial(database, records, res
 
 def test_a_clip_of_the_whole_trajectory_is_followed_without_error_or_transition():
     for speed, turn_rate in ((2.0, 50.0), (1.0, -100.0), (3.0, 25.0)):
-        options = EvaluationOptions(grid=Grid((speed,), (turn_rate,)), families=("circle",))
+        options = EvaluationOptions(speeds_m_s=(speed,), turn_rates_deg_s=(turn_rate,), families=("circle",))
         (trial,) = suite_trials(options)
         asked = reference(trial)
         database = trajectory_database((asked.positions, asked.headings))
         for follow in ("time", "path"):
-            followed = replace(options, controller=ControllerOptions(follow=follow))
+            followed = options.replace(controller=ControllerOptions(follow=follow))
             metrics = assemble(database, followed, [trial], run_suite(database, followed)).trials[0].metrics
             assert metrics["offset_max"] < 1e-10
             assert abs(metrics["se_omega_deg"]) < 1e-10
@@ -212,7 +213,8 @@ def test_straight_and_circle_clips_hold_speed_and_turn_in_every_mode():
         database = trajectory_database(arc(speed, 0.0, 40.0), arc(speed, turn_rate, 40.0))
         for follow in ("time", "path", "open_loop"):
             options = EvaluationOptions(
-                grid=Grid((speed,), (turn_rate,)),
+                speeds_m_s=(speed,),
+                turn_rates_deg_s=(turn_rate,),
                 families=("circle",),
                 controller=ControllerOptions(follow=follow, root_inertialisation=False),
             )
@@ -228,7 +230,7 @@ def test_straight_and_circle_clips_hold_speed_and_turn_in_every_mode():
 
 def test_a_set_that_holds_the_mirror_image_of_every_clip_turns_alike_to_both_sides():
     options = EvaluationOptions(families=("circle",), controller=ControllerOptions(root_inertialisation=False))
-    grid = options.grid
+    grid = options
     database = trajectory_database(*(arc(v, w, 10.0) for v, w in product(grid.speeds_m_s, grid.turn_rates_deg_s)))
     result = assemble(database, options, suite_trials(options), run_suite(database, options))
 

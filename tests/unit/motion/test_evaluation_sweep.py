@@ -1,6 +1,5 @@
 """Other weights give what a database built with them gives, and groups are ranked by what they do."""
 
-from dataclasses import replace
 from math import radians
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 from tests.support.suggestion_cases import OPTIONS, evaluated
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.improvement.objective import DataSetObjective
+from marey_motion.evaluation.improvement.objective import objective_value
 from marey_motion.evaluation.improvement.sweep import (
     GROUPS,
     SweepRow,
@@ -23,8 +22,9 @@ from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import SourceClip
-from marey_motion.matching.options import DatabaseOptions, FeatureWeights
 from marey_motion.rigs import map_joints
+from marey_schemas.options.improvement import ObjectiveOptions
+from marey_schemas.options.matching import DatabaseOptions, FeatureWeights
 
 
 def walks(weights=None):
@@ -54,7 +54,7 @@ def test_other_weights_are_those_of_a_database_built_with_them(database):
 
 
 def test_a_group_without_weight_plays_no_part_and_cannot_be_brought_back(database):
-    silent = reweighted(database, replace(FeatureWeights(), hip_velocity=0.0))
+    silent = reweighted(database, FeatureWeights(hip_velocity=0.0))
     own = next(group for group in silent.layout.groups if group.name == "hip_velocity")
     assert np.abs(silent.normaliser.apply(silent.features)[:, own.start : own.stop]).max() < 1e-12
     with pytest.raises(MotionError, match="hip_velocity"):
@@ -66,7 +66,7 @@ def test_each_row_of_a_sweep_is_an_evaluation_with_these_weights(database):
     for row in rows:
         result = evaluated(reweighted(database, row.weights))
         assert row.metrics == pooled_metrics(result.trials)
-        assert row.objective == DataSetObjective().value(result.trials, 0.0)
+        assert row.objective == objective_value(ObjectiveOptions(), result.trials, 0.0)
     assert rows[0].objective != rows[1].objective
 
 
@@ -85,7 +85,7 @@ def test_the_group_whose_weight_changes_most_is_the_most_influential():
     base = FeatureWeights()
 
     def row(objective, **weights):
-        return SweepRow(replace(base, **weights), {}, {}, objective)
+        return SweepRow(base.replace(**weights), {}, {}, objective)
 
     found = group_influences(
         [

@@ -18,12 +18,11 @@ from tests.support.suggestion_cases import (
 from marey_motion.evaluation.improvement.resimulation import needed_rows
 from marey_motion.evaluation.improvement.selection import without_rows, without_sources
 from marey_motion.evaluation.improvement.unused import find_unused
-from marey_motion.evaluation.options import Grid
 from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.evaluation.suite import run_suite
-from marey_motion.matching.options import DatabaseOptions
 from marey_motion.matching.record import Status
 from marey_motion.matching.search import build_index
+from marey_schemas.options.matching import DatabaseOptions
 
 VARIANTS = {
     "as usual": {},
@@ -41,7 +40,7 @@ def unused_of(database, options=OPTIONS):
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_removing_all_that_is_unused_leaves_every_record_bit_identical(variant):
-    options = replace(OPTIONS, controller=replace(OPTIONS.controller, **VARIANTS[variant]))
+    options = OPTIONS.replace(controller=OPTIONS.controller.replace(**VARIANTS[variant]))
     database = made_database(wandering_tracks())
     records, unused = unused_of(database, options)
     assert unused.clips
@@ -65,8 +64,9 @@ def test_frames_that_a_search_may_not_choose_stay_in_one_clip_with_the_frame_tha
     features = database.features.copy()
     features[:, 15:21] += farther[:, None]
     database = replace(database, features=features)
-    controller = replace(OPTIONS.controller, reselect_window_s=2.0, continuing_bias=1.0)
-    options = replace(OPTIONS, grid=Grid((1.0,), (0.0,)), approach_s=0.4, duration_s=0.1, controller=controller)
+    controller = OPTIONS.controller.replace(reselect_window_s=2.0, continuing_bias=1.0)
+    options = OPTIONS.replace(speeds_m_s=(1.0,), turn_rates_deg_s=(0.0,), approach_s=0.4, controller=controller)
+    options = options.model_copy(update={"duration_s": 0.1})  # less than may be asked for
 
     records, unused = unused_of(database, options)
 

@@ -10,8 +10,8 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.scenario import Trial, reference
 from marey_motion.matching.controller import run_trial
 from marey_motion.matching.explain import Explanation, explain_choice
-from marey_motion.matching.options import ControllerOptions
 from marey_motion.matching.record import Status, TrialRecord
+from marey_schemas.options.matching import ControllerOptions
 
 DATABASE = made_database(random_tracks(12, seed=21))
 INDEX = index_of(DATABASE)
@@ -108,7 +108,7 @@ def test_between_searches_the_clip_just_goes_on():
 
 def test_the_end_of_a_clip_leaves_nothing_to_go_on():
     database = made_database([arc_track(2.0, 0.0, 5.0)])
-    options = ControllerOptions(continuing_bias=-1e9)
+    options = ControllerOptions(continuing_bias=-1000.0)
     path = reference(Trial("circle", 2.0, 0.0))
     record = run_trial(database, index_of(database), path, options)
 

@@ -15,9 +15,9 @@ from marey_motion.formats.predecessor.encoding import encode_document
 from marey_motion.formats.predecessor.model import read_predecessor_model
 from marey_motion.formats.predecessor.model_writer import write_predecessor_model
 from marey_motion.formats.predecessor.time_functions import PredecessorTime, as_log_slopes
-from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.modelling.training import train_primitive
+from marey_schemas.options.modelling import ModelOptions
 
 QUICK = ModelOptions(leave_one_out=False, folds=0, report_samples=0)
 

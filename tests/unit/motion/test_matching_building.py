@@ -14,11 +14,11 @@ from marey_motion.looping import about_vertical, rotated
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database, database_digest
 from marey_motion.matching.database import MatchingDatabase, SourceClip
-from marey_motion.matching.options import DatabaseOptions
 from marey_motion.mirroring import mirror_clip
 from marey_motion.retargeting import plan_retarget, retarget
 from marey_motion.rigs import guess_axes, map_joints
 from marey_motion.skeleton import Skeleton
+from marey_schemas.options.matching import DatabaseOptions
 
 DEFAULTS = DatabaseOptions()
 BODY = MatchingBody.from_mapping(studio_skeleton(), map_joints(studio_skeleton()))

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from tests.support.plain_features import plain_rows
 
 from marey_motion.clip import Clip
@@ -11,8 +12,8 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.features import feature_layout
-from marey_motion.matching.options import DatabaseOptions, FeatureWeights
 from marey_motion.rigs import map_joints
+from marey_schemas.options.matching import DatabaseOptions, FeatureWeights
 
 DEFAULTS = DatabaseOptions()
 BODY = MatchingBody.from_mapping(studio_skeleton(), map_joints(studio_skeleton()))
@@ -106,18 +107,22 @@ def test_many_joints_are_warned_of() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (DatabaseOptions(extra_joints=("tail",)), "extra_joints: the skeleton has no tail; it has head"),
-        (DatabaseOptions(extra_joints=("head", "head")), "named twice"),
-        (DatabaseOptions(horizons_s=()), "horizons_s"),
-        (DatabaseOptions(horizons_s=(0.5, 0.25)), "horizons_s"),
-        (DatabaseOptions(horizons_s=(0.0, 0.25)), "horizons_s"),
-        (DatabaseOptions(horizons_s=(0.005, 0.25)), "horizons_s: .* a frame \\(1/60 s\\) or more"),
-        (DatabaseOptions(horizons_s=(0.25, 0.252)), "horizons_s: .* a frame"),
-        (DatabaseOptions(horizons_s=(0.02,), rate_hz=20.0), "horizons_s: .* a frame \\(1/20 s\\)"),
-        (DatabaseOptions(weights=FeatureWeights(hip_velocity=-1.0)), "weights.hip_velocity: a weight of -1.0"),
-        (DatabaseOptions(rate_hz=0.0), "rate_hz"),
+        ({"extra_joints": ("head", "head")}, "extra_joints\n.*named twice"),
+        ({"horizons_s": ()}, "horizons_s"),
+        ({"horizons_s": (0.5, 0.25)}, "horizons_s"),
+        ({"horizons_s": (0.0, 0.25)}, "horizons_s"),
+        ({"horizons_s": (0.005, 0.25)}, "horizons_s: .* a frame \\(1/60 s\\) or more"),
+        ({"horizons_s": (0.25, 0.252)}, "horizons_s: .* a frame"),
+        ({"horizons_s": (0.02,), "rate_hz": 20.0}, "horizons_s: .* a frame \\(1/20 s\\)"),
+        ({"weights": {"hip_velocity": -1.0}}, "weights.hip_velocity"),
+        ({"rate_hz": 0.0}, "rate_hz"),
     ],
 )
-def test_options_that_make_no_sense_are_refused_by_name(options: DatabaseOptions, message: str) -> None:
-    with pytest.raises(MotionError, match=message):
-        built(CLIPS["5 frames"], options)
+def test_options_that_make_no_sense_are_refused_by_name(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        DatabaseOptions.model_validate(options)
+
+
+def test_a_joint_that_the_skeleton_lacks_is_refused_by_name() -> None:
+    with pytest.raises(MotionError, match="extra_joints: the skeleton has no tail; it has head"):
+        built(CLIPS["5 frames"], DatabaseOptions(extra_joints=("tail",)))

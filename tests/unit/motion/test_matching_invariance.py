@@ -1,7 +1,5 @@
 """What exact roots must give, and what must not change a result: databases whose answer is known."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from tests.support.made_databases import (
@@ -21,7 +19,7 @@ from tests.support.made_databases import (
 )
 
 from marey_motion.evaluation.scenario import Trial
-from marey_motion.matching.options import ControllerOptions
+from marey_schemas.options.matching import ControllerOptions
 
 # Data that is the scenario
 
@@ -30,7 +28,7 @@ from marey_motion.matching.options import ControllerOptions
 @pytest.mark.parametrize(("speed", "turn_rate_deg"), [(2.0, 50.0), (1.0, -100.0), (3.0, 25.0)])
 def test_a_clip_that_is_the_trajectory_is_played_from_its_start_to_its_end(speed, turn_rate_deg, follow):
     trial = circle(speed, turn_rate_deg)
-    record = play(made_database([path_track(trial)]), trial, replace(EXACT, follow=follow))
+    record = play(made_database([path_track(trial)]), trial, EXACT.replace(follow=follow))
 
     speeds, turn_rates = on_the_circle(record)
     # Where other rows are played than those of the tick, the rounding of a turn's steps adds up instead of repeating.
@@ -52,7 +50,7 @@ def test_a_straight_line_and_a_circle_give_the_wished_speeds(follow):
         database = made_database([arc_track(speed, 0.0, 40.0), arc_track(speed, turn_rate_deg, 40.0)])
         trial = circle(speed, turn_rate_deg)
 
-        record = play(database, trial, replace(EXACT, follow=follow))
+        record = play(database, trial, EXACT.replace(follow=follow))
 
         speeds, turn_rates = on_the_circle(record)
         assert abs(speeds.mean() - speed) <= 2e-4

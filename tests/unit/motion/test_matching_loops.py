@@ -12,9 +12,9 @@ from marey_motion.looping import LoopSeam, continue_motion, loop_seam, moves_of_
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import MatchingDatabase, SourceClip
-from marey_motion.matching.options import DatabaseOptions
 from marey_motion.motion import Motion
 from marey_motion.rigs import map_joints
+from marey_schemas.options.matching import DatabaseOptions
 
 BODY = MatchingBody.from_mapping(studio_skeleton(), map_joints(studio_skeleton()))
 LOOPS = DatabaseOptions(end_policy="loop")
@@ -96,7 +96,7 @@ def test_without_the_policy_a_loop_is_a_clip_that_ends(long_walk: Clip) -> None:
 
 def test_a_mirrored_loop_turns_the_other_way(long_walk: Clip) -> None:
     clip = long_walk.sliced(120, 120 + stride_frames(long_walk))
-    plain, mirrored = built(clip), built(clip, replace(LOOPS, mirroring="only"))
+    plain, mirrored = built(clip), built(clip, LOOPS.replace(mirroring="only"))
     signs = np.tile([-1.0, 1.0], 6)
     np.testing.assert_allclose(mirrored.features[:, 15:], plain.features[:, 15:] * signs, atol=1e-9)
     assert mirrored.selectable.all()

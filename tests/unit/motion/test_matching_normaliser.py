@@ -10,8 +10,8 @@ from marey_motion.matching.building import build_database, union_normaliser, wit
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.features import feature_layout
 from marey_motion.matching.normaliser import Normaliser, fit_normaliser
-from marey_motion.matching.options import DatabaseOptions, FeatureWeights
 from marey_motion.rigs import map_joints
+from marey_schemas.options.matching import DatabaseOptions, FeatureWeights
 
 DEFAULTS = DatabaseOptions()
 BODY = MatchingBody.from_mapping(studio_skeleton(), map_joints(studio_skeleton()))

@@ -19,10 +19,10 @@ from marey_motion.matching.building import build_database
 from marey_motion.matching.controller import run_trial
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.normaliser import Normaliser
-from marey_motion.matching.options import ControllerOptions, DatabaseOptions
 from marey_motion.matching.record import Status, TrialRecord
 from marey_motion.matching.search import SearchIndex, build_index
 from marey_motion.rigs import map_joints
+from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
 
 FOLLOWS = ("time", "path", "open_loop")
 EXACT = ControllerOptions(root_inertialisation=False)
@@ -100,7 +100,7 @@ def test_a_clip_asked_to_do_what_it_does_is_played_through(speed, turn_rate_deg,
         turn_rates_rad_s=60 * np.diff(database.root_headings, append=database.root_headings[-1]),
     )
 
-    record = play(database, own, replace(EXACT, follow=follow))
+    record = play(database, own, EXACT.replace(follow=follow))
 
     assert record.rows.tolist() == list(range(1980))
     assert np.abs(record.positions - database.root_positions[:1980]).max() < 1e-12
@@ -126,7 +126,7 @@ def test_a_straight_walk_and_a_circle_give_the_wished_speeds(speed, turn_rate_de
     trial = circle(speed, turn_rate_deg)
     database = database_of([take("a", (40.0, speed, 0.0)), take("b", (40.0, speed, turn_rate_deg))])
 
-    record = play(database, trial, replace(EXACT, follow=follow))
+    record = play(database, trial, EXACT.replace(follow=follow))
 
     bias, turn_bias = static_errors(record, trial)
     assert -LEAN_M * trial.turn_rate_rad_s < bias < 2e-3
@@ -256,7 +256,7 @@ def test_a_loop_of_two_strides_walks_on_for_half_a_minute():
     )
     trial = circle(1.4, 0.0)
 
-    record = play(looping, trial, replace(EXACT, follow="open_loop", continuing_bias=-1e9))
+    record = play(looping, trial, EXACT.replace(follow="open_loop", continuing_bias=-1000.0))
 
     assert np.count_nonzero(record.status == Status.FORCED) == -(-1980 // stride)
     assert not np.any(record.status == Status.REPLACING)

@@ -6,7 +6,6 @@ from pydantic import ValidationError
 from tests.support.modelling_examples import bending_chains, chain, walks
 
 from marey_motion.errors import MotionError
-from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.primitive_documents import (
     primitive_from_tree,
     primitive_to_tree,
@@ -18,7 +17,6 @@ from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.models import MotionPrimitiveDocument
 from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree, encode_tree
-from marey_schemas.job_params import ModelParams
 
 SKELETON = {"item": "skel_1", "revision": 2}
 
@@ -133,10 +131,3 @@ def test_arrays_that_do_not_fit_are_refused(place, told):
         tree["mixture"]["covariances"] = tree["mixture"]["covariances"][:, :-1, :-1]
     with pytest.raises(ValidationError, match=told):
         MotionPrimitiveDocument.model_validate(tree)
-
-
-def test_what_can_be_asked_for_are_the_options_of_training():
-    asked = ModelParams()
-    options = ModelOptions(**asked.model_dump(include=set(ModelOptions().as_tree())))
-    assert options == ModelOptions()
-    assert set(ModelOptions().as_tree()) <= set(ModelParams.model_fields)

@@ -10,7 +10,6 @@ import pytest
 from tests.support.drawn_figures import cut_off, is_sound, rows_of
 from tests.support.model_examples import FRAMES, walks
 
-from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.search.check import SearchCheck
 from marey_motion.modelling.training import train_primitive
 from marey_motion.skeleton import Skeleton
@@ -26,6 +25,7 @@ from marey_reports.models.figures import (
 from marey_reports.models.figures.components import draw_component
 from marey_reports.models.figures.latent_space import ellipse
 from marey_reports.models.figures.samples import reach_of
+from marey_schemas.options.modelling import ModelOptions
 
 QUICK = ModelOptions(report_samples=20, starts=1)
 
@@ -276,10 +276,10 @@ ODD = {
     "no components": lambda: modelled(alike(walks(3), 3)),
     "one example": lambda: modelled(alike(walks(2), 1)),
     "two examples": lambda: modelled(walks(2)),
-    "several kinds": lambda: modelled(walks(40), replace(QUICK, mixture_components=3, spatial_components=2)),
-    "one pose component": lambda: modelled(walks(), replace(QUICK, spatial_components=1, most_temporal_components=0)),
-    "only time": lambda: modelled(walks(), replace(QUICK, spatial_components=0)),
-    "nothing held out": lambda: modelled(walks(), replace(QUICK, folds=0, leave_one_out=False, report_samples=0)),
+    "several kinds": lambda: modelled(walks(40), QUICK.replace(mixture_components=3, spatial_components=2)),
+    "one pose component": lambda: modelled(walks(), QUICK.replace(spatial_components=1, most_temporal_components=0)),
+    "only time": lambda: modelled(walks(), QUICK.replace(spatial_components=0)),
+    "nothing held out": lambda: modelled(walks(), QUICK.replace(folds=0, leave_one_out=False, report_samples=0)),
     "long names": lambda: modelled(walks(6, names=LONG_NAMES)),
     "no known joints": lambda: modelled(headless(walks())),
     "few frames": lambda: modelled(walks(5, frames=6)),
@@ -302,7 +302,7 @@ def test_odd_models_are_drawn_and_nothing_is_cut_off(odd):
 
 
 def test_two_hundred_examples_are_drawn_as_twenty_are():
-    subject = modelled(walks(200), replace(QUICK, leave_one_out=False, folds=0))
+    subject = modelled(walks(200), QUICK.replace(leave_one_out=False, folds=0))
     drawn = {**draw_alignment_figures(subject.examples), **draw_model_figures(subject)}
     assert len(rows_of(drawn["likelihood"], "examples")) == 200
     assert "170 likeliest are not shown" in drawn["likelihood"].caption

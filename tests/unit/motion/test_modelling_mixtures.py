@@ -10,7 +10,8 @@ from tests.support.tiers import examples
 
 from marey_motion.errors import MotionError
 from marey_motion.modelling.mixture import LatentMixture
-from marey_motion.modelling.mixture_fitting import MixtureOptions, fit_mixture, one_thread
+from marey_motion.modelling.mixture_fitting import fit_mixture, one_thread
+from marey_schemas.options.modelling import MixtureOptions
 
 
 def two_kinds(examples=200, dimensions=3, apart=8.0, seed=0):
@@ -152,7 +153,7 @@ def test_a_mixture_that_fits_its_own_examples_alone_is_not_taken():
         fitted = fit_mixture(random.standard_t(4, (26, 6)), MixtureOptions(criterion="aic"))
         refused += [one.refusal for one in fitted.candidates]
         if len(fitted.mixture.weights) > 1:
-            single = fit_mixture(random.standard_t(4, (26, 6)), MixtureOptions(components=1))
+            single = fit_mixture(random.standard_t(4, (26, 6)), MixtureOptions(mixture_components=1))
             assert fitted.held_out is not None
             assert single.held_out is not None
     assert "held-out" in refused
@@ -172,9 +173,9 @@ def test_held_out_likelihoods_are_those_of_mixtures_that_lack_the_example():
 
 
 def test_the_choice_can_be_made_by_hand():
-    assert len(fit_mixture(two_kinds(), MixtureOptions(components=3)).mixture.weights) == 3
+    assert len(fit_mixture(two_kinds(), MixtureOptions(mixture_components=3)).mixture.weights) == 3
     with pytest.raises(MotionError, match="9 components for 8 examples"):
-        fit_mixture(two_kinds(8), MixtureOptions(components=9))
+        fit_mixture(two_kinds(8), MixtureOptions(mixture_components=9))
 
 
 def test_numbers_that_are_none_are_refused():

@@ -14,7 +14,8 @@ from marey_motion.modelling.search.objective import build_objective
 from marey_motion.modelling.search.optimise import RefineOptions, _Prior, refine
 from marey_motion.modelling.search.samples import search_tree
 from marey_motion.modelling.search.steps import SeveralSteps, Step
-from marey_motion.modelling.search.tree import TreeOptions, build_tree
+from marey_motion.modelling.search.tree import build_tree
+from marey_schemas.options.modelling import TreeOptions
 
 WRIST = (JointPosition("left_wrist", "middle", (0.35, 1.0, 0.6)),)
 
@@ -106,7 +107,7 @@ def test_no_iterations_return_the_start():
 
 def test_what_a_motion_does_already_is_met_within_a_millimetre():
     primitive, latents = walking()
-    tree = build_tree(primitive, 1, TreeOptions(3000, features="latent"))
+    tree = build_tree(primitive, 1, TreeOptions(samples=3000, features="latent"))
     for example in latents[::8]:
         pose = primitive.poses(example[None], [float(FRAMES // 2)])[:, 0]
         place = forward_kinematics(primitive.skeleton, pose)[0, standard_joints()["left_wrist"]]

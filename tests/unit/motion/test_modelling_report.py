@@ -7,12 +7,12 @@ import pytest
 from tests.support.model_examples import walks
 from tests.support.report_pages import HOSTILE, is_sound
 
-from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.training import train_primitive
 from marey_motion.modelling.training_warnings import Warned
 from marey_motion.modelling.verdict import verdict_of
 from marey_reports.models.figures import ModelSubject, draw_alignment_figures, draw_model_figures
 from marey_reports.models.page import render_model_report
+from marey_schemas.options.modelling import ModelOptions
 
 ORIGIN = {
     "aligned": [{"item": "item_1", "revision": 2, "name": "lab/aligned/walk 00"}],

@@ -13,21 +13,21 @@ from tests.support.tiers import examples
 
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
-from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.search.constraints import JointPosition, RootPosition
 from marey_motion.modelling.search.objective import build_objective
 from marey_motion.modelling.search.optimise import RefineOptions, refine
 from marey_motion.modelling.search.samples import search_all, search_closely, search_tree
 from marey_motion.modelling.search.steps import SeveralSteps, Step
-from marey_motion.modelling.search.tree import END_EFFECTORS, SampleTree, TreeOptions, build_tree
+from marey_motion.modelling.search.tree import END_EFFECTORS, SampleTree, build_tree
 from marey_motion.modelling.training import train_primitive
+from marey_schemas.options.modelling import ModelOptions, TreeOptions
 
 EVERYTHING = 10**6
 
 
 @cache
 def grown(leaf_size=1, samples=2000):
-    return build_tree(walking()[0], 2, TreeOptions(samples, leaf_size=leaf_size, features="latent"))
+    return build_tree(walking()[0], 2, TreeOptions(samples=samples, leaf_size=leaf_size, features="latent"))
 
 
 def wrist_at(x, y, z):
@@ -110,7 +110,7 @@ def test_where_everything_costs_the_same_the_first_in_the_tree_are_found():
 
 
 def test_a_root_that_is_a_leaf_is_searched():
-    tree = build_tree(walking()[0], 2, TreeOptions(50, leaf_size=50, features="latent"))
+    tree = build_tree(walking()[0], 2, TreeOptions(samples=50, leaf_size=50, features="latent"))
     objective = wrist_at(0.3, 1.0, 0.4)
     assert search_tree(objective, tree).costs == search_all(objective, tree).costs
 
@@ -183,7 +183,7 @@ def own_keyframes(**options):
     """
     aligned, joints = walks(24), standard_joints()
     primitive = train_primitive(aligned, ModelOptions(leave_one_out=False, report_samples=0, **options)).primitive
-    tree = build_tree(primitive, 0, TreeOptions(10_000), end_effectors=[joints[name] for name in END_EFFECTORS])
+    tree = build_tree(primitive, 0, TreeOptions(samples=10_000), end_effectors=[joints[name] for name in END_EFFECTORS])
     poses = aligned.poses[:, aligned.keyframes["contact"]]
     wrists = forward_kinematics(aligned.skeleton, poses)[:, joints["left_wrist"]]
     wanted = [(JointPosition("left_wrist", "contact", tuple(place)),) for place in wrists.tolist()]

@@ -7,9 +7,9 @@ import pytest
 from tests.support.model_examples import walks
 
 from marey_motion.kinematics import forward_kinematics
-from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.search.check import check_search
 from marey_motion.rigs import map_joints
+from marey_schemas.options.modelling import ModelOptions
 
 OPTIONS = ModelOptions(starts=1)
 

@@ -9,7 +9,6 @@ from marey_motion.alignment.signs import consistent_poses
 from marey_motion.formats import read_motion
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.matching.body import MatchingBody
-from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.search.constraints import JointPosition
 from marey_motion.modelling.search.objective import build_objective
 from marey_motion.modelling.search.optimise import RefineOptions
@@ -20,6 +19,7 @@ from marey_motion.modelling.training import train_primitive
 from marey_motion.retargeting import plan_retarget, retarget
 from marey_motion.rigs import guess_axes, map_joints
 from marey_motion.skeleton import same_hierarchy
+from marey_schemas.options.modelling import ModelOptions
 
 TARGETS = 200
 HELD_OUT_EVERY = 4

@@ -22,15 +22,16 @@ from marey_motion.modelling.search.found_motions import found_motion
 from marey_motion.modelling.search.optimise import RefineOptions
 from marey_motion.modelling.search.step_search import search_steps
 from marey_motion.modelling.search.steps import MOST_STEPS, Step, TransitionOptions
-from marey_motion.modelling.search.tree import TreeOptions, build_tree
+from marey_motion.modelling.search.tree import build_tree
 from marey_motion.quaternions import from_axis_angle
 from marey_motion.rigs import map_joints
+from marey_schemas.options.modelling import TreeOptions
 
 START = Placement(0.5, 1.0, -2.0)
 
 
 def tree():
-    return build_tree(walking()[0], 1, TreeOptions(2000, features="latent"))
+    return build_tree(walking()[0], 1, TreeOptions(samples=2000, features="latent"))
 
 
 def walk_to(*places):
@@ -130,7 +131,7 @@ def test_a_tolerance_that_is_larger_lets_joints_jump_more():
 def test_one_step_needs_no_hips_and_shoulders():
     primitive = sliding(2)
     step = Step(primitive, (RootPosition("end", (0.3, None)),), {})
-    one = build_tree(primitive, 0, TreeOptions(500, features="latent"))
+    one = build_tree(primitive, 0, TreeOptions(samples=500, features="latent"))
     sequel = search_steps([step], [one], start=Placement(0.0, 0.1, 0.0), refining=RefineOptions(1e-4))
     assert sequel.measured.errors[0][0] < 1e-3
     with pytest.raises(MotionError, match="left_hip"):
@@ -154,7 +155,7 @@ def test_steps_of_different_skeletons_make_no_motion():
     sequel = search_steps(THREE[:1], [tree()])
     primitive = sliding(2)
     other = Step(primitive, (), {})
-    wrong = search_steps([other], [build_tree(primitive, 0, TreeOptions(10, features="latent"))])
+    wrong = search_steps([other], [build_tree(primitive, 0, TreeOptions(samples=10, features="latent"))])
     with pytest.raises(InvalidConstraint, match="different skeletons") as caught:
         found_motion([THREE[0], other], joined(sequel, wrong))
     assert caught.value.where == "steps[1]"

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from scipy.stats import multivariate_normal
 from tests.support.modelling_examples import aligned_set, bending_chains, chain, unit_poses, walks, warps
 
@@ -13,7 +14,6 @@ from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.modelling import reconstruction_kernels
 from marey_motion.modelling.fpca import Keep, find_components
-from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.primitive_documents import trained_to_tree
 from marey_motion.modelling.reconstruction import comparison_frames, reconstruction_errors
 from marey_motion.modelling.sample_quality import FootQuality
@@ -22,6 +22,7 @@ from marey_motion.modelling.training import fit_examples, train_primitive
 from marey_motion.modelling.training_warnings import warnings_of
 from marey_motion.modelling.verdict import headline_of, verdict_of
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
+from marey_schemas.options.modelling import ModelOptions
 
 SCALINGS = ["jacobian", "root_max", "sfpca", "none"]
 QUICK = ModelOptions(leave_one_out=False, folds=0, report_samples=0)
@@ -37,7 +38,7 @@ def as_bytes(trained):
 @pytest.mark.parametrize("scaling", SCALINGS)
 def test_examples_come_back_from_their_latent_vectors(scaling):
     aligned = bending_chains(size=0.02)
-    options = dataclasses.replace(QUICK, scaling=scaling, spatial_components=20, temporal_share=1.0)
+    options = QUICK.replace(scaling=scaling, spatial_components=20, temporal_share=1.0)
     primitive = train_primitive(aligned, options).primitive
     latents = primitive.latents_of(aligned.poses, aligned.time_functions)
     poses = primitive.poses(latents)
@@ -180,7 +181,7 @@ def test_training_gives_the_same_bytes_every_time_and_on_any_number_of_threads(s
 
 def test_what_a_left_out_example_loses_is_what_a_model_without_it_loses():
     aligned = bending_chains(8)
-    options = dataclasses.replace(QUICK, spatial_share=1.0)
+    options = QUICK.replace(spatial_share=1.0)
     fitted = fit_examples(aligned, options)
     found = reconstruction_errors(aligned.skeleton, fitted.spatial, fitted.poses, 5)
     basis = fitted.spatial.functions.basis
@@ -334,5 +335,5 @@ def test_examples_that_make_no_model_are_refused_by_name():
     ],
 )
 def test_options_out_of_range_are_refused_by_name(name, value):
-    with pytest.raises(MotionError, match=name):
+    with pytest.raises(ValidationError, match=name):
         ModelOptions(**{name: value})

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from tests.support.search_primitives import sliding, standard_joints, walking
 from tests.support.tiers import examples
 
@@ -15,10 +16,11 @@ from marey_motion.modelling.mixture import LatentMixture
 from marey_motion.modelling.search.constraints import JointPosition
 from marey_motion.modelling.search.objective import build_objective
 from marey_motion.modelling.search.samples import search_tree
-from marey_motion.modelling.search.tree import END_EFFECTORS, SampleTree, TreeOptions, build_tree
+from marey_motion.modelling.search.tree import END_EFFECTORS, SampleTree, build_tree
 from marey_motion.modelling.search.tree_documents import sample_tree_from_tree, sample_tree_to_tree
 from marey_schemas.documents.sample_trees import SampleTreeDocument
 from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree, encode_tree
+from marey_schemas.options.modelling import TreeOptions
 
 LATENT = TreeOptions(samples=600, features="latent")
 
@@ -49,7 +51,11 @@ def test_a_tree_holds_each_sample_of_the_model_once():
 )
 def test_children_share_the_samples_of_their_parent(seed, samples, branching, leaf_size, depth):
     primitive, _ = walking()
-    tree = build_tree(primitive, seed, TreeOptions(samples, branching, leaf_size, depth, "latent"))
+    tree = build_tree(
+        primitive,
+        seed,
+        TreeOptions(samples=samples, branching=branching, leaf_size=leaf_size, depth=depth, features="latent"),
+    )
     levels = np.zeros(len(tree.sizes), dtype=int)
     for node in range(len(tree.sizes)):
         below = children(tree, node)
@@ -88,7 +94,7 @@ def test_two_clear_groups_are_told_apart():
     primitive = sliding(1)
     far = LatentMixture(np.array([0.3, 0.7]), np.array([[-50.0], [50.0]]), np.full((2, 1, 1), 1.0))
     object.__setattr__(primitive, "mixture", far)
-    tree = build_tree(primitive, 4, TreeOptions(200, branching=2, features="latent"))
+    tree = build_tree(primitive, 4, TreeOptions(samples=200, branching=2, features="latent"))
     left, right = (members(tree, node) for node in children(tree, 0))
     assert (np.sign(left) != np.sign(right[0])).all()
     assert same(np.sign(right))
@@ -99,7 +105,7 @@ def test_threads_and_repetitions_make_the_same_bytes():
     wanted = [standard_joints()[name] for name in END_EFFECTORS]
 
     def built(_number):
-        tree = build_tree(primitive, 11, TreeOptions(1500), end_effectors=wanted)
+        tree = build_tree(primitive, 11, TreeOptions(samples=1500), end_effectors=wanted)
         return tree.samples.tobytes() + tree.sizes.tobytes() + tree.children.tobytes()
 
     alone = {built(0), built(1)}
@@ -170,9 +176,8 @@ def test_nodes_that_make_no_tree_are_refused(sizes, children):
     ("field", "value"), [("samples", 0), ("branching", 1), ("leaf_size", 0), ("depth", 0), ("samples", 10**8)]
 )
 def test_options_out_of_range_are_refused_by_name(field, value):
-    with pytest.raises(MotionError, match=str(value)) as caught:
+    with pytest.raises(ValidationError, match=field):
         TreeOptions(**{field: value})
-    assert caught.value.where == field
 
 
 def test_end_effectors_are_needed_to_group_by_them():
@@ -184,7 +189,7 @@ def test_end_effectors_are_needed_to_group_by_them():
 @pytest.mark.parametrize("candidates", [1, 4, 1000])
 def test_no_search_evaluates_more_motions_than_its_tree_tells_before(branching, leaf_size, depth, candidates):
     primitive = walking()[0]
-    options = TreeOptions(300, branching, leaf_size, depth, "latent")
+    options = TreeOptions(samples=300, branching=branching, leaf_size=leaf_size, depth=depth, features="latent")
     tree = build_tree(primitive, 1, options)
     for height in (0.8, 1.2):
         constraints = (JointPosition("left_wrist", "middle", (0.3, height, 0.5)),)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.options import EvaluationOptions, Grid
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials
+from marey_schemas.options.evaluation import EvaluationOptions
 
 RATE_HZ = 60.0
 
@@ -26,7 +26,8 @@ def test_the_default_suite_is_that_of_the_paper_in_a_stable_order():
 
 def test_the_options_of_a_suite_reach_its_trials():
     options = EvaluationOptions(
-        grid=Grid((1.5,), (0.0, 30.0)),
+        speeds_m_s=(1.5,),
+        turn_rates_deg_s=(0.0, 30.0),
         families=("switching",),
         approach_s=2.0,
         duration_s=10.0,

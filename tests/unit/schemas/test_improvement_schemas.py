@@ -5,7 +5,7 @@ from pydantic import ValidationError
 
 from marey_schemas.job_kinds import MOST_TASKS, find_kind
 from marey_schemas.job_params import OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
-from marey_schemas.options.improvement import ObjectiveParams
+from marey_schemas.options.improvement import ObjectiveOptions
 
 
 def test_a_sweep_has_a_task_for_every_setting_and_never_too_many():
@@ -16,8 +16,8 @@ def test_a_sweep_has_a_task_for_every_setting_and_never_too_many():
 @pytest.mark.parametrize(
     ("params", "given"),
     [
-        (ObjectiveParams, {"offset": -1}),
-        (ObjectiveParams, {"seconds": float("nan")}),
+        (ObjectiveOptions, {"offset": -1}),
+        (ObjectiveOptions, {"seconds": float("nan")}),
         (OptimiseParams, {"max_steps": 0}),
         (SuggestParams, {"removals": 1001}),
         (SweepParams, {"factors": ()}),

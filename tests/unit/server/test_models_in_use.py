@@ -11,10 +11,10 @@ import pytest
 from tests.support.modelling_examples import bending_chains
 
 from marey_motion.documents import skeleton_to_document
-from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.primitive_documents import primitive_to_tree
 from marey_motion.modelling.training import train_primitive
 from marey_schemas.lru import LruCache
+from marey_schemas.options.modelling import ModelOptions
 from marey_server.errors import InvalidProblem
 from marey_server.motions.models import FoundModel, LoadedModel, parse_model, sample_document, sample_file, size_bytes
 from marey_server.store.items.reading import FoundPart

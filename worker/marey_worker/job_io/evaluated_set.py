@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from marey_motion.evaluation.improvement.objective import DataSetObjective
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import records_from_tree, result_from_tree
 from marey_motion.evaluation.scenario import Trial
 from marey_schemas.documents.reports import StoredFile
 from marey_schemas.encoding.codecs import JSON, encode_tree
 from marey_schemas.kinds import Kind
-from marey_schemas.options.improvement import ObjectiveParams
 from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import Context
 from marey_worker.job_io.matching_clips import MatchingClips, read_evaluated_clips, refusing_motion_errors
@@ -45,11 +43,6 @@ def read_evaluated_set(context: Context) -> EvaluatedSet:
     (pin,) = context.inputs["evaluation"]
     result, document = read_result(context, pin)
     return EvaluatedSet(result, read_evaluated_clips(context, pin, document, result.options.database))
-
-
-def objective_of(params: ObjectiveParams) -> DataSetObjective:
-    """The objective that was asked for."""
-    return DataSetObjective(**params.model_dump())
 
 
 def store_document(context: Context, tree: Mapping[str, Any]) -> dict[str, Any]:

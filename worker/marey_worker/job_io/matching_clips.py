@@ -9,13 +9,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+from pydantic import ValidationError
+
 from marey_motion import documents
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.normaliser import Normaliser
-from marey_motion.matching.options import DatabaseOptions
 from marey_motion.matching.search import SearchIndex, build_index
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
@@ -23,6 +24,7 @@ from marey_schemas.encoding.canonical import canonical_json, document_digest
 from marey_schemas.job_params import EvaluateParams
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
+from marey_schemas.options.matching import DatabaseOptions
 from marey_schemas.wording import counted
 from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import Context, JobRefused
@@ -118,11 +120,13 @@ def read_evaluated_clips(
 
 @contextmanager
 def refusing_motion_errors() -> Iterator[None]:
-    """What the mathematics refuses, no second try will change."""
+    """Turn a `MotionError`, or options out of range in a stored document, into a `JobRefused`, which is not retried."""
     try:
         yield
     except MotionError as error:
         raise JobRefused(error.code, str(error)) from error
+    except ValidationError as error:
+        raise JobRefused("option-invalid", str(error)) from error
 
 
 def build_set(

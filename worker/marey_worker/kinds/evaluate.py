@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from marey_motion.evaluation.judgement import judge
-from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.relevance import recorded_rows, sum_by_source
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import records_from_tree, records_to_tree, result_to_tree
@@ -20,11 +19,11 @@ from marey_schemas.documents.reports import EvaluationReport
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.job_params import EvaluateParams
 from marey_schemas.kinds import Kind
+from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.worker_protocol import StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import read_clips, refusing_motion_errors, wanted_clips
 from marey_worker.job_io.stored_reports import store_report
-from marey_worker.kinds.evaluation_options import options_of
 
 GATHERING_STEPS = 4
 Headline = dict[str, float | int | None]
@@ -32,7 +31,7 @@ Headline = dict[str, float | int | None]
 
 def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
     """Let motion matching follow this task's share of the trials; the result names the file of their records."""
-    options = options_of(params)
+    options = EvaluationOptions.of(params)
     trials = _trials(params, options)[context.task.position :: context.task.size]
     clips = read_clips(context, params, options.database)
     started = time.monotonic()
@@ -56,7 +55,7 @@ def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
 
 def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Measure the records of all trials and stage the evaluation, with its report if it is wanted."""
-    options = options_of(params)
+    options = EvaluationOptions.of(params)
     context.progress(0, GATHERING_STEPS, "reading what the trials recorded")
     database = read_clips(context, params, options.database).database
     trials = _trials(params, options)

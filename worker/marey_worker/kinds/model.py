@@ -11,7 +11,6 @@ from pydantic import ValidationError
 from marey_motion import documents
 from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.alignment.aligned_documents import StoredExample, set_from_examples, uid_of
-from marey_motion.modelling.options import DEFAULT_OPTIONS, ModelOptions
 from marey_motion.modelling.primitive_documents import trained_to_tree
 from marey_motion.modelling.search.check import SearchCheck, check_search
 from marey_motion.modelling.training import TrainedPrimitive, train_primitive
@@ -25,12 +24,11 @@ from marey_schemas.documents.reports import ModelReport
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.job_params import ModelParams
 from marey_schemas.kinds import Kind
+from marey_schemas.options.modelling import ModelOptions
 from marey_schemas.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 from marey_worker.job_io.stored_reports import store_report
-
-OPTIONS = set(DEFAULT_OPTIONS.as_tree())
 
 
 def run(context: Context, params: ModelParams) -> dict[str, Any]:
@@ -46,7 +44,7 @@ def run(context: Context, params: ModelParams) -> dict[str, Any]:
         aligned = _aligned(context, pins, skeleton, motions, infos)
         trained = train_primitive(
             aligned,
-            ModelOptions(**params.model_dump(include=OPTIONS)),
+            ModelOptions.of(params),
             name=params.name,
             seed=context.seed,
             threads=context.threads,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from marey_motion.evaluation.improvement.optimise import OptimisationOptions, OptimisationStep, optimise
+from marey_motion.evaluation.improvement.optimise import OptimisationStep, optimise
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.selection import joined, same_skeleton, source_of
 from marey_motion.evaluation.improvement.suggestion_documents import optimisation_to_tree
@@ -12,7 +12,7 @@ from marey_motion.matching.database import MatchingDatabase
 from marey_schemas.job_params import OptimiseParams
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.candidates import Candidates, read_candidates
-from marey_worker.job_io.evaluated_set import EvaluatedSet, objective_of, read_evaluated_set, store_document
+from marey_worker.job_io.evaluated_set import EvaluatedSet, read_evaluated_set, store_document
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 
 
@@ -25,10 +25,6 @@ def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
         simulation = _simulation(context, evaluated, database)
         own = {source_of(clip) for clip in evaluated.clips.database.clips}
         names = {source_of(clip): clip.name for clip in database.clips if clip.mirrored_from is None}
-        options = OptimisationOptions(
-            objective=objective_of(params.objective),
-            **params.model_dump(include={"least_gain", "max_steps", "max_evaluations", "max_data_s", "consider"}),
-        )
         steps: list[OptimisationStep] = []
 
         def made(step: OptimisationStep) -> None:
@@ -37,7 +33,7 @@ def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
 
         found = optimise(
             simulation,
-            options,
+            params,
             absent=simulation.sources.keys() - own,
             made=made,
             progress=lambda done, total, uid: context.progress(

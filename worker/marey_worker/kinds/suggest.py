@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from marey_motion.evaluation.improvement.suggest import SuggestionOptions, Suggestions, suggest
+from marey_motion.evaluation.improvement.suggest import Suggestions, suggest
 from marey_motion.evaluation.improvement.suggestion_documents import suggestions_to_tree
 from marey_schemas.job_params import SuggestParams
 from marey_worker.context import Context
 from marey_worker.job_io.candidates import read_candidates
-from marey_worker.job_io.evaluated_set import objective_of, read_evaluated_set, store_document
+from marey_worker.job_io.evaluated_set import read_evaluated_set, store_document
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 
 
@@ -17,19 +17,12 @@ def run(context: Context, params: SuggestParams) -> dict[str, Any]:
     """Look for suggestions; the result counts them and names the document that has them all."""
     evaluated = read_evaluated_set(context)
     candidates = read_candidates(context, evaluated)
-    options = SuggestionOptions(
-        objective=objective_of(params.objective),
-        removals=params.removals,
-        consider=params.consider,
-        duplicate_cm=params.duplicate_cm,
-        blendable_m=params.blendable_m,
-    )
     with refusing_motion_errors():
         found = suggest(
             evaluated.clips.database,
             evaluated.result,
             collections=candidates.databases,
-            options=options,
+            options=params,
             threads=context.threads,
             progress=context.progress,
         )

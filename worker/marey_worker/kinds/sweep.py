@@ -7,10 +7,10 @@ from dataclasses import asdict
 from typing import Any
 
 from marey_motion.evaluation.improvement.sweep import SweepRow, group_influences, sweep_weights, vary_each_group
-from marey_motion.matching.options import FeatureWeights
 from marey_schemas.job_params import SweepParams
+from marey_schemas.options.matching import FeatureWeights
 from marey_worker.context import Context
-from marey_worker.job_io.evaluated_set import objective_of, read_evaluated_set, store_document
+from marey_worker.job_io.evaluated_set import read_evaluated_set, store_document
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 
 SWEEP_SCHEMA = "marey/sweep@1"
@@ -25,7 +25,7 @@ def run(context: Context, params: SweepParams) -> dict[str, Any]:
             evaluated.clips.database,
             evaluated.result.options,
             settings[context.task.position :: context.task.size],
-            objective=objective_of(params.objective),
+            objective=params.objective,
             trials=evaluated.trials,
             threads=context.threads,
             progress=context.progress,
@@ -38,7 +38,7 @@ def gather(context: Context, params: SweepParams, results: Sequence[Mapping[str,
     # Task i of n has made the settings i, i + n, i + 2n and so on.
     longest = max(len(result["rows"]) for result in results)
     found = [result["rows"][turn] for turn in range(longest) for result in results if turn < len(result["rows"])]
-    rows = [SweepRow(**{**row, "weights": FeatureWeights(**row["weights"])}) for row in found]
+    rows = [SweepRow(**{**row, "weights": FeatureWeights.model_construct(**row["weights"])}) for row in found]
     influences = [asdict(influence) for influence in group_influences(rows)]
     document = {
         "schema": SWEEP_SCHEMA,
@@ -51,7 +51,7 @@ def gather(context: Context, params: SweepParams, results: Sequence[Mapping[str,
         "settings": len(rows),
         "objective": rows[0].objective,
         "best_objective": best.objective,
-        "best_weights": asdict(best.weights),
+        "best_weights": best.weights.model_dump(),
         "influences": influences,
         "document": store_document(context, document),
     }
@@ -59,7 +59,7 @@ def gather(context: Context, params: SweepParams, results: Sequence[Mapping[str,
 
 def _row(row: SweepRow) -> dict[str, Any]:
     return {
-        "weights": asdict(row.weights),
+        "weights": row.weights.model_dump(),
         "metrics": dict(row.metrics),
         "headlines": row.headlines,
         "objective": row.objective,

@@ -6,13 +6,14 @@ import time
 from typing import Any
 
 from marey_motion.modelling.primitive_documents import primitive_from_tree
-from marey_motion.modelling.search.tree import END_EFFECTORS, TreeOptions, build_tree
+from marey_motion.modelling.search.tree import END_EFFECTORS, build_tree
 from marey_motion.modelling.search.tree_documents import sample_tree_to_tree
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.job_params import TreeParams
 from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import Kind
+from marey_schemas.options.modelling import TreeOptions
 from marey_schemas.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
@@ -31,7 +32,7 @@ def run(context: Context, params: TreeParams) -> dict[str, Any]:
     _require_same_place(context, pin)
     context.progress(0, 2, "reading the model")
     model = context.document(Kind.MODEL, pin.item, pin.revision, "model")
-    options = TreeOptions(**params.model_dump())
+    options = TreeOptions.of(params)
     with refusing_motion_errors():
         skeleton, mapping, _axes = read_rigged(context, Rig.as_stored(RevisionRef.model_validate(model["skeleton"])))
         primitive = primitive_from_tree(model, skeleton)

@@ -23,8 +23,6 @@ from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 
 ProgressCallback = Callable[[int, int, str], None]
 
-THRESHOLD_CM = 3.0
-
 
 @dataclass(frozen=True)
 class NearDuplicate:
@@ -58,7 +56,7 @@ class NearDuplicates:
 def find_near_duplicates(
     database: MatchingDatabase,
     *,
-    threshold_cm: float = THRESHOLD_CM,
+    threshold_cm: float,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from marey_motion.arrays import Floats
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.improvement.selection import clips_by_source, same_skeleton
-from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.result import Coverage
 from marey_motion.evaluation.similarity import every_kth, nearest_poses, window_cells, window_rows
 from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
+from marey_schemas.options.evaluation import EvaluationOptions
 
 ProgressCallback = Callable[[int, int, str], None]
 
@@ -215,7 +215,7 @@ def _filling(
     measured: int,
 ) -> Filling:
     filled = np.minimum(own, coverage.deficit_s)
-    speeds, turn_rates = np.unique(options.grid.speeds_m_s), np.unique(options.grid.turn_rates_deg_s)
+    speeds, turn_rates = np.unique(options.speeds_m_s), np.unique(options.turn_rates_deg_s)
     cells = [
         FilledCell(float(speeds[v]), float(turn_rates[w]), float(filled[v, w]), float(coverage.deficit_s[v, w]))
         for v, w in np.argwhere(filled > 0.0).tolist()

@@ -3,61 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from marey_motion.errors import MotionError
 from marey_motion.evaluation.result import TrialResult
+from marey_schemas.options.improvement import ObjectiveOptions
 
 HEADLINES = ("offset_mean", "abs_se_v", "abs_se_omega_deg", "pose_cost_mean", "transitions_per_s")
 """Metrics by which changes of a data set are told."""
 
 
-@dataclass(frozen=True)
-class DataSetObjective:
-    """mean offset + a · speed error + a' · turn rate error + b · pose cost + c · seconds of data, in metres.
+def objective_value(weights: ObjectiveOptions, results: Sequence[TrialResult], seconds: float) -> float:
+    """Compute the objective, in metres, of trials over `seconds` of data.
 
     Parameters
     ----------
-    offset : weight of `offset_mean`
-    abs_se_v : metres of offset that an error of 1 m/s counts as
-    abs_se_omega_deg : metres of offset that an error of 1 degree/s counts as
-    pose_cost : metres of offset that a metre of `pose_cost_mean` counts as
-    seconds : metres of offset that a second of data counts as; what does not help by more than this goes
+    weights : ObjectiveOptions    weights of the terms
+    results : sequence of TrialResult    the trials
+    seconds : float    seconds of data
+
+    Returns
+    -------
+    float    metres: mean offset, speed error, turn rate error, pose cost and seconds, each times its weight
     """
-
-    offset: float = 1.0
-    abs_se_v: float = 0.5
-    abs_se_omega_deg: float = 0.005
-    pose_cost: float = 0.5
-    seconds: float = 0.0001
-
-    def __post_init__(self) -> None:
-        for name, weight in vars(self).items():
-            if not (np.isfinite(weight) and weight >= 0.0):
-                raise MotionError("a weight is a finite number, 0 or more", where=name)
-
-    def value(self, results: Sequence[TrialResult], seconds: float) -> float:
-        """Compute the objective of trials.
-
-        Parameters
-        ----------
-        results : sequence of TrialResult    the trials
-        seconds : float    seconds of data
-
-        Returns
-        -------
-        float    metres
-        """
-        means = headline_means(results)
-        return (
-            self.offset * means["offset_mean"]
-            + self.abs_se_v * means["abs_se_v"]
-            + self.abs_se_omega_deg * means["abs_se_omega_deg"]
-            + self.pose_cost * means["pose_cost_mean"]
-            + self.seconds * seconds
-        )
+    means = headline_means(results)
+    return (
+        weights.offset * means["offset_mean"]
+        + weights.abs_se_v * means["abs_se_v"]
+        + weights.abs_se_omega_deg * means["abs_se_omega_deg"]
+        + weights.pose_cost * means["pose_cost_mean"]
+        + weights.seconds * seconds
+    )
 
 
 def headline_means(results: Sequence[TrialResult]) -> dict[str, float]:

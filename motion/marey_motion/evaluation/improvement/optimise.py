@@ -7,40 +7,19 @@ falls with every step, so no set comes twice and the loop ends. The log of the s
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.filling import source_seconds
-from marey_motion.evaluation.improvement.objective import DataSetObjective, headline_means
+from marey_motion.evaluation.improvement.objective import headline_means, objective_value
 from marey_motion.evaluation.improvement.resimulation import NONE, Resimulation, Sources
+from marey_schemas.options.improvement import OptimisationOptions
 
 Action = Literal["start", "remove", "add"]
 ProgressCallback = Callable[[int, int, str], None]
-
-
-@dataclass(frozen=True)
-class OptimisationOptions:
-    """What to aim for and when to stop.
-
-    Parameters
-    ----------
-    least_gain : metres of objective; a step that gains less is not made, and the loop ends
-    max_steps : at most so many steps
-    max_evaluations : at most so many candidates tried, over all steps; None for any number
-    max_data_s : nothing is added that makes the set longer than this; None for any length
-    consider : at each step, only so many removals (of clips that the fewest trials need) and so many additions (of
-        clips that fill most of what the set lacks) are tried; None for all
-    """
-
-    objective: DataSetObjective = field(default_factory=DataSetObjective)
-    least_gain: float = 1e-4
-    max_steps: int = 50
-    max_evaluations: int | None = None
-    max_data_s: float | None = None
-    consider: int | None = 20
 
 
 @dataclass(frozen=True)
@@ -141,7 +120,7 @@ def _step(
         action=action,
         sources=tuple(sources),
         absent=tuple(sorted(absent)),
-        objective=options.objective.value(results, seconds),
+        objective=objective_value(options.objective, results, seconds),
         metrics=headline_means(results),
         data_s=seconds,
         evaluations=evaluations,
@@ -150,7 +129,7 @@ def _step(
 
 
 def _require_same(simulation: Resimulation, options: OptimisationOptions, last: OptimisationStep) -> None:
-    value = options.objective.value(simulation.results(last.absent), simulation.seconds(last.absent))
+    value = objective_value(options.objective, simulation.results(last.absent), simulation.seconds(last.absent))
     if value != last.objective:
         raise MotionError(
             f"the objective is {value:.17g} where the log has {last.objective:.17g}; go on with the same clips, "
@@ -182,7 +161,7 @@ class _Search:
                 return None
             self._evaluations += 1
             results = self._simulation.results(absent)
-            value = self._options.objective.value(results, self._simulation.seconds(absent))
+            value = objective_value(self._options.objective, results, self._simulation.seconds(absent))
             if best is None or value < best[0]:
                 best = value, action, sources, absent
             if progress is not None:

@@ -6,8 +6,9 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
-from marey_motion.evaluation.improvement.objective import DataSetObjective, headline_changes, headline_means
+from marey_motion.evaluation.improvement.objective import headline_changes, headline_means, objective_value
 from marey_motion.evaluation.improvement.resimulation import NONE, Resimulation
+from marey_schemas.options.improvement import ObjectiveOptions
 
 ProgressCallback = Callable[[int, int, str], None]
 
@@ -52,7 +53,7 @@ class PlannedRemoval:
 
 def leave_one_out(
     simulation: Resimulation,
-    objective: DataSetObjective,
+    objective: ObjectiveOptions,
     *,
     removed: Collection[str] = NONE,
     consider: int | None = None,
@@ -75,7 +76,7 @@ def leave_one_out(
     gone = frozenset(removed)
     outcomes = simulation.outcomes(gone)
     whole = [outcome.result for outcome in outcomes]
-    before, value = headline_means(whole), objective.value(whole, 0.0)
+    before, value = headline_means(whole), objective_value(objective, whole, 0.0)
     counts = Counter(source for outcome in outcomes for source in outcome.needed)
     rarest = sorted(counts, key=lambda source: (counts[source], source))
     candidates = [source for source in rarest if simulation.leaves_rows(gone | {source})][:consider]
@@ -83,7 +84,7 @@ def leave_one_out(
     for done, source in enumerate(candidates):
         results = simulation.results(gone | {source})
         seconds = simulation.seconds_of(source)
-        harm = objective.value(results, 0.0) - value
+        harm = objective_value(objective, results, 0.0) - value
         changes = headline_changes(before, headline_means(results))
         name = name_of(simulation, source)
         found.append(Removal(source, name, seconds, counts[source], changes, harm, harm / seconds))
@@ -95,7 +96,7 @@ def leave_one_out(
 def plan_removals(
     simulation: Resimulation,
     count: int,
-    objective: DataSetObjective,
+    objective: ObjectiveOptions,
     *,
     removed: Collection[str] = NONE,
     consider: int | None = None,

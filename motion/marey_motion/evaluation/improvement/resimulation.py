@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from marey_motion.evaluation.improvement.selection import clips_by_source, require_sources, rows_of_sources, source_of
 from marey_motion.evaluation.metrics import measure_trial
-from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.result import TrialResult
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials
 from marey_motion.evaluation.suite import CancelCallback, guide_for, run_suite
@@ -29,6 +28,7 @@ from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.display import switched_rows
 from marey_motion.matching.record import TrialRecord
 from marey_motion.matching.search import Method, SearchIndex, build_index
+from marey_schemas.options.evaluation import EvaluationOptions
 
 Sources = frozenset[str]
 NONE: Sources = frozenset()

@@ -6,19 +6,17 @@ Everything is a proposal with its predicted effect; nothing is changed.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.duplicates import (
-    THRESHOLD_CM,
     NearDuplicate,
     NearDuplicates,
     find_near_duplicates,
     spared_sources,
 )
 from marey_motion.evaluation.improvement.filling import Addition, Filling, plan_fillings, rank_fillings
-from marey_motion.evaluation.improvement.objective import DataSetObjective
 from marey_motion.evaluation.improvement.redundancy import PlannedRemoval, Removal, leave_one_out, plan_removals
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.unused import Unused, find_unused
@@ -28,32 +26,12 @@ from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.similarity import PoseSimilarity, accepted_distance, measure_similarity
 from marey_motion.evaluation.suite import CancelCallback
 from marey_motion.matching.database import MatchingDatabase
+from marey_schemas.options.improvement import SuggestionOptions
 
 ProgressCallback = Callable[[int, int, str], None]
 
 USUAL_BLENDABLE_M = 0.5
 """Summed over seven joints; taken where a suite made no transition whose cost could tell."""
-
-
-@dataclass(frozen=True)
-class SuggestionOptions:
-    """What to look for.
-
-    Parameters
-    ----------
-    objective : what counts as harm of a removal
-    removals : how many removals to plan; 0 leaves clips out in turn only
-    consider : only so many clips, those that the fewest trials need, are left out in turn; None for all
-    duplicate_cm : up to which distance per frame clips are near-duplicates
-    blendable_m : up to which summed distance poses can be blended; the median pose cost of the suite's transitions
-        when None
-    """
-
-    objective: DataSetObjective = field(default_factory=DataSetObjective)
-    removals: int = 10
-    consider: int | None = 50
-    duplicate_cm: float = THRESHOLD_CM
-    blendable_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,7 +64,7 @@ def suggestions_to_tree(suggestions: Suggestions) -> Tree:
         "schema": SUGGESTIONS_SCHEMA,
         "dataset": found.result.provenance.dataset,
         "normaliser": found.result.provenance.normaliser,
-        "options": asdict(found.options),
+        "options": found.options.model_dump(),
         "unused": {
             "clips": [{**asdict(clip), "reason": reasons.why_unused_clip(clip)} for clip in found.unused.clips],
             "ranges": [

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.improvement.objective import DataSetObjective, headline_means
+from marey_motion.evaluation.improvement.objective import headline_means, objective_value
 from marey_motion.evaluation.metrics import measure_trial, pooled_metrics
-from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.result import Metrics
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials
 from marey_motion.evaluation.suite import CancelCallback, run_suite
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.features import feature_layout
 from marey_motion.matching.normaliser import UNMATCHED_SCALE
-from marey_motion.matching.options import DatabaseOptions, FeatureWeights
+from marey_schemas.options.evaluation import EvaluationOptions
+from marey_schemas.options.improvement import ObjectiveOptions
+from marey_schemas.options.matching import DatabaseOptions, FeatureWeights
 
 ProgressCallback = Callable[[int, int, str], None]
 
-GROUPS = tuple(field.name for field in fields(FeatureWeights))
+GROUPS = tuple(FeatureWeights.model_fields)
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Influence:
     gain: float
 
 
-def vary_each_group(options: DatabaseOptions, factors: Sequence[float] = (0.5, 2.0)) -> tuple[FeatureWeights, ...]:
+def vary_each_group(options: DatabaseOptions, factors: Sequence[float]) -> tuple[FeatureWeights, ...]:
     """List the options' weights, then each group's weight times each factor with all others unchanged.
 
     Parameters
@@ -67,7 +68,11 @@ def vary_each_group(options: DatabaseOptions, factors: Sequence[float] = (0.5, 2
     groups = [group for group in GROUPS if group != "extra_joints" or options.extra_joints]
     return (
         weights,
-        *(replace(weights, **{group: getattr(weights, group) * factor}) for group in groups for factor in factors),
+        *(
+            weights.model_copy(update={group: getattr(weights, group) * factor})
+            for group in groups
+            for factor in factors
+        ),
     )
 
 
@@ -76,7 +81,7 @@ def sweep_weights(
     options: EvaluationOptions,
     settings: Sequence[FeatureWeights],
     *,
-    objective: DataSetObjective | None = None,
+    objective: ObjectiveOptions | None = None,
     trials: Sequence[Trial] | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
@@ -91,7 +96,7 @@ def sweep_weights(
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
     settings : sequence of FeatureWeights    weights to try
-    objective : DataSetObjective    measure of the result
+    objective : ObjectiveOptions    measure of the result
     trials : sequence of Trial, optional    the suite's when None
     threads : int, optional    trials at once
     progress : callable, optional    called as progress(done, total, name)
@@ -102,7 +107,7 @@ def sweep_weights(
     tuple of SweepRow    one per setting
     """
     wanted = suite_trials(options) if trials is None else tuple(trials)
-    aim = objective or DataSetObjective()
+    aim = objective or ObjectiveOptions()
     tell = progress or (lambda _done, _total, _note: None)
     rows = []
     for number, weights in enumerate(settings):
@@ -118,7 +123,9 @@ def sweep_weights(
             for trial, record in zip(wanted, records, strict=True)
         ]
         # The price of data is the same for all settings, and left out.
-        rows.append(SweepRow(weights, pooled_metrics(results), headline_means(results), aim.value(results, 0.0)))
+        rows.append(
+            SweepRow(weights, pooled_metrics(results), headline_means(results), objective_value(aim, results, 0.0))
+        )
     return tuple(rows)
 
 
@@ -138,7 +145,7 @@ def reweighted(database: MatchingDatabase, weights: FeatureWeights) -> MatchingD
     ------
     MotionError    for a group whose weight was 0: its scale is not known
     """
-    options = replace(database.options, weights=weights)
+    options = database.options.model_copy(update={"weights": weights})
     scale = database.normaliser.scale.copy()
     pairs = zip(database.layout.groups, feature_layout(options, database.body).groups, strict=True)
     for before, after in pairs:
@@ -162,10 +169,10 @@ def group_influences(rows: Sequence[SweepRow]) -> tuple[Influence, ...]:
     -------
     tuple of Influence    one per group
     """
-    base = asdict(rows[0].weights)
+    base = rows[0].weights.model_dump()
     found = []
     for group in GROUPS:
-        own = [row for row in rows if {**asdict(row.weights), group: base[group]} == base]
+        own = [row for row in rows if {**row.weights.model_dump(), group: base[group]} == base]
         values = np.array([row.objective for row in own])
         if len({getattr(row.weights, group) for row in own}) > 1:
             best = own[int(np.argmin(values))]

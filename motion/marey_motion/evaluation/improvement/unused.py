@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from marey_motion.evaluation.improvement.resimulation import needed_rows
 from marey_motion.evaluation.improvement.selection import clips_by_source
-from marey_motion.evaluation.options import EvaluationOptions
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import TrialRecord
 from marey_motion.matching.search import SearchIndex, build_index
 from marey_motion.matching.simulation_root import DIRECTION_WINDOW_S
+from marey_schemas.options.evaluation import EvaluationOptions
 
 LEAST_RANGE_S = 0.5
 """Shorter stretches are not worth a cut."""

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.arrays import Floats
-from marey_motion.modelling.options import ModelOptions
 from marey_motion.modelling.reconstruction import CM_PER_M
 from marey_motion.modelling.sample_quality import toe_positions
 from marey_motion.modelling.search.constraints import JointPosition
 from marey_motion.modelling.search.optimise import RefineOptions
 from marey_motion.modelling.search.step_search import search_steps
 from marey_motion.modelling.search.steps import Step
-from marey_motion.modelling.search.tree import TreeOptions, build_tree
+from marey_motion.modelling.search.tree import build_tree
 from marey_motion.modelling.training import train_primitive
+from marey_schemas.options.modelling import ModelOptions, TreeOptions
 
 REACHING = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
 """Standard joints."""
@@ -71,7 +71,7 @@ def check_search(
     others = [clip for clip in aligned.clips if clip.uid != aligned.reference]
     held_out = others[::HELD_OUT_EVERY]
     kept = replace(aligned, clips=tuple(clip for clip in aligned.clips if clip not in held_out))
-    quick = replace(options, leave_one_out=False, folds=0, report_samples=0)
+    quick = options.replace(leave_one_out=False, folds=0, report_samples=0)
     primitive = train_primitive(kept, quick, seed=seed).primitive
     tree = build_tree(primitive, seed, TreeOptions(samples=SAMPLES), end_effectors=tuple(joints.values()))
     frames = _most_varied(aligned, tuple(joints.values()))

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,47 +19,10 @@ from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search import objective_kernels
 from marey_motion.modelling.search import tree_kernels as kernels
 from marey_motion.modelling.search.tracking import Tracked, track_points
-
-FeatureKind = Literal["latent", "end_effectors"]
+from marey_schemas.options.modelling import TreeOptions
 
 END_EFFECTORS = ("left_wrist", "right_wrist", "left_ankle", "right_ankle", "head")
 """Standard joints."""
-
-MOST_SAMPLES = 1_000_000
-MOST_LEVELS = 64
-
-
-@dataclass(frozen=True)
-class TreeOptions:
-    """How a tree is made.
-
-    Parameters
-    ----------
-    samples : drawn from the primitive
-    branching : children of a node, at most
-    leaf_size : nodes of so many samples or fewer are not split
-    depth : levels below the root, at most
-    features : what is clustered: `latent`, the spatial scores; `end_effectors`, where hands, feet and head are at the
-        keyframes, the middle and the end
-    """
-
-    samples: int = 10_000
-    branching: int = 4
-    leaf_size: int = 1
-    depth: int = MOST_LEVELS
-    features: FeatureKind = "end_effectors"
-
-    def __post_init__(self) -> None:
-        limits = {
-            "samples": (1, MOST_SAMPLES),
-            "branching": (2, 256),
-            "leaf_size": (1, MOST_SAMPLES),
-            "depth": (1, MOST_LEVELS),
-        }
-        for name, (least, most) in limits.items():
-            value = getattr(self, name)
-            if not least <= value <= most:
-                raise MotionError(f"{value} is not within {least} to {most}", code="tree-options", where=name)
 
 
 DEFAULT_TREE = TreeOptions()

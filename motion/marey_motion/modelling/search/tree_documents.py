@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from marey_motion.modelling.search.tree import SampleTree, TreeOptions
+from marey_motion.modelling.search.tree import SampleTree
 from marey_schemas.documents.references import PartDigestRef
+from marey_schemas.options.modelling import TreeOptions
 
 TREE_SCHEMA = "marey/sample-tree@1"
 
@@ -36,7 +36,7 @@ def sample_tree_to_tree(
         "schema": TREE_SCHEMA,
         "model_digest": model_digest if isinstance(model_digest, str) else model_digest.model_dump(),
         "seed": seed,
-        "options": asdict(options),
+        "options": options.model_dump(),
         "samples": np.ascontiguousarray(tree.samples),
         "sizes": np.ascontiguousarray(tree.sizes),
         "children": np.ascontiguousarray(tree.children),

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.options import Family
 from marey_motion.evaluation.result import EvaluationResult
 from marey_reports.drawing.drawn import DrawnFigure, Sketch, finish
 from marey_reports.evaluation.figures.clip_graph import draw_clip_graph
@@ -23,6 +22,7 @@ from marey_reports.evaluation.figures.offsets import draw_offsets
 from marey_reports.evaluation.figures.scenarios import draw_circle, draw_switching
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
 from marey_reports.evaluation.figures.transition_costs import draw_transition_costs
+from marey_schemas.options.evaluation import Family
 
 __all__ = ["FIGURES", "DrawnFigure", "FigureKind", "FigureOptions", "draw_figure", "draw_figures"]
 

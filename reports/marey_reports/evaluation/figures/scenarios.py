@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from marey_motion.arrays import Floats
-from marey_motion.evaluation.options import Family
 from marey_motion.evaluation.scenario import Reference, Trial, reference
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import COLOURS, INK, PAPER, REFERENCE, SMALL, Place, add_keys, add_panel, new_figure
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject, choose_trial, find_record
+from marey_schemas.options.evaluation import Family
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

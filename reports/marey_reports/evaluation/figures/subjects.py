@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.judgement import strain
 from marey_motion.evaluation.metrics import TrialSeries, trial_series
-from marey_motion.evaluation.options import Family
 from marey_motion.evaluation.relevance import count_switches, measure_usage
 from marey_motion.evaluation.result import ClipUsage, EvaluationResult
 from marey_motion.evaluation.scenario import Trial, reference
 from marey_motion.matching.record import Status, TrialRecord
+from marey_schemas.options.evaluation import Family
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,67 @@
+"""Options of alignment: the cost of a pair of poses, and the path through the costs."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, StringConstraints, field_validator
+
+from marey_schemas.base import Options
+from marey_schemas.names import JointName
+
+CostMethod = Literal["turned", "plain"]
+
+MEDOID = "medoid"
+NEAREST_MEAN_LENGTH = "nearest_mean_length"
+"""Choices of a reference; any other name is that of an example."""
+
+_Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
+
+
+class CostOptions(Options):
+    """How poses are compared."""
+
+    cost: CostMethod = Field(
+        "turned",
+        description="Cost of a pair of poses. turned: after the best turn about the vertical and shift on the ground; "
+        "plain: as they are.",
+    )
+    window: int = Field(1, ge=1, le=61, description="Odd number of frames that are compared at once.")
+
+    @field_validator("window")
+    @classmethod
+    def _check_window(cls, window: int) -> int:
+        if window % 2 == 0:
+            raise ValueError("must be odd: as many frames before as after")
+        return window
+
+
+class AlignOptions(CostOptions):
+    """How examples of an action are aligned."""
+
+    reference: Annotated[str, StringConstraints(min_length=1, max_length=64)] = Field(
+        MEDOID,
+        description="Clip whose time is the canonical time. medoid: the clip nearest to all others; "
+        "nearest_mean_length: the clip whose length is nearest to the mean; or the id of a clip.",
+    )
+    rate_hz: float | None = Field(
+        None,
+        gt=0,
+        le=1000,
+        allow_inf_nan=False,
+        description="Rate of canonical frames, in hertz; absent: that of the reference where it is named, else the "
+        "most common one.",
+    )
+    slope_limit: int | None = Field(
+        3,
+        ge=0,
+        le=60,
+        description="Greatest number of frames in a row of one clip that belong to one frame of the other; null: any.",
+    )
+    weights: dict[JointName, _Weight] = Field(
+        default_factory=dict,
+        max_length=4096,
+        description="Weight in the cost by joint, under its own or its standard name; others count 1, and 0 where the "
+        "joint carries nothing of the body.",
+    )
+    keep_height: bool = Field(True, description="Leave heights above the floor as they are.")
