@@ -19,7 +19,7 @@ _Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 
 
 class CostOptions(Options):
-    """How poses are compared."""
+    """Comparison of poses: the cost of a pair."""
 
     cost: CostMethod = Field(
         "turned",
@@ -37,7 +37,7 @@ class CostOptions(Options):
 
 
 class AlignOptions(CostOptions):
-    """How examples of an action are aligned."""
+    """Alignment of the examples of an action."""
 
     reference: Annotated[str, StringConstraints(min_length=1, max_length=64)] = Field(
         MEDOID,

@@ -31,7 +31,7 @@ class ObjectiveChoice(Options):
 
 
 class SuggestionOptions(ObjectiveChoice):
-    """Which suggestions to look for."""
+    """Suggestions to look for."""
 
     removals: int = Field(
         10,
@@ -63,7 +63,7 @@ class SuggestionOptions(ObjectiveChoice):
 
 
 class OptimisationOptions(ObjectiveChoice):
-    """When an optimisation stops, and how much it tries."""
+    """Limits of an optimisation."""
 
     least_gain: float = Field(
         1e-4,

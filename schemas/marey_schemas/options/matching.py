@@ -38,7 +38,7 @@ class FeatureWeights(Options):
 
 
 class DatabaseOptions(Options):
-    """How clips become a database for motion matching."""
+    """Database that clips become for motion matching."""
 
     mirroring: Mirroring = Field(
         "none", description="add: a mirrored copy of every clip beside it; only: the mirrored copies alone."
@@ -95,7 +95,7 @@ class DatabaseOptions(Options):
 
 
 class ControllerOptions(Options):
-    """How motion matching plays a database."""
+    """Controller that plays a database."""
 
     follow: Follow = Field(
         "time",

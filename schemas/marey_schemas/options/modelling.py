@@ -19,7 +19,7 @@ _Share = Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)]
 
 
 class MixtureOptions(Options):
-    """How a mixture of normal distributions is fitted to latent vectors."""
+    """Fit of a mixture of normal distributions to latent vectors."""
 
     criterion: Criterion = Field("bic", description="Criterion that chooses the number of mixture components.")
     most_mixture_components: int = Field(
@@ -43,7 +43,7 @@ class MixtureOptions(Options):
 
 
 class ModelOptions(MixtureOptions):
-    """How a model is trained."""
+    """Training of a model."""
 
     scaling: Scaling = Field(
         "jacobian",
@@ -84,7 +84,7 @@ class ModelOptions(MixtureOptions):
 
 
 class TreeOptions(Options):
-    """How samples of a model are grouped in a tree."""
+    """Tree in which samples of a model are grouped."""
 
     samples: int = Field(10_000, ge=1, le=MOST_TREE_SAMPLES, description="Number of samples drawn from the model.")
     branching: int = Field(4, ge=2, le=64, description="Greatest number of children of a node.")

@@ -64,7 +64,7 @@ def leave_one_out(
     Parameters
     ----------
     simulation : Resimulation    the suite over the set
-    objective : DataSetObjective    measure of harm
+    objective : ObjectiveOptions    measure of harm
     removed : collection of str    sources that are removed already
     consider : int, optional    only so many sources, those that the fewest trials need, then by uid; all when None
     progress : callable, optional    called as progress(sources done, total, uid)
@@ -111,7 +111,7 @@ def plan_removals(
     ----------
     simulation : Resimulation    the suite over the set
     count : int    number of removals, at most
-    objective : DataSetObjective    measure of harm
+    objective : ObjectiveOptions    measure of harm
     removed : collection of str    sources that are removed already
     consider : int, optional    as for `leave_one_out`
     progress : callable, optional    called as progress(steps done, total, uid)
