@@ -37,11 +37,11 @@ def move_to_ground(take: Take, *, height_m: float | None = None) -> Take:
     Parameters
     ----------
     take : Take    F frames
-    height_m : float, optional    height of the ground, metres; estimated when None
+    height_m : float, optional    height of the ground, metres; estimated and recorded when None
 
     Returns
     -------
-    Take    F frames with a finding
+    Take    F frames
 
     Raises
     ------

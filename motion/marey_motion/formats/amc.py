@@ -33,10 +33,15 @@ def read_amc(
 
     Parameters
     ----------
-    data : the AMC file
-    file : its name, for messages
-    companion, companion_name : the ASF file, and its name for messages
-    frame_rate_hz : frames per second; AMC files carry none, 120 is assumed with a warning
+    data : bytes    content of the AMC file
+    file : str    its name, for messages
+    companion : bytes, optional    content of the ASF file
+    companion_name : str    its name, for messages
+    frame_rate_hz : float, optional    frames per second; AMC files carry none, 120 is assumed with a warning
+
+    Returns
+    -------
+    SourceMotion    F frames of J joints
 
     Raises
     ------

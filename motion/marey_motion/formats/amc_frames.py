@@ -33,6 +33,16 @@ class BoneTable:
 
     @classmethod
     def of(cls, bones: list[Bone]) -> BoneTable:
+        """Lay out the bones for the scanner.
+
+        Parameters
+        ----------
+        bones : list of Bone    bones in the order of the skeleton
+
+        Returns
+        -------
+        BoneTable    names and columns as arrays
+        """
         names = [bone.name.encode() for bone in bones]
         widths = [len(bone.channels) for bone in bones]
         return cls(
@@ -43,11 +53,17 @@ class BoneTable:
 
 
 def scan_frames(lines: TextLines, skeleton: AsfSkeleton) -> tuple[NDArray[np.float64], int]:
-    """Read every frame from where `lines` stands.
+    """Read every frame from the current line on.
+
+    Parameters
+    ----------
+    lines : TextLines    lines of the file
+    skeleton : AsfSkeleton    bones with C channels in all
 
     Returns
     -------
-    (F, C) float64 values, the bones' channels side by side, and the number of gaps in the frames' numbers
+    values : (F, C) float64    the bones' channels side by side, degrees or radians and the file's unit of length
+    gaps : int    number of gaps in the frames' numbers
 
     Raises
     ------

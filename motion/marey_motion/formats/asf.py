@@ -65,25 +65,58 @@ class AsfSkeleton:
     root_position: NDArray[np.float64]
 
     def offsets(self) -> NDArray[np.float64]:
-        """(J, 3) offset of each joint from its parent, the file's unit."""
+        """Compute the offset of each joint from its parent.
+
+        Returns
+        -------
+        (J, 3) float64    in the file's unit
+        """
         vectors = np.array([bone.vector for bone in self.bones])
         offsets = vectors[self.parents]
         offsets[0] = self.root_position
         return offsets
 
     def end_sites(self) -> tuple[tuple[int, NDArray[np.float64]], ...]:
-        """The tips of the bones that end the hierarchy."""
+        """List the tips of the bones that end the hierarchy.
+
+        Returns
+        -------
+        tuple of (int, (3,) float64)    joint and offset in the file's unit
+        """
         inner = set(self.parents.tolist())
         return tuple((j, bone.vector) for j, bone in enumerate(self.bones) if j not in inner)
 
 
 def read_asf(data: bytes, file: str) -> SourceMotion:
-    """Read a skeleton in its own unit and axes. Raises `FormatError` with the line, and the bone where there is one."""
+    """Read a skeleton in its own unit and axes.
+
+    Parameters
+    ----------
+    data : bytes    content of the file
+    file : str    its name, for messages
+
+    Returns
+    -------
+    SourceMotion    a source without motion
+
+    Raises
+    ------
+    FormatError    with the line, and the bone where there is one
+    """
     return skeleton_source(parse_asf(data, file))
 
 
 def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
-    """Make a source without motion of a parsed skeleton."""
+    """Make a source without motion from a parsed skeleton.
+
+    Parameters
+    ----------
+    skeleton : AsfSkeleton    the parsed file
+
+    Returns
+    -------
+    SourceMotion    a source without motion
+    """
     names = tuple(bone.name for bone in skeleton.bones)
     scale: float | None = None
     declared: tuple[str, ...] = ()
@@ -105,7 +138,21 @@ def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
 
 
 def parse_asf(data: bytes, file: str) -> AsfSkeleton:
-    """Read an ASF file; `FormatError` with the line, and the bone where there is one."""
+    """Parse an ASF file.
+
+    Parameters
+    ----------
+    data : bytes    content of the file
+    file : str    its name, for messages
+
+    Returns
+    -------
+    AsfSkeleton    bones, the root first
+
+    Raises
+    ------
+    FormatError    with the line, and the bone where there is one
+    """
     return _AsfReader(TextLines(data, file)).read()
 
 

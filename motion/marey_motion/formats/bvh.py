@@ -44,13 +44,17 @@ class ChannelColumns:
 
 
 def read_bvh(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> SourceMotion:
-    """Read a BVH file as it stands, in its own unit and axes.
+    """Read a BVH file in its own unit and axes.
 
     Parameters
     ----------
-    data : the file
-    file : its name, for messages
-    frame_rate_hz : replaces the rate that follows from the file's Frame Time
+    data : bytes    content of the file
+    file : str    its name, for messages
+    frame_rate_hz : float, optional    replaces the rate that follows from the file's Frame Time
+
+    Returns
+    -------
+    SourceMotion    F frames of J joints
 
     Raises
     ------
@@ -81,7 +85,16 @@ def read_bvh(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
 
 
 def channel_columns(channels: tuple[tuple[str, ...], ...]) -> ChannelColumns:
-    """Lay the channels of all joints out as the columns of a line of numbers."""
+    """Assign the channels of all joints to the columns of a line of numbers.
+
+    Parameters
+    ----------
+    channels : tuple of tuples of str    names of each joint's channels
+
+    Returns
+    -------
+    ChannelColumns    columns of turns and positions
+    """
     shape = (len(channels), 3)
     turns, axes, positions = np.full(shape, NO_COLUMN), np.zeros(shape, np.int64), np.full(shape, NO_COLUMN)
     labels: list[tuple[int, str]] = []

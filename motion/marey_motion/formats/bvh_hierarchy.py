@@ -42,7 +42,20 @@ class BvhHeader:
 
 
 def read_header(lines: TextLines) -> BvhHeader:
-    """Read a BVH file up to its first line of numbers; `FormatError` with the line of whatever is wrong."""
+    """Read a BVH file up to its first line of numbers.
+
+    Parameters
+    ----------
+    lines : TextLines    lines of the file
+
+    Returns
+    -------
+    BvhHeader    joints, channels and frame time
+
+    Raises
+    ------
+    FormatError    with the line that is wrong
+    """
     first = next(iter(lines), b"")
     if first.upper() != b"HIERARCHY":
         shown = f"the file begins with {excerpt(first)!r}" if first else "the file is empty"

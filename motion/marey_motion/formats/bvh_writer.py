@@ -29,9 +29,15 @@ def write_bvh(
 
     Parameters
     ----------
-    unit : unit of length by name ("cm", "m", "inch", …) or in metres
-    rotation_order : order of the turns, outermost first, for joints of which `source` does not tell one
-    source : record of the file the clip was imported from; its joints keep their rotation orders
+    clip : Clip    F frames
+    unit : str or float    unit of length by name ("cm", "m", "inch", …) or in metres
+    rotation_order : str    order of the turns, outermost first, for joints without one in `source`
+    source : SourceInfo, optional    record of the file the clip was imported from; its joints keep their rotation
+        orders
+
+    Returns
+    -------
+    bytes    content of the file
 
     Raises
     ------
@@ -118,7 +124,16 @@ def _channel_values(clip: Clip, order: list[int], axes: NDArray[np.int64], scale
 
 
 def format_table(values: NDArray[np.float64]) -> bytes:
-    """Lines of numbers with six decimals, separated by blanks."""
+    """Format lines of numbers with six decimals, separated by blanks.
+
+    Parameters
+    ----------
+    values : (F, C) float64    the numbers
+
+    Returns
+    -------
+    bytes    F lines
+    """
     largest = float(np.abs(values).max(initial=0.0))
     if not largest < _LARGEST:
         raise FormatError(f"a value of {largest:.3g} does not fit a BVH file", code="value-range")

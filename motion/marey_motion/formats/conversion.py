@@ -1,4 +1,4 @@
-"""The one place where a file's unit and axes become metres, right-handed, Y up."""
+"""Conversion of a file's unit and axes to metres, right-handed, Y up."""
 
 from __future__ import annotations
 
@@ -32,11 +32,21 @@ _TO_Y_UP: dict[UpAxis, list[list[int]]] = {
 
 
 def convert(source: SourceMotion, file: str, options: ImportOptions) -> ImportedMotion:
-    """Turn a motion as its file has it into a clip, with the record of what was inferred, changed and noticed.
+    """Convert a motion in its file's unit and axes to a clip, with the record of the import.
+
+    Parameters
+    ----------
+    source : SourceMotion    the file in its own unit and axes
+    file : str    its name, for messages
+    options : ImportOptions    facts given by the user
+
+    Returns
+    -------
+    ImportedMotion    clip and skeleton in metres, Y up
 
     Raises
     ------
-    AmbiguousUnits    when neither the file, its body nor the options tell the unit or the upward axis
+    AmbiguousUnits    when neither the file, its body nor the options give the unit or the upward axis
     """
     _check_range(source, file)
     try:

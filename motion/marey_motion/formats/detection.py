@@ -28,6 +28,15 @@ _ZIP = b"PK\x03\x04"
 def detect_format(data: bytes, name: str) -> FileFormat:
     """Find the format of a file; its content counts more than its name.
 
+    Parameters
+    ----------
+    data : bytes    content of the file
+    name : str    its name
+
+    Returns
+    -------
+    FileFormat    row of the table of formats
+
     Raises
     ------
     UnknownFormat    for empty files, archives and formats without a row in `marey_schemas.formats`

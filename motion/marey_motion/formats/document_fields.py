@@ -1,4 +1,4 @@
-"""Fields of documents nobody validated: the value in the type that is needed, or an error that names the field."""
+"""Fields of unvalidated documents: the value in the required type, or an error that names the field."""
 
 from __future__ import annotations
 
@@ -13,7 +13,23 @@ T = TypeVar("T")
 
 
 def field_of(document: Any, name: str, kind: type[T] | tuple[type[T], ...], file: str) -> T:
-    """`document[name]`, which must be there and of this type."""
+    """Read a field that must exist and have a type.
+
+    Parameters
+    ----------
+    document : object    the document
+    name : str    name of the field
+    kind : type or tuple of types    types to accept
+    file : str    name of the file, for messages
+
+    Returns
+    -------
+    object    the value
+
+    Raises
+    ------
+    FormatError    naming the field
+    """
     value = document.get(name) if isinstance(document, dict) else None
     if not isinstance(value, kind):
         needed = " or ".join(one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,)))
@@ -22,7 +38,22 @@ def field_of(document: Any, name: str, kind: type[T] | tuple[type[T], ...], file
 
 
 def text_list(document: Any, name: str, file: str) -> list[str]:
-    """A list of texts."""
+    """Read a list of texts.
+
+    Parameters
+    ----------
+    document : object    the document
+    name : str    name of the field
+    file : str    name of the file, for messages
+
+    Returns
+    -------
+    list of str    the texts
+
+    Raises
+    ------
+    FormatError    naming the field
+    """
     values = field_of(document, name, list, file)
     if not all(isinstance(value, str) and value for value in values):
         raise FormatError(f"field {name!r} must be a list of names", file=file)
@@ -30,7 +61,24 @@ def text_list(document: Any, name: str, file: str) -> list[str]:
 
 
 def number_list(document: Any, name: str, count: int, file: str, joint: str | None = None) -> NDArray[np.float64]:
-    """A list of `count` finite numbers."""
+    """Read a list of finite numbers.
+
+    Parameters
+    ----------
+    document : object    the document
+    name : str    name of the field
+    count : int    length of the list
+    file : str    name of the file, for messages
+    joint : str, optional    name of the joint, for messages
+
+    Returns
+    -------
+    (count,) float64    the numbers
+
+    Raises
+    ------
+    FormatError    naming the field
+    """
     values = field_of(document, name, list, file)
     numbers = number_array(values, file, name, joint)
     if numbers.shape != (count,):
@@ -41,7 +89,23 @@ def number_list(document: Any, name: str, count: int, file: str, joint: str | No
 
 
 def number_array(values: Any, file: str, name: str, joint: str | None = None) -> NDArray[np.float64]:
-    """Nested lists of equal lengths as an array of finite numbers."""
+    """Convert nested lists of equal lengths to an array of finite numbers.
+
+    Parameters
+    ----------
+    values : object    nested lists
+    file : str    name of the file, for messages
+    name : str    name of the field, for messages
+    joint : str, optional    name of the joint, for messages
+
+    Returns
+    -------
+    (...) float64    the numbers
+
+    Raises
+    ------
+    FormatError    naming the field
+    """
     try:
         array = np.array(values)
         if array.dtype.kind not in "iuf":

@@ -21,15 +21,25 @@ LONGEST_FRAME_TIME_S = 1.0
 
 
 def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWarning]) -> float:
-    """The rate of a file whose frames are `frame_time_s` apart; None where the file does not say.
+    """Compute the rate of a file from its frame time.
 
-    Files round: .0083333 means 120 Hz. A known rate within a relative 1e-4 is taken instead of the reciprocal, and
-    where they differ beyond the last bits a warning says so. Farther from it, as .0333 is from 30 Hz, the reciprocal
-    is taken and a warning names the rate that may be meant.
+    Files round: .0083333 means 120 Hz. A known rate within a relative 1e-4 is taken instead of the reciprocal, with a
+    warning where they differ beyond the last bits. Farther from it, as .0333 is from 30 Hz, the reciprocal is taken and
+    a warning names the rate that may be meant.
+
+    Parameters
+    ----------
+    frame_time_s : float or None    seconds between frames; None where the file does not say
+    file : str    name of the file, for messages
+    warnings : list of CheckWarning    receives the warnings
+
+    Returns
+    -------
+    float    frames per second
 
     Raises
     ------
-    FormatError    where no rate of a motion follows, naming the option that sets it
+    FormatError    where no valid rate follows, naming the option that sets it
     """
     if frame_time_s is None:
         raise _no_rate("no Frame Time tells the frame rate", file)

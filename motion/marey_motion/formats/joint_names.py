@@ -1,4 +1,4 @@
-"""Unique joint names out of the names a file has."""
+"""Unique joint names made from the names in a file."""
 
 from __future__ import annotations
 
@@ -10,9 +10,18 @@ MAX_NAME_LENGTH = 255
 
 
 def unique_names(names: Sequence[str], parents: Sequence[int]) -> tuple[str, ...]:
-    """Names as they are where they are unique, else with the parent's name before them and, if need be, a number.
+    """Make names unique with the parent's name before them and, if necessary, a number.
 
     The same hierarchy always gets the same names.
+
+    Parameters
+    ----------
+    names : sequence of str    names of J joints, which may repeat
+    parents : sequence of int    index of each joint's parent
+
+    Returns
+    -------
+    tuple of str    unique names; those that were unique are unchanged
     """
     counts = Counter(names)
     taken = {name for name, count in counts.items() if count == 1}

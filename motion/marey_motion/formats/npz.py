@@ -60,7 +60,16 @@ _ARCHIVE_ERRORS = (
 
 
 def write_npz(motion: Clip | Skeleton) -> bytes:
-    """Write a clip, or a skeleton alone."""
+    """Write a clip, or a skeleton alone.
+
+    Parameters
+    ----------
+    motion : Clip or Skeleton    the content
+
+    Returns
+    -------
+    bytes    content of the file
+    """
     skeleton = motion.skeleton if isinstance(motion, Clip) else motion
     arrays: dict[str, NDArray[Any]] = {
         "format": np.array(MARK),
@@ -87,7 +96,17 @@ def write_npz(motion: Clip | Skeleton) -> bytes:
 
 
 def read_npz(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> SourceMotion:
-    """Read what `write_npz` wrote, or any archive with the same members.
+    """Read an archive written by `write_npz`, or any other with the same members.
+
+    Parameters
+    ----------
+    data : bytes    content of the file
+    file : str    its name, for messages
+    frame_rate_hz : float, optional    replaces the file's rate
+
+    Returns
+    -------
+    SourceMotion    F frames of J joints, in metres
 
     Raises
     ------

@@ -53,13 +53,20 @@ class BadNumber(ValueError):
 
 @compiled
 def parse_number(text, start):  # type: ignore[no-untyped-def]
-    """Read one decimal number at `text[start:]`, which must end in a line feed: no loop looks for the end of the text.
+    """Read one decimal number at `text[start:]`, which must end in a line feed: no loop checks for the end of the text.
 
     Positions are unsigned, because signed ones cost a test for negative indices at every byte.
 
+    Parameters
+    ----------
+    text : (bytes,) uint8    the text
+    start : int    position of the first byte
+
     Returns
     -------
-    (kind, value, stop) : `stop` is one past the token; `value` holds only when `kind` is `EXACT`
+    kind : int    `EXACT`, `LONG` or `MALFORMED`
+    value : float    valid only when `kind` is `EXACT`
+    stop : int    one past the token
     """
     i = np.uint64(start)
     negative = text[i] == 45
@@ -158,22 +165,35 @@ def _scan(text, width, values, long_tokens, state):  # type: ignore[no-untyped-d
 
 
 def ending_in_a_line(text: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The text itself where it ends in a line feed, else a copy that does."""
+    """Append a line feed to a text without one at its end.
+
+    Parameters
+    ----------
+    text : (bytes,) uint8    the text
+
+    Returns
+    -------
+    (bytes,) uint8    the text itself, or a copy
+    """
     return text if text.size and text[-1] == _LINE_FEED else np.append(text, _LINE_FEED)
 
 
 def scan_numbers(text: NDArray[np.uint8], width: int, first_line: int) -> NumberTable:
-    """Read a block of whitespace-separated numbers, one row a line.
+    """Read a block of numbers separated by white space, one row per line.
 
     Parameters
     ----------
-    text : (bytes,) uint8
+    text : (bytes,) uint8    the text
     width : int    numbers expected in a line; other counts are reported, not refused
     first_line : int    number of the first line of `text`, from 1
 
+    Returns
+    -------
+    NumberTable    the numbers, and the first line with another count
+
     Raises
     ------
-    BadToken    at the first token that is no finite decimal number
+    BadToken    at the first token that is not a finite decimal number
     """
     text = ending_in_a_line(text)
     # Sized by what the text can hold, never by what a header declares; untouched pages cost nothing.
@@ -212,7 +232,16 @@ def _bad_token_at(text: NDArray[np.uint8], state: NDArray[np.int64]) -> BadNumbe
 
 
 def excerpt(token: bytes) -> str:
-    """The token as it can stand in a message: short, one line, printable."""
+    """Shorten a token for messages: one line, printable.
+
+    Parameters
+    ----------
+    token : bytes    the token
+
+    Returns
+    -------
+    str    the excerpt
+    """
     text = token[:40].decode("utf-8", "replace")
     shown = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
     return shown + ("…" if len(token) > 40 else "")

@@ -1,4 +1,4 @@
-"""Rotations that a file gives as quaternions: checked, normalised, and continuous in sign."""
+"""Rotations given as quaternions in files: checked, normalised, and continuous in sign."""
 
 from __future__ import annotations
 
@@ -17,7 +17,18 @@ _ROUNDING = 1e-6
 def as_rotations(
     values: NDArray[np.floating], joint_names: tuple[str, ...], file: str, warnings: list[CheckWarning]
 ) -> NDArray[np.float64]:
-    """Unit, sign-continuous quaternions (F, J, 4) from what a file holds (w, x, y, z); says what had to be mended.
+    """Normalise the quaternions of a file and warn of the changes.
+
+    Parameters
+    ----------
+    values : (F, J, 4)    quaternions (w, x, y, z)
+    joint_names : tuple of str    names of the joints, for messages
+    file : str    name of the file, for messages
+    warnings : list of CheckWarning    receives the warnings
+
+    Returns
+    -------
+    (F, J, 4) float64    unit quaternions, continuous in sign
 
     Raises
     ------

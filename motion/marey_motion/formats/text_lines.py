@@ -1,4 +1,4 @@
-"""Lines of a text file as its author numbered them, and the few things every text reader refuses."""
+"""Lines of a text file with their numbers, and the errors that all text readers share."""
 
 from __future__ import annotations
 
@@ -40,7 +40,12 @@ class TextLines:
                 yield line
 
     def next(self) -> bytes | None:
-        """The next line without surrounding whitespace, None at the end of the file."""
+        """Read the next line.
+
+        Returns
+        -------
+        bytes or None    the line without surrounding white space, None at the end of the file
+        """
         if self.position >= len(self.data):
             return None
         end = _LINE_END.search(self.data, self.position)
@@ -49,17 +54,59 @@ class TextLines:
         return self.data[start : end.start() if end else None].strip()
 
     def error(self, message: str, *, code: str | None = None, joint: str | None = None) -> FormatError:
-        """An error that points at the current line."""
+        """Make an error that points at the current line.
+
+        Parameters
+        ----------
+        message : str    the problem and its remedy
+        code : str, optional    stable slug
+        joint : str, optional    name of the joint that was being read
+
+        Returns
+        -------
+        FormatError    the error, to be raised
+        """
         return FormatError(message, code=code, file=self.file, line=max(self.number, 1), joint=joint)
 
     def numbers(self, words: list[bytes], count: int, what: str, joint: str | None = None) -> list[float]:
-        """Exactly `count` finite decimal numbers out of `words`."""
+        """Parse an exact number of finite decimal numbers.
+
+        Parameters
+        ----------
+        words : list of bytes    the words
+        count : int    required number of words
+        what : str    name of the value, for messages
+        joint : str, optional    name of the joint, for messages
+
+        Returns
+        -------
+        list of float    the numbers
+
+        Raises
+        ------
+        FormatError    where there are more, fewer or others
+        """
         if len(words) != count:
             raise self.error(f"{what} has {counted(len(words), 'value')}, {count} are needed", joint=joint)
         return [self.number_in(word, what, joint) for word in words]
 
     def number_in(self, word: bytes, what: str, joint: str | None = None) -> float:
-        """One finite decimal number."""
+        """Parse one finite decimal number.
+
+        Parameters
+        ----------
+        word : bytes    the word
+        what : str    name of the value, for messages
+        joint : str, optional    name of the joint, for messages
+
+        Returns
+        -------
+        float    the number
+
+        Raises
+        ------
+        FormatError    where it is something else
+        """
         value = read_number(word)
         if value is None:
             raise self.error(f"{what}: {number_problem(excerpt(word))}", code="bad-number", joint=joint)
@@ -67,7 +114,16 @@ class TextLines:
 
 
 def read_number(word: bytes) -> float | None:
-    """A finite decimal number as `float` reads it, None for anything else (`float` also takes "nan" and "1_0")."""
+    """Parse a finite decimal number as `float` does, without "nan" and "1_0", which `float` accepts.
+
+    Parameters
+    ----------
+    word : bytes    the word
+
+    Returns
+    -------
+    float or None    None for anything else
+    """
     if not word or not _NUMBER.fullmatch(word):
         return None
     value = float(word)
@@ -80,7 +136,16 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?,?")
 
 
 def number_problem(word: str) -> str:
-    """Why `word` is not a finite decimal number, and what to do about it."""
+    """Explain why a word is not a finite decimal number, and the remedy.
+
+    Parameters
+    ----------
+    word : str    the word
+
+    Returns
+    -------
+    str    for an error message
+    """
     if _NOT_FINITE.match(word):
         return f"{word} is not finite; repair or cut these frames"
     if _DECIMAL_COMMA.fullmatch(word):
@@ -91,7 +156,16 @@ def number_problem(word: str) -> str:
 
 
 def decode_name(name: bytes) -> str:
-    """A joint name as text: UTF-8, or Latin-1 where it is not, without control characters."""
+    """Decode a joint name: UTF-8, or Latin-1 where it is not, without control characters.
+
+    Parameters
+    ----------
+    name : bytes    the name in the file
+
+    Returns
+    -------
+    str    the name
+    """
     try:
         text = name.decode("utf-8")
     except UnicodeDecodeError:

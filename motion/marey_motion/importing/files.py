@@ -127,7 +127,16 @@ class ImportedFile:
 
 
 def planned_entry(planned: PlannedFile) -> ImportEntry | None:
-    """Make the entry of a file that is not read itself: a companion of others, or one that its name refuses."""
+    """Describe the plan of a file in plain values.
+
+    Parameters
+    ----------
+    planned : PlannedFile    the plan
+
+    Returns
+    -------
+    dict    plain values
+    """
     if planned.role == "companion":
         return ImportEntry(name=planned.name, status="companion")
     if planned.role == "refused":
@@ -155,7 +164,16 @@ def import_file(file: FileToImport) -> ImportedFile:
 
 
 def refusal_of(error: MotionError) -> Refusal:
-    """Describe an error for the entry of its file, with line and joint where they are known."""
+    """Describe the refusal of a file in plain values.
+
+    Parameters
+    ----------
+    error : MotionError    reason of the refusal
+
+    Returns
+    -------
+    dict    plain values
+    """
     place = {name: value for name in ("line", "joint") if (value := getattr(error, name, None)) is not None}
     return Refusal(code=error.code, detail=str(error), **place)
 
@@ -190,7 +208,16 @@ def _imported(file: FileToImport) -> ImportedFile:
 
 
 def reader_options(given: UserOptions) -> ImportOptions:
-    """Translate the user's options for the readers; a unit by name becomes its size in metres."""
+    """Convert the user's options for the readers; a unit by name becomes its size in metres.
+
+    Parameters
+    ----------
+    given : options    options of an import
+
+    Returns
+    -------
+    ImportOptions    options of the readers
+    """
     chosen = {name: value for name in _READER_OPTIONS if (value := getattr(given, name, None)) is not None}
     if given.unit is not None:
         chosen.setdefault("unit_scale_m", unit_in_metres(given.unit))
@@ -198,12 +225,32 @@ def reader_options(given: UserOptions) -> ImportOptions:
 
 
 def given_skeleton(given: GivenSkeleton) -> Skeleton:
-    """Make the skeleton of a stored hierarchy."""
+    """Make the skeleton of a stored hierarchy.
+
+    Parameters
+    ----------
+    given : GivenSkeleton    the stored skeleton
+
+    Returns
+    -------
+    Skeleton    J joints
+    """
     return skeleton_from_document(SkeletonHierarchy.model_validate(given.hierarchy))
 
 
 def skeleton_item(file: FileToImport, skeleton: Skeleton, clip: Clip | None) -> ImportedItem:
-    """Make the item of a file's own skeleton; an equal skeleton of the project is used instead."""
+    """Make the item of a file's own skeleton; an equal skeleton of the project is used instead.
+
+    Parameters
+    ----------
+    file : FileToImport    the file
+    skeleton : Skeleton    its joints
+    clip : Clip or None    motion to read the joints' axes from
+
+    Returns
+    -------
+    ImportedItem    an item with hierarchy and mapping
+    """
     mapping, axes = _anatomy(skeleton, clip)
     parts = {
         "hierarchy": as_tree(skeleton_to_document(skeleton)),
@@ -215,7 +262,19 @@ def skeleton_item(file: FileToImport, skeleton: Skeleton, clip: Clip | None) -> 
 
 
 def main_item(file: FileToImport, kind: Kind, item_name: str, parts: Mapping[str, Tree]) -> ImportedItem:
-    """Make the item that the file is about, with the file's name, in the user's collection, with the user's tags."""
+    """Make the main item of a file, with the file's name, in the user's collection, with the user's tags.
+
+    Parameters
+    ----------
+    file : FileToImport    the file
+    kind : Kind    kind of the item
+    item_name : str    name of the item
+    parts : mapping of str to tree    its documents
+
+    Returns
+    -------
+    ImportedItem    the item
+    """
     return ImportedItem(file.planned.name, kind, item_name, file.collection, parts, file.options.tags)
 
 
@@ -229,7 +288,16 @@ def _anatomy(skeleton: Skeleton, clip: Clip | None) -> tuple[JointMapping, dict[
 
 
 def as_tree(document: Any) -> Tree:
-    """Convert a document to plain values and arrays."""
+    """Convert a document to plain values and arrays.
+
+    Parameters
+    ----------
+    document : model    a document of `marey_schemas`
+
+    Returns
+    -------
+    dict    plain values and arrays
+    """
     tree: Tree = document.model_dump(by_alias=True, exclude_none=True)
     return tree
 

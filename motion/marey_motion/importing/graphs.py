@@ -32,9 +32,20 @@ FindModels = Callable[[str, str | None], tuple[int, Sequence[NamedModel]]]
 
 
 def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
-    """Make the item of a graph: each node gets the model of its name, best the one beside the graph.
+    """Make the item of a graph: each node gets the model of its name, preferably the one beside the graph.
 
-    Raises `FormatError` where there is none, or several in other collections, and where the graph is not consistent.
+    Parameters
+    ----------
+    graph : ImportedGraph    the graph
+    find : callable    finds the models of a name
+
+    Returns
+    -------
+    ImportedItem    the item
+
+    Raises
+    ------
+    FormatError    where a model is missing or ambiguous, and where the graph is inconsistent
     """
     models = {name: _find_model(find, name, graph.collection) for _, name in graph.graph.nodes}
     actions: dict[str, Any] = {}

@@ -34,7 +34,21 @@ from marey_schemas.options.modelling import TreeOptions
 
 
 def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
-    """Import a model with its tree, or a graph. Raises `FormatError`."""
+    """Import a model with its tree, or a graph.
+
+    Parameters
+    ----------
+    file : FileToImport    the file
+    source : SourceDocument    its decoded content
+
+    Returns
+    -------
+    ImportedFile    items, or the graph
+
+    Raises
+    ------
+    FormatError    where the file is wrong
+    """
     name = file.planned.name
     if source.subject == "tree":
         message = "a tree over samples of a model; import it together with its model, named alike, as in walk_mm.json"

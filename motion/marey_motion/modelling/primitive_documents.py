@@ -119,7 +119,16 @@ def primitive_from_tree(tree: Mapping[str, Any], skeleton: Skeleton) -> MotionPr
 
 
 def report_from_tree(tree: Mapping[str, Any]) -> TrainingReport | None:
-    """How good the model of a part `model` is; None where it was not trained here."""
+    """Read the training report of a part `model`.
+
+    Parameters
+    ----------
+    tree : mapping    plain values and arrays
+
+    Returns
+    -------
+    TrainingReport or None    None where the model was not trained here
+    """
     training = tree.get("training")
     if training is None:
         return None

@@ -1,6 +1,6 @@
-"""What the predecessor keeps beside an aligned clip: its sections in canonical frames, and its time function.
+"""The predecessor's alignment of a clip: its sections in canonical frames, and its time function.
 
-The time function names a frame of the source for each canonical frame, as whole numbers, so it stands still where the
+The time function names a frame of the source for each canonical frame, as whole numbers, so it stays constant where the
 source is slower. Some programs wrote it as a text of JSON in the document.
 """
 
@@ -39,7 +39,16 @@ class PredecessorAlignment:
 
 
 def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
-    """Read what is kept beside an aligned clip.
+    """Read the alignment of a clip.
+
+    Parameters
+    ----------
+    data : bytes    content of the file
+    file : str    its name, for messages
+
+    Returns
+    -------
+    PredecessorAlignment    time function and sections
 
     Raises
     ------
@@ -68,7 +77,17 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
 
 
 def write_predecessor_alignment(time_function: Floats, sections: Sequence[tuple[int, int]] = ()) -> bytes:
-    """Write the time function (N,), to the nearest whole frame, and sections [start, end) of canonical frames."""
+    """Write a time function, to the nearest whole frame, and sections.
+
+    Parameters
+    ----------
+    time_function : (N,) float64    source frame of each canonical frame
+    sections : sequence of (int, int)    canonical frames [start, end) of each
+
+    Returns
+    -------
+    bytes    content of the file
+    """
     return encode_document(
         {
             SECTIONS: [{"start_idx": start, "end_idx": end} for start, end in sections],
@@ -79,10 +98,19 @@ def write_predecessor_alignment(time_function: Floats, sections: Sequence[tuple[
 
 
 def as_increasing(frames: NDArray[np.int64], source_frames: int) -> Floats:
-    """A time function (N,) that rises strictly from 0 to the last frame of the source, near one of whole frames (N,).
+    """Make a time function of whole frames strictly increasing.
 
-    Where that stands still, time goes on evenly: each frame of the source is passed in the middle of the canonical
+    Where it is constant, time continues evenly: each frame of the source is passed in the middle of the canonical
     frames that name it.
+
+    Parameters
+    ----------
+    frames : (N,) int64    source frame of each canonical frame
+    source_frames : int    frames of the source
+
+    Returns
+    -------
+    (N,) float64    strictly increasing from 0 to the last frame of the source
     """
     if frames.max() >= source_frames:
         message = f"the time function names frame {int(frames.max())} of a source of {source_frames}"

@@ -1,9 +1,9 @@
-"""The predecessor's annotations: what its data base keeps beside a clip, and the files it exports.
+"""The predecessor's annotations: the documents in its data base, and the files it exports.
 
-Three forms: a list of sections, `{"sections": [{"start_idx", "end_idx"}]}`; sections by label,
-`{"sections": {label: [{"start_idx", "end_idx"}]}}`; and the frames of each label, `{"semantic_annotation": {label:
-[frames]}}`. In some programs of the predecessor a section holds its frame `end_idx`, in others it ends before it; the
-documents do not tell which, so the reader is told.
+Three forms: a list of sections, `{"sections": [{"start_idx", "end_idx"}]}`; sections by label, `{"sections": {label:
+[{"start_idx", "end_idx"}]}}`; and the frames of each label, `{"semantic_annotation": {label: [frames]}}`. In some
+programs of the predecessor a section includes its frame `end_idx`, in others it ends before it; the documents do not
+say which, so it is an option of the reader.
 """
 
 from __future__ import annotations
@@ -34,18 +34,25 @@ def read_predecessor_annotation(
     end_index: EndIndex = "inclusive",
     labels: Sequence[str] | None = None,
 ) -> Layer:
-    """Read an annotation of a clip of so many frames, in any of its forms.
+    """Read an annotation of a clip, in any of its forms.
 
     Parameters
     ----------
-    end_index : whether sections hold their frame `end_idx`. Inclusive, as the predecessor's editor writes and shows
-        them; its time warping reads them as exclusive.
-    labels : read only these, as where those of a document overlap and must become several layers. Sections of a list
-        have no label and are called "section 1" and so on.
+    data : bytes    content of the file
+    file : str    its name, for messages
+    frame_count : int    frames of the clip
+    end_index : str    "inclusive" where sections include their frame `end_idx`, as the predecessor's editor writes and
+        shows them; "exclusive" as its time warping reads them
+    labels : sequence of str, optional    read only these, as where those of a document overlap and must become several
+        layers. Sections of a list have no label and are named "section 1" and so on.
+
+    Returns
+    -------
+    Layer    segments and keyframes
 
     Raises
     ------
-    FormatError    naming the label and section; also where sections overlap or go beyond the clip
+    FormatError    naming the label and section; also where sections overlap or exceed the clip
     """
     return layer_of_document(decode_document(data, file), file, frame_count, end_index=end_index, labels=labels)
 
@@ -58,7 +65,24 @@ def layer_of_document(
     end_index: EndIndex = "inclusive",
     labels: Sequence[str] | None = None,
 ) -> Layer:
-    """As `read_predecessor_annotation`, of a document that was decoded."""
+    """Read an annotation from a decoded document, as `read_predecessor_annotation`.
+
+    Parameters
+    ----------
+    document : mapping    the document
+    file : str    name of the file, for messages
+    frame_count : int    frames of the clip
+    end_index : str    "inclusive" or "exclusive"
+    labels : sequence of str, optional    read only these
+
+    Returns
+    -------
+    Layer    segments and keyframes
+
+    Raises
+    ------
+    FormatError    naming the label and section
+    """
     if isinstance(document.get(SEMANTIC), dict):
         found = _frames_by_label(document[SEMANTIC], file)
     else:
@@ -79,9 +103,20 @@ def layer_of_document(
 def write_predecessor_annotation(
     layer: Layer, *, form: AnnotationForm = "labels", end_index: EndIndex = "inclusive"
 ) -> bytes:
-    """Write an annotation as JSON. The forms know no keyframes; they stand under `keyframes`, which others pass over.
+    """Write an annotation as JSON.
 
-    The list loses the labels. The frames of a label do not tell where two of its segments touch.
+    The forms have no keyframes; these are written under `keyframes`, which other programs ignore. The list loses the
+    labels. The frames of a label do not show where two of its segments touch.
+
+    Parameters
+    ----------
+    layer : Layer    segments and keyframes
+    form : str    "labels", "list" or "frames"
+    end_index : str    "inclusive" or "exclusive"
+
+    Returns
+    -------
+    bytes    content of the file
     """
     past = 1 if end_index == "inclusive" else 0
     document: dict[str, Any] = {}

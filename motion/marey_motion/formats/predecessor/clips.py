@@ -42,6 +42,18 @@ def motion_of_document(
 ) -> SourceMotion:
     """Read a clip document with the file of its skeleton document, or a skeleton document alone.
 
+    Parameters
+    ----------
+    document : dict    the decoded document
+    file : str    name of the file, for messages
+    skeleton : bytes, optional    content of the file with the skeleton document
+    skeleton_file : str    its name, for messages
+    frame_rate_hz : float, optional    replaces the document's rate
+
+    Returns
+    -------
+    SourceMotion    in centimetres
+
     Raises
     ------
     FormatError    naming the field, and the joint where there is one
@@ -63,11 +75,21 @@ def motion_of_document(
 
 
 def write_predecessor(clip: Clip, *, form: ClipForm = "poses", encoding: Encoding = "bson.bz2") -> bytes:
-    """Write a clip document: rows of numbers ("poses") or the engine's objects ("frames").
+    """Write a clip document.
+
+    Parameters
+    ----------
+    clip : Clip    F frames
+    form : str    rows of numbers ("poses") or the engine's objects ("frames")
+    encoding : str    "json", "bson" or "bson.bz2"
+
+    Returns
+    -------
+    bytes    content of the file
 
     Raises
     ------
-    FormatError    for joints below the root that move against their parents, which the format cannot hold
+    FormatError    for translations of joints below the root, which the format cannot hold
     """
     skeleton = clip.skeleton
     if clip.translated_joints:
@@ -98,7 +120,18 @@ def write_predecessor(clip: Clip, *, form: ClipForm = "poses", encoding: Encodin
 def write_predecessor_skeleton(
     skeleton: Skeleton, *, form: SkeletonForm = "database", encoding: Encoding = "json"
 ) -> bytes:
-    """Write a skeleton document, as the data base holds it or as files do."""
+    """Write a skeleton document, in the form of the data base or of files.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    form : str    "database" or "file"
+    encoding : str    "json", "bson" or "bson.bz2"
+
+    Returns
+    -------
+    bytes    content of the file
+    """
     return encode_document(skeleton_document(skeleton, form=form), encoding)
 
 

@@ -31,7 +31,15 @@ def read_predecessor(
 
     Parameters
     ----------
-    companion, companion_name : the skeleton document of a clip, and its name for messages
+    data : bytes    content of the file
+    file : str    its name, for messages
+    companion : bytes, optional    the skeleton document of a clip
+    companion_name : str    its name, for messages
+    frame_rate_hz : float, optional    replaces the document's rate
+
+    Returns
+    -------
+    SourceMotion or SourceDocument    motion in centimetres, or the document
 
     Raises
     ------
@@ -58,12 +66,29 @@ def model_name(stem: str) -> str:
     """Name a model after its file: `walk_leftStance` of `walk_leftStance_quaternion_mm`.
 
     The stem may still have the first of two suffixes, as in `walk_mm.bson` of `walk_mm.bson.bz2`.
+
+    Parameters
+    ----------
+    stem : str    name of the file without its suffix
+
+    Returns
+    -------
+    str    name of the model
     """
     return _without(_without(stem, _SUFFIXES), _MODEL_ENDINGS)
 
 
 def pair_trees(names: Sequence[str]) -> dict[str, str]:
-    """Find the tree of each model among files, by their names, as in `walk_mm.json` and `walk_cluster_tree.json`."""
+    """Find the tree of each model among files, by their names, as in `walk_mm.json` and `walk_cluster_tree.json`.
+
+    Parameters
+    ----------
+    names : sequence of str    paths of the files
+
+    Returns
+    -------
+    dict of str to str    path of the tree by path of the model
+    """
     trees: dict[tuple[str, str], str] = {}
     models: dict[tuple[str, str], str] = {}
     for name in names:

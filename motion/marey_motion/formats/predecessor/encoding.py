@@ -16,7 +16,17 @@ _BZ2_MARK = b"BZh"
 
 
 def encode_document(document: dict[str, Any], encoding: Encoding) -> bytes:
-    """Bytes of a document."""
+    """Encode a document.
+
+    Parameters
+    ----------
+    document : dict    the document
+    encoding : str    "json", "bson" or "bson.bz2"
+
+    Returns
+    -------
+    bytes    content of the file
+    """
     if encoding == "json":
         return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     blob: bytes = bson.encode(document)
@@ -24,7 +34,16 @@ def encode_document(document: dict[str, Any], encoding: Encoding) -> bytes:
 
 
 def decode_document(data: bytes, file: str) -> dict[str, Any]:
-    """The document in a blob; nothing larger than `MAX_BYTES` is unpacked.
+    """Decode a document; nothing larger than `MAX_BYTES` is unpacked.
+
+    Parameters
+    ----------
+    data : bytes    content of the file
+    file : str    its name, for messages
+
+    Returns
+    -------
+    dict    the document
 
     Raises
     ------

@@ -47,12 +47,30 @@ class PredecessorGraph:
 
 
 def is_graph(document: Mapping[str, Any]) -> bool:
-    """Whether a document is a graph of models."""
+    """Check whether a document is a graph of models.
+
+    Parameters
+    ----------
+    document : mapping    the document
+
+    Returns
+    -------
+    bool    True where it is
+    """
     return isinstance(document.get("nodes"), Mapping) and any(name in document for name in START_FIELDS)
 
 
 def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGraph:
-    """The graph of a document.
+    """Read the graph of a document.
+
+    Parameters
+    ----------
+    document : mapping    the document
+    file : str    name of the file, for messages
+
+    Returns
+    -------
+    PredecessorGraph    the graph
 
     Raises
     ------
@@ -77,7 +95,17 @@ def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGrap
 
 
 def write_predecessor_graph(graph: PredecessorGraph, *, encoding: Encoding = "json") -> bytes:
-    """Write a graph, with its start under both names that programs look for."""
+    """Write a graph, with its start under both names that programs read.
+
+    Parameters
+    ----------
+    graph : PredecessorGraph    the graph
+    encoding : str    "json", "bson" or "bson.bz2"
+
+    Returns
+    -------
+    bytes    content of the file
+    """
     nodes: dict[str, dict[str, Any]] = {}
     for (action, name), node in graph.nodes.items():
         nodes.setdefault(action, {})[node.model_id] = {

@@ -66,7 +66,16 @@ class PredecessorModel:
 
 
 def layout_of(document: Document) -> Layout | None:
-    """Which layout a document has; None where it is no model."""
+    """Detect the layout of a document.
+
+    Parameters
+    ----------
+    document : mapping    the document
+
+    Returns
+    -------
+    str or None    "1", "2", "3" or "static"; None where it is not a model
+    """
     if isinstance(document.get("sspm"), dict) and "gmm" in document:
         return "3"
     if "eigen_vectors_spatial" in document:
@@ -79,7 +88,13 @@ def read_predecessor_model(data: bytes, file: str, *, skeleton: Skeleton | None 
 
     Parameters
     ----------
-    skeleton : that it moves, where the document does not hold its own
+    data : bytes    content of the file
+    file : str    its name, for messages
+    skeleton : Skeleton, optional    its skeleton, where the document does not hold one
+
+    Returns
+    -------
+    PredecessorModel    the model in metres
 
     Raises
     ------
@@ -89,7 +104,22 @@ def read_predecessor_model(data: bytes, file: str, *, skeleton: Skeleton | None 
 
 
 def model_of_document(document: Document, file: str, *, skeleton: Skeleton | None = None) -> PredecessorModel:
-    """As `read_predecessor_model`, of a document that was decoded."""
+    """Read a model from a decoded document, as `read_predecessor_model`.
+
+    Parameters
+    ----------
+    document : mapping    the document
+    file : str    name of the file, for messages
+    skeleton : Skeleton, optional    its skeleton, where the document does not hold one
+
+    Returns
+    -------
+    PredecessorModel    the model in metres
+
+    Raises
+    ------
+    FormatError    naming the field that is wrong
+    """
     layout = layout_of(document)
     if layout is None:
         message = "the document is no model: it has neither 'sspm', 'eigen_vectors_spatial' nor 'spatial_coeffs'"
@@ -337,7 +367,17 @@ def _on_skeleton(
 
 
 def columns_of(animated: list[str] | tuple[str, ...], skeleton: Skeleton) -> NDArray[np.int64]:
-    """Channels of a pose of the skeleton that hold the root's translation and these joints' rotations, in order."""
+    """Select the channels of a pose for the root's translation and some joints' rotations, in order.
+
+    Parameters
+    ----------
+    animated : sequence of str    names of k joints
+    skeleton : Skeleton    J joints
+
+    Returns
+    -------
+    (3 + 4·k,) int64    columns of a pose (3 + 4·J)
+    """
     joints = np.array([skeleton.index_of(name) for name in animated], dtype=np.int64)
     return np.concatenate((np.arange(3), (3 + 4 * joints[:, None] + np.arange(4)).ravel()))
 

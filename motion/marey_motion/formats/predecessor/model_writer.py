@@ -29,7 +29,14 @@ def write_predecessor_model(
 
     Parameters
     ----------
-    animated_joints : joints whose rotations are written, all of them without; the others rest
+    primitive : MotionPrimitive    the model
+    layout : str    "2" or "3"
+    animated_joints : tuple of str    joints whose rotations are written, all when empty; the others rest
+    encoding : str    "json", "bson" or "bson.bz2"
+
+    Returns
+    -------
+    bytes    content of the file
     """
     joints = animated_joints or primitive.skeleton.joint_names
     document = model_document(primitive, joints) if layout == "3" else _flat_document(primitive, joints)
@@ -37,7 +44,17 @@ def write_predecessor_model(
 
 
 def model_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...]) -> dict[str, Any]:
-    """The primitive in layout 3."""
+    """Convert a primitive to layout 3.
+
+    Parameters
+    ----------
+    primitive : MotionPrimitive    the model
+    animated_joints : tuple of str    joints whose rotations are written
+
+    Returns
+    -------
+    dict    the document
+    """
     mean, vectors = _space(primitive, animated_joints)
     time = as_coefficients(primitive)
     frame_time_s = 1.0 / primitive.frame_rate_hz

@@ -29,7 +29,16 @@ _ROTATIONS = ["Xrotation", "Yrotation", "Zrotation"]
 
 
 def read_skeleton_document(document: Document, file: str) -> SourceMotion:
-    """A skeleton document of either form, without motion.
+    """Read a skeleton document of either form.
+
+    Parameters
+    ----------
+    document : dict    the document
+    file : str    name of the file, for messages
+
+    Returns
+    -------
+    SourceMotion    in centimetres, without motion
 
     Raises
     ------
@@ -49,7 +58,17 @@ def read_skeleton_document(document: Document, file: str) -> SourceMotion:
 
 
 def skeleton_document(skeleton: Skeleton, *, form: SkeletonForm = "database") -> Document:
-    """A skeleton as the predecessor's data base or its files hold it; every leaf joint gets a tip to stay a joint."""
+    """Convert a skeleton to the form of the predecessor's data base or files; every leaf joint gets a tip to stay a joint.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    form : str    "database" or "file"
+
+    Returns
+    -------
+    dict    the document, in centimetres
+    """
     tips = _tips(skeleton)
     return _listed_document(skeleton, tips) if form == "database" else _nested_document(skeleton, tips)
 

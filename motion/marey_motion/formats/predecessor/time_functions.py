@@ -50,7 +50,16 @@ class PredecessorTime:
     directions: Floats
 
     def time_functions(self, scores: Floats) -> Floats:
-        """Frames of the example (m, N) at each canonical frame, from 0, of scores (m, k)."""
+        """Compute the frame of the example at each canonical frame.
+
+        Parameters
+        ----------
+        scores : (m, k) float64    scores
+
+        Returns
+        -------
+        (m, N) float64    frames, from 0
+        """
         logarithms = self.mean + scores @ self.directions
         if self.form == "coefficients":
             values = np.cumsum(np.exp(logarithms), axis=1) @ self.basis.at_frames.T
@@ -62,11 +71,19 @@ class PredecessorTime:
 def as_log_slopes(
     time: PredecessorTime, scores: Floats, variances: Floats, file: str
 ) -> tuple[FunctionalComponents, float]:
-    """Our form of a time function, and by how many frames it is off at most over scores (m, k) that the model draws.
+    """Convert a time function to logarithms of slopes.
 
     Parameters
     ----------
-    variances : (k,) of the scores
+    time : PredecessorTime    the time function
+    scores : (m, k) float64    scores that the model draws
+    variances : (k,) float64    variances of the scores
+    file : str    name of the file, for messages
+
+    Returns
+    -------
+    components : FunctionalComponents    our form
+    error_frames : float    largest difference over the scores
     """
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
         wanted = time.time_functions(scores)
@@ -87,9 +104,20 @@ def as_log_slopes(
 
 
 def components_of(basis: SplineBasis, mean: Floats, directions: Floats, variances: Floats) -> FunctionalComponents:
-    """Components with mean (n, D), directions (k, n, D) and the projections that undo them.
+    """Make components with the projections that invert their directions.
 
-    How much of the variance of the examples was left out is not known: the energy is that of what is kept.
+    The variance of the examples that was left out is not known: the energy is that of the kept components.
+
+    Parameters
+    ----------
+    basis : SplineBasis    splines with n coefficients
+    mean : (n, D) float64    mean function
+    directions : (k, n, D) float64    change per unit of each score
+    variances : (k,) float64    variances of the scores
+
+    Returns
+    -------
+    FunctionalComponents    the components
     """
     flat = directions.reshape(len(directions), mean.size)
     projections = np.asarray(np.linalg.pinv(flat).T.reshape(directions.shape) if len(flat) else directions)
@@ -99,7 +127,16 @@ def components_of(basis: SplineBasis, mean: Floats, directions: Floats, variance
 
 
 def as_coefficients(primitive: MotionPrimitive) -> PredecessorTime:
-    """The time function of a primitive in the predecessor's form `coefficients`, over the scores of its own latents."""
+    """Convert the time function of a primitive to the predecessor's form `coefficients`, over the scores of its latents.
+
+    Parameters
+    ----------
+    primitive : MotionPrimitive    the model
+
+    Returns
+    -------
+    PredecessorTime    the time function
+    """
     scores, times = _drawn(primitive)
     count = min(WRITTEN_COEFFICIENTS, primitive.frame_count)
     basis = SplineBasis.clamped(primitive.frame_count, max(DEGREE + 1, count))
@@ -114,7 +151,16 @@ def as_coefficients(primitive: MotionPrimitive) -> PredecessorTime:
 
 
 def as_increments(primitive: MotionPrimitive) -> PredecessorTime:
-    """The time function of a primitive in the predecessor's form `increments`, over the scores of its own latents."""
+    """Convert the time function of a primitive to the predecessor's form `increments`, over the scores of its latents.
+
+    Parameters
+    ----------
+    primitive : MotionPrimitive    the model
+
+    Returns
+    -------
+    PredecessorTime    the time function
+    """
     count = min(WRITTEN_COEFFICIENTS, primitive.frame_count)
     basis = SplineBasis.clamped(primitive.frame_count, max(DEGREE + 1, count))
     fitting = np.linalg.pinv(basis.at_frames[1:])

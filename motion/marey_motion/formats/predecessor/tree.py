@@ -25,22 +25,54 @@ MOST_LEVELS = 64
 
 
 def is_tree(document: Mapping[str, Any]) -> bool:
-    """Whether a document is a cluster tree."""
+    """Check whether a document is a cluster tree.
+
+    Parameters
+    ----------
+    document : mapping    the document
+
+    Returns
+    -------
+    bool    True where it is
+    """
     return "data" in document and isinstance(document.get("root"), Mapping) and "indices" in document["root"]
 
 
 def read_predecessor_tree(data: bytes, file: str) -> SampleTree:
     """Read a cluster tree, as JSON, BSON or compressed BSON.
 
+    Parameters
+    ----------
+    data : bytes    content of the file
+    file : str    its name, for messages
+
+    Returns
+    -------
+    SampleTree    the samples
+
     Raises
     ------
-    FormatError    naming the node, by its place from the root, that is wrong
+    FormatError    naming the node that is wrong, by its path from the root
     """
     return tree_of_document(decode_document(data, file), file)
 
 
 def tree_of_document(document: Mapping[str, Any], file: str) -> SampleTree:
-    """As `read_predecessor_tree`, of a document that was decoded."""
+    """Read a cluster tree from a decoded document, as `read_predecessor_tree`.
+
+    Parameters
+    ----------
+    document : mapping    the document
+    file : str    name of the file, for messages
+
+    Returns
+    -------
+    SampleTree    the samples
+
+    Raises
+    ------
+    FormatError    naming the node that is wrong, by its path from the root
+    """
     samples = number_array(field_of(document, "data", list, file), file, "data")
     if samples.ndim != 2 or not len(samples):
         raise FormatError(f"field 'data' has shape {samples.shape}; a row for each sample is needed", file=file)
@@ -69,8 +101,14 @@ def write_predecessor_tree(tree: SampleTree, spatial: int, branching: int, *, en
 
     Parameters
     ----------
-    spatial : numbers of a latent vector that tell of space; they are the features
-    branching : children of a node, at most
+    tree : SampleTree    the samples
+    spatial : int    spatial numbers of a latent vector; they are the features
+    branching : int    children of a node, at most
+    encoding : str    "json", "bson" or "bson.bz2"
+
+    Returns
+    -------
+    bytes    content of the file
     """
     samples = tree.samples.astype(np.float64)
     nodes = [

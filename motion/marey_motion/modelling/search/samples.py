@@ -113,7 +113,18 @@ def _descend(
 
 
 def search_all(objective: Objective, tree: SampleTree, *, top: int = 1) -> FoundSamples:
-    """Evaluate every sample."""
+    """Evaluate every sample of a tree.
+
+    Parameters
+    ----------
+    objective : Objective    constraints
+    tree : SampleTree    samples of the same primitive
+    top : int    samples to return
+
+    Returns
+    -------
+    FoundSamples    the best samples, the best first
+    """
     _check(objective, tree, 1, top)
     costs = objective.costs(tree.samples.astype(np.float64))
     return _best(tree, np.arange(len(costs)), costs, top, len(costs))
