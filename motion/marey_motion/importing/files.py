@@ -127,7 +127,7 @@ class ImportedFile:
 
 
 def planned_entry(planned: PlannedFile) -> ImportEntry | None:
-    """Describe the plan of a file in plain values.
+    """Make the entry of a file that is not read itself: a companion of others, or one refused by its name.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def planned_entry(planned: PlannedFile) -> ImportEntry | None:
 
     Returns
     -------
-    dict    plain values
+    ImportEntry or None    None for a file to read
     """
     if planned.role == "companion":
         return ImportEntry(name=planned.name, status="companion")
@@ -164,7 +164,7 @@ def import_file(file: FileToImport) -> ImportedFile:
 
 
 def refusal_of(error: MotionError) -> Refusal:
-    """Describe the refusal of a file in plain values.
+    """Describe an error for the entry of its file, with line and joint where they are known.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def refusal_of(error: MotionError) -> Refusal:
 
     Returns
     -------
-    dict    plain values
+    Refusal    code and text
     """
     place = {name: value for name in ("line", "joint") if (value := getattr(error, name, None)) is not None}
     return Refusal(code=error.code, detail=str(error), **place)

@@ -58,7 +58,9 @@ def read_skeleton_document(document: Document, file: str) -> SourceMotion:
 
 
 def skeleton_document(skeleton: Skeleton, *, form: SkeletonForm = "database") -> Document:
-    """Convert a skeleton to the form of the predecessor's data base or files; every leaf joint gets a tip to stay a joint.
+    """Convert a skeleton to the form of the predecessor's data base or files.
+
+    Every leaf joint gets a tip, without which it would be read as a tip.
 
     Parameters
     ----------

@@ -127,7 +127,7 @@ def components_of(basis: SplineBasis, mean: Floats, directions: Floats, variance
 
 
 def as_coefficients(primitive: MotionPrimitive) -> PredecessorTime:
-    """Convert the time function of a primitive to the predecessor's form `coefficients`, over the scores of its latents.
+    """Convert the time function of a primitive to the predecessor's form `coefficients`.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def as_coefficients(primitive: MotionPrimitive) -> PredecessorTime:
 
     Returns
     -------
-    PredecessorTime    the time function
+    PredecessorTime    the time function, over the scores of the primitive's latents
     """
     scores, times = _drawn(primitive)
     count = min(WRITTEN_COEFFICIENTS, primitive.frame_count)
@@ -151,7 +151,7 @@ def as_coefficients(primitive: MotionPrimitive) -> PredecessorTime:
 
 
 def as_increments(primitive: MotionPrimitive) -> PredecessorTime:
-    """Convert the time function of a primitive to the predecessor's form `increments`, over the scores of its latents.
+    """Convert the time function of a primitive to the predecessor's form `increments`.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def as_increments(primitive: MotionPrimitive) -> PredecessorTime:
 
     Returns
     -------
-    PredecessorTime    the time function
+    PredecessorTime    the time function, over the scores of the primitive's latents
     """
     count = min(WRITTEN_COEFFICIENTS, primitive.frame_count)
     basis = SplineBasis.clamped(primitive.frame_count, max(DEGREE + 1, count))
