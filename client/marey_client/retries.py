@@ -1,4 +1,4 @@
-"""When a request is sent again, and how long to wait before."""
+"""Repeated requests: after which failures a request is sent again, how often, and after how long a wait."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 
 import httpx
 
+from marey_schemas.backoff import Backoff
+
 NEVER_ARRIVED = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
 """Failures after which the server cannot have seen the request."""
 
@@ -18,14 +20,14 @@ BUSY_STATUSES = frozenset({429, 502, 503, 504})
 
 @dataclass(frozen=True)
 class Retries:
-    """Exponential backoff with full jitter, bounded in number and time.
+    """Exponential backoff with jitter, bounded in number and time.
 
     Parameters
     ----------
     tries : how often a request is sent at most
     first_s, longest_s : the wait before the second try is at most `first_s`, doubles, and never exceeds `longest_s`
     total_s : no try starts later than this after the first
-    sleep, uniform : replaceable in tests
+    sleep, random_unit : replaceable in tests; `random_unit` draws from [0, 1)
     """
 
     tries: int = 10
@@ -33,12 +35,12 @@ class Retries:
     longest_s: float = 15.0
     total_s: float = 90.0
     sleep: Callable[[float], None] = field(default=time.sleep, repr=False)
-    uniform: Callable[[float, float], float] = field(default=random.uniform, repr=False)
+    random_unit: Callable[[], float] = field(default=random.random, repr=False)
 
     def delay_s(self, tried: int, retry_after_s: float | None) -> float:
         """Seconds to wait after `tried` tries; never less than the server asked for."""
-        ceiling = min(self.longest_s, self.first_s * 2 ** (tried - 1))
-        return self.uniform(ceiling / 2, ceiling) + (retry_after_s or 0.0)
+        backoff = Backoff(self.first_s, self.longest_s, random_unit=self.random_unit)
+        return backoff.delay_s(tried) + (retry_after_s or 0.0)
 
 
 ONCE = Retries(tries=1)

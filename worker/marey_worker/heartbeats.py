@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-import random
 import threading
 import time
 
 from marey_client.errors import LeaseLost, MareyError
+from marey_schemas.backoff import spread
 from marey_schemas.jobs import Progress
 from marey_schemas.worker_protocol import HeartbeatAnswer, Lease
 from marey_worker.attempt_api import AttemptApi
@@ -20,6 +20,8 @@ CONFIRM_AFTER = 2 / 3
 PROGRESS_EVERY_S = 2.0
 RETRY_S = 1.0
 TICK_S = 0.25
+JITTER = 0.2
+"""Share of the interval by which heartbeats of many attempts are spread."""
 
 
 class LeaseKeeper:
@@ -63,12 +65,12 @@ class LeaseKeeper:
             self._beat(patiently=patiently)
 
     def _run(self) -> None:
-        wait_s = self._jittered(self._interval_s)
+        wait_s = spread(self._interval_s, JITTER)
         while not self._stopped.wait(TICK_S):
             silent_s = time.monotonic() - self._tried
             news = self._progress is not self._told and silent_s >= PROGRESS_EVERY_S
             if news or silent_s >= wait_s:
-                wait_s = self._jittered(self._interval_s if self._try_beat() else RETRY_S)
+                wait_s = spread(self._interval_s if self._try_beat() else RETRY_S, JITTER)
 
     def _try_beat(self) -> bool:
         try:
@@ -93,6 +95,3 @@ class LeaseKeeper:
             self._ttl_s = answer.lease_ttl_s
             if answer.cancel_requested:
                 self.cancelled.set()
-
-    def _jittered(self, seconds: float) -> float:
-        return seconds * random.uniform(0.8, 1.0)  # noqa: S311 - spreads heartbeats, no secret

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import random
 import socket
 import threading
 import time
@@ -16,6 +15,7 @@ from typing import Self
 from marey_client.errors import Forbidden, Invalid, MareyError, Unauthenticated
 from marey_client.retries import ONCE
 from marey_client.transport import Transport
+from marey_schemas.backoff import Backoff
 from marey_schemas.job_kinds import job_kinds
 from marey_schemas.worker_protocol import ClaimRequest, Lease
 from marey_worker import faults
@@ -27,7 +27,7 @@ from marey_worker.job_io.input_cache import InputCache
 log = logging.getLogger(__name__)
 
 CLAIM_WAIT_S = 20.0
-LONGEST_PAUSE_S = 15.0
+PAUSES = Backoff(first_s=0.5, longest_s=15.0)
 INTERRUPTED_STATUS = 143
 FAILED_STATUS = 1
 JOBS_PER_CHILD = 1000
@@ -116,7 +116,7 @@ class Supervisor:
                 except (MareyError, ChildBroken) as error:
                     failures += 1
                     log.warning("no work: %s", error)
-                    self._stopping.wait(_pause_s(failures))
+                    self._stopping.wait(PAUSES.delay_s(failures))
                     continue
                 failures = 0
                 for lease in leases:
@@ -172,7 +172,3 @@ class _Bench:
             self._child.wait_until_ready()
         self._jobs += 1
         return self._child
-
-
-def _pause_s(failures: int) -> float:
-    return random.uniform(0.5, 1.0) * min(LONGEST_PAUSE_S, 0.25 * 2.0**failures)  # noqa: S311 - spreads retries

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-import random
 import sys
 import time
 from asyncio.subprocess import Process
@@ -17,12 +16,12 @@ from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+from marey_schemas.backoff import Backoff
 from marey_schemas.log_lines import LogForm
 
 log = logging.getLogger(__name__)
 
-FIRST_PAUSE_S = 0.5
-LONGEST_PAUSE_S = 30.0
+PAUSES = Backoff(first_s=0.5, longest_s=30.0, jitter=0.25)
 HEALTHY_AFTER_S = 30.0
 """A worker that lived so long did not fail at the start: the next one starts soon."""
 
@@ -75,7 +74,7 @@ class _LocalWorker:
             if self._stopping.is_set():
                 return
             quick_ends = 0 if time.monotonic() - started > HEALTHY_AFTER_S else quick_ends + 1
-            pause_s = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0**quick_ends) * random.uniform(0.75, 1.0)  # noqa: S311
+            pause_s = PAUSES.delay_s(quick_ends + 1)
             log.warning("worker %s ended with status %d; starting it again in %.1f s", self._name, status, pause_s)
             await self._pause(pause_s)
 

@@ -34,7 +34,7 @@ class Scripted:
         return answer(request) if callable(answer) else answer
 
     def marey(self, **options):
-        retries = Retries(sleep=self.waited.append, uniform=lambda low, high: high)
+        retries = Retries(sleep=self.waited.append, random_unit=lambda: 0.0)
         return Marey(
             "http://server.test/", "marey_secret", http=httpx.MockTransport(self), **{"retries": retries, **options}
         )

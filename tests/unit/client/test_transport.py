@@ -285,5 +285,5 @@ def test_a_password_is_sent_though_it_hides_itself(script):
 
 def test_a_server_that_starts_again_is_waited_for():
     restart_s = 15.0
-    patient = Retries(uniform=lambda low, high: low)  # even where every wait is as short as can be
+    patient = Retries(random_unit=lambda: 1.0)  # even where every wait is as short as can be
     assert sum(patient.delay_s(tried, None) for tried in range(1, patient.tries)) > restart_s

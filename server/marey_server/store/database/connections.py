@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import errno
 import json
-import random
 import sqlite3
 import threading
 import time
@@ -22,6 +21,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import sqlalchemy
 from sqlalchemy import URL, Connection, Engine, event, exc, make_url
 
+from marey_schemas.backoff import Backoff
 from marey_server.access.principal import Principal
 from marey_server.errors import InvalidProblem, StorageFullProblem, UnavailableProblem
 from marey_server.store import tables
@@ -41,6 +41,7 @@ WAL_CHECK_EVERY_S = 5.0
 WAL_PATIENCE_MS = 250
 """How long a write waits for readers to let the log be written back: most reads are shorter, but a backup is not."""
 WRITE_TRIES = 5
+WRITE_BACKOFF = Backoff(first_s=0.02, longest_s=0.16, jitter=1.0)
 READ_TRIES = 3
 
 _POSTGRES_SETTINGS = {
@@ -128,7 +129,7 @@ class Database:
             except _FAILURES as error:
                 if attempt == WRITE_TRIES - 1 or not _worth_retrying(error):
                     raise _translated(error) from error
-                time.sleep(random.uniform(0, 0.02 * 2**attempt))  # noqa: S311 - spreads retries, no secret
+                time.sleep(WRITE_BACKOFF.delay_s(attempt + 1))
             else:
                 tx.run_after_commit()
                 return answer

@@ -6,6 +6,8 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from marey_schemas.backoff import Backoff
+
 SECOND_US = 1_000_000
 
 
@@ -36,10 +38,11 @@ class QueuePolicy:
         return round(self.end_grace_s * SECOND_US)
 
     def backoff_us(self, failures: int) -> int:
-        """How long a job rests after its `failures`-th failure: four times as long each time, less up to a quarter."""
-        steps = min(failures - 1, 16)
-        rest_s = min(self.longest_backoff_s, self.first_backoff_s * 4.0**steps)
-        return round(rest_s * (1 - 0.25 * self.random_unit()) * SECOND_US)
+        """Return how long a job waits after its `failures`-th failure: four times as long each time."""
+        backoff = Backoff(
+            self.first_backoff_s, self.longest_backoff_s, factor=4.0, jitter=0.25, random_unit=self.random_unit
+        )
+        return round(backoff.delay_s(failures) * SECOND_US)
 
 
 DEFAULT_POLICY = QueuePolicy()
