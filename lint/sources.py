@@ -19,6 +19,9 @@ PACKAGES = {
 }
 """Folder of each package of the product, and its name."""
 
+GENERATED = "<!-- Written by `make docs`"
+"""Pages that begin so repeat texts of the code."""
+
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
 
 
@@ -111,7 +114,7 @@ def read_house(root: Path) -> House:
     users += [root / "pyproject.toml", root / "Makefile", *root.glob("*/marey_*/__init__.pyi")]
     return House(
         {module.name: module for module in modules},
-        {path: path.read_text("utf-8") for path in pages},
+        {path: text for path in pages if not (text := path.read_text("utf-8")).startswith(GENERATED)},
         {path: path.read_text("utf-8") for path in users if path.is_file()},
     )
 

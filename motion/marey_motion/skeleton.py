@@ -134,18 +134,6 @@ class Skeleton:
         return tuple(tuple(one) for one in lists)
 
     @cached_property
-    def is_depth_first(self) -> bool:
-        """Whether each joint follows its parent or a descendant of it, as nested formats such as BVH require."""
-        open_chain: list[int] = []
-        for joint, parent in enumerate(self.parents.tolist()):
-            while open_chain and open_chain[-1] != parent:
-                open_chain.pop()
-            if parent >= 0 and not open_chain:
-                return False
-            open_chain.append(joint)
-        return True
-
-    @cached_property
     def _indices(self) -> dict[str, int]:
         return {name: joint for joint, name in enumerate(self.joint_names)}
 

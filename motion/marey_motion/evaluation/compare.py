@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +11,7 @@ from numpy.typing import NDArray
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.provenance import require_comparable
 from marey_motion.evaluation.result import EvaluationResult
-from marey_motion.matching.building import union_normaliser, with_normaliser
-from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import TrialRecord
-
-Policy = Literal["pinned", "union"]
 
 CONFIDENCE = 0.95
 RESAMPLES = 9_999
@@ -139,27 +134,6 @@ def compare_results(before: EvaluationResult, after: EvaluationResult) -> Compar
         newly_unused=tuple(sorted((used[0] - used[1]) & uids[1])),
         coverage_change_s=after.coverage.seconds - before.coverage.seconds,
     )
-
-
-def under_one_normaliser(
-    before: MatchingDatabase, after: MatchingDatabase, policy: Policy
-) -> tuple[MatchingDatabase, MatchingDatabase]:
-    """Give two databases equal costs, so that evaluations of them can be compared.
-
-    Parameters
-    ----------
-    before, after : MatchingDatabase    the databases
-    policy : str    "pinned" gives the second one the first one's normaliser; "union" gives both one that is fitted to
-        the rows of both
-
-    Returns
-    -------
-    (MatchingDatabase, MatchingDatabase)    both under one normaliser
-    """
-    if policy == "pinned":
-        return before, with_normaliser(after, before.normaliser)
-    union = union_normaliser((before, after))
-    return with_normaliser(before, union), with_normaliser(after, union)
 
 
 def paired_change(metric: str, before: Sequence[float], after: Sequence[float]) -> MetricChange:

@@ -17,7 +17,7 @@ from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.result import Coverage
 from marey_motion.matching.database import MatchingDatabase
-from marey_schemas.options.evaluation import EvaluationOptions, Grid
+from marey_schemas.options.evaluation import EvaluationOptions
 
 WINDOW_S = 1.0
 SPEED_STEP_M_S, TURN_RATE_STEP_DEG_S = 0.25, 25.0
@@ -219,85 +219,6 @@ class Hole:
     turn_rate_deg_s: float
     seconds: float
     deficit_s: float
-
-
-def coverage_holes(coverage: Coverage, grid: Grid) -> tuple[Hole, ...]:
-    """List the cells with too little data, the emptiest first, then by speed and turn rate.
-
-    Parameters
-    ----------
-    coverage : Coverage    seconds per cell
-    grid : Grid    speeds and turn rates of the cells
-
-    Returns
-    -------
-    tuple of Hole    cells with their deficit in seconds
-    """
-    speeds, turn_rates = np.unique(grid.speeds_m_s), np.unique(grid.turn_rates_deg_s)
-    holes = [
-        Hole(float(speeds[v]), float(turn_rates[w]), float(coverage.seconds[v, w]), float(coverage.deficit_s[v, w]))
-        for v, w in np.argwhere(coverage.deficit_s > 0.0).tolist()
-    ]
-    return tuple(sorted(holes, key=lambda hole: (-hole.deficit_s, hole.speed_m_s, hole.turn_rate_deg_s)))
-
-
-@dataclass(frozen=True, eq=False)
-class Density:
-    """A smooth map of where data lies, for the eye; measures come from the cells.
-
-    Parameters
-    ----------
-    speeds_m_s, turn_rates_deg_s : (V,), (O,) centres of an even raster
-    seconds : (V, O) seconds of data per m/s and degree/s
-    """
-
-    speeds_m_s: Floats
-    turn_rates_deg_s: Floats
-    seconds: Floats
-
-
-def coverage_density(coverage: Coverage, rate_hz: float, *, resolution: int = 96) -> Density:
-    """Estimate the density of the windows, with a Gaussian kernel half as wide as a cell of the map.
-
-    The raster holds all data and the whole map, and has the same number of points to left and right.
-
-    Parameters
-    ----------
-    coverage : Coverage    the windows
-    rate_hz : float    frames per second
-    resolution : int    points per side, about
-
-    Returns
-    -------
-    Density    seconds of data per m/s and degree/s
-    """
-    from scipy.ndimage import gaussian_filter
-
-    turn_rates = np.degrees(coverage.turn_rate_rad_s)
-    speed_width, turn_width = _typical_cell(coverage)
-    fastest = max(coverage.speed_edges_m_s[-1], float(np.max(coverage.speed_m_s, initial=0.0)) + 2.0 * speed_width)
-    widest = max(
-        float(np.max(np.abs(coverage.turn_rate_edges_deg_s))),
-        float(np.max(np.abs(turn_rates), initial=0.0)) + 2.0 * turn_width,
-    )
-    speed_edges = np.linspace(0.0, fastest, resolution + 1)
-    turn_edges = np.linspace(-widest, widest, resolution + 1 + resolution % 2)
-    counts = cell_counts(coverage.speed_m_s, speed_edges, turn_rates, turn_edges)
-    steps = speed_edges[1] - speed_edges[0], turn_edges[1] - turn_edges[0]
-    smooth = gaussian_filter(
-        counts, (0.5 * speed_width / steps[0], 0.5 * turn_width / steps[1]), mode=("reflect", "constant"), truncate=4.0
-    )
-    return Density(
-        speeds_m_s=0.5 * (speed_edges[1:] + speed_edges[:-1]),
-        turn_rates_deg_s=0.5 * (turn_edges[1:] + turn_edges[:-1]),
-        seconds=smooth / (rate_hz * steps[0] * steps[1]),
-    )
-
-
-def _typical_cell(coverage: Coverage) -> tuple[float, float]:
-    return float(np.median(np.diff(coverage.speed_edges_m_s))), float(
-        np.median(np.diff(coverage.turn_rate_edges_deg_s))
-    )
 
 
 def _sums(values: Floats, span: int) -> Floats:

@@ -12,13 +12,10 @@ from numpy.typing import NDArray
 from marey_motion.arrays import Floats
 from marey_motion.errors import ModelError
 from marey_motion.modelling.mixture import LatentMixture
-from marey_motion.modelling.mixture_fitting import MixtureCandidate
 from marey_motion.modelling.primitive import FunctionalComponents, MotionPrimitive
-from marey_motion.modelling.reconstruction import ReconstructionErrors
-from marey_motion.modelling.sample_quality import FootQuality
 from marey_motion.modelling.splines import DEGREE, SplineBasis
 from marey_motion.modelling.training import TrainedPrimitive
-from marey_motion.modelling.training_report import Durations, ExampleReport, TrainingReport
+from marey_motion.modelling.training_report import TrainingReport
 from marey_motion.modelling.verdict import headline_of, verdict_of
 from marey_motion.skeleton import Skeleton
 
@@ -115,39 +112,6 @@ def primitive_from_tree(tree: Mapping[str, Any], skeleton: Skeleton) -> MotionPr
         keyframes=dict(tree.get("keyframes") or {}),
         duration_range_s=_range_of(tree, "duration_range_s"),
         log_slope_range=_range_of(tree, "log_slope_range"),
-    )
-
-
-def report_from_tree(tree: Mapping[str, Any]) -> TrainingReport | None:
-    """Read the training report of a part `model`.
-
-    Parameters
-    ----------
-    tree : mapping    plain values and arrays
-
-    Returns
-    -------
-    TrainingReport or None    None where the model was not trained here
-    """
-    training = tree.get("training")
-    if training is None:
-        return None
-    errors = training["reconstruction"]
-    feet = {name: training[name] and FootQuality(**training[name]) for name in ("training_feet", "sample_feet")}
-    drawn = training["sample_durations"]
-    return TrainingReport(
-        spatial_energy=training["spatial_energy"],
-        temporal_energy=training["temporal_energy"],
-        mixture_method=training["mixture_method"],
-        candidates=tuple(MixtureCandidate(**one) for one in training["candidates"]),
-        log_likelihood=training["log_likelihood"],
-        held_out_log_likelihood=training["held_out_log_likelihood"],
-        examples=tuple(ExampleReport(**one) for one in training["examples"]),
-        reconstruction=None if errors is None else ReconstructionErrors(**errors),
-        time_error_frames=training["time_error_frames"],
-        training_durations=Durations(**training["training_durations"]),
-        sample_durations=None if drawn is None else Durations(**drawn),
-        **feet,
     )
 
 

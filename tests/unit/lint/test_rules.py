@@ -146,10 +146,12 @@ def test_the_baseline_of_the_wording_only_shrinks(tmp_path):
     assert not list(apply_baseline(offences, {"a.py": 3}, ROOT))
     (left,) = apply_baseline(offences[:1], {"a.py": 3}, ROOT)
     assert "--shrink" in left.message
-    shrink_baseline(offences, ROOT, path)
-    assert read_baseline(path) == {"a.py": 2}
+    shrink_baseline([*offences, *offences], ROOT, path)
+    assert read_baseline(path) == {"a.py": 2}, "no more than before"
     shrink_baseline(offences[:1], ROOT, path)
     assert read_baseline(path) == {"a.py": 1}
+    shrink_baseline([offences[0]._replace(path=ROOT / "c.py")], ROOT, path)
+    assert read_baseline(path) == {"c.py": 1}, "the text has moved"
 
 
 @pytest.mark.parametrize(

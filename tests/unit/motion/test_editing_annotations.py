@@ -175,6 +175,11 @@ commands = st.one_of(
 )
 
 
+def segment_at(layer, frame):
+    """The segment that holds a frame."""
+    return next(one for one in layer.segments if one.start <= frame < one.end)
+
+
 def expected(before, command, given_):
     """The label of every frame after a command that was accepted, painted frame by frame."""
     labels_ = labelled(before)
@@ -183,12 +188,12 @@ def expected(before, command, given_):
     elif command == "clear":
         labels_ = [None] * before.frame_count
     elif command in ("remove_segment", "relabel_segment", "split_segment"):
-        segment = before.segment_at(given_["at"])
+        segment = segment_at(before, given_["at"])
         start = given_["at"] if command == "split_segment" else segment.start
         label = None if command == "remove_segment" else given_["label"] or segment.label
         labels_[start : segment.end] = [label] * (segment.end - start)
     elif command == "move_boundary":
-        segment = before.segment_at(given_["at"])
+        segment = segment_at(before, given_["at"])
         if given_["edge"] == "end":
             follower = [one.label for one in before.segments if one.start == segment.end]
             left_behind = range(given_["to"], segment.end)

@@ -7,8 +7,6 @@ from tests.support.evaluation_cases import RATE_HZ, arc, root_database
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import (
     cell_edges,
-    coverage_density,
-    coverage_holes,
     measure_coverage,
     sliding_windows,
 )
@@ -75,7 +73,6 @@ def test_a_database_without_a_second_of_motion_covers_nothing():
     assert coverage.seconds.sum() == 0.0
     assert coverage.index == 0.0
     assert coverage.deficit_s == pytest.approx(1.0)
-    assert len(coverage_density(coverage, RATE_HZ).speeds_m_s) == 96
 
 
 def test_every_trial_owns_the_cell_around_it():
@@ -85,7 +82,7 @@ def test_every_trial_owns_the_cell_around_it():
     assert coverage.seconds.shape == (9, 9)
     assert coverage.seconds == pytest.approx(121 / RATE_HZ)
     assert coverage.index == 1.0
-    assert coverage_holes(coverage, OPTIONS) == ()
+    assert not coverage.deficit_s.any()
     assert coverage.speed_edges_m_s[[0, 1, -1]] == pytest.approx([0.875, 1.125, 3.125])
     assert coverage.turn_rate_edges_deg_s[[0, 1, -1]] == pytest.approx([-112.5, -87.5, 112.5])
 
@@ -97,15 +94,13 @@ def test_what_is_faster_than_any_trial_is_a_window_without_a_cell():
     assert coverage.seconds.sum() == 0.0
 
 
-def test_holes_say_how_much_is_missing_the_emptiest_first():
+def test_cells_say_how_much_they_lack():
     options = EvaluationOptions(speeds_m_s=(1.0, 2.0), turn_rates_deg_s=(-50.0, 0.0), coverage_least_s=2.0)
     half = 0.5 * RATE_HZ - 1  # windows besides the first, for half a second in all
     root = root_database(arc(1.0, 0.0, 3.0 - 1 / RATE_HZ), arc(2.0, -50.0, 1.0 + half / RATE_HZ))
     coverage = measure_coverage(root, options)
-    holes = coverage_holes(coverage, options)
 
-    assert [(hole.speed_m_s, hole.turn_rate_deg_s) for hole in holes] == [(1.0, -50.0), (2.0, 0.0), (2.0, -50.0)]
-    assert [hole.deficit_s for hole in holes] == pytest.approx([2.0, 2.0, 1.5])
+    assert coverage.deficit_s == pytest.approx(np.array([[2.0, 0.0], [1.5, 2.0]]))
     assert coverage.index == 0.25
 
 
@@ -129,7 +124,7 @@ def test_seconds_that_are_enough_to_the_frame_leave_no_hole():
     for windows, holes in ((110, 1), (111, 0)):
         coverage = measure_coverage(root_database(arc(1.0, 0.0, (windows + 59) / RATE_HZ)), enough)
         assert len(coverage.speed_m_s) == windows
-        assert len(coverage_holes(coverage, enough)) == holes
+        assert np.count_nonzero(coverage.deficit_s) == holes
 
 
 def test_what_goes_straight_or_nearly_so_counts_as_alike_on_both_sides():
@@ -193,22 +188,3 @@ def test_a_single_speed_has_a_cell_of_the_usual_width():
     assert cell_edges((3.0, 1.0, 2.0), 0.25) == pytest.approx([0.5, 1.5, 2.5, 3.5])
     with pytest.raises(MotionError, match="at least one speed"):
         cell_edges((), 0.25)
-
-
-def test_the_density_keeps_the_seconds_and_peaks_where_the_data_is():
-    coverage = measure_coverage(root_database(arc(2.0, 50.0, 10.0)), OPTIONS)
-    density = coverage_density(coverage, RATE_HZ)
-    v, w = np.unravel_index(np.argmax(density.seconds), density.seconds.shape)
-    cell = np.diff(density.speeds_m_s)[0] * np.diff(density.turn_rates_deg_s)[0]
-
-    assert density.speeds_m_s[v] == pytest.approx(2.0, abs=0.05)
-    assert density.turn_rates_deg_s[w] == pytest.approx(50.0, abs=3.0)
-    assert density.seconds.sum() * cell == pytest.approx(541 / RATE_HZ, rel=1e-3)
-
-
-def test_the_density_of_mirrored_data_is_mirrored():
-    left = arc(1.5, 40.0, 5.0)
-    here = coverage_density(measure_coverage(root_database(left), OPTIONS), RATE_HZ)
-    there = coverage_density(measure_coverage(root_database(mirrored(left)), OPTIONS), RATE_HZ)
-
-    assert there.seconds[:, ::-1] == pytest.approx(here.seconds, abs=1e-12)

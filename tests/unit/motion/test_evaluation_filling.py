@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.support.made_databases import arc_track, made_database
+from tests.support.smaller_databases import without_sources
 from tests.support.suggestion_cases import OPTIONS, evaluated, named, with_mirrored
 
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.improvement.filling import plan_fillings, rank_fillings
-from marey_motion.evaluation.improvement.selection import joined, without_sources
+from marey_motion.evaluation.improvement.selection import joined
 from marey_motion.evaluation.suite import EvaluationCancelled
 
 THRESHOLD = 1.5

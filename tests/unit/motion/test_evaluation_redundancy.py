@@ -3,13 +3,13 @@
 import pytest
 from pydantic import ValidationError
 from tests.support.made_databases import made_database
+from tests.support.smaller_databases import without_sources
 from tests.support.suggestion_cases import OPTIONS, evaluated, named, wandering_tracks, with_mirrored
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.objective import HEADLINES, headline_means, objective_value
 from marey_motion.evaluation.improvement.redundancy import leave_one_out, plan_removals
 from marey_motion.evaluation.improvement.resimulation import Resimulation
-from marey_motion.evaluation.improvement.selection import without_sources
 from marey_motion.evaluation.suite import EvaluationCancelled
 from marey_schemas.options.improvement import ObjectiveOptions
 

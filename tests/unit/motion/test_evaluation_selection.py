@@ -5,17 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.support.made_databases import made_database
+from tests.support.smaller_databases import without_rows, without_sources
 from tests.support.suggestion_cases import named, same_to_the_bit, simulated, wandering_tracks, with_mirrored
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.improvement.selection import (
-    clips_by_source,
-    joined,
-    rows_of_sources,
-    same_skeleton,
-    without_rows,
-    without_sources,
-)
+from marey_motion.evaluation.improvement.selection import clips_by_source, joined, rows_of_sources, same_skeleton
 
 ROWS = ("features", "selectable", "root_positions", "root_headings", "pose_points", "poses", "contacts")
 

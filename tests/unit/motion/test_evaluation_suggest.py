@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.support.made_databases import arc_track, made_database
+from tests.support.smaller_databases import without_rows, without_sources
 from tests.support.suggestion_cases import (
     UNWANTED,
     evaluated,
@@ -21,7 +22,7 @@ from marey_motion.evaluation.improvement.filling import FilledCell, Filling
 from marey_motion.evaluation.improvement.objective import headline_means
 from marey_motion.evaluation.improvement.reasons import why_filling, why_redundant
 from marey_motion.evaluation.improvement.redundancy import Removal
-from marey_motion.evaluation.improvement.selection import joined, without_rows, without_sources
+from marey_motion.evaluation.improvement.selection import joined
 from marey_motion.evaluation.improvement.suggest import suggest
 from marey_motion.evaluation.improvement.suggestion_documents import comparison_to_tree, suggestions_to_tree
 from marey_motion.evaluation.similarity import accepted_distance

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.support.made_databases import arc_track, made_database
+from tests.support.smaller_databases import without_rows, without_sources
 from tests.support.suggestion_cases import (
     OPTIONS,
     UNWANTED,
@@ -16,7 +17,6 @@ from tests.support.suggestion_cases import (
 )
 
 from marey_motion.evaluation.improvement.resimulation import needed_rows
-from marey_motion.evaluation.improvement.selection import without_rows, without_sources
 from marey_motion.evaluation.improvement.unused import find_unused
 from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.evaluation.suite import run_suite

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from tests.support.constraint_derivatives import constraint_jacobian
 
 from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
 from marey_motion.editing.inverse_kinematics.solving import (
     SolvedPoses,
     TwoBoneLimb,
-    constraint_jacobian,
     limb_ending_at,
     measure_residuals,
     solve,

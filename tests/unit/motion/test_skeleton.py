@@ -76,14 +76,6 @@ def test_children_and_the_path_to_the_root_follow_the_parents(body):
     assert [body.joint_names[joint] for joint in body.path_to_root(3)] == ["LeftFoot", "LeftLeg", "LeftUpLeg", "Hips"]
 
 
-def test_depth_first_order_is_told_from_other_orders():
-    assert chain().is_depth_first
-    assert chain(parents=[-1, 0, 0]).is_depth_first
-    four = {"offsets": np.zeros((4, 3)), "rest_rotations": quaternions.identity(4), "joint_names": tuple("abcd")}
-    assert chain(**four, parents=[-1, 0, 1, 0]).is_depth_first
-    assert not chain(**four, parents=[-1, 0, 0, 1]).is_depth_first
-
-
 def test_the_rest_pose_turns_with_the_rest_rotations():
     quarter = quaternions.from_axis_angle([0, 0, 1], np.pi / 2)
     skeleton = chain(rest_rotations=np.stack([quarter, quarter, quaternions.identity()]))

@@ -63,23 +63,6 @@ class Layer:
         _require_segments(self.segments, self.frame_count)
         _require_keyframes(self.keyframes, self.frame_count)
 
-    def segment_at(self, frame: int) -> Segment:
-        """Find the segment that holds a frame.
-
-        Parameters
-        ----------
-        frame : int    frame of the clip
-
-        Returns
-        -------
-        Segment    the segment
-
-        Raises
-        ------
-        AnnotationError    where none does
-        """
-        return self.segments[self._index_at(frame)]
-
     def _index_at(self, frame: int) -> int:
         index = bisect_right(self.segments, frame, key=_start) - 1
         if index < 0 or frame >= self.segments[index].end:

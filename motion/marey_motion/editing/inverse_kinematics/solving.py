@@ -375,35 +375,6 @@ def measure_residuals(skeleton: Skeleton, motion: Motion, targets: Sequence[Targ
     return found.before
 
 
-def constraint_jacobian(
-    skeleton: Skeleton, motion: Motion, targets: Sequence[Target], freedom: Freedom = _ANYWHERE
-) -> tuple[Floats, Floats, tuple[int, ...]]:
-    """Compute the scaled errors of the first frame and their derivatives.
-
-    Columns are displacements of local rotations, q·exp(d), joint by joint in the order returned, then the root's
-    translation, which is left out (zeros) where the root does not move.
-
-    Parameters
-    ----------
-    skeleton : Skeleton    J joints
-    motion : Motion    F frames
-    targets : sequence of targets    C targets
-    freedom : Freedom    joints that may turn
-
-    Returns
-    -------
-    errors : (3·C,) float64    scaled errors
-    derivatives : (3·C, 3·V + 3) float64    by the displacements
-    joints : tuple of int    indices of the V joints
-    """
-    from marey_motion.editing.inverse_kinematics import least_squares_kernels
-
-    problem = pose_problem(skeleton, motion, targets, freedom)
-    room = problem.stepping(0.0)
-    least_squares_kernels.residuals_and_jacobian(problem.body, problem.targets, problem.roots, problem.rotations, room)
-    return room.scaled_errors, room.jacobian, tuple(problem.joints[problem.body.movable].tolist())
-
-
 def limb_targets(
     targets: Sequence[Target], limb: TwoBoneLimb | None
 ) -> tuple[PositionTarget, OrientationTarget | None] | None:

@@ -1,9 +1,9 @@
 """A suite of trials over parts of one database, simulated no more often than needed.
 
-Clips are taken away by making their rows unselectable, which gives the very trials that a database without them gives
-(`selection.without_sources`): a row is displayed only when it was chosen or follows one that was, both within its clip;
-what a trial computes depends on displayed and chosen rows and on the least cost among selectable ones; and since the
-order of rows stays, ties go to the same row.
+Clips are taken away by making their rows unselectable, which gives the very trials that a database without them gives:
+a row is displayed only when it was chosen or follows one that was, both within its clip; what a trial computes depends
+on displayed and chosen rows and on the least cost among selectable ones; and since the order of rows stays, ties go to
+the same row.
 
 For the same reason a trial that neither displays nor chooses a row of some clips is, without these clips, the same to
 the last bit: at every search the row that was cheapest is still there and still the first of the cheapest, and what

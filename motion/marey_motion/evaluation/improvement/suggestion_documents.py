@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from marey_motion.errors import MotionError
 from marey_motion.evaluation.compare import Comparison
 from marey_motion.evaluation.improvement import reasons
-from marey_motion.evaluation.improvement.optimise import Optimisation, OptimisationStep
+from marey_motion.evaluation.improvement.optimise import Optimisation
 from marey_motion.evaluation.improvement.redundancy import PlannedRemoval, Removal
 from marey_motion.evaluation.improvement.suggest import Suggestions
 from marey_motion.evaluation.similarity import PoseSimilarity
@@ -132,27 +131,6 @@ def optimisation_to_tree(optimisation: Optimisation) -> Tree:
         "ended": optimisation.ended,
         "steps": [_plain(step) for step in optimisation.steps],
     }
-
-
-def steps_from_tree(tree: Mapping[str, Any]) -> tuple[OptimisationStep, ...]:
-    """Read the log written by `optimisation_to_tree`.
-
-    Parameters
-    ----------
-    tree : mapping    plain values and arrays
-
-    Returns
-    -------
-    tuple of OptimisationStep    the steps
-    """
-    if tree.get("schema") != OPTIMISATION_SCHEMA:
-        raise MotionError(
-            f"a document of schema {OPTIMISATION_SCHEMA} is needed, not {tree.get('schema')}", where="schema"
-        )
-    return tuple(
-        OptimisationStep(**{**step, "sources": tuple(step["sources"]), "absent": tuple(step["absent"])})
-        for step in tree["steps"]
-    )
 
 
 def _plain(value: Any) -> Any:

@@ -3,11 +3,11 @@
 Both can go without changing any trial, to the last bit, as long as the normaliser stays: `resimulation` says why for
 clips. Of a used clip those frames are unneeded that lie farther than `MARGIN_BEFORE_S` before and the look-ahead plus
 `MARGIN_AFTER_S` after every frame that a trial displayed or chose, and beyond the window of frames that a search there
-may not choose. Taking their rows out of the database
-(`selection.without_rows`) leaves the rows that are needed, the ones that follow them and all their features as they
-are. The margins are as wide as filters and differences reach, so that they hold what the features of needed frames
-were made from, too; but a recording that is cut there is sampled and filtered anew, which rounds differently, and its
-frames near the cut look ahead into nothing: that is near the same, not the same, and is not called safe.
+may not choose. Taking their rows out of the database leaves the rows that are needed, the ones that follow them and all
+their features as they are. The margins are as wide as filters and differences reach, so that they hold what the
+features of needed frames were made from, too; but a recording that is cut there is sampled and filtered anew, which
+rounds differently, and its frames near the cut look ahead into nothing: that is near the same, not the same, and is not
+called safe.
 """
 
 from __future__ import annotations

@@ -112,24 +112,6 @@ def _descend(
     return replace(best, latents=drawn(best.latents))
 
 
-def search_all(objective: Objective, tree: SampleTree, *, top: int = 1) -> FoundSamples:
-    """Evaluate every sample of a tree.
-
-    Parameters
-    ----------
-    objective : Objective    constraints
-    tree : SampleTree    samples of the same primitive
-    top : int    samples to return
-
-    Returns
-    -------
-    FoundSamples    the best samples, the best first
-    """
-    _check(objective, tree, 1, top)
-    costs = objective.costs(tree.samples.astype(np.float64))
-    return _best(tree, np.arange(len(costs)), costs, top, len(costs))
-
-
 def _check(objective: Objective, tree: SampleTree, candidates: int, top: int) -> None:
     if tree.dimensions != objective.primitive.dimensions:
         held, needed = tree.dimensions, objective.primitive.dimensions

@@ -1,0 +1,60 @@
+"""Databases with clips or rows really taken out, to compare with results that were computed without doing so."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from marey_motion.arrays import Flags
+from marey_motion.errors import MotionError
+from marey_motion.evaluation.improvement.selection import rows_of_sources
+from marey_motion.matching.database import DatabaseClip, MatchingDatabase
+
+
+def without_sources(database: MatchingDatabase, sources: Collection[str]) -> MatchingDatabase:
+    """The database without the clips of these sources. Raises `MotionError` for unknown ones, and when none is left."""
+    removed = rows_of_sources(database.clips, sources)
+    return _gathered(database, [clip for clip in database.clips if not removed[clip.start]], ~removed)
+
+
+def without_rows(database: MatchingDatabase, removed: Flags) -> MatchingDatabase:
+    """The database without these rows (N,); where rows inside a clip go, what is left of it are clips of their own.
+
+    A part of a clip is named by its uid and its frames, as "walk#120-480". Its last row cannot be chosen, since nothing
+    follows it.
+    """
+    selectable = database.selectable.copy()
+    pieces = []
+    for clip in database.clips:
+        kept = np.flatnonzero(~removed[clip.start : clip.stop])
+        if len(kept) == clip.frame_count:
+            pieces.append(clip)
+            continue
+        for run in np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1) if len(kept) else ():
+            first, stop = int(run[0]), int(run[-1]) + 1
+            name = f"#{first}-{stop}"
+            piece = replace(clip, start=clip.start + first, stop=clip.start + stop, loop=False)
+            pieces.append(replace(piece, uid=clip.uid + name, name=clip.name + name))
+            selectable[clip.start + stop - 1] = False
+    return _gathered(replace(database, selectable=selectable), pieces, ~removed)
+
+
+def _gathered(database: MatchingDatabase, clips: Sequence[DatabaseClip], kept: Flags) -> MatchingDatabase:
+    """The rows of `clips`, which are all that are `kept`, in one database."""
+    if not clips:
+        raise MotionError("no clip is left", code="no-clips")
+    before = np.concatenate(([0], np.cumsum(kept)))
+    return replace(
+        database,
+        clips=tuple(replace(clip, start=int(before[clip.start]), stop=int(before[clip.stop])) for clip in clips),
+        **{name: rows[kept] for name, rows in _by_row(database).items()},
+    )
+
+
+def _by_row(database: MatchingDatabase) -> dict[str, Any]:
+    """The arrays that have one entry per row."""
+    values = {field.name: getattr(database, field.name) for field in fields(database)}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
