@@ -6,8 +6,11 @@ from collections.abc import Sequence
 
 
 def counted(number: int, noun: str) -> str:
-    """`number` with its noun, which takes an s unless there is exactly one: "1 frame", "103,568 frames"."""
-    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+    """Return a number with its noun, in the plural unless there is exactly one: "1 frame", "103,568 trajectories"."""
+    if number == 1:
+        return f"1 {noun}"
+    plural = f"{noun[:-1]}ies" if noun.endswith("y") and noun[-2] not in "aeou" else f"{noun}s"
+    return f"{number:,} {plural}"
 
 
 def one_of(names: Sequence[str]) -> str:

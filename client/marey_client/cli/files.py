@@ -13,6 +13,7 @@ from marey_client.cli.addresses import Address, find_item, kind_named, require_i
 from marey_client.cli.failures import Refused, WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, print_pairs, print_table, progress, tell
+from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.formats import EXPORT_FORMATS
 from marey_schemas.wording import counted, one_of
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from marey_schemas.imports import ImportEntry
     from marey_schemas.kinds import Kind
 
+UPLOAD = OptionsOf("marey_schemas.options.imports:ImportOptions", short={"frame_rate_hz": "--fps"})
 DOWNLOADS_AT_ONCE = 4
 
 WARNINGS_SHOWN = 2  # of each code: a folder of thousands shows what it has, not everything it has
@@ -31,7 +33,8 @@ WARNINGS_SHOWN = 2  # of each code: a folder of thousands shows what it has, not
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
-    for command in (upload, ls, show, download):
+    add_command(app, upload, options=UPLOAD)
+    for command in (ls, show, download):
         app.command()(command)
 
 
@@ -39,34 +42,16 @@ def upload(
     context: typer.Context,
     places: Annotated[list[Path], typer.Argument(help="Motion files, or folders of them.")],
     project: Annotated[str, typer.Option(help="The project they go to.")],
-    collection: Annotated[str, typer.Option(help="The folder in the project.")] = "",
-    unit: Annotated[str | None, typer.Option(help="m, dm, cm, mm, inch, ft or cmu; default: found out.")] = None,
-    unit_scale_m: Annotated[float | None, typer.Option(help="Metres per unit, where no named unit fits.")] = None,
-    up_axis: Annotated[str | None, typer.Option(help="x, y, z, -x, -y or -z; default: found out.")] = None,
-    left_handed: Annotated[bool, typer.Option("--left-handed", help="The files are left-handed; mirror them.")] = False,
-    align_floor: Annotated[bool, typer.Option("--align-floor", help="Put the feet on height 0.")] = False,
-    frame_rate_hz: Annotated[
-        float | None, typer.Option("--fps", help="Frames per second; default: the file's.")
-    ] = None,
-    skeleton: Annotated[str | None, typer.Option(help="Id of the skeleton the clips must use.")] = None,
-    trim_rest_pose: Annotated[bool, typer.Option("--trim-rest-pose", help="Drop rest poses at the ends.")] = False,
-    tag: Annotated[list[str] | None, typer.Option(help="Tag of every clip; may be repeated.")] = None,
-    subject: Annotated[str | None, typer.Option(help="Who moves.")] = None,
-    licence: Annotated[str | None, typer.Option(help="What the data may be used for.")] = None,
-    capture_system: Annotated[str | None, typer.Option(help="What recorded it.")] = None,
+    options: Chosen,
+    left_handed: Annotated[bool, typer.Option("--left-handed", help="The same as --handedness left.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Import motion files. Each goes in or is refused with a reason; the same file again makes nothing new."""
     from marey_client.imports import find_files, left_out_text
     from marey_schemas.options.imports import ImportOptions
 
-    given = {
-        "collection": collection, "unit": unit, "unit_scale_m": unit_scale_m, "up_axis": up_axis,
-        "frame_rate_hz": frame_rate_hz, "skeleton": skeleton, "trim_rest_pose": trim_rest_pose or None,
-        "handedness": "left" if left_handed else None, "align_floor": align_floor or None,
-        "tags": tuple(tag) if tag else None, "subject": subject, "licence": licence, "capture_system": capture_system,
-    }  # fmt: skip
-    options = ImportOptions.model_validate({key: value for key, value in given.items() if value is not None})
+    if left_handed:
+        options["handedness"] = "left"
     found = find_files(places)
     if found.left_out:
         tell(left_out_text(found.left_out))
@@ -75,7 +60,7 @@ def upload(
         to.read()  # a project that is not there is told before its bytes are sent
         try:
             with progress() as advance:
-                entries = to.imports.upload(found.files, options, notice=advance)
+                entries = to.imports.upload(found.files, ImportOptions.model_validate(options), notice=advance)
         except KeyboardInterrupt:
             tell("interrupted; what was imported stays, and the same command again sends only what is missing")
             raise

@@ -13,10 +13,11 @@ from marey_motion.evaluation.scenario import demand
 from marey_reports.drawing.markup import Content, Html, element, joined
 from marey_reports.drawing.page import Section, shown
 from marey_reports.drawing.tables import Cell, Number, facts, folded, number, share, table
-from marey_reports.drawing.words import amount, duration
+from marey_reports.drawing.words import duration
 from marey_reports.evaluation.definitions import METRICS
 from marey_reports.evaluation.figures import DrawnFigure
 from marey_reports.evaluation.words import find_holes
+from marey_schemas.wording import counted
 
 Figures = Mapping[str, DrawnFigure]
 
@@ -71,7 +72,7 @@ def error_chapter(result: EvaluationResult, figures: Figures) -> Section:
     text = (
         "Every trajectory is followed."
         if not lost
-        else f"{amount(lost, 'trajectory')} of {len(result.trials)} {'is' if lost == 1 else 'are'} not followed."
+        else f"{counted(lost, 'trajectory')} of {len(result.trials)} {'is' if lost == 1 else 'are'} not followed."
     )
     rows = [_trial_row(each) for each in worst]
     listing = table("The worst trials; what is beyond its limit is marked", TRIAL_HEADS, rows, numbers=range(1, 8))
@@ -92,7 +93,7 @@ def load_chapter(result: EvaluationResult, figures: Figures) -> Section:
         total += used[half].share
         half += 1
     text = (
-        f"{amount(half, 'clip')} of {len(used)} used {'makes' if half == 1 else 'make'} up half of what was displayed."
+        f"{counted(half, 'clip')} of {len(used)} used {'makes' if half == 1 else 'make'} up half of what was displayed."
         if used
         else "No clip was displayed."
     )
@@ -114,7 +115,7 @@ def unused_chapter(result: EvaluationResult) -> Section:
     seconds = sum(len(source.popularity) for source in unused) / result.options.database.rate_hz
     text = element(
         "p",
-        f"{amount(len(unused), 'clip')} of {len(sources)}, {duration(seconds)} of motion, "
+        f"{counted(len(unused), 'clip')} of {len(sources)}, {duration(seconds)} of motion, "
         f"{'was' if len(unused) == 1 else 'were'} displayed in no trial. Without "
         f"{'it' if len(unused) == 1 else 'them'} these trials stay the same to the bit, when the normaliser is kept; "
         "trials of other kinds may need them.",
@@ -133,7 +134,9 @@ def recording_chapter(result: EvaluationResult, figures: Figures) -> Section:
     missing = float(result.coverage.deficit_s.sum())
     rest = sum(hole.missing_s for hole in holes[MOST_HOLES:])
     items = [element("li", hole.words, ": ", element("b", f"{duration(hole.missing_s)} missing")) for hole in holes]
-    more = element("p", f"and {duration(rest)} in {amount(len(holes) - MOST_HOLES, 'smaller hole')}.") if rest else None
+    more = (
+        element("p", f"and {duration(rest)} in {counted(len(holes) - MOST_HOLES, 'smaller hole')}.") if rest else None
+    )
     return Section(
         "record",
         "What to record next",

@@ -12,9 +12,9 @@ from marey_motion.evaluation.scenario import demand
 from marey_reports.drawing.markup import Content, Html, element
 from marey_reports.drawing.page import Section, shown
 from marey_reports.drawing.tables import Cell, Number, facts, folded, number, table
-from marey_reports.drawing.words import amount
 from marey_reports.evaluation.definitions import METRICS
 from marey_reports.evaluation.figures import DrawnFigure
+from marey_schemas.wording import counted
 
 Figures = Mapping[str, DrawnFigure]
 
@@ -35,7 +35,7 @@ def compared(before: EvaluationResult, after: EvaluationResult) -> str:
         start = "Better" if second.followed > first.followed else "Worse"
         parts = [f"the character follows {_share(second)} trajectories, {first.followed} before"]
     if gained or lost:
-        parts.append(f"{amount(gained, 'trajectory')} gained and {lost} lost")
+        parts.append(f"{counted(gained, 'trajectory')} gained and {lost} lost")
     offsets = before.suite.get("offset_mean"), after.suite.get("offset_mean")
     if offsets[0] is not None and offsets[1] is not None:
         parts.append(f"it is {offsets[1]:.2f} m from its path on average, {offsets[0]:.2f} m before")
@@ -108,7 +108,7 @@ def trial_chapter(
     pairs = [(old, new) for old, new in paired(before, after) if old.metrics != new.metrics]
     pairs.sort(key=lambda pair: (-abs(_shift(*pair)), pair[0].trial.name))
     changed = sum(not each.same_motion for each in comparison.changed) if comparison is not None else len(pairs)
-    text = f"{amount(changed, 'trial')} of {len(before.trials)} went another way."
+    text = f"{counted(changed, 'trial')} of {len(before.trials)} went another way."
     if comparison is not None and (others := len(comparison.changed) - changed):
         text += f" {others} more went the same way with other clips."
     heads = ("trial", "distance before (m)", "after (m)", "change (m)", "followed before", "after")

@@ -14,7 +14,6 @@ from marey_motion.evaluation.result import EvaluationResult, TrialResult
 from marey_motion.evaluation.scenario import demand
 from marey_reports.drawing.markup import element
 from marey_reports.drawing.page import Section, page
-from marey_reports.drawing.words import amount
 from marey_reports.evaluation.chapters import (
     appendix_chapter,
     baseline_chapter,
@@ -37,6 +36,7 @@ from marey_reports.evaluation.comparison import (
 from marey_reports.evaluation.definitions import definitions
 from marey_reports.evaluation.figures import DrawnFigure, draw_figures
 from marey_reports.evaluation.provenance import provenance
+from marey_schemas.wording import counted
 
 __all__ = ["compared", "render_comparison", "render_report", "verdict"]
 
@@ -100,16 +100,16 @@ def verdict(result: EvaluationResult) -> str:
     judgement = judge(result)
     if judgement.worst is None:
         return "Not judged: the evaluation has no trials."
-    parts = [f"the character follows {judgement.followed} of {amount(judgement.trials, 'trajectory')}"]
+    parts = [f"the character follows {judgement.followed} of {counted(judgement.trials, 'trajectory')}"]
     if judgement.followed < judgement.trials:
         parts[0] += f", worst at a {demand(judgement.worst.trial)} ({_failing(judgement.worst)})"
     missing = result.coverage.deficit_s
     enough = int(np.count_nonzero(missing <= 0.0))
-    parts.append(f"{enough} of {amount(missing.size, 'cell')} of speed and turn rate hold enough data")
+    parts.append(f"{enough} of {counted(missing.size, 'cell')} of speed and turn rate hold enough data")
     sources = sum_by_source(result.clips, result.usage)
     unused = sum(1 for source in sources if not source.ticks)
     if unused:
-        parts.append(f"{unused} of {amount(len(sources), 'clip')} {'is' if unused == 1 else 'are'} never used")
+        parts.append(f"{unused} of {counted(len(sources), 'clip')} {'is' if unused == 1 else 'are'} never used")
     return f"{judgement.grade.capitalize()}: {'; '.join(parts)}."
 
 

@@ -13,9 +13,9 @@ from marey_reports.drawing.drawn import DrawnFigure
 from marey_reports.drawing.markup import Content, Html, element
 from marey_reports.drawing.page import Section, shown
 from marey_reports.drawing.tables import Cell, Number, facts, folded, number, table
-from marey_reports.drawing.words import amount
 from marey_reports.models.figures.samples import Reach, reach_of
 from marey_reports.models.figures.subjects import ModelSubject
+from marey_schemas.wording import counted
 
 Figures = Mapping[str, DrawnFigure]
 
@@ -29,7 +29,7 @@ def headline(trained: TrainedPrimitive) -> Html:
     durations, drawn = report.training_durations, report.sample_durations
     lasting = "" if drawn is None else f"samples {drawn.least_s:.1f}–{drawn.most_s:.1f} s"
     odd = sum(example.outlier for example in report.examples)
-    kinds = amount(len(primitive.mixture.weights), "kind")
+    kinds = counted(len(primitive.mixture.weights), "kind")
     return facts(
         (
             ("examples", str(len(report.examples)), f"{odd} odd" if odd else "none of them odd"),
@@ -110,8 +110,8 @@ def variation_chapter(subject: ModelSubject, figures: Figures) -> Section:
         text = "Nothing: all examples are the same motion, and so are all samples."
         return Section("variation", "What it can vary", element("p", text))
     text = (
-        f"A motion of this model is {amount(spatial, 'number')} for its poses and {amount(temporal, 'number')} for its "
-        "time. Each number turns one of the knobs below; the first ones turn most."
+        f"A motion of this model is {counted(spatial, 'number')} for its poses and {counted(temporal, 'number')} for "
+        "its time. Each number turns one of the knobs below; the first ones turn most."
     )
     components = [name for name in figures if name.startswith("component-")]
     return Section(
@@ -157,7 +157,7 @@ def making_chapter(subject: ModelSubject, figures: Figures) -> Section:
     aligned = subject.examples
     reference = next(clip.name for clip in aligned.clips if clip.uid == aligned.reference)
     text = (
-        f"{amount(len(aligned.clips), 'clip')}, brought to one place, one direction and the time of {reference}: "
+        f"{counted(len(aligned.clips), 'clip')}, brought to one place, one direction and the time of {reference}: "
         f"{aligned.frame_count} canonical frames at {aligned.frame_rate_hz:g} Hz."
     )
     keys = sorted(aligned.keyframes.items(), key=lambda each: (each[1], each[0]))

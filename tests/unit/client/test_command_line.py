@@ -271,7 +271,7 @@ def test_a_project_that_is_not_there_is_told_before_any_byte_is_sent(script, mak
     monkeypatch.setattr(files, "connect", lambda context: script.marey())
     script.answers = [make_problem(404, "no-project")]
     with pytest.raises(NotFound):
-        files.upload(NO_OPTIONS, [tmp_path], project="nowhere")
+        files.upload(NO_OPTIONS, [tmp_path], "nowhere", {})
     assert [request.method for request in script.requests] == ["GET"]
 
 
@@ -324,7 +324,7 @@ def test_who_interrupts_an_upload_is_told_how_to_go_on(script, monkeypatch, tmp_
     monkeypatch.setattr(files, "connect", lambda context: script.marey())
     script.answers = [httpx.Response(200, json=PROJECT), interrupt]
     with pytest.raises(KeyboardInterrupt):
-        files.upload(NO_OPTIONS, [tmp_path], project="lab")
+        files.upload(NO_OPTIONS, [tmp_path], "lab", {})
     assert "the same command again sends only what is missing" in capsys.readouterr().err
 
 

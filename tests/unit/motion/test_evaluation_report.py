@@ -20,12 +20,13 @@ from marey_motion.matching.building import build_database
 from marey_motion.matching.database import SourceClip
 from marey_motion.rigs import map_joints
 from marey_reports.drawing.markup import element, text
-from marey_reports.drawing.words import amount, duration
+from marey_reports.drawing.words import duration
 from marey_reports.evaluation.definitions import METRICS
 from marey_reports.evaluation.figures import FIGURES, draw_figures
 from marey_reports.evaluation.page import compared, render_comparison, render_report, verdict
 from marey_reports.evaluation.words import find_holes
 from marey_schemas.options.evaluation import EvaluationOptions
+from marey_schemas.wording import counted
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +212,7 @@ def test_a_hole_is_told_as_an_animator_says_it(result):
 
 
 def test_amounts_durations_and_demands_are_words():
-    assert [amount(1, "clip"), amount(2, "trajectory"), amount(1200, "cell")] == [
+    assert [counted(1, "clip"), counted(2, "trajectory"), counted(1200, "cell")] == [
         "1 clip",
         "2 trajectories",
         "1,200 cells",

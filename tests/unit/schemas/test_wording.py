@@ -8,3 +8,8 @@ from marey_schemas.wording import counted
 )
 def test_a_noun_takes_an_s_unless_there_is_exactly_one(number: int, told: str) -> None:
     assert counted(number, "frame") == told
+
+
+@pytest.mark.parametrize(("noun", "told"), [("trajectory", "2 trajectories"), ("day", "2 days")])
+def test_a_noun_in_y_takes_the_plural_of_its_kind(noun: str, told: str) -> None:
+    assert counted(2, noun) == told

@@ -20,7 +20,6 @@ from marey_reports.drawing.paper import (
     name_ticks,
     new_figure,
 )
-from marey_reports.drawing.words import amount
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
 from marey_schemas.wording import counted
 
@@ -129,6 +128,6 @@ def _caption(subjects: Sequence[Subject], uses: Sequence[_Use]) -> str:
         used = sum(1 for ticks in use.ticks.values() if ticks)
         parts.append(
             f"{subject.prefix}{used} of {len(use.ticks)} clips used over {sum(use.ticks.values()):,} displayed frames, "
-            f"{amount(use.transitions, 'transition')} between them."
+            f"{counted(use.transitions, 'transition')} between them."
         )
     return "How often frames of each clip were displayed. " + " ".join(parts)

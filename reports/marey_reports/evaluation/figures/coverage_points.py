@@ -23,7 +23,6 @@ from marey_reports.drawing.paper import (
     plain,
     reach,
 )
-from marey_reports.drawing.words import amount
 from marey_reports.evaluation.figures.axes import SPEED, TURN_RATE, mark_sides
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
 from marey_schemas.wording import counted
@@ -162,5 +161,5 @@ def _caption(
         turn, speed = np.degrees(subject.result.coverage.turn_rate_rad_s), subject.result.coverage.speed_m_s
         beyond = int(np.count_nonzero((np.abs(turn) > limits[0][1]) | (speed > limits[1][1])))
         outside = f"; {beyond:,} lie beyond the axes" if beyond else ""
-        parts.append(f"{subject.prefix}{total:,} windows from {amount(held, 'clip')}, {drawn} drawn{outside}.")
+        parts.append(f"{subject.prefix}{total:,} windows from {counted(held, 'clip')}, {drawn} drawn{outside}.")
     return "Each point is the mean speed and turn rate of one second of a clip. " + " ".join(parts)

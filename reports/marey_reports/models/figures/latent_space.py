@@ -21,8 +21,8 @@ from marey_reports.drawing.paper import (
     new_figure,
     write,
 )
-from marey_reports.drawing.words import amount
 from marey_reports.models.figures.subjects import ModelSubject
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -82,7 +82,9 @@ def _mixture(components: int) -> str:
 def _odd_ones(count: int) -> str:
     if not count:
         return "No example stands apart from the others."
-    return f"{amount(count, 'example')} {'stands' if count == 1 else 'stand'} apart from the others, marked by a cross."
+    return (
+        f"{counted(count, 'example')} {'stands' if count == 1 else 'stand'} apart from the others, marked by a cross."
+    )
 
 
 def _pairs(spatial: int, temporal: int) -> list[tuple[int, int]]:

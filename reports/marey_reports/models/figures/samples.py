@@ -12,8 +12,8 @@ from marey_motion.rigs import map_joints
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import COLOURS, REFERENCE, Place, add_keys, add_panel, new_figure
 from marey_reports.drawing.strips import StripRow, draw_strips
-from marey_reports.drawing.words import amount
 from marey_reports.models.figures.subjects import ModelSubject, evenly, position_table
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,8 +62,8 @@ def draw_samples(subject: ModelSubject) -> Sketch:
     figure = draw_strips(subject.body, rows, moments, subject.seen_from_rad, cell_in=CELL_IN)
     spread = [_spread_cm(subject, points) for points in (examples, samples)]
     caption = (
-        f"{amount(len(chosen), 'training example')} above, {amount(len(samples), 'sample')} of the model below, on top "
-        "of each other at the same moments of canonical time, and seen from the same place. Where the lower row is "
+        f"{counted(len(chosen), 'training example')} above, {counted(len(samples), 'sample')} of the model below, on "
+        "top of each other at the same moments of canonical time, and seen from the same place. Where the lower row is "
         "tighter than the upper one, the model varies less than what it was made of; where it is wider, more. On "
         f"average joints lie {spread[0]:.0f} cm from the middle of the examples, and {spread[1]:.0f} cm from that of "
         "the samples."
@@ -114,7 +114,7 @@ def draw_paths(subject: ModelSubject) -> Sketch:
     table = _path_table(names, list(joints), frames, np.concatenate(list(sets.values())))
     caption = (
         f"The ways of {_listed(list(joints))}, in metres from where the root begins, the body facing forward: "
-        f"{amount(len(chosen), 'training example')} on the left, as many samples of the model on the right; from the "
+        f"{counted(len(chosen), 'training example')} on the left, as many samples of the model on the right; from the "
         "side above, from above below. Samples should fill the space of the examples, and not leave it."
     )
     return Sketch(figure, {"paths": table}, caption)

@@ -9,8 +9,8 @@ import numpy as np
 from marey_motion.arrays import Floats
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import COLOURS, REFERENCE, Place, add_keys, add_panel, new_figure, tick_whole_numbers
-from marey_reports.drawing.words import amount
 from marey_reports.models.figures.subjects import ModelSubject
+from marey_schemas.wording import counted
 
 BINS = 30
 
@@ -20,7 +20,7 @@ def draw_search_check(subject: ModelSubject) -> Sketch | None:
     check = subject.check
     if check is None:
         return None
-    examples = amount(len(set(check.examples)), "example")
+    examples = counted(len(set(check.examples)), "example")
     about = f"where hands and feet of {examples} were, by a model made without them"
     sketch = draw_search_errors(check.searched_cm, check.refined_cm, about=about)
     whose = {"example": check.examples, "joint": check.joints, "canonical_frame": check.frames}
@@ -57,6 +57,6 @@ def _caption(searched_cm: Floats, refined_cm: Floats, about: str) -> str:
         return "No target was searched for."
     found = [f"{np.median(values):.1f} cm (worst {values.max():.1f} cm)" for values in (searched_cm, refined_cm)]
     return (
-        f"How near the model comes to {amount(len(searched_cm), 'target')}{f', {about}' if about else ''}: half of "
+        f"How near the model comes to {counted(len(searched_cm), 'target')}{f', {about}' if about else ''}: half of "
         f"them within {found[0]} by the search of its tree alone, and within {found[1]} after refinement."
     )

@@ -20,8 +20,8 @@ from marey_reports.drawing.paper import (
     tick_whole_numbers,
     write,
 )
-from marey_reports.drawing.words import amount
 from marey_reports.models.figures.subjects import ModelSubject
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,7 +75,7 @@ def _held(kind: str, energy: Floats, kept: int) -> str:
     whose = "The poses of the examples" if kind == "poses" else "Their time"
     verb = "vary" if kind == "poses" else "varies"
     return (
-        f"{whose} {verb} in {amount(len(energy), 'independent way')}; the model keeps {kept} of them, and with them "
+        f"{whose} {verb} in {counted(len(energy), 'independent way')}; the model keeps {kept} of them, and with them "
         f"{100.0 - lost:.1f} % of the variance."
     )
 

@@ -21,8 +21,8 @@ from marey_reports.drawing.paper import (
     shortened,
     told_apart,
 )
-from marey_reports.drawing.words import amount
 from marey_reports.models.figures.canonical_time import CANONICAL_TIME, mark_keyframes, percents
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -114,12 +114,12 @@ def _clips(aligned: AlignedSet) -> dict[str, object]:
 def _caption(aligned: AlignedSet, reference: int) -> str:
     durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
     keyframes = (
-        f" Dotted lines are the {amount(len(aligned.keyframes), 'keyframe')} that all share."
+        f" Dotted lines are the {counted(len(aligned.keyframes), 'keyframe')} that all share."
         if aligned.keyframes
         else ""
     )
     return (
-        f"How {amount(len(aligned.clips), 'clip')} of {durations.min():.2f} to {durations.max():.2f} s were laid over "
+        f"How {counted(len(aligned.clips), 'clip')} of {durations.min():.2f} to {durations.max():.2f} s were laid over "
         f"{aligned.clips[reference].name}, the reference: on the left, which moment of each clip belongs to which "
         "moment of canonical time; on the right, how fast the clip plays there, compared with the reference. The clips "
         f"whose timing is least like the reference's are in colour.{keyframes}"
