@@ -208,7 +208,6 @@ def _imported(file: FileToImport) -> ImportedFile:
 
 
 def reader_options(given: UserOptions) -> ImportOptions:
-<<<<<<< HEAD
     """Convert the user's options for the readers; a unit by name becomes its size in metres.
 
     Parameters
@@ -219,11 +218,7 @@ def reader_options(given: UserOptions) -> ImportOptions:
     -------
     ImportOptions    options of the readers
     """
-    chosen = {name: value for name in _READER_OPTIONS if (value := getattr(given, name, None)) is not None}
-=======
-    """Translate the user's options for the readers; a unit by name becomes its size in metres."""
     chosen = {name: value for name in _READER_OPTIONS if (value := getattr(given, name)) is not None}
->>>>>>> a2cd65e (cli: take the options of uploads from the schema)
     if given.unit is not None:
         chosen.setdefault("unit_scale_m", unit_in_metres(given.unit))
     return ImportOptions(**chosen)
