@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
-from docs.docstrings import public_functions
+from lint.docstrings import KERNELS, public_functions
 
 MOTION = Path(__file__).parents[1] / "motion"
 PACKAGE = MOTION / "marey_motion"
@@ -29,7 +29,7 @@ def library_page() -> str:
         text += _entry(module, name)
     text += "## Modules\n\n"
     for file in sorted(PACKAGE.rglob("*.py")):
-        if not file.stem.endswith(("kernels", "lanes")):
+        if not file.stem.endswith(KERNELS):
             text += _module(file)
     return text.rstrip() + "\n"
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from lint import circles, class_names, folders, lengths, lists, small_modules, unused, wording
+from lint import circles, class_names, docstrings, folders, lengths, lists, small_modules, unused, wording
 from lint.commit_subject import faults_of
 from lint.exceptions import apply_baseline, apply_exceptions, read_baseline, shrink_baseline
 from lint.sources import House, Module, Offence
@@ -46,6 +46,31 @@ def test_a_folder_of_26_modules_is_full():
     assert messages(folders.find(house(full))) == ["26 modules, more than 25; make rooms of them"]
     del full["marey_x.m0"]
     assert not list(folders.find(house(full)))
+
+
+NUMPYDOC = '"""Turn.\n\n    Parameters\n    ----------\n    {}\n\n    Returns\n    -------\n    float\n    """'
+
+WITHOUT_RESULT = NUMPYDOC.format("angle : float    radians").partition("    Returns")[0] + '"""'
+
+
+@pytest.mark.parametrize(
+    ("docstring", "fault"),
+    [
+        ("", "turned has no docstring"),
+        ('"""Turn."""', "turned does not document angle under Parameters"),
+        (NUMPYDOC.format("axis : str\n    angle : float"), "turned documents axis, which it does not take"),
+        (WITHOUT_RESULT, "turned does not document what it returns under Returns"),
+    ],
+)
+def test_a_function_of_the_library_documents_what_it_takes_and_returns(docstring, fault):
+    text = f"def turned(angle: float) -> float:\n    {docstring}\n    return angle\n"
+    assert messages(docstrings.find(house({"marey_motion.turns": text}))) == [fault]
+    assert not list(docstrings.find(house({"marey_motion.turn_kernels": text, "marey_server.turns": text})))
+
+
+def test_a_documented_function_of_the_library_is_fine():
+    text = f"def turned(angle: float) -> float:\n    {NUMPYDOC.format('angle : float    radians')}\n    return angle\n"
+    assert not list(docstrings.find(house({"marey_motion.turns": text})))
 
 
 def test_a_small_module_with_one_importer_belongs_into_it():

@@ -1,33 +1,34 @@
-"""Checks that public functions of motion document parameters and results: `python -m docs.docstrings`.
+"""Rule: public functions of the motion library document what they take and return, with shapes, units and frames.
 
-Functions of kernel modules take what their callers prepare, and are left out.
+Functions of kernel modules take what their callers prepare, and are left out. The words are for people to judge; the
+rule compares names of parameters, and asks for a section on results.
 """
 
 from __future__ import annotations
 
 import ast
 import re
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
-PACKAGE = Path(__file__).parents[1] / "motion" / "marey_motion"
+from lint.sources import House, Offence
+
+PACKAGE = "marey_motion"
+KERNELS = ("kernels", "lanes")
+"""Endings of the names of modules with compiled functions."""
+
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 _SECTION = re.compile(r"^(Parameters|Returns|Yields)\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", re.MULTILINE | re.DOTALL)
 _NAMES = re.compile(r"^([\w*]+(?:, [\w*]+)*)(?= : |    |$)", re.MULTILINE)
 
 
-def problems(package: Path = PACKAGE) -> dict[str, str]:
-    """Find the public functions that document too little, by name, with the reason."""
-    found = {}
-    for file in sorted(package.rglob("*.py")):
-        if file.stem.endswith(("kernels", "lanes")):
+def find(house: House) -> Iterator[Offence]:
+    """Find public functions of the library whose docstrings lack something."""
+    for module in house.modules.values():
+        if module.name.partition(".")[0] != PACKAGE or module.name.endswith(KERNELS):
             continue
-        module = ".".join(file.relative_to(package.parent).with_suffix("").parts).removesuffix(".__init__")
-        for name, function in public_functions(ast.parse(file.read_text(encoding="utf-8"))):
+        for name, function in public_functions(module.tree):
             if reason := problem_of(function):
-                found[f"{module}.{name}"] = reason
-    return found
+                yield Offence(module.path, function.lineno, f"{module.name}.{name}", f"{name} {reason}")
 
 
 def public_functions(tree: ast.Module | ast.ClassDef, within: str = "") -> Iterator[tuple[str, Function]]:
@@ -52,12 +53,12 @@ def problem_of(function: Function) -> str:
     listed = re.findall(r"\w+", " ".join(_NAMES.findall(sections.get("Parameters", ""))))
     given = _parameters(function)
     if missing := [name for name in given if name not in listed]:
-        return f"does not document {', '.join(missing)}"
+        return f"does not document {', '.join(missing)} under Parameters"
     if unknown := [name for name in listed if name not in given]:
         return f"documents {', '.join(unknown)}, which it does not take"
     result = ast.unparse(function.returns) if function.returns else "None"
     if result not in ("None", "NoReturn") and not sections.keys() & {"Returns", "Yields"}:
-        return "does not document what it returns"
+        return "does not document what it returns under Returns"
     return ""
 
 
@@ -65,14 +66,3 @@ def _parameters(function: Function) -> list[str]:
     given = function.args
     every = [*given.posonlyargs, *given.args, *given.kwonlyargs, *filter(None, (given.vararg, given.kwarg))]
     return [each.arg for each in every if each.arg not in ("self", "cls")]
-
-
-def main() -> int:
-    """Report functions that document too little."""
-    found = problems()
-    sys.stderr.writelines(f"{name} {reason}\n" for name, reason in found.items())
-    return int(bool(found))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
