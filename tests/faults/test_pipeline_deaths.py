@@ -94,7 +94,7 @@ def assert_made_once(lab: ProjectHandle, run: PipelineRun) -> None:
 
 
 @pytest.mark.parametrize("nth", ["@1", "@2"])
-@pytest.mark.parametrize("place", ["bind.before_commit", "bind.after_commit"])
+@pytest.mark.parametrize("place", ["late_inputs.before_commit", "late_inputs.after_commit"])
 def test_a_server_killed_where_a_job_gets_its_inputs_goes_on_with_all_of_them_or_none(
     server: ServerProcess,
     takes: list[LocalFile],

@@ -13,7 +13,7 @@ from marey_server.errors import ForbiddenProblem, InvalidProblem, LeaseLostProbl
 from marey_server.store import projects
 from marey_server.store.jobs import completion, queue
 from marey_server.store.jobs.endings import Ended
-from marey_server.store.jobs.propagation import settle
+from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.transaction import Transaction
 
 
@@ -178,12 +178,12 @@ def test_an_overdue_job_that_cannot_be_taken_back_keeps_no_other_from_it(
     leases = {lease.job: lease for lease in desk.claim_many()}
     desk.clock.advance(1000)
 
-    def settle_all_but_one(tx: Transaction, ended: list[Ended]) -> None:
+    def propagate_all_but_one(tx: Transaction, ended: list[Ended]) -> None:
         if any(end.id == jobs[1] for end in ended):
             raise ValueError("a fault of ours")
-        settle(tx, ended)
+        propagate_ends(tx, ended)
 
-    monkeypatch.setattr("marey_server.store.jobs.failure.settle", settle_all_but_one)
+    monkeypatch.setattr("marey_server.store.jobs.failure.propagate_ends", propagate_all_but_one)
     assert desk.reap() == 2
     assert [desk.state(job) for job in jobs] == ["failed", "running", "failed"]
     desk.complete(leases[jobs[1]])

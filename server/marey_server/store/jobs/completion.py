@@ -1,4 +1,4 @@
-"""The last word of an attempt: its results are published with everything that follows, or it failed."""
+"""Ends attempts: publishes the results of those that succeeded, and records those that failed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from marey_server.errors import ApiProblem, NotFoundProblem
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs import staging
 from marey_server.store.jobs.endings import ENDED_COLUMNS, AttemptEnd, Ended, as_ended, end_attempts
-from marey_server.store.jobs.failure import ENDING_COLUMNS, carry_out, judge
+from marey_server.store.jobs.failure import ENDING_COLUMNS, apply_outcome, decide_outcome
 from marey_server.store.jobs.fan_out import release_tasks
 from marey_server.store.jobs.fencing import (
     HELD,
@@ -33,7 +33,7 @@ from marey_server.store.jobs.fencing import (
     require_attempt,
 )
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
-from marey_server.store.jobs.propagation import settle
+from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.tables import attempt, job, staged_output
 from marey_server.store.transaction import Transaction
 
@@ -42,7 +42,7 @@ _Place = tuple[str, int]
 
 
 def complete(tx: Transaction, job_id: str, fence: int, request: CompleteRequest) -> CompleteAnswer:
-    """End the job with success and publish what the attempt staged. The same `write_id` again: the same answer.
+    """End the job with success and publish what the attempt staged. A repeated `write_id` gets the same answer.
 
     Raises `LeaseLostProblem` if the attempt does not hold the job, or has ended it with another `write_id`.
     """
@@ -51,13 +51,13 @@ def complete(tx: Transaction, job_id: str, fence: int, request: CompleteRequest)
     ended = _complete(tx, {place: request})
     if place not in ended:
         return _same_answer(tx, place, request.write_id)
-    settle(tx, [end for end, _ in ended.values()])
+    propagate_ends(tx, [end for end, _ in ended.values()])
     _pass_fault_points(tx)
     return ended[place][1]
 
 
 def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> list[BatchCompletionResult]:
-    """Complete many jobs in one transaction, for the worker that claimed them; each is refused by itself."""
+    """Complete many jobs of one worker in one transaction; a refusal concerns one job alone."""
     requests = {(one.job, one.fence): one for one in reversed(completions)}
     own = _claimed_by_caller(tx, requests)
     publishing = {place for place in own if any(staging.named_blobs(requests[place].result))} | _staged(tx, own)
@@ -69,7 +69,7 @@ def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> li
                 ended |= _complete(tx, {place: requests[place]})
         except ApiProblem as error:
             refused[place] = error
-    settle(tx, [end for end, _ in ended.values()])
+    propagate_ends(tx, [end for end, _ in ended.values()])
     _pass_fault_points(tx)
     answers = {place: answer for place, (_, answer) in ended.items()}
     return [_result(tx, one, answers, refused, own) for one in completions]
@@ -94,7 +94,7 @@ _WIN = Prepared(
 def _complete(
     tx: Transaction, requests: Mapping[_Place, CompleteRequest]
 ) -> dict[_Place, tuple[Ended, CompleteAnswer]]:
-    """End those of the jobs that are still held, and record and publish what they brought."""
+    """End the jobs that are still held, record their results and publish their outputs."""
     if not requests:
         return {}
     won = tx.run(_WIN, {"now": tx.now_us, **held_parameters(requests)})
@@ -154,7 +154,7 @@ _RECORD = Prepared(
 
 
 def _record(tx: Transaction, records: Sequence[dict[str, Any]]) -> None:
-    """Write down what the jobs brought; this transaction has won them already."""
+    """Store the results of jobs that this transaction has ended."""
     tx.run_each(_RECORD, records)
 
 
@@ -174,7 +174,7 @@ def _same_answer(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswe
 
 
 def _claimed_by_caller(tx: Transaction, places: Iterable[_Place]) -> set[_Place]:
-    """The attempts that were claimed with the caller's own token."""
+    """Return the attempts that were claimed with the caller's own token."""
     statement = select(attempt.c.job_id, attempt.c.fence).where(
         tuple_(attempt.c.job_id, attempt.c.fence).in_(list(places))
     )
@@ -184,7 +184,7 @@ def _claimed_by_caller(tx: Transaction, places: Iterable[_Place]) -> set[_Place]
 
 
 def _staged(tx: Transaction, places: Collection[_Place]) -> set[_Place]:
-    """Those of the attempts that have staged something."""
+    """Return the attempts that have staged something."""
     columns = (staged_output.c.job_id, staged_output.c.fence)
     rows = tx.execute(select(*columns).where(tuple_(*columns).in_(list(places))).distinct())
     return {(row.job_id, row.fence) for row in rows}
@@ -215,7 +215,7 @@ def _result(
 def fail(
     tx: Transaction, job_id: str, fence: int, request: FailRequest, policy: QueuePolicy = DEFAULT_POLICY
 ) -> FailAnswer:
-    """End the attempt without success. The same `write_id` again: the same answer.
+    """End the attempt without success. A repeated `write_id` gets the same answer.
 
     Raises `LeaseLostProblem` if the attempt does not hold the job, or has ended with another `write_id`.
     """
@@ -226,28 +226,28 @@ def fail(
             raise lease_lost(job_id, fence)
         return FailAnswer(**earlier)
     row = hold(tx, job_id, fence, *ENDING_COLUMNS)
-    verdict = judge(row, request, policy, poisoned=_is_poisoned(tx, job_id, request.signature))
+    outcome = decide_outcome(row, request, policy, poisoned=_is_poisoned(tx, job_id, request.signature))
     answer = FailAnswer(
         job=job_id,
-        state=JobState(verdict.state),
-        retry_in_s=None if verdict.rest_us is None else verdict.rest_us / SECOND_US,
+        state=JobState(outcome.state),
+        retry_in_s=None if outcome.rest_us is None else outcome.rest_us / SECOND_US,
     )
     end = AttemptEnd(
         job_id,
         fence,
-        verdict.outcome,
+        outcome.attempt_outcome,
         request.detail,
         request.signature,
         request.write_id,
         answer.model_dump(mode="json"),
     )
-    carry_out(tx, row, held(job_id, fence), verdict, end)
+    apply_outcome(tx, row, held(job_id, fence), outcome, end)
     faults.point("fail.before_commit")
     return answer
 
 
 def _is_poisoned(tx: Transaction, job_id: str, signature: str | None) -> bool:
-    """Whether an earlier attempt ended in the same way: trying once more would only take another worker down."""
+    """Return whether an earlier attempt ended in the same way, so that another try would only stop another worker."""
     if signature is None:
         return False
     seen = exists().where(attempt.c.job_id == job_id, attempt.c.signature == signature)

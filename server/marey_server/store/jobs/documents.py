@@ -1,4 +1,4 @@
-"""Rows of jobs as they travel."""
+"""Documents of jobs, made from rows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IN_LIST = 1000
 
 
 def select_jobs() -> Select[Any]:
-    """Jobs with the names of their project and author."""
+    """Select jobs with the names of their project and author."""
     return (
         select(job, project.c.name.label("project_name"), user.c.name.label("author_name"))
         .join(project, project.c.id == job.c.project_id)
@@ -30,7 +30,7 @@ _JOBS_BY_ID = Prepared(select_jobs().where(job.c.id.in_(bindparam("ids", expandi
 
 
 def job_documents(tx: Transaction, ids: Sequence[str]) -> list[Job]:
-    """The documents of these jobs, in this order."""
+    """Return the documents of these jobs, in this order."""
     found: dict[str, Job] = {}
     for start in range(0, len(ids), IN_LIST):
         rows = tx.run(_JOBS_BY_ID, {"ids": list(ids[start : start + IN_LIST])})
@@ -39,7 +39,7 @@ def job_documents(tx: Transaction, ids: Sequence[str]) -> list[Job]:
 
 
 _UNSAID = {column.key: None if column.default is None else column.default.arg for column in job.c}  # type: ignore[attr-defined]
-"""What stands in the columns of a new row that it does not name."""
+"""Values of columns that a new row does not name."""
 
 
 def document_of_new(tx: Transaction, project_name: str, row: Mapping[str, Any], after: Collection[str]) -> Job:
@@ -51,7 +51,7 @@ def document_of_new(tx: Transaction, project_name: str, row: Mapping[str, Any], 
 
 
 def as_documents(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Job]:
-    """Rows of `select_jobs` as they travel; gathering jobs with the states of their tasks."""
+    """Make documents of rows of `select_jobs`; those of gathering jobs hold the states of their tasks."""
     gathering = [row for row in rows if row.size is not None]
     children = _children(tx, [row.id for row in gathering])
     at_work = [row for row in gathering if row.state == JobState.RUNNING and row.lease_expires_us is None]
@@ -68,7 +68,7 @@ _DEPENDENCIES = Prepared(
 
 
 def _after(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, tuple[str, ...]]:
-    """The jobs each of these comes after. Whom a job waits to share a result with, it does not need."""
+    """Return the jobs that each of these depends on, without those whose result it waits to share."""
     shared = {row.id: row.cached_from for row in rows}
     found: dict[str, tuple[str, ...]] = {}
     for row in tx.run(_DEPENDENCIES, {"ids": list(shared)}):
@@ -94,7 +94,7 @@ def _children(tx: Transaction, parents: Sequence[str]) -> dict[str, dict[str, in
 def _progress_of_tasks(
     tx: Transaction, heads: Sequence[Row[Any]], children: Mapping[str, dict[str, int]]
 ) -> dict[str, Progress]:
-    """How far gathering jobs are, counted in tasks: those that have ended, and what is done of those that run."""
+    """Return the progress of gathering jobs in tasks: those that ended, plus the done part of those that run."""
     if not heads:
         return {}
     running: dict[str, list[Progress]] = {}

@@ -1,4 +1,4 @@
-"""The end of a job: the one transition that is never taken back."""
+"""Ends of jobs and attempts. A job that has ended never changes its state again."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Ended:
 
     @property
     def succeeded(self) -> bool:
-        """Whether its results are there."""
+        """Whether the job succeeded, so that its results exist."""
         return self.state == "succeeded"
 
 
@@ -36,23 +36,23 @@ ENDED_COLUMNS = (job.c.id, job.c.project_id, job.c.state, job.c.parent_id, job.c
 
 
 def as_ended(row: Row[Any]) -> Ended:
-    """From a row that has `ENDED_COLUMNS`."""
+    """Read a row that has `ENDED_COLUMNS`."""
     return Ended(row.id, row.project_id, row.state, row.parent_id, row.failure)
 
 
 def failure_document(reason: FailureReason, code: str, detail: str) -> dict[str, Any]:
-    """Why a job failed, as it is stored."""
+    """Return the stored document of a failure."""
     return JobFailure(reason=reason, code=code, detail=detail[:LONGEST_DETAIL]).model_dump(mode="json")
 
 
 def dependency_failure(cause: str, state: str) -> dict[str, Any]:
-    """Why a job failed that needed another one to succeed."""
+    """Return the failure of a job whose dependency did not succeed."""
     detail = f"This job needs {cause} to succeed, and that is {state}."
     return failure_document(FailureReason.DEPENDENCY_FAILED, "dependency-failed", detail)
 
 
 def end_jobs(tx: Transaction, condition: ColumnElement[bool], state: str, **values: Any) -> list[Ended]:
-    """Bring jobs to a final `state`. The condition says which states and which fences they may leave."""
+    """Move the jobs that meet `condition` to a final `state`. The condition names the fences, too."""
     statement = (
         update(job)
         .where(condition)
@@ -64,7 +64,7 @@ def end_jobs(tx: Transaction, condition: ColumnElement[bool], state: str, **valu
 
 @dataclass(frozen=True, slots=True)
 class AttemptEnd:
-    """How a try at a job ended."""
+    """The end of one attempt."""
 
     job_id: str
     fence: int
@@ -94,7 +94,7 @@ _END_ATTEMPT = Prepared(
 
 
 def end_attempts(tx: Transaction, ends: Sequence[AttemptEnd]) -> None:
-    """Record how attempts ended; one that has ended already keeps its end."""
+    """Record the ends of attempts; an attempt that has ended already keeps its first end."""
     if not ends:
         return
     tx.run_each(

@@ -1,4 +1,4 @@
-"""Events of jobs, many in one statement, and the wake-ups that go with them."""
+"""Events of jobs, many in one statement, and the wake-ups of waiting requests."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from marey_server.store.transaction import Transaction
 from marey_server.store.wakeups import wakeups
 
 EventOfJob = tuple[str, str, dict[str, Any]]
-"""Project id, job id, body."""
+"""Project id, job id and body of an event."""
 
 
 _INSERT = Prepared(insert(event))
@@ -30,14 +30,14 @@ def emit_job_events(tx: Transaction, kind: str, events: Sequence[EventOfJob]) ->
 
 
 def wake_workers(tx: Transaction, kinds: Iterable[str]) -> None:
-    """Once committed, let those who wait for work of these kinds look again."""
+    """Wake requests that wait for work of these kinds, after the commit."""
     topics = {f"work:{kind}" for kind in kinds}
     if topics:
         tx.after_commit(lambda: wakeups.announce(topics))
 
 
 def wake_watchers(tx: Transaction, job_ids: Iterable[str]) -> None:
-    """Once committed, let those who wait for the end of these jobs look again."""
+    """Wake requests that wait for the end of these jobs, after the commit."""
     topics = {f"job:{job_id}" for job_id in job_ids}
     if topics:
         tx.after_commit(lambda: wakeups.announce(topics))

@@ -1,4 +1,4 @@
-"""What becomes of a job whose attempt ended without success: tried again, failed or cancelled."""
+"""Decides whether a job whose attempt did not succeed is retried, failed or cancelled, and applies that."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from marey_server.store.jobs.endings import AttemptEnd, end_attempts, end_jobs, 
 from marey_server.store.jobs.events import emit_job_events, wake_workers
 from marey_server.store.jobs.fencing import lease_lost
 from marey_server.store.jobs.policy import QueuePolicy
-from marey_server.store.jobs.propagation import settle
+from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.tables import job
 from marey_server.store.transaction import Transaction
 
 TIME_LIMIT = "time-limit"
-"""The code with which a worker reports that it stopped a job because its time was over."""
+"""Code that a worker reports when it stopped a job at its time limit."""
 
 ENDING_COLUMNS = (
     job.c.id,
@@ -36,21 +36,21 @@ ENDING_COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
-    """Where the job goes (`state`), what the attempt is recorded as (`outcome`), how long a queued job rests."""
+class AttemptOutcome:
+    """Next state of a job after an attempt, outcome of the attempt, and wait before a retry."""
 
     state: str
-    outcome: str
+    attempt_outcome: str
     rest_us: int | None = None
     failure: dict[str, Any] | None = None
     counts: bool = True
     """Whether the attempt counts against `max_attempts`; an interruption has a count of its own."""
 
 
-def judge(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, poisoned: bool) -> Verdict:
-    """The verdict on an attempt whose worker reports a failure. `row` holds `ENDING_COLUMNS`."""
+def decide_outcome(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, poisoned: bool) -> AttemptOutcome:
+    """Decide what follows an attempt whose worker reports a failure. `row` holds `ENDING_COLUMNS`."""
     if row.cancel_requested_us is not None:
-        return Verdict("cancelled", "cancelled")
+        return AttemptOutcome("cancelled", "cancelled")
     if request.interrupted:
         return _interrupted(row, policy)
     if request.code == TIME_LIMIT:
@@ -63,72 +63,77 @@ def judge(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, poisoned:
     if row.attempt >= row.max_attempts:
         detail = f"{row.attempt} attempts failed; the last: {request.detail or request.code}"
         return _failed(FailureReason.ATTEMPTS_EXHAUSTED, request.code, detail)
-    return Verdict("queued", "failed", policy.backoff_us(row.attempt))
+    return AttemptOutcome("queued", "failed", policy.backoff_us(row.attempt))
 
 
-def judge_expired(row: Row[Any], policy: QueuePolicy) -> Verdict:
-    """The verdict on an attempt whose lease ran out. The job is queued at once: it has rested for a lease already.
+def decide_expired_outcome(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome:
+    """Decide what follows an attempt whose lease expired. A retry is queued at once: the lease was wait enough.
 
     A lease that was renewed to the last moment allowed belonged to a worker that lived and did not stop in time; one
     that ended earlier, to a worker that was lost, however late that is noticed.
     """
     if row.cancel_requested_us is not None:
-        return Verdict("cancelled", "cancelled")
+        return AttemptOutcome("cancelled", "cancelled")
     if row.lease_expires_us >= row.deadline_us + policy.end_grace_us:
         return _over_time(row)
     if row.attempt >= row.max_attempts:
         detail = f"{row.attempt} attempts were made; the last worker was not heard of again."
-        return _failed(FailureReason.ATTEMPTS_EXHAUSTED, "worker-lost", detail, outcome="lost")
-    return Verdict("queued", "lost", 0)
+        return _failed(FailureReason.ATTEMPTS_EXHAUSTED, "worker-lost", detail, attempt_outcome="lost")
+    return AttemptOutcome("queued", "lost", 0)
 
 
-def _interrupted(row: Row[Any], policy: QueuePolicy) -> Verdict:
+def _interrupted(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome:
     if row.interruptions >= policy.max_interruptions:
         detail = f"The job's workers were stopped {row.interruptions + 1} times."
-        return _failed(FailureReason.ATTEMPTS_EXHAUSTED, "interrupted", detail, outcome="interrupted")
-    return Verdict("queued", "interrupted", 0, counts=False)
+        return _failed(FailureReason.ATTEMPTS_EXHAUSTED, "interrupted", detail, attempt_outcome="interrupted")
+    return AttemptOutcome("queued", "interrupted", 0, counts=False)
 
 
-def _over_time(row: Row[Any]) -> Verdict:
+def _over_time(row: Row[Any]) -> AttemptOutcome:
     detail = f"The attempt took longer than its limit of {row.time_limit_s} s."
-    return _failed(FailureReason.TIMEOUT, TIME_LIMIT, detail, outcome="timeout")
+    return _failed(FailureReason.TIMEOUT, TIME_LIMIT, detail, attempt_outcome="timeout")
 
 
-def _failed(reason: FailureReason, code: str, detail: str, outcome: str = "failed") -> Verdict:
-    return Verdict("failed", outcome, failure=failure_document(reason, code, detail))
+def _failed(reason: FailureReason, code: str, detail: str, attempt_outcome: str = "failed") -> AttemptOutcome:
+    return AttemptOutcome("failed", attempt_outcome, failure=failure_document(reason, code, detail))
 
 
-def carry_out(
-    tx: Transaction, row: Row[Any], condition: ColumnElement[bool], verdict: Verdict, end: AttemptEnd, **values: Any
+def apply_outcome(
+    tx: Transaction,
+    row: Row[Any],
+    condition: ColumnElement[bool],
+    outcome: AttemptOutcome,
+    end: AttemptEnd,
+    **values: Any,
 ) -> None:
-    """Bring the job where the verdict says, if `condition` still holds, and let what follows follow.
+    """Move the job to its next state if `condition` still holds, end the attempt, and propagate the end of the job.
 
     Raises `LeaseLostProblem` if it does not.
     """
-    if verdict.rest_us is None:
-        failure = {} if verdict.failure is None else {"failure": verdict.failure}
-        ended = end_jobs(tx, condition, verdict.state, **failure, **values)
+    if outcome.rest_us is None:
+        failure = {} if outcome.failure is None else {"failure": outcome.failure}
+        ended = end_jobs(tx, condition, outcome.state, **failure, **values)
         moved = bool(ended)
     else:
         ended = []
-        moved = _queue_again(tx, row, condition, verdict, values)
+        moved = _queue_again(tx, row, condition, outcome, values)
     if not moved:
         raise lease_lost(end.job_id, end.fence)
     end_attempts(tx, [end])
     staging.drop_staged(tx, [(end.job_id, end.fence)])
-    settle(tx, ended)
+    propagate_ends(tx, ended)
 
 
 def _queue_again(
-    tx: Transaction, row: Row[Any], condition: ColumnElement[bool], verdict: Verdict, values: dict[str, Any]
+    tx: Transaction, row: Row[Any], condition: ColumnElement[bool], outcome: AttemptOutcome, values: dict[str, Any]
 ) -> bool:
-    uncounted = {} if verdict.counts else {"attempt": job.c.attempt - 1, "interruptions": job.c.interruptions + 1}
+    uncounted = {} if outcome.counts else {"attempt": job.c.attempt - 1, "interruptions": job.c.interruptions + 1}
     queued = tx.execute(
         update(job)
         .where(condition)
         .values(
             state="queued",
-            run_at_us=tx.now_us + (verdict.rest_us or 0),
+            run_at_us=tx.now_us + (outcome.rest_us or 0),
             lease_expires_us=None,
             deadline_us=None,
             progress=None,
@@ -140,6 +145,6 @@ def _queue_again(
     ).scalar_one_or_none()
     if queued is None:
         return False
-    emit_job_events(tx, "job.requeued", [(queued, row.id, {"fence": row.fence, "outcome": verdict.outcome})])
+    emit_job_events(tx, "job.requeued", [(queued, row.id, {"fence": row.fence, "outcome": outcome.attempt_outcome})])
     wake_workers(tx, [row.kind])
     return True

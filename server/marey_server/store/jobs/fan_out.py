@@ -1,4 +1,4 @@
-"""The end of a fan-out: one result from the results of its tasks, as their sum or by the work of a worker."""
+"""Ends fan-outs: combines the results of tasks, or queues the gathering job so that a worker does."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from marey_server.store.tables import job, job_blob, staged_output
 from marey_server.store.transaction import Transaction
 
 MOST_GATHERED = 1000
-"""Entries of a list, such as refusals with their reasons, that the gathering job repeats."""
+"""Largest number of entries of a list, such as refusals, in a combined result."""
 
 
 def gather(tx: Transaction, parent_id: str) -> list[Ended]:
@@ -51,7 +51,7 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
 
 
 def release_tasks(tx: Transaction, gathered: Collection[str]) -> None:
-    """Let go of what the tasks of these jobs brought, now that it has been gathered.
+    """Delete the results of the tasks of these jobs, which have been gathered.
 
     The blobs they named may be collected, and the tasks answer no later job: the gathered result does.
     """
@@ -73,7 +73,7 @@ def combine_results(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _combine(known: Any, value: Any) -> Any:
-    """What was combined so far and one more; what does not fit together is left out."""
+    """Combine a value with one more; values of different types are omitted."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return value + (known if isinstance(known, int | float) else 0)
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""The fence: what an attempt must still hold for anything it writes to count.
+"""Fencing: the condition under which a write of an attempt counts.
 
 A claim raises the job's fence; whoever worked under an older one has lost the job without knowing it. Every write of an
 attempt repeats this predicate in the transaction of the write, since a check of its own would be outrun.
@@ -23,12 +23,12 @@ WAITING: ColumnElement[str] = literal_column("'waiting'")
 
 
 def same_fence(fence: int) -> ColumnElement[bool]:
-    """Nobody has claimed the job since this attempt did."""
+    """Condition that nobody has claimed the job since this attempt did."""
     return job.c.fence == fence
 
 
 def held(job_id: str, fence: int) -> ColumnElement[bool]:
-    """The attempt still holds its job: the predicate of every write of a worker."""
+    """Condition that the attempt still holds its job, for every write of a worker."""
     return and_(job.c.id == job_id, job.c.state == RUNNING, same_fence(fence))
 
 
@@ -37,16 +37,16 @@ HELD = and_(
     job.c.state == RUNNING,
     tuple_(job.c.id, job.c.fence).in_(bindparam("held_attempts", expanding=True)),
 )
-"""The same of several attempts, for statements that are built once; `held_parameters` gives the attempts."""
+"""The condition `held` for several attempts, in prepared statements; `held_parameters` gives the attempts."""
 
 
 def held_parameters(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
-    """The parameters of `HELD`."""
+    """Return the parameters of `HELD`."""
     return {"held_ids": [job_id for job_id, _ in attempts], "held_attempts": list(attempts)}
 
 
 def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
-    """The credential must be that of this very attempt.
+    """Check that the credential is that of this attempt.
 
     Raises `NotFoundProblem` for a credential that is no attempt's of this job, `LeaseLostProblem` for another attempt
     of it.
@@ -60,7 +60,7 @@ def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
 
 
 def hold(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any]) -> Row[Any]:
-    """Keep the job from changing hands until the transaction ends, and read `columns` of it.
+    """Lock the job for this transaction and read `columns` of it.
 
     Raises `LeaseLostProblem` if the attempt does not hold it any more.
     """
@@ -72,12 +72,12 @@ def hold(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any])
 
 
 def lease_lost(job_id: str, fence: int) -> LeaseLostProblem:
-    """The error that tells a worker to stop."""
+    """Return the error on which a worker stops."""
     return LeaseLostProblem(f"Attempt {fence} does not hold {job_id} any more. Stop working on it.")
 
 
 def earlier_answer(tx: Transaction, job_id: str, fence: int, write_id: str) -> dict[str, Any] | None:
-    """What the attempt's last word with this `write_id` was answered; `None` if it has not been said."""
+    """Return the stored answer for this `write_id`, or None."""
     statement = select(attempt.c.answer).where(
         attempt.c.job_id == job_id, attempt.c.fence == fence, attempt.c.write_id == write_id
     )
@@ -86,5 +86,5 @@ def earlier_answer(tx: Transaction, job_id: str, fence: int, write_id: str) -> d
 
 
 def earlier(first: Any, second: Any) -> ColumnElement[int]:
-    """The smaller of two times in SQL; both databases have a function for it, under different names."""
+    """Return the smaller of two times in SQL; the databases name their functions for it differently."""
     return case((first < second, first), else_=second)

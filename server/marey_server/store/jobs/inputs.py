@@ -1,4 +1,4 @@
-"""From what a job's submission names to the exact revisions it will read."""
+"""Resolves the inputs that a submission names to the exact revisions that the job reads."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ MOST_INPUTS = 100_000
 IN_LIST = 1000
 
 Pin = dict[str, Any]
-"""An input as the job keeps it: the fields of `PinnedInput`, or `{job}` as long as that job has yet to make it."""
+"""A stored input: the fields of `PinnedInput`, or `{job}` until that job has made it."""
 
 PinnedInputs = dict[str, list[Pin]]
 
 
 class FoundItem(NamedTuple):
-    """An item as it stands."""
+    """An item at its newest revision."""
 
     id: str
     kind: str
@@ -44,13 +44,13 @@ _ITEMS_BY_ID = Prepared(_ITEMS.where(item.c.id.in_(bindparam("ids", expanding=Tr
 
 
 def find_items(tx: Transaction, project: ProjectRow, requests: Iterable[JobCreate]) -> dict[str, FoundItem]:
-    """Those items of the project that the requests name one by one, by id."""
+    """Return the items that the requests name one by one, by id."""
     choices = (choice for request in requests for many in request.inputs.values() for choice in _as_many(many))
     return items_by_id(tx, project.id, (choice.item for choice in choices if isinstance(choice, ItemInput)))
 
 
 def items_by_id(tx: Transaction, project_id: str, ids: Iterable[str]) -> dict[str, FoundItem]:
-    """Those of the items that are there in the project, by id."""
+    """Return the items that exist in the project, by id."""
     wanted = sorted(set(ids))
     rows = [
         FoundItem(row.id, row.kind, row.name, row.head, row.path)
@@ -153,7 +153,7 @@ def _pin_input(
 
 
 def late_inputs(request: JobCreate, at: str = "") -> Iterator[tuple[str, str, str]]:
-    """Those inputs that other jobs make: where the request says so, the input's name, and the job's id."""
+    """Return the inputs that other jobs make: their place in the request, the input's name, and the job's id."""
     for name, choices in request.inputs.items():
         for index, choice in enumerate(_as_many(choices)):
             if isinstance(choice, JobOutputsInput):
@@ -162,7 +162,7 @@ def late_inputs(request: JobCreate, at: str = "") -> Iterator[tuple[str, str, st
 
 
 def pin(found: FoundItem, number: int) -> Pin:
-    """An item at a revision, as the job keeps it."""
+    """Return an item at a revision as the job stores it."""
     return {"item": found.id, "revision": number, "kind": found.kind, "name": found.name, "collection": found.path}
 
 
@@ -170,7 +170,7 @@ def pin(found: FoundItem, number: int) -> Pin:
 
 
 def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: str) -> list[FoundItem]:
-    """The items of the input's kind in a collection and below it, by place and name."""
+    """Return the items of the input's kind in and below a collection, ordered by place and name."""
     statement = _ITEMS.where(item.c.kind == spec.kind.value).limit(MOST_INPUTS + 1)
     if path:
         statement = statement.where(_within(path))
@@ -179,13 +179,13 @@ def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: st
 
 
 def _within(path: str) -> ColumnElement[bool]:
-    """Compared as text, not with LIKE, which on SQLite takes `A` for `a`."""
+    """Compare as text, not with LIKE, which ignores case on SQLite."""
     below = f"{path}/"
     return or_(collection.c.path == path, func.substr(collection.c.path, 1, len(below)) == below)
 
 
 def _missing_revisions(request: JobCreate, known: dict[str, FoundItem], at: str) -> list[FieldError]:
-    """Revisions that were named by number and do not exist."""
+    """Return the revisions that were named by number and do not exist."""
     asked: list[tuple[str, ItemInput]] = []
     for name, choices in request.inputs.items():
         for index, choice in enumerate(_as_many(choices)):

@@ -16,7 +16,7 @@ LONGEST_KEY = 512
 
 
 def labels_key(labels: Mapping[str, str]) -> str:
-    """The labels in a fixed order, such as `gpu=a100,site=lyon`; raises `InvalidProblem` if there are too many."""
+    """Return the labels in a fixed order, such as `gpu=a100,site=lyon`. Raises `InvalidProblem` for too many."""
     pairs = _checked_pairs(labels)
     key = ",".join(pairs)
     if len(key) > LONGEST_KEY:
@@ -25,7 +25,7 @@ def labels_key(labels: Mapping[str, str]) -> str:
 
 
 def keys_within(labels: Mapping[str, str]) -> list[str]:
-    """The key of every set of labels that a worker carrying `labels` satisfies, the empty one first."""
+    """Return the key of every set of labels that a worker with `labels` satisfies, the empty one first."""
     pairs = _checked_pairs(labels)
     return [",".join(subset) for size in range(len(pairs) + 1) for subset in combinations(pairs, size)]
 

@@ -1,4 +1,4 @@
-"""Inputs that other jobs make: once all of those have succeeded, a job gets the very revisions they made.
+"""Late inputs: inputs that other jobs make. Once those have succeeded, the job gets the revisions they made.
 
 It happens in the transaction that makes the job ready, with its row locked, and does what a submission does for a job
 whose inputs are there: the job is spread over tasks, gets its cache key, and is queued or shares a result.
@@ -28,16 +28,16 @@ from marey_server.store.transaction import Transaction
 IN_LIST = 1000
 
 
-class UnbindableError(Exception):
-    """Why a job cannot get its inputs: the code and detail of its failure."""
+class LateInputError(Exception):
+    """A late input that cannot be pinned; holds the code and detail of the job's failure."""
 
     def __init__(self, code: str, detail: str) -> None:
         super().__init__(detail)
         self.code = code
 
 
-def bind(tx: Transaction, ids: Sequence[str]) -> list[Ended]:
-    """Give waiting jobs, all of whose dependencies have succeeded, the inputs these made, and let them go on.
+def pin_late_inputs(tx: Transaction, ids: Sequence[str]) -> list[Ended]:
+    """Pin the outputs of succeeded dependencies as inputs of the waiting jobs, and queue these.
 
     Returns the jobs that ended by it: those for which nothing was made, and those whose result is there.
     """
@@ -45,10 +45,10 @@ def bind(tx: Transaction, ids: Sequence[str]) -> list[Ended]:
         return []
     heads: list[NewJob] = []
     ended: list[Ended] = []
-    for row in _unbound(tx, ids):
+    for row in _ready_for_inputs(tx, ids):
         try:
-            heads.append(_bound(tx, row))
-        except UnbindableError as error:
+            heads.append(_with_late_inputs(tx, row))
+        except LateInputError as error:
             failure = failure_document(FailureReason.ERROR, error.code, str(error))
             ended += end_jobs(tx, and_(job.c.id == row.id, job.c.state == WAITING), "failed", failure=failure)
     tasks, sources = layout.lay_out(tx, heads)
@@ -56,30 +56,30 @@ def bind(tx: Transaction, ids: Sequence[str]) -> list[Ended]:
     everything = [*heads, *tasks]
     wake_workers(tx, {one.submission.kind.name for one in everything if one.state == "queued"})
     ended += result_cache.join(tx, [(one, sources[one.id]) for one in everything if one.id in sources])
-    faults.point("bind.before_commit")
-    tx.after_commit(lambda: faults.point("bind.after_commit"))
+    faults.point("late_inputs.before_commit")
+    tx.after_commit(lambda: faults.point("late_inputs.after_commit"))
     return ended
 
 
-def _unbound(tx: Transaction, ids: Sequence[str]) -> Iterable[Row[Any]]:
+def _ready_for_inputs(tx: Transaction, ids: Sequence[str]) -> Iterable[Row[Any]]:
     for start in range(0, len(ids), IN_LIST):
         chosen = and_(job.c.id.in_(ids[start : start + IN_LIST]), job.c.state == WAITING, job.c.unbound)
         yield from tx.execute(select(job).where(chosen).order_by(job.c.id).with_for_update()).all()
 
 
-def _bound(tx: Transaction, row: Row[Any]) -> NewJob:
-    """The job with its inputs. The kind is that of now: the server may have been changed since the submission."""
+def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
+    """Return the job with its inputs, by the present declaration of its kind; it may have changed since."""
     try:
         kind = find_kind(row.kind)
         params = kind.params.model_validate(row.params)
     except UnknownKindError as error:
-        raise UnbindableError("unknown-kind", f"This server does not know the kind any more: {error}.") from error
+        raise LateInputError("unknown-kind", f"This server does not know the kind any more: {error}.") from error
     except ValidationError as error:
         detail = f"{kind.name} does not take these parameters any more: {error.errors()[0]['msg']}"
-        raise UnbindableError("invalid-params", detail) from error
+        raise LateInputError("invalid-params", detail) from error
     pins = _pin_outputs(tx, row, kind)
     if (clash := find_clash(kind, params, pins, row.into_path)) is not None:
-        raise UnbindableError(clash.code, clash.detail)
+        raise LateInputError(clash.code, clash.detail)
     submission = Submission(
         kind,
         layout.request_of(row),
@@ -109,13 +109,13 @@ def _write(tx: Transaction, heads: Sequence[NewJob], tasks: Sequence[NewJob]) ->
 
 
 class _Made(NamedTuple):
-    """What a job made, and the place its results went to."""
+    """Outputs of a job, and the collection they were written to."""
 
     into: str
     pins: list[Pin]
 
     def below(self, one: Pin) -> str:
-        """Where an output stands below that place; its whole place, where it was moved elsewhere."""
+        """Return the place of an output below that collection, or its whole place if it was moved elsewhere."""
         path: str = one["collection"]
         return f"{path}/".removeprefix(f"{self.into}/").rstrip("/") if self.into else path
 
@@ -126,7 +126,7 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
     for name, entries in row.inputs.items():
         spec = kind.inputs.get(name)
         if spec is None:
-            raise UnbindableError("unknown-input", f"{kind.name} has no input {name!r} any more.")
+            raise LateInputError("unknown-input", f"{kind.name} has no input {name!r} any more.")
         chosen: dict[tuple[str, int], Pin] = {}
         for entry in entries:
             for one in _resolved(tx, row.project_id, name, spec, entry, made):
@@ -136,13 +136,13 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
         if not spec.many and len(chosen) != 1:
             sources = ", ".join(entry["job"] for entry in entries if "job" in entry)
             detail = f"The input {name!r} takes one {spec.kind}; {sources} made {len(chosen)}."
-            raise UnbindableError("one-item", detail)
+            raise LateInputError("one-item", detail)
         pins[name] = list(chosen.values())
         if len(entries) == 1 and "job" in entries[0]:  # of several makers, things of one name may stand in like places
             pins[name] = [one | {"below": made[entries[0]["job"]].below(one)} for one in pins[name]]
     total = sum(map(len, pins.values()))
     if total > MOST_INPUTS:
-        raise UnbindableError("too-many", f"The job has {total} inputs; at most {MOST_INPUTS} are possible.")
+        raise LateInputError("too-many", f"The job has {total} inputs; at most {MOST_INPUTS} are possible.")
     return pins
 
 
@@ -160,12 +160,12 @@ def _resolved(
     found = [one for one in made[source].pins if one["kind"] == spec.kind]
     if not found and spec.required:
         detail = f"{source} made no {spec.kind} that is there, which this job needs as its input {name!r}."
-        raise UnbindableError("no-input", detail)
+        raise LateInputError("no-input", detail)
     return found
 
 
 def _outputs(tx: Transaction, project_id: str, job_id: str) -> _Made:
-    """What a job, or its tasks, made, in their order, each item at the last revision it was given; deleted ones not."""
+    """Return the outputs of a job or of its tasks, each item at its last revision; deleted items are omitted."""
     columns = (job.c.size, job.c.gathers, job.c.outputs, job.c.into_path)
     row = tx.execute(select(*columns).where(job.c.id == job_id)).one()
     published = [row.outputs]

@@ -1,4 +1,4 @@
-"""From a checked submission to the rows of its job: one, or a gathering job and its tasks, each where it belongs."""
+"""Makes rows from checked submissions: one job, or a gathering job and its tasks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from marey_server.store.transaction import Transaction
 
 @dataclass(frozen=True)
 class Submission:
-    """A job that was checked."""
+    """A checked submission of one job."""
 
     kind: KindDeclaration
     request: JobCreate
@@ -31,14 +31,14 @@ class Submission:
     after: tuple[str, ...] = ()
     """Jobs that must succeed first; those that make its inputs are among them."""
     unbound: bool = False
-    """Whether some of the pins are still to be made by other jobs."""
+    """Whether other jobs have yet to make some of the inputs."""
     id: str = field(default_factory=lambda: new_id("job"))
     retry_of: str | None = None
 
 
 @dataclass
 class NewJob:
-    """A row to be."""
+    """A job that is about to be inserted."""
 
     id: str
     project_id: str
@@ -55,21 +55,21 @@ class NewJob:
 
     @property
     def cache_mode(self) -> str:
-        """Whether a result that is there may serve."""
+        """Whether a cached result may be used."""
         return self.submission.request.cache
 
     @property
     def unbound(self) -> bool:
-        """Whether some of its inputs are still to be made."""
+        """Whether other jobs have yet to make some of its inputs."""
         return self.submission.unbound
 
     def end(self) -> Ended:
-        """The end of a job that ends before it begins, because one it needs did not succeed."""
+        """The end of a job that never starts because a dependency did not succeed."""
         return Ended(self.id, self.project_id, self.state, self.parent_id, self.failure)
 
 
 def request_of(row: Row[Any]) -> JobCreate:
-    """What a job was asked for with, apart from its inputs and labels and from the jobs it came after."""
+    """Return the request that a row was submitted with, without inputs, labels and dependencies."""
     return JobCreate(
         kind=row.kind,
         params=row.params,
@@ -98,7 +98,7 @@ def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dic
 
 
 def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_cache.SharedResult]:
-    """Give jobs their cache keys; those whose result is there or under way wait for it instead of being queued."""
+    """Give jobs their cache keys; those whose result exists or is being computed wait for it."""
     _set_cache_keys(tx, jobs)
     sources = result_cache.decide(tx, [one for one in jobs if one.state == "queued"])
     for one in jobs:
@@ -108,7 +108,7 @@ def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_c
 
 
 def _spread(head: NewJob) -> list[NewJob]:
-    """The tasks of a job that has several, which makes it a gathering job; they start when it does."""
+    """Return the tasks of a job that has several, and make it a gathering job; tasks start when it does."""
     shares = _shares(head.submission)
     if len(shares) < 2:
         return []
@@ -126,7 +126,7 @@ def _spread(head: NewJob) -> list[NewJob]:
 
 
 def _shares(submission: Submission) -> list[PinnedInputs]:
-    """The inputs of each task: some items of the input that is spread, or everything where tasks are counted."""
+    """Return the inputs of each task: a share of the spread input, or all inputs if tasks are counted."""
     fanned = submission.kind.fan_out
     if fanned is None:
         return [submission.pins] * submission.task_count
@@ -159,7 +159,7 @@ def _has_key(submission: Submission) -> bool:
 
 
 def _newest_revisions(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, int]:
-    """Of the items that the parameters of jobs name; those that are not there in the job's project are left out."""
+    """Return the newest revisions of items that parameters name; items that do not exist in the project are omitted."""
     wanted: dict[str, set[str]] = {}
     for one in jobs:
         named = result_cache.named_items(one.submission.kind, one.submission.params)
@@ -169,7 +169,7 @@ def _newest_revisions(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, int]
 
 
 def new_row(tx: Transaction, one: NewJob) -> dict[str, Any]:
-    """The row to insert."""
+    """Return the row to insert."""
     submission, request = one.submission, one.submission.request
     return {
         "id": one.id,
@@ -199,7 +199,7 @@ def new_row(tx: Transaction, one: NewJob) -> dict[str, Any]:
 
 
 def layout_columns(tx: Transaction, one: NewJob) -> dict[str, Any]:
-    """Those columns of a row that depend on its inputs."""
+    """Return the columns of a row that depend on its inputs."""
     return {
         "state": one.state,
         "inputs": one.pins,

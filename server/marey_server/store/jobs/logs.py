@@ -1,4 +1,4 @@
-"""What attempts print: appended by offset while they run, sealed when they end, read as one text."""
+"""Logs of attempts: appended by offset while they run, closed when they end, read as one text."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_READ_BYTES = 2**20
 
 
 class LogOffset(ConflictProblem):
-    """The log goes on at another offset."""
+    """The log continues at another offset."""
 
     code = "log-offset"
 
@@ -63,13 +63,13 @@ def _is_said(tx: Transaction, job_id: str, fence: int, offset: int, data: bytes)
 
 @dataclass(frozen=True, slots=True)
 class LogPage:
-    """A piece of a job's log, which is what its attempts printed one after another."""
+    """A piece of a job's log: the output of its attempts, one after another."""
 
     data: bytes
     offset: int
-    """Where the next piece begins."""
+    """Offset of the next piece."""
     sealed: bool
-    """Nothing will be added any more, and this piece reaches the end."""
+    """Whether the log is complete and this piece reaches its end."""
 
 
 class _Span(NamedTuple):

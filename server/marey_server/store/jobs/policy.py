@@ -1,4 +1,4 @@
-"""The figures of the queue, in one place, so that a server's settings and a test can say others."""
+"""Durations and limits of the queue, which settings of a server and tests may replace."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SECOND_US = 1_000_000
 
 @dataclass(frozen=True)
 class QueuePolicy:
-    """How long things last and how often they are tried.
+    """Durations of leases and waits, and limits of retries.
 
     `random_unit` draws from [0, 1); a test that gives its own makes backoff predictable.
     """
@@ -34,7 +34,7 @@ class QueuePolicy:
 
     @property
     def end_grace_us(self) -> int:
-        """Grace of a worker that was told to stop, in microseconds."""
+        """Time that a worker has to stop after a cancel or its time limit, in microseconds."""
         return round(self.end_grace_s * SECOND_US)
 
     def backoff_us(self, failures: int) -> int:

@@ -1,5 +1,5 @@
-"""What follows from the end of a job, in the same transaction: its dependants move, its gathering job counts, those
-that wait to share its result get it.
+"""Propagates the end of a job to dependants, fan-out parent and jobs waiting on its cached result, in the same
+transaction.
 
 Rows are locked downstream: a job before its gathering job and before its dependants.
 """
@@ -23,11 +23,11 @@ from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import Transaction
 
 PAGE = 1000
-"""Ended jobs looked at in one statement."""
+"""Ended jobs per statement."""
 
 
-def settle(tx: Transaction, ended: Iterable[Ended]) -> None:
-    """Let everything follow that follows from these ends, until nothing more does."""
+def propagate_ends(tx: Transaction, ended: Iterable[Ended]) -> None:
+    """Propagate these ends to dependants, gathering jobs and jobs that share a result, until no further job ends."""
     queue = list(ended)
     while queue:
         page, queue = queue[:PAGE], queue[PAGE:]
@@ -37,12 +37,12 @@ def settle(tx: Transaction, ended: Iterable[Ended]) -> None:
 
 
 def make_ready(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
-    """Let waiting jobs whose dependencies are met go on: into the queue, to their tasks, or to a result that is there.
-    Those whose inputs were to be made get them first.
+    """Queue waiting jobs whose dependencies have succeeded, start their tasks, or give them a cached result.
 
+    Jobs with late inputs get these first.
     The rows hold `READY_COLUMNS`. Returns the jobs that ended by it.
     """
-    ended = late_inputs.bind(tx, [row.id for row in rows if row.unbound])
+    ended = late_inputs.pin_late_inputs(tx, [row.id for row in rows if row.unbound])
     for row in rows:
         if row.size is not None:
             ended += _open_fan_out(tx, row)
@@ -95,7 +95,7 @@ def _waiting(tx: Transaction, ids: Sequence[str]) -> Sequence[Row[Any]]:
 
 
 def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[Ended]]) -> list[Ended]:
-    """Let waiting jobs go on, or end, now that jobs they waited for have ended."""
+    """Count ended dependencies at waiting jobs; make jobs ready, or end those that can no longer run."""
     following: list[Ended] = []
     left: dict[str, int] = {}
     shared: list[Row[Any]] = []
@@ -122,7 +122,7 @@ def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
 
 
 def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
-    """End a waiting job, and its tasks, because `cause` did not succeed: failed, or cancelled if to be skipped."""
+    """End a waiting job and its tasks because `cause` did not succeed: failed, or cancelled if it is to be skipped."""
     waits = and_(job.c.id == row.id, job.c.state == WAITING)
     tasks = end_jobs(tx, and_(job.c.parent_id == row.id, job.c.state == WAITING), "cancelled")
     if row.on_failure == "skip":
@@ -134,7 +134,7 @@ def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
 
 
 def _open_fan_out(tx: Transaction, row: Row[Any]) -> list[Ended]:
-    """The gathering job runs from now on, and its tasks may."""
+    """Start a gathering job and make its tasks ready."""
     tasks = tx.execute(
         select(*READY_COLUMNS).where(job.c.parent_id == row.id, job.c.state == WAITING).order_by(job.c.position)
     ).all()
@@ -149,7 +149,7 @@ def _open_fan_out(tx: Transaction, row: Row[Any]) -> list[Ended]:
 
 
 def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
-    """Count the tasks that ended at their gathering jobs; where it was the last one, the gathering job ends too."""
+    """Count ended tasks at their gathering jobs, and gather the results of those whose last task has ended."""
     following = _stop_idle_tasks(tx, {end.parent_id for end in ended if end.state == "failed"} - {None})
     for parent_id, count in sorted(Counter(end.parent_id for end in ended if end.parent_id is not None).items()):
         left = tx.execute(
@@ -164,7 +164,7 @@ def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 
 
 def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
-    """Cancel tasks that nobody has begun where a worker would gather: with one failed there is nothing to gather."""
+    """Cancel tasks that have not started, if a worker was to gather: after one failure there is nothing to gather."""
     if not parents:
         return []
     gathered = select(job.c.id).where(job.c.id.in_(parents), job.c.gathers)
@@ -191,7 +191,7 @@ def _admit(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
 
 
 def _stop_sharing(tx: Transaction, rows: Sequence[Row[Any]]) -> None:
-    """The job they waited for brought no result: they go on by themselves, the first of them for all."""
+    """Release jobs whose shared computation did not succeed; the first of them computes the result for all."""
     if rows:
         ids = [row.id for row in rows]
         tx.execute(update(job).where(job.c.id.in_(ids)).values(cached_from=None, dependencies_left=0))

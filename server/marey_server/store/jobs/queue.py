@@ -1,4 +1,4 @@
-"""Claims and heartbeats: how a job gets a worker and keeps it."""
+"""Claims and heartbeats of jobs."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def heartbeat(
 
 
 def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
-    """Pick and claim."""
+    """Pick jobs and claim them."""
     pick = _pick(restriction)
     now_us = bindparam("now_us", type_=BigInteger)
     deadline_us = now_us + cast(job.c.time_limit_s, BigInteger) * SECOND_US
@@ -152,7 +152,7 @@ def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
 
 
 def _pick(restriction: _Restriction) -> CTE:
-    """The ids to claim: of jobs that share a concurrency key only the first, and none while one runs."""
+    """Return the ids to claim; of jobs with one concurrency key only the first, and none while one runs."""
 
     def claimable(candidate: FromClause) -> ColumnElement[bool]:
         conditions = [
@@ -191,7 +191,7 @@ def _pick_order(row: Row[Any]) -> tuple[Any, ...]:
 
 
 def _is_workable(candidate: FromClause, restriction: _Restriction) -> ColumnElement[bool]:
-    """The caller may do the work of the job's project: a worker reads what a project holds and writes in its name.
+    """Return the condition that the caller may work for the job's project, whose data a worker reads and writes.
 
     Asked row by row, so that no plan begins with the projects instead of the pick order.
     """
@@ -206,7 +206,7 @@ def _is_workable(candidate: FromClause, restriction: _Restriction) -> ColumnElem
 
 
 class _Restriction(NamedTuple):
-    """What a claim is limited to, besides kinds and labels."""
+    """Limits of a claim besides kinds and labels."""
 
     one_job: bool
     named_projects: bool
@@ -246,7 +246,7 @@ def _claim_rows(tx: Transaction, request: ClaimRequest, policy: QueuePolicy) -> 
 
 
 def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
-    """How many tasks the gathering jobs have that some of these belong to."""
+    """Return the number of tasks of the gathering jobs that these belong to."""
     parents = {row.parent_id for row in rows if row.parent_id is not None}
     if not parents:
         return {}

@@ -1,4 +1,4 @@
-"""Jobs as their users see them: read, listed, cancelled."""
+"""Reads, lists and cancels jobs for their users."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from marey_server.store.jobs.events import emit_job_events
 from marey_server.store.jobs.fencing import RUNNING, earlier
 from marey_server.store.jobs.logs import MOST_READ_BYTES, LogPage, read_log
 from marey_server.store.jobs.policy import DEFAULT_POLICY, QueuePolicy
-from marey_server.store.jobs.propagation import settle
+from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import attempt, job, user
 from marey_server.store.transaction import Transaction
@@ -37,12 +37,12 @@ UNFINISHED = tuple(state.value for state in JobState if not state.terminal)
 
 @dataclass(frozen=True, slots=True)
 class JobFilters:
-    """Which jobs a list holds; what is empty does not matter."""
+    """Filters of a list of jobs; an empty one matches every job."""
 
     states: tuple[JobState, ...] = ()
     kinds: tuple[str, ...] = ()
     parent: str | None = None
-    """Tasks of this gathering job; without it, tasks are left out."""
+    """Lists the tasks of this gathering job; without it, tasks are omitted."""
     author: str | None = None
 
 
@@ -50,7 +50,7 @@ class JobFilters:
 
 
 def read_job(tx: Transaction, job_id: str) -> Job:
-    """A job and how it stands. Raises `NotFoundProblem`."""
+    """Return a job with its state and progress. Raises `NotFoundProblem`."""
     row, _ = find_job(tx, job_id)
     return as_documents(tx, [row])[0]
 
@@ -65,7 +65,7 @@ def list_jobs(
     limit: int = listing.DEFAULT_LIMIT,
     count: bool = False,
 ) -> Page:
-    """One page of a project's jobs, without the tasks of fan-outs unless they are asked for."""
+    """Return one page of a project's jobs, without tasks unless the filters name their gathering job."""
     project_row = projects.require(tx, project)
     order = listing.parse_order(sort, SORT_KEYS)
     identity = [project_row.id, asdict(filters)]
@@ -79,7 +79,7 @@ def list_jobs(
 
 
 def list_attempts(tx: Transaction, job_id: str) -> Page:
-    """Every try at a job, the first one first."""
+    """Return the attempts of a job, the first one first."""
     find_job(tx, job_id)
     rows = tx.execute(select(attempt).where(attempt.c.job_id == job_id).order_by(attempt.c.fence))
     return Page(items=tuple(_attempt_document(row) for row in rows))
@@ -98,7 +98,7 @@ def _attempt_document(row: Row[Any]) -> Attempt:
 
 
 def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
-    """What a job published; where it is the sum of its tasks, what they published, task by task."""
+    """Return the outputs of a job, or of its tasks in their order."""
     row, _ = find_job(tx, job_id)
     if row.size is None or row.gathers:
         return Page(items=tuple(JobOutput(**output) for output in row.outputs or ()))
@@ -110,7 +110,7 @@ def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit:
 
 
 def list_results(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
-    """What the tasks of a gathering job brought, in their order; empty for other jobs."""
+    """Return the results of the tasks of a gathering job, in their order; empty for other jobs."""
     find_job(tx, job_id)
     order = listing.parse_order("position", {"position": job.c.position, "id": job.c.id})
     statement = select(job.c.id, job.c.position, job.c.state, job.c.result).where(job.c.parent_id == job_id)
@@ -120,13 +120,13 @@ def list_results(tx: Transaction, job_id: str, cursor: str | None = None, limit:
 
 
 def list_job_events(tx: Transaction, job_id: str, after: int = 0, limit: int = 100) -> Page:
-    """What happened to a job, for members of its project."""
+    """Return the events of a job, for members of its project."""
     _, project = find_job(tx, job_id)
     return Page(items=tuple(events.list_events(tx, project.name, after=after, limit=limit, subject=job_id)))
 
 
 def read_job_log(tx: Transaction, job_id: str, offset: int = 0, limit: int = MOST_READ_BYTES) -> LogPage:
-    """A piece of what a job's attempts printed, for members of its project."""
+    """Return a piece of a job's log, for members of its project."""
     row, _ = find_job(tx, job_id)
     return read_log(tx, row, offset, limit)
 
@@ -150,7 +150,7 @@ def _conditions(project_id: str, filters: JobFilters) -> list[ColumnElement[bool
 
 
 def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLICY) -> Job:
-    """Cancel a job, at once where nobody works on it, else as soon as the worker stops or its grace is over.
+    """Cancel a job: at once if it does not run, else when its worker stops or the grace period ends.
 
     A gathering job is cancelled with its tasks. Cancelling twice is cancelling once.
     Raises `ConflictProblem` for a job that has succeeded or failed, `ForbiddenProblem` for somebody else's job.
@@ -162,7 +162,7 @@ def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLIC
     whole = _cancel(tx, job.c.id == job_id, policy)
     if row.unbound:  # it may have got its inputs, and tasks, since it was read
         tasks = _cancel(tx, of_job, policy)
-    settle(tx, [as_ended(one) for one in (*tasks, *whole) if one.state != "running"])
+    propagate_ends(tx, [as_ended(one) for one in (*tasks, *whole) if one.state != "running"])
     document = job_documents(tx, [job_id])[0]
     if not whole and document.state != JobState.CANCELLED:
         raise ConflictProblem(f"The job has {document.state} already; nothing can be cancelled.", code="job-ended")
@@ -170,7 +170,7 @@ def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLIC
 
 
 def _cancel(tx: Transaction, which: ColumnElement[bool], policy: QueuePolicy) -> Sequence[Row[Any]]:
-    """Cancel those of the jobs that have not ended, in one statement whatever their state, and read how they stand now.
+    """Cancel the jobs that have not ended, in one statement, and return them in their new states.
 
     A running job's time is over with the cancellation, so that its lease cannot outlive the grace. A gathering job has
     no lease while its tasks are at work, and ends with them.
@@ -212,7 +212,7 @@ def find_job(tx: Transaction, job_id: str) -> tuple[Row[Any], ProjectRow]:
 
 
 def require_own(tx: Transaction, row: Row[Any], project: ProjectRow, what: str) -> None:
-    """Contributors act on their own jobs, maintainers on all."""
+    """Check that the caller owns the job or is a maintainer. Raises `ForbiddenProblem`."""
     if roles.includes(project.role, Role.MAINTAINER):
         return
     if not roles.includes(project.role, Role.CONTRIBUTOR) or row.author_id != tx.principal.user_id:

@@ -1,4 +1,4 @@
-"""Takes back jobs whose lease has run out: from dead workers, and from those that do not stop when told to."""
+"""Reclaims jobs whose lease expired: from dead workers, and from workers that did not stop in time."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from sqlalchemy.exc import OperationalError
 from marey_schemas.worker_protocol import ClaimRequest, Lease
 from marey_server.store.jobs import result_cache
 from marey_server.store.jobs.endings import AttemptEnd
-from marey_server.store.jobs.failure import ENDING_COLUMNS, carry_out, judge_expired
+from marey_server.store.jobs.failure import ENDING_COLUMNS, apply_outcome, decide_expired_outcome
 from marey_server.store.jobs.fencing import QUEUED, RUNNING, held
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
-from marey_server.store.jobs.propagation import settle
+from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.jobs.queue import claim
 from marey_server.store.tables import job
 from marey_server.store.transaction import Transaction
@@ -26,7 +26,7 @@ PAGE = 256
 
 
 class StartGrace:
-    """Holds the reaper back for a whole lease after this process has started or the database has been away.
+    """Delay of the reaper by one lease after this process started or the database was unreachable.
 
     Leases run out while nobody can renew them; those who live renew them in this time. A jump of the clock counts as an
     absence too, and so does a long write that all others waited for: a lease has what a heartbeat leaves of it.
@@ -40,7 +40,7 @@ class StartGrace:
         self._seen_us = 0
 
     def over(self, now_us: int) -> bool:
-        """Whether leases may be taken back; `now_us` is the database's time."""
+        """Return whether leases may be reclaimed; `now_us` is the time of the database."""
         with self._lock:
             if self._since_us is None or not 0 <= now_us - self._seen_us <= self._longest_silence_us:
                 self._since_us = now_us
@@ -48,13 +48,13 @@ class StartGrace:
             return now_us - self._since_us >= self._ttl_us
 
     def restart(self) -> None:
-        """The database could not be reached."""
+        """Note that the database could not be reached."""
         with self._lock:
             self._since_us = None
 
 
 class ReapedPage(NamedTuple):
-    """How many jobs were taken back, and where to go on; `after` is None behind the last page."""
+    """Number of reclaimed jobs, and the position to continue from; `after` is None after the last page."""
 
     taken: int
     after: tuple[int, str] | None
@@ -66,7 +66,7 @@ def reap_page(
     after: tuple[int, str] | None = None,
     limit: int = PAGE,
 ) -> ReapedPage:
-    """Take back up to `limit` jobs, longest overdue first, from `after` on.
+    """Reclaim up to `limit` jobs from `after` on, the longest overdue first.
 
     Each is moved by an update of its own that repeats fence and overdue lease, so that a heartbeat or a result which
     comes at the same moment either wins or finds the lease gone. One that cannot be moved keeps no other from it.
@@ -88,13 +88,13 @@ def reap_page(
 
 
 def _take_back(tx: Transaction, row: Row[Any], policy: QueuePolicy) -> bool:
-    """Move one overdue job and all that follows from it; whether that worked."""
+    """End the attempt of one overdue job and propagate the end; return whether that succeeded."""
     try:
         with tx.connection.begin_nested():
-            verdict = judge_expired(row, policy)
+            outcome = decide_expired_outcome(row, policy)
             condition = and_(held(row.id, row.fence), job.c.lease_expires_us <= tx.now_us)
-            end = AttemptEnd(row.id, row.fence, verdict.outcome, "The lease ran out.")
-            carry_out(tx, row, condition, verdict, end, fence=job.c.fence + 1)
+            end = AttemptEnd(row.id, row.fence, outcome.attempt_outcome, "The lease ran out.")
+            apply_outcome(tx, row, condition, outcome, end, fence=job.c.fence + 1)
     except OperationalError:  # concerns the database, not this job: the whole page is tried again
         raise
     except Exception:
@@ -106,7 +106,7 @@ def _take_back(tx: Transaction, row: Row[Any], policy: QueuePolicy) -> bool:
 def claim_after_reaping(
     tx: Transaction, request: ClaimRequest, grace: StartGrace, policy: QueuePolicy = DEFAULT_POLICY
 ) -> list[Lease]:
-    """Claim; where there is nothing to claim, take back what is overdue and look once more."""
+    """Claim jobs; if there are none, reclaim overdue jobs and claim once more."""
     leases = claim(tx, request, policy)
     if not leases and grace.over(tx.now_us) and reap_page(tx, policy).taken:
         leases = claim(tx, request, policy)
@@ -114,7 +114,7 @@ def claim_after_reaping(
 
 
 def correct_times(tx: Transaction, policy: QueuePolicy = DEFAULT_POLICY) -> int:
-    """Shorten leases and rests that end later than any can that began by now: the database's clock was set back."""
+    """Shorten leases and waits that end too late because the clock of the database was set back."""
     latest_us = tx.now_us + policy.lease_ttl_us
     leases = tx.execute(
         update(job).where(job.c.state == RUNNING, job.c.lease_expires_us > latest_us).values(lease_expires_us=latest_us)
@@ -127,7 +127,7 @@ def correct_times(tx: Transaction, policy: QueuePolicy = DEFAULT_POLICY) -> int:
 
 
 def share_waiting(tx: Transaction) -> int:
-    """Serve jobs that wait for a result that is there; how many."""
+    """Give waiting jobs the shared results that exist by now; return their number."""
     ended = result_cache.share_waiting(tx)
-    settle(tx, ended)
+    propagate_ends(tx, ended)
     return len(ended)

@@ -1,4 +1,4 @@
-"""One computation for identical jobs: a finished one lends its result, a running one lets others wait for it.
+"""Result cache: identical jobs share one computation, finished or still running.
 
 Jobs are identical when kind, version of the kind, parameters, seed and inputs are; an input counts with its item, its
 name, its place and the content of those of its documents that the kind reads, since results are named after inputs and
@@ -29,16 +29,16 @@ from marey_server.store.tables import job, job_dependency, revision_part
 from marey_server.store.transaction import Transaction
 
 SHARED_AT_ONCE = 64
-"""Jobs that get their cached result in the transaction of the submission; the leader serves the others."""
+"""Largest number of jobs that get a cached result within their submission; the leader serves the others."""
 
 MOST_SHARED_OUTPUTS = 256
-"""Results that are published for them in one transaction; of a job that has more, all are."""
+"""Largest number of outputs published for them in one transaction; a job with more is published whole."""
 
 IN_LIST = 1000
 
 
 class SharedResult(NamedTuple):
-    """The job whose result another one shares."""
+    """A job whose result another job shares."""
 
     id: str
     finished: bool
@@ -71,7 +71,7 @@ def cache_key(
 
 
 def has_key(kind: KindDeclaration, params: Mapping[str, Any], inputs: Collection[str]) -> bool:
-    """Whether a job with these parameters and with inputs of these names depends on nothing but its key."""
+    """Return whether the result of a job with these parameters and inputs depends on its key alone."""
     in_place = kind.in_place is not None and params.get(kind.in_place)
     by_names = not set(kind.never_cached_without) <= set(inputs)
     if kind.never_cached_for is not None:
@@ -80,12 +80,12 @@ def has_key(kind: KindDeclaration, params: Mapping[str, Any], inputs: Collection
 
 
 def named_items(kind: KindDeclaration, params: Mapping[str, Any]) -> list[str]:
-    """The ids of the items that the parameters name and whose newest revisions are read."""
+    """Return the ids of items that the parameters name and whose newest revisions are read."""
     return [params[name] for name in kind.newest_of if params.get(name)]
 
 
 def part_digests(tx: Transaction, inputs: Iterable[PinnedInputs]) -> dict[tuple[str, int], dict[str, str]]:
-    """Part name to document digest, by item and revision, for everything pinned."""
+    """Return the digest of each part, by item and revision, of all pinned inputs."""
     items = sorted({pin["item"] for pins in inputs for many in pins.values() for pin in many})
     found: dict[tuple[str, int], dict[str, str]] = {}
     for start in range(0, len(items), IN_LIST):
@@ -98,7 +98,7 @@ def part_digests(tx: Transaction, inputs: Iterable[PinnedInputs]) -> dict[tuple[
 def input_contents(
     kind: KindDeclaration, pins: Mapping[str, Any], parts: Mapping[tuple[str, int], dict[str, str]]
 ) -> dict[str, Any]:
-    """What the inputs of a job are to it, apart from their revision numbers."""
+    """Return the content of a job's inputs, independent of their revision numbers."""
     return {
         name: [_content(pin, kind.inputs[name].parts, parts[pin["item"], pin["revision"]]) for pin in many]
         for name, many in pins.items()
@@ -137,7 +137,7 @@ def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult
 
 
 def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, str], SharedResult]:
-    """The newest finished job of each key, else the oldest that is under way."""
+    """Return the newest finished job of each key, else the oldest unfinished one."""
     keys = sorted({one.cache_key for one in asking if one.cache_mode == "use"})
     projects = sorted({one.project_id for one in asking})
     active = or_(job.c.state == QUEUED, job.c.state == RUNNING)
@@ -168,7 +168,7 @@ def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, st
 
 
 def join(tx: Transaction, joining: Sequence[tuple[Any, SharedResult]]) -> list[Ended]:
-    """Let waiting jobs (`id`) share the result of their sources: now where it is there, else when it comes."""
+    """Let waiting jobs (`id`) share the results of their sources, now or when these finish."""
     if not joining:
         return []
     for row, source in joining:
@@ -196,7 +196,7 @@ def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
 
 
 def share_waiting(tx: Transaction) -> list[Ended]:
-    """Serve jobs whose result is there and who wait for it: up to `SHARED_AT_ONCE` of them."""
+    """Give up to `SHARED_AT_ONCE` waiting jobs the results that exist by now."""
     source = job.alias("source")
     rows = tx.execute(
         select(job.c.id)
@@ -263,7 +263,7 @@ def _publish_anew(tx: Transaction, job_id: str) -> list[Ended]:
 
 
 def _compute_again(tx: Transaction, job_id: str) -> None:
-    """Queue a job that waited to share a result. It does not come after the job that has it: it never needed that."""
+    """Queue a job that waited to share a result, and drop its dependency on the job that was to bring it."""
     row = tx.execute(select(job.c.kind, job.c.cached_from).where(job.c.id == job_id)).one()
     waited = and_(job_dependency.c.job_id == job_id, job_dependency.c.on_job_id == row.cached_from)
     tx.execute(delete(job_dependency).where(waited))

@@ -1,4 +1,4 @@
-"""Places of results, looked at before a job is queued: all that can be told without computing anything.
+"""Places of results, checked before a job is queued, as far as nothing has to be computed.
 
 The worker looks again, clip by clip; but each task of a job sees its own share of the inputs only.
 """
@@ -16,7 +16,7 @@ from marey_server.store.jobs.inputs import Pin, PinnedInputs
 
 
 class Clash(NamedTuple):
-    """Why results cannot go where they should; `place` is where the submission says so."""
+    """A clash of result places; `place` is the field of the submission that causes it."""
 
     place: str
     code: str
@@ -39,7 +39,7 @@ def find_clash(kind: KindDeclaration, params: Any, pins: PinnedInputs, into: str
 
 
 def _too_long(kind: KindDeclaration, pins: PinnedInputs, into: str) -> tuple[str, str] | None:
-    """Results of many inputs lie below `into` as their inputs lie in the project."""
+    """Check results of many inputs, which lie below `into` as their inputs lie in the project."""
     kept = [pin for name, spec in kind.inputs.items() if spec.many for pin in pins.get(name, ()) if "job" not in pin]
     for folder in sorted({"", *map(_folder, kept)}) if into else ():
         try:
@@ -61,7 +61,7 @@ def _same_name(named: list[Pin]) -> tuple[str, str] | None:
 def _over_another_input(
     kind: KindDeclaration, params: Any, pins: Mapping[str, list[Pin]], into: str
 ) -> tuple[str, str] | None:
-    """The first result that would become the next revision of something else that the job reads, too."""
+    """Return the first result that would become a revision of another input of the same job."""
     named = pins.get(kind.named_after or "", [])
     if kind.in_place is not None and getattr(params, kind.in_place):
         return None
@@ -84,10 +84,10 @@ def _over_another_input(
 
 
 def _folder(pin: Pin) -> str:
-    """Where below `into` the result of an input goes."""
+    """Return the place of an input's result below `into`."""
     return str(pin.get("below", pin["collection"]))
 
 
 def _path(*names: str) -> str:
-    """Names that are not empty, joined."""
+    """Join the names that are not empty."""
     return "/".join(filter(None, names))

@@ -1,4 +1,4 @@
-"""Jobs tried again: one that did not succeed, those it needs that did not either, and those that failed with it."""
+"""Retries of jobs that did not succeed, with their unsuccessful dependencies and the jobs that failed with them."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
 
 
 class _Family:
-    """Jobs that are tried again together."""
+    """Jobs that are retried together."""
 
     def __init__(self, tx: Transaction, project: ProjectRow) -> None:
         self._tx = tx
         self._project = project
         self._rows: dict[str, Row[Any]] = {}
         self._needs: dict[str, dict[str, str]] = {}
-        """Of each job: the jobs it came after, and which newer try each of them has."""
+        """Dependencies of each job, and the newest retry of each dependency."""
 
     def add_with_needed(self, ids: Collection[str]) -> None:
-        """Add jobs, and those they need that did not succeed, and so on."""
+        """Add jobs and their unsuccessful dependencies, recursively."""
         while ids:
             rows = _rows(self._tx, ids)
             for row in rows.values():
@@ -71,7 +71,7 @@ class _Family:
             ids = [one for one, state in states.items() if state in UNSUCCESSFUL]
 
     def add_dependants(self) -> None:
-        """Add the jobs that ended because one of these did not succeed and miss nothing else, and so on."""
+        """Add the jobs that ended because one of these did not succeed and lack nothing else, recursively."""
         behind: Collection[str] = list(self._rows)
         while behind:
             rows = {row.id: row for row in self._doomed_after(behind)}
@@ -82,7 +82,7 @@ class _Family:
             self._take({one: rows[one] for one in behind}, {one: needs[one] for one in behind})
 
     def submit(self) -> dict[str, Job]:
-        """Submit them anew; the new jobs by the ids of the old ones."""
+        """Submit the jobs again; return the new ones by the ids of the old ones."""
         again = {one: new_id("job") for one in self._rows}
         outside = {latest for needs in self._needs.values() for latest in needs.values()} - again.keys()
         upstream = dict.fromkeys(again.values(), JobState.WAITING)
@@ -102,7 +102,7 @@ class _Family:
             raise ConflictProblem(detail, code="too-many")
 
     def _doomed_after(self, ids: Collection[str]) -> Iterable[Row[Any]]:
-        """Jobs the caller may try again that came after one of these, ended for it, and have not been tried again."""
+        """Return jobs without a retry that ended because one of these did, if the caller may retry them."""
         later = job.alias("later")
         statement = (
             select(job)
@@ -128,7 +128,7 @@ class _Family:
 
 
 def _again(tx: Transaction, row: Row[Any], new: str, stand_ins: Mapping[str, str]) -> Submission:
-    """A job as it is submitted again under the id `new`, after the jobs that stand in for those it came after."""
+    """Return the submission that retries a job under the id `new`, with its dependencies replaced by their retries."""
     try:
         kind = find_kind(row.kind)
     except UnknownKindError as error:
@@ -149,7 +149,7 @@ def _again(tx: Transaction, row: Row[Any], new: str, stand_ins: Mapping[str, str
 
 
 def _late_pins(row: Row[Any], stand_ins: Mapping[str, str]) -> PinnedInputs:
-    """The inputs of a job that never got them, to be made by the stand-ins."""
+    """Return the late inputs of a job that never got them, to be made by the retries."""
     return {
         name: [{"job": stand_ins[entry["job"]]} if "job" in entry else entry for entry in entries]
         for name, entries in row.inputs.items()
@@ -157,7 +157,7 @@ def _late_pins(row: Row[Any], stand_ins: Mapping[str, str]) -> PinnedInputs:
 
 
 def _pins_of(tx: Transaction, row: Row[Any], fanned: str | None) -> PinnedInputs:
-    """The inputs of a job; those of a gathering job are with its tasks."""
+    """Return the inputs of a job; a gathering job has them in its tasks."""
     if row.size is None or fanned is None:
         return dict(row.inputs)
     statement = select(job.c.inputs).where(job.c.parent_id == row.id).order_by(job.c.position)
@@ -166,7 +166,7 @@ def _pins_of(tx: Transaction, row: Row[Any], fanned: str | None) -> PinnedInputs
 
 
 def _concurrency_key(tx: Transaction, row: Row[Any]) -> str | None:
-    """The key of a job, or of a gathering job's tasks."""
+    """Return the labels key of a job, or of a gathering job's tasks."""
     key: str | None = row.concurrency_key
     if row.size is not None:
         key = tx.execute(select(job.c.concurrency_key).where(job.c.parent_id == row.id).limit(1)).scalar()
@@ -200,7 +200,7 @@ def _needs(tx: Transaction, rows: Mapping[str, Row[Any]]) -> dict[str, dict[str,
 
 
 def _latest_tries(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
-    """The newest job that tries each of these again, or tries its try again; itself where nobody has."""
+    """Return the newest retry of each job, or the job itself if it has none."""
     latest = {one: one for one in ids}
     looking: Collection[str] = set(ids)
     while looking:

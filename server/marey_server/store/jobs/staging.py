@@ -1,4 +1,4 @@
-"""Results of an attempt: staged while it runs, published when it completes."""
+"""Outputs of an attempt: staged while it runs, published when it completes."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ IN_LIST = 1000
 _DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
 
 StagedDraft = dict[str, Any]
-"""A draft as it is stored: kind, item_name, collection below `into`, tags, reuse, sources, parts by digest."""
+"""A stored draft: kind, item_name, collection below `into`, tags, reuse, sources, parts by digest."""
 
 
 @dataclass(frozen=True, slots=True)
 class PreparedOutput:
-    """A staged output whose documents are checked and encoded, which needs no database."""
+    """A staged output with checked and encoded documents."""
 
     output: StagedOutput
     parts: Mapping[str, PreparedDocument]
@@ -56,7 +56,7 @@ def prepare_output(output: StagedOutput) -> PreparedOutput:
 
 
 def stage(tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOutput]) -> int:
-    """Keep results until the attempt completes; one of the same name replaces the earlier. How many there are now.
+    """Store outputs until the attempt completes, replacing those of the same names; return their number.
 
     Raises `LeaseLostProblem` if the attempt does not hold the job, `InvalidProblem` for sources that are no inputs of
     the job.
@@ -110,7 +110,7 @@ def _staged_draft(tx: Transaction, prepared: PreparedOutput, pins: PinnedInputs)
 
 
 def _pinned_sources(output: StagedOutput, pins: PinnedInputs) -> dict[str, list[list[Any]]]:
-    """The inputs a result names, or all, as (item, revision); only what the job was given can be a source."""
+    """Return the inputs that an output names as sources, or all of them, as (item, revision)."""
     if not output.sources:
         return {role: [[pin["item"], pin["revision"]] for pin in many] for role, many in pins.items()}
     return {role: [_pinned_source(role, source, pins) for source in named] for role, named in output.sources.items()}
@@ -138,7 +138,7 @@ _DROP_STAGED = Prepared(delete(staged_output).where(_BY_ATTEMPTS))
 def staged_drafts(
     tx: Transaction, attempts: Collection[tuple[str, int]]
 ) -> dict[tuple[str, int], dict[str, StagedDraft]]:
-    """What attempts (job id and fence) staged: drafts by name, in the order staged."""
+    """Return the drafts that attempts (job id and fence) staged, by name, in the order of staging."""
     drafts: dict[tuple[str, int], dict[str, StagedDraft]] = {}
     for row in tx.run(_STAGED, {"attempts": list(attempts)}):
         drafts.setdefault((row.job_id, row.fence), {})[row.name] = row.draft
@@ -146,7 +146,7 @@ def staged_drafts(
 
 
 def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> bool:
-    """Keep the documents of an earlier job's drafts from being collected; whether all are still there."""
+    """Protect the documents of an earlier job's drafts from garbage collection; return whether all exist."""
     wanted = sorted({digest for draft in drafts.values() for digest in draft["parts"].values()})
     kept = 0
     for start in range(0, len(wanted), IN_LIST):
@@ -156,12 +156,12 @@ def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> boo
 
 
 def drop_staged(tx: Transaction, attempts: Collection[tuple[str, int]]) -> None:
-    """Forget what attempts (job id and fence) staged: they ended without success, or no identical job can use it."""
+    """Delete the drafts of attempts (job id and fence) that did not succeed or whose results no other job can share."""
     tx.run(_DROP_STAGED, {"attempts": list(attempts)})
 
 
 def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: PinnedInputs) -> dict[str, StagedDraft]:
-    """The drafts of an identical job, made from our inputs: the same items, at revisions of the same content."""
+    """Return the drafts of an identical job with our inputs as sources: equal content of the same items."""
     revisions = {
         (role, their["item"], their["revision"]): our["revision"]
         for role, many in theirs.items()
@@ -180,7 +180,7 @@ def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: P
 
 
 def publish_drafts(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> list[dict[str, Any]]:
-    """Publish the results of a job (`id, project_id, into_path, author_id, message`); what became of each."""
+    """Publish the drafts of a job (`id, project_id, into_path, author_id, message`); return the published outputs."""
     if not drafts:
         return []
     published = publish(
@@ -220,7 +220,7 @@ def _draft(name: str, draft: StagedDraft, row: Any) -> Draft:
 
 
 def named_blobs(tree: Any) -> Iterator[str]:
-    """Digests that stand under a member `blob`, anywhere in parameters or in a result."""
+    """Return the digests under members named `blob`, anywhere in parameters or in a result."""
     if isinstance(tree, Mapping):
         for name, value in tree.items():
             if name == "blob" and isinstance(value, str) and _DIGEST.fullmatch(value):
@@ -233,7 +233,7 @@ def named_blobs(tree: Any) -> Iterator[str]:
 
 
 def keep_named_blobs(tx: Transaction, job_id: str, digests: set[str]) -> None:
-    """Keep the blobs a job names, which the caller must be allowed to read.
+    """Protect the blobs that a job names from garbage collection; the caller must be allowed to read them.
 
     Raises `ConflictProblem` (`missing-blobs`) for those he has not sent and may not read.
     """

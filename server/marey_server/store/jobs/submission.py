@@ -1,4 +1,4 @@
-"""How jobs come to be: checked, pinned, split, and put where they belong, many in one transaction."""
+"""Submission of jobs: checks requests, pins inputs, splits fan-outs and inserts rows, many in one transaction."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from marey_server.store.jobs.endings import dependency_failure
 from marey_server.store.jobs.events import emit_job_events, wake_workers
 from marey_server.store.jobs.inputs import FoundItem, find_items, late_inputs, pin_inputs
 from marey_server.store.jobs.labels import labels_key
-from marey_server.store.jobs.late_inputs import bind
+from marey_server.store.jobs.late_inputs import pin_late_inputs
 from marey_server.store.jobs.layout import NewJob, Submission, lay_out, new_row
-from marey_server.store.jobs.propagation import settle
+from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.jobs.result_places import find_clash
 from marey_server.store.projects import ProjectRow, require
 from marey_server.store.tables import job, job_dependency
@@ -38,14 +38,14 @@ _INSERT_JOB = Prepared(insert(job))
 
 
 class Upstream(NamedTuple):
-    """A job that others wait for."""
+    """A job that others depend on."""
 
     kind: str
     state: JobState
 
 
 def submit(tx: Transaction, project: str, requests: Sequence[JobCreate]) -> list[Job]:
-    """Submit jobs to a project, all or none; the answer is in the order asked.
+    """Submit jobs to a project, all or none; return them in the order of the requests.
 
     Raises `InvalidProblem` with a pointer for each thing that makes no sense, and what `require` raises.
     """
@@ -60,7 +60,7 @@ def submit_at(
     requests: Mapping[str, JobCreate],
     ids: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Job]:
-    """Submit what a request asks for at each of these places, as `submit` does.
+    """Submit the jobs of a request, as `submit` does.
 
     `ids` are the ids of jobs to be, by the place that asks for them, where others of the jobs wait for those.
     """
@@ -78,7 +78,7 @@ def submit_at(
 def submit_checked(
     tx: Transaction, project: ProjectRow, submissions: Sequence[Submission], upstream: Mapping[str, JobState]
 ) -> list[Job]:
-    """Write the rows of checked jobs and let each go as far as it can.
+    """Insert the rows of checked jobs and queue those that wait for nothing.
 
     `upstream` holds the states of the jobs they come after, which must be locked; one that is among the submissions
     counts as waiting.
@@ -97,8 +97,8 @@ def submit_checked(
     ended = [one.end() for one in everything if one.state in ("failed", "cancelled")]
     ended += result_cache.join(tx, [(one, sources[one.id]) for one in everything if one.id in sources])
     bindable = [one.id for one in heads if one.unbound and one.state == "waiting" and not one.dependencies_left]
-    ended += bind(tx, bindable)
-    settle(tx, ended)
+    ended += pin_late_inputs(tx, bindable)
+    propagate_ends(tx, ended)
     faults.point("submit.before_commit")
     tx.after_commit(lambda: faults.point("submit.after_commit"))
     if ended or sources or bindable or tasks:  # what was inserted has been changed since, or is not the whole of it
@@ -155,7 +155,7 @@ def _invalid(pointer: str, code: str, detail: str) -> InvalidProblem:
 def _lock_upstream(
     tx: Transaction, project: ProjectRow, requests: Mapping[str, JobCreate], to_be: Collection[str]
 ) -> dict[str, Upstream]:
-    """Every job that is waited for and is there, locked so that none ends before the waiting is written down.
+    """Return the dependencies that exist, locked so that none ends before the waiting jobs are inserted.
 
     Only jobs that exist, or come before in the same request, can be waited for, so that none can wait for itself.
     """
@@ -176,7 +176,7 @@ def _lock_upstream(
 
 
 def lock_jobs(tx: Transaction, project: ProjectRow, ids: Iterable[str]) -> dict[str, Upstream]:
-    """Those of the jobs that are there in the project, locked so that none ends before this transaction does."""
+    """Return the jobs that exist in the project, locked so that none ends before this transaction does."""
     wanted = sorted(set(ids))
     found: dict[str, Upstream] = {}
     for start in range(0, len(wanted), IN_LIST):
