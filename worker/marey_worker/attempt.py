@@ -177,24 +177,33 @@ class RunningAttempt:
         self._watch = Watch(lease, self._keeper, stopping, self._job_log, time.monotonic())
         self._transfers = ThreadPoolExecutor(TRANSFERS_AT_ONCE, thread_name_prefix="marey-transfer")
 
-    def run(self, child: ChildProcess) -> Done | Failed | Stop | None:
-        """Have `child` do the job and tell the server how it went. Afterwards the child is idle, or dead."""
-        end: Done | Failed | Stop | None = None
+    def run(self, child: ChildProcess) -> Done | Failed | Stop:
+        """Have `child` do the job; `finish` must follow. Afterwards the child is idle, or dead."""
         try:
             child.send(self._order())
             end = self._attend(child)
             if isinstance(end, Stop):
                 child.kill()
+        except BaseException:
+            self._close()
+            raise
+        return end
+
+    def finish(self, end: Done | Failed | Stop) -> None:
+        """Report the end to the server, while the child may do another job already."""
+        try:
             self._report(end)
         except LeaseLost as error:
             log.warning("%s: given up: %s", self._lease.job, error)
         except MareyError as error:
-            log.error("%s: its end could not be told: %s", self._lease.job, error)
+            log.error("%s: its end could not be reported: %s", self._lease.job, error)
         finally:
-            self._keeper.stop()
-            self._transfers.shutdown(wait=False, cancel_futures=True)
-            shutil.rmtree(self._scratch, ignore_errors=True)
-        return end
+            self._close()
+
+    def _close(self) -> None:
+        self._keeper.stop()
+        self._transfers.shutdown(wait=False, cancel_futures=True)
+        shutil.rmtree(self._scratch, ignore_errors=True)
 
     def _order(self) -> Run:
         lease = self._lease

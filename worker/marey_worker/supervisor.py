@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Mapping
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
@@ -23,6 +24,7 @@ from marey_worker.attempt import RunningAttempt, Stop
 from marey_worker.attempt_api import AttemptApi, claim
 from marey_worker.child_process import ChildBroken, ChildProcess
 from marey_worker.job_io.input_cache import InputCache
+from marey_worker.messages import Done, Failed
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +106,8 @@ class Supervisor:
 
     def _claim_and_run(self) -> None:
         failures = 0
-        with _Bench(self._options) as bench:
+        finishing: Future[None] | None = None
+        with _Bench(self._options) as bench, ThreadPoolExecutor(1, thread_name_prefix="marey-finish") as finisher:
             while not self._stopping.is_set():
                 try:
                     child = bench.child()
@@ -120,7 +123,11 @@ class Supervisor:
                     continue
                 failures = 0
                 for lease in leases:
-                    self._attempt(lease, child)
+                    earlier, finishing = finishing, self._attempt(lease, child, finisher)
+                    if earlier is not None:
+                        earlier.result()  # one report at a time is under way, and what went wrong with it is raised
+            if finishing is not None:
+                finishing.result()
 
     def _claim(self) -> tuple[Lease, ...]:
         wanted = ClaimRequest(
@@ -132,18 +139,31 @@ class Supervisor:
         )
         return claim(self._claims, wanted)
 
-    def _attempt(self, lease: Lease, child: ChildProcess) -> None:
+    def _attempt(self, lease: Lease, child: ChildProcess, finisher: Executor) -> Future[None]:
+        """Have a job done; its success is reported while the child does the next one."""
         self._running.add(lease.job)
         try:
             faults.point("worker.after_claim")
             log.info("%s: %s, attempt %d", lease.job, lease.kind, lease.attempt)
             api = AttemptApi(self._transport, lease)
-            end = RunningAttempt(
+            attempt = RunningAttempt(
                 api, lease, self._cache, self._transport.url, self._stopping, threads=self._options.threads_of_a_slot
-            ).run(child)
-            self._interrupted |= end is Stop.INTERRUPTED
-        finally:
+            )
+            end = attempt.run(child)
+        except BaseException:
             self._running.discard(lease.job)
+            raise
+        self._interrupted |= end is Stop.INTERRUPTED
+        finishing = finisher.submit(self._finish, attempt, end, lease.job)
+        if not isinstance(end, Done):
+            finishing.result()
+        return finishing
+
+    def _finish(self, attempt: RunningAttempt, end: Done | Failed | Stop, job: str) -> None:
+        try:
+            attempt.finish(end)
+        finally:
+            self._running.discard(job)
 
 
 class _Bench:

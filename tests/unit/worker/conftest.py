@@ -41,6 +41,10 @@ class FakeServer:
         self.cancelled = set()
         self.lost = set()
         self.silent = set()
+        self.started = []
+        self.completing = set()
+        self.may_complete = threading.Event()
+        self.may_complete.set()
         self.ttl_s, self.heartbeat_s = 60.0, 15.0
         self.tokens_seen = set()
         self._claims = 0
@@ -78,6 +82,7 @@ class FakeServer:
                     if job[1] in wanted["kinds"]:
                         self.jobs.remove(job)
                         self._claims += 1
+                        self.started.append(job[0])
                         return [self._lease(*job)]
             time.sleep(0.01)
         return []
@@ -158,6 +163,8 @@ def _handler(server):
             self.reply(204)
 
         def on_complete(self, job, body):
+            server.completing.add(job)
+            server.may_complete.wait(60)
             server.completed[job] = json.loads(body)
             self.reply(200, json.dumps({"job": job, "state": "succeeded"}).encode())
 

@@ -29,6 +29,27 @@ def test_a_child_stays_warm_between_jobs(server, start_worker):
     assert len({end["result"]["pid"] for end in ends}) == 1
 
 
+def test_the_next_job_begins_while_the_end_of_the_last_one_is_reported(server, start_worker):
+    server.may_complete.clear()
+    start_worker("--slots", "1")
+    first, second = (server.submit("add", {"a": 1, "b": n}) for n in range(2))
+    server.until(lambda: server.started == [first, second])
+    assert not server.completed
+    server.may_complete.set()
+    assert [server.ended(job)["result"]["sum"] for job in (first, second)] == [1, 2]
+
+
+def test_a_worker_that_stops_reports_what_is_done(server, start_worker):
+    server.may_complete.clear()
+    worker = start_worker("--slots", "1")
+    job = server.submit("add", {"a": 1, "b": 1})
+    server.until(lambda: job in server.completing)
+    worker.process.send_signal(signal.SIGTERM)
+    server.may_complete.set()
+    assert worker.process.wait(30) == 0
+    assert server.completed[job]["result"]["sum"] == 2
+
+
 def test_a_task_knows_its_place_and_the_job_that_gathers_gets_what_the_tasks_returned(server, start_worker):
     start_worker("--slots", "1")
     task = server.submit("tally", {"tasks": 3}, position=2, size=3)

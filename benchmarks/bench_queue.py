@@ -1,0 +1,162 @@
+"""Clips through the queue and one worker: to another skeleton, and to BVH files; beside pymotion in one process.
+
+Marey's times are those that a person waits, from the submission until the job has ended: clips are read from the
+server, computed by the worker, sent back, checked and published. pymotion computes from arrays in memory.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pymotion.io.bvh import BVH  # type: ignore[import-untyped]
+from pymotion.ops import skeleton as pymotion_skeleton  # type: ignore[import-untyped]
+from pymotion.rotations import quat as pymotion_quat  # type: ignore[import-untyped]
+
+from benchmarks.local_server import PROJECT, LocalServer, clean_environment, clip_parts, local_server
+from benchmarks.material import captured_walk
+from benchmarks.timing import Row
+from marey_client import Marey
+from marey_client.project import ProjectHandle
+from marey_motion.clip import Clip
+from marey_motion.documents import mapping_to_document, skeleton_to_document
+from marey_motion.formats import write_bvh
+from marey_motion.gait import game_skeleton
+from marey_motion.retargeting import RetargetPlan, plan_retarget
+from marey_motion.rigs import guess_axes, map_joints
+from marey_motion.skeleton import Skeleton
+from marey_schemas.access import ProjectCreate
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.jobs import CollectionInput, Job, JobCreate
+
+CLIPS, FRAMES, JOINTS = 96, 300, 31
+GOAL_POSES_PER_S = 50_000
+WORKER_STOP_S = 60
+
+Floats = NDArray[np.floating]
+
+
+def run() -> list[Row]:
+    """One server, one worker with one slot."""
+    clips = [captured_walk(FRAMES, JOINTS, seed) for seed in range(CLIPS)]
+    with local_server() as server, _worker(server), server.client() as marey:
+        project = marey.create_project(ProjectCreate(name=PROJECT))
+        target = _seed(project, clips)
+        marey.jobs.wait(project.retarget([CollectionInput(collection="first")], target, into="warm").id)
+        takes, game = CollectionInput(collection="takes"), CollectionInput(collection="game")
+        export = JobCreate(kind="export", inputs={"clips": (game,)}, params={"format": "bvh"})
+        retargeting_s = _timed(marey, lambda: project.retarget([takes], target, into=game.collection))
+        writing_s = _timed(marey, lambda: project.submit(export))
+    plan = _plan(clips[0].skeleton, game_skeleton())
+    moved, peer_retargeting_s = _retarget_with_pymotion(clips, plan)
+    return [
+        _row("clips to retargeted clips", retargeting_s, peer_retargeting_s, GOAL_POSES_PER_S),
+        _row("clips to BVH files", writing_s, _write_with_pymotion(moved, plan.target), None),
+    ]
+
+
+@contextmanager
+def _worker(server: LocalServer) -> Iterator[None]:
+    """Run a worker with one slot while the block runs."""
+    with tempfile.TemporaryDirectory(prefix="marey-bench-") as cache:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "marey_client.cli", "worker", "--cache", cache],
+            env=clean_environment() | {"MAREY_URL": server.url, "MAREY_TOKEN": server.token},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            yield
+        finally:
+            process.terminate()
+            process.wait(WORKER_STOP_S)
+
+
+def _seed(project: ProjectHandle, clips: list[Clip]) -> str:
+    """Store the clips in `takes`, one of them in `first`, and a skeleton to move them to; its id."""
+    skeletons = []
+    for name, skeleton in (("studio", clips[0].skeleton), ("game", game_skeleton())):
+        mapping = map_joints(skeleton)
+        parts = {
+            "hierarchy": skeleton_to_document(skeleton).model_dump(by_alias=True),
+            "mapping": mapping_to_document(mapping, guess_axes(skeleton, mapping)).model_dump(by_alias=True),
+        }
+        skeletons.append(project.skeletons.create(name, parts).item.id)
+    studio = RevisionRef(item=skeletons[0], revision=1)
+    for number, clip in enumerate(clips):
+        project.clips.create(f"take-{number:03}", clip_parts(clip, studio), collection="takes")
+    project.clips.create("warm-up", clip_parts(clips[0], studio), collection="first")
+    return skeletons[1]
+
+
+def _timed(marey: Marey, submit: Callable[[], Job]) -> float:
+    """Seconds from the submission of a job to its end."""
+    started = time.perf_counter()
+    ended = marey.jobs.wait(submit().id)
+    seconds = time.perf_counter() - started
+    assert ended.result is not None
+    assert ended.result["clips"] == CLIPS, ended.result
+    return seconds
+
+
+def _plan(source: Skeleton, target: Skeleton) -> RetargetPlan:
+    rigs = [(skeleton, mapping := map_joints(skeleton), guess_axes(skeleton, mapping)) for skeleton in (source, target)]
+    return plan_retarget(*rigs[0], *rigs[1])
+
+
+def _retarget_with_pymotion(clips: list[Clip], plan: RetargetPlan) -> tuple[list[Floats], float]:
+    """Local rotations of the target's joints for each clip, and the seconds all of them took."""
+    offsets, parents = clips[0].skeleton.offsets.astype(np.float32), clips[0].skeleton.parents.copy()
+    target_parents = plan.target.parents.copy()
+    parents[0] = target_parents[0] = 0  # pymotion's mark of the root
+    started = time.perf_counter()
+    moved = []
+    for clip in clips:
+        _, turned = pymotion_skeleton.fk_quat(clip.rotations, clip.root_translations, offsets, parents)
+        world = np.empty((clip.frame_count, plan.target.joint_count, 4))
+        for joint, source in enumerate(plan.sources):
+            if source >= 0:
+                world[:, joint] = pymotion_quat.mul(turned[:, source], plan.corrections[joint])
+            elif joint:
+                world[:, joint] = pymotion_quat.mul(world[:, target_parents[joint]], plan.target.rest_rotations[joint])
+            else:
+                world[:, joint] = plan.target.rest_rotations[joint]
+        moved.append(pymotion_skeleton.from_global_rotations(world, target_parents))
+    return moved, time.perf_counter() - started
+
+
+def _write_with_pymotion(moved: list[Floats], target: Skeleton) -> float:
+    """Seconds to write clips as BVH files."""
+    rest = np.tile(np.concatenate([target.offsets[0], target.rest_rotations.ravel()]), (FRAMES, 1)).astype(np.float32)
+    with tempfile.TemporaryDirectory(prefix="marey-bench-") as folder:
+        template = Path(folder, "template.bvh")
+        template.write_bytes(write_bvh(Clip(target, 60.0, rest)))
+        file = BVH()
+        file.load(str(template))
+        _, positions, *_ = file.get_data()
+        started = time.perf_counter()
+        for number, rotations in enumerate(moved):
+            file.set_data(rotations, positions)
+            file.save(str(Path(folder, f"{number}.bvh")))
+        return time.perf_counter() - started
+
+
+def _row(job: str, ours_s: float, peer_s: float, goal: int | None) -> Row:
+    poses = CLIPS * FRAMES
+    return Row(
+        job,
+        f"{CLIPS} clips of {FRAMES} frames, one worker",
+        f"{poses / ours_s:,.0f} poses/s",
+        f"pymotion in one process, from memory: {poses / peer_s:,.0f} poses/s",
+        peer_s / ours_s,
+        "" if goal is None else f"≥ {goal:,} poses/s",
+        None if goal is None else poses / ours_s >= goal,
+    )
