@@ -5,10 +5,11 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 DATA   ?=
 PIP    := $(BIN)/python -m pip --disable-pip-version-check -q
-PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadgroup
+ARGS   ?=
+PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadgroup $(ARGS)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo check test soak lint format dev bench docs clean
+.PHONY: help installed demo check test soak lint format dev bench docs clean
 
 help: ## Show what can be made
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -26,6 +27,8 @@ $(VENV)/.installed-dev: pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) install -c constraints.txt -e '.[dev]'
 	$(BIN)/python -m marey_motion.warm_up --processes 2
 	@touch $@ $(VENV)/.installed-all
+
+installed: $(VENV)/.installed-dev
 
 demo: $(VENV)/.installed-all ## From takes to an evaluated, reported dataset; DATA=folder for your own motion
 	$(BIN)/marey demo $(if $(DATA),"$(DATA)")

@@ -49,9 +49,19 @@ def new_lab(marey: Marey) -> Iterator[Callable[[], ProjectHandle]]:
         def make() -> ProjectHandle:
             project = marey.create_project(ProjectCreate(name="lab"))
             after.callback(project.delete)
+            after.callback(cancel_jobs, marey, project)
             return project
 
         yield make
+
+
+def cancel_jobs(marey: Marey, project: ProjectHandle) -> None:
+    """Cancel the jobs that a test has left, which would keep the worker from those of the next test."""
+    left = [job for job in project.jobs() if not job.state.terminal]
+    for job in left:
+        marey.jobs.cancel(job.id)
+    for job in left:
+        marey.jobs.wait(job.id, timeout_s=120, require_success=False)
 
 
 @pytest.fixture

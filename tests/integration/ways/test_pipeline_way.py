@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from benchmarks.pipeline_under_fire import write_takes
 from tests.support.command_line import CommandLine
-from tests.support.server_process import ServerProcess, serving
 
 from marey_client import Marey
 from marey_client.errors import NoAnnotations
@@ -31,19 +30,6 @@ TAKES = 20
 QUICK = ("model.leave_one_out=false", "model.folds=0", "model.report_samples=20", "tree.samples=500")
 QUICK_FLAGS = tuple(flag for choice in QUICK for flag in ("--set", choice))
 CHANGED = "walk-003"
-
-
-@pytest.fixture
-def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
-    """One for each test: jobs may still run when a test ends, and would keep the worker from those of the next."""
-    with serving(tmp_path, database_url) as process:
-        yield process
-
-
-@pytest.fixture
-def marey(server: ServerProcess) -> Iterator[Marey]:
-    with server.client() as client:
-        yield client
 
 
 @pytest.fixture

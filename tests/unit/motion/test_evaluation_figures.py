@@ -39,6 +39,7 @@ def other():
     return made_up(seed=5, clips=9, sway_m=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_figure_is_drawn_of_one_result_and_of_two_with_the_same_bytes_each_time(name, result, other):
     for compared in (None, other):
@@ -80,6 +81,7 @@ def test_the_files_of_a_figure_are_its_pictures_and_its_data(result):
     assert [float(row["mean"]) for row in rows] == figure.data["tables"]["fits"]["mean"]
 
 
+@pytest.mark.slow
 def test_all_figures_of_a_result_are_drawn_but_those_it_has_no_trials_or_records_for(result):
     assert list(draw_figures(result)) == list(FIGURES)
     assert not set(draw_figures(replace(result, records=()))) & set(ONE_TRIAL)
@@ -405,6 +407,7 @@ LITTLE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("little", LITTLE)
 def test_evaluations_of_little_are_drawn(little):
     for figure in draw_figures(LITTLE[little]()).values():

@@ -55,6 +55,7 @@ def test_a_report_is_one_sound_file_that_shows_every_figure(page, figures):
         assert figure.caption in page.text
 
 
+@pytest.mark.slow
 def test_the_same_result_gives_the_same_page(result):
     assert render_report(result, title="Walks") == render_report(result, title="Walks")
 
@@ -76,6 +77,7 @@ def test_pictures_and_tables_can_be_read_aloud(result, figures):
     assert '<html lang="en">' in source
 
 
+@pytest.mark.slow
 def test_names_of_clips_and_titles_are_shown_and_never_run(result):
     hostile = made_up(names=HOSTILE, unused=10, seed=2)
     page = is_sound(render_report(hostile, title=HOSTILE[1]))
@@ -143,6 +145,7 @@ def test_digests_and_options_are_there_to_repeat_it(page, result):
     assert result.provenance.clips[result.clips[3].uid] in page.text
 
 
+@pytest.mark.slow
 def test_a_report_of_a_thousand_clips_stays_small():
     big = made_up(clips=1_000, frames=1_000, unused=300)
     source = render_report(big, title="big")
@@ -152,6 +155,7 @@ def test_a_report_of_a_thousand_clips_stays_small():
     is_sound(source)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["bare", "nothing used", "no trials", "no metrics"])
 def test_reports_are_made_of_little(change, result):
     little = {
@@ -300,6 +304,7 @@ def test_a_comparison_says_whether_it_helped(result):
     assert compared(result, result).startswith("Neither better nor worse: ")
 
 
+@pytest.mark.slow
 def test_a_comparison_shows_what_came_went_and_changed(result):
     after = made_up(seed=4, clips=10, turns_deg_s=(-90.0, 20.0), sway_m=0.05)
     after = replace(after, clips=(replace(after.clips[0], uid="new@1", name="newcomer"), *after.clips[1:]))

@@ -51,6 +51,7 @@ def test_every_figure_is_sound(figures):
         is_sound(figure)
 
 
+@pytest.mark.slow
 def test_the_same_model_gives_the_same_bytes(subject, figures):
     again = {**draw_alignment_figures(subject.examples), **draw_model_figures(replace(subject))}
     assert {name: figure.files() for name, figure in again.items()} == {
@@ -215,6 +216,7 @@ def test_an_outline_holds_two_standard_deviations():
     assert np.einsum("ni,ij,nj->n", away, np.linalg.inv(covariance), away) == pytest.approx(np.full(60, 4.0))
 
 
+@pytest.mark.slow
 def test_examples_stand_in_the_order_of_their_likelihood_and_odd_ones_are_named(subject):
     examples = list(subject.report.examples)
     examples[4] = replace(examples[4], held_out_log_likelihood=-1e4, outlier=True, name="limping")
@@ -288,6 +290,7 @@ ODD = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("odd", ODD)
 def test_odd_models_are_drawn_and_nothing_is_cut_off(odd):
     subject = ODD[odd]()
@@ -301,6 +304,7 @@ def test_odd_models_are_drawn_and_nothing_is_cut_off(odd):
             assert "<b>" not in is_sound(finish(sketch, name, "", name)).svg
 
 
+@pytest.mark.slow
 def test_two_hundred_examples_are_drawn_as_twenty_are():
     subject = modelled(walks(200), QUICK.replace(leave_one_out=False, folds=0))
     drawn = {**draw_alignment_figures(subject.examples), **draw_model_figures(subject)}
@@ -315,6 +319,7 @@ def test_the_figures_of_no_samples_of_the_search_say_so():
     assert draw_search_errors(np.zeros(0), np.zeros(0)).caption == "No target was searched for."
 
 
+@pytest.mark.slow
 def test_the_check_of_searches_is_drawn_where_there_is_one(subject):
     found = SearchCheck(("walk001", "walk001"), ("left_wrist", "right_wrist"), (5, 9), np.array([2.0, 3.0]), np.ones(2))
     figure = draw_model_figures(replace(subject, check=found))["search-errors"]

@@ -90,6 +90,7 @@ def test_it_says_what_the_model_was_made_of(page):
     assert "jacobian" in page.text
 
 
+@pytest.mark.slow
 def test_names_and_titles_are_shown_and_never_run():
     trained, subject = made(walks(6, names=(*HOSTILE, "plain")))
     drawn = {**draw_alignment_figures(subject.examples), **draw_model_figures(subject)}
@@ -98,6 +99,7 @@ def test_names_and_titles_are_shown_and_never_run():
     assert "alert" not in "".join(page.scripts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("odd", ["copies", "bare"])
 def test_models_of_little_are_reported(odd):
     aligned = walks(3)

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from marey_motion import warm_up
 
 READ_A_WALK = """
@@ -50,6 +52,7 @@ def test_compiled_code_is_discarded_after_any_source_of_kernels_has_changed(tmp_
     assert not compiled.exists()
 
 
+@pytest.mark.slow
 def test_a_first_file_finds_the_kernels_compiled(tmp_path: Path) -> None:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     subprocess.run([sys.executable, "-m", "marey_motion.warm_up", "files"], env=environment, check=True)
@@ -59,6 +62,7 @@ def test_a_first_file_finds_the_kernels_compiled(tmp_path: Path) -> None:
     assert {file.name for file in tmp_path.rglob("*.nbi")} == before
 
 
+@pytest.mark.slow
 def test_what_is_compiled_is_not_compiled_again_until_a_kernel_changes(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(warm_up, "STAMP", tmp_path / "kernels-compiled")
     compiled: list[tuple[str, ...]] = []
