@@ -10,7 +10,7 @@ from tests.support.rest_server import Server
 
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, mapping_to_document, skeleton_to_document
-from marey_motion.editing.allowance import PER_COMMAND, PER_NUMBER
+from marey_motion.editing.compute_budget import PER_COMMAND, PER_NUMBER
 from marey_motion.editing.registry import apply_edit
 from marey_motion.kinematics import global_positions
 from marey_motion.rigs import guess_axes, map_joints

@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 
 import httpx
 import pytest
-from tests.support.evaluation_results import made_up
+from tests.support.evaluation_results import synthetic_result
 from tests.support.rest_server import Server
 
 from marey_motion.evaluation.result_documents import records_to_tree, result_to_tree
@@ -113,7 +113,7 @@ def test_other_items_have_no_report(owner: httpx.Client) -> None:
 @pytest.fixture
 def walked(owner: httpx.Client) -> str:
     """The path of an evaluation with the ticks of its trials."""
-    result = made_up()
+    result = synthetic_result()
     trials = [each.trial for each in result.trials]
     parts = {"evaluation": result_to_tree(result), "records": records_to_tree(trials, result.records)}
     parts["evaluation"] |= {"verdict": "Good.", "headline": {}}
@@ -156,22 +156,22 @@ def test_a_walk_graph_is_the_same_in_json_and_in_graphml(owner: httpx.Client, wa
     assert list(walks) == graph["trials"]
     for text, walk in zip(walks.values(), graph["walks"], strict=True):
         assert [int(run.partition(":")[2]) for run in text.split()] == walk["frames"]
-    ticks = sum(len(record.rows) for record in made_up().records)
+    ticks = sum(len(record.rows) for record in synthetic_result().records)
     assert sum(graph["nodes"]["ticks"]) == ticks == sum(sum(walk["frames"]) for walk in graph["walks"])
 
 
 def test_a_walk_graph_of_one_trial_holds_its_walk_alone(owner: httpx.Client, walked: str) -> None:
-    trial = made_up().trials[0].trial.name
+    trial = synthetic_result().trials[0].trial.name
     graph = owner.get(f"{walked}/walk-graph", params={"trial": trial}).json()
     assert graph["trials"] == [trial]
-    assert sum(graph["nodes"]["ticks"]) == sum(graph["walks"][0]["frames"]) == len(made_up().records[0].rows)
+    assert sum(graph["nodes"]["ticks"]) == sum(graph["walks"][0]["frames"]) == len(synthetic_result().records[0].rows)
     unknown = owner.get(f"{walked}/walk-graph", params={"trial": "hop"}).json()
     assert (unknown["code"], trial in unknown["detail"]) == ("no-trial", True)
 
 
 def test_documents_that_contradict_each_other_give_no_walk_graph(owner: httpx.Client, evaluation: str) -> None:
     assert owner.get(f"{evaluation}/walk-graph").json()["status"] == 404
-    result = made_up()
+    result = synthetic_result()
     trials = [each.trial for each in result.trials]
     records = records_to_tree(trials, result.records)
     records["rows"] = records["rows"] + 10**6

@@ -41,7 +41,7 @@ class Making:
     names: tuple[str, ...] = ()
 
 
-def made_up(options=SMALL, **making):
+def synthetic_result(options=SMALL, **making):
     """A plausible evaluation, the same for the same arguments."""
     how = Making(**making)
     random = np.random.default_rng(how.seed)

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from tests.support.made_databases import arc_track, made_database, mirrored_track, random_tracks
+from tests.support.synthetic_databases import arc_track, mirrored_track, random_tracks, synthetic_database
 
 from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.evaluation.suite import assemble, run_suite
@@ -31,7 +31,7 @@ def with_mirrored(tracks):
         (one for track in tracks for one in (track, mirrored_track(track)._replace(uid=f"{track.uid}~mirrored"))),
         key=lambda track: track.uid,
     )
-    database = made_database(both)
+    database = synthetic_database(both)
     clips = tuple(
         replace(clip, mirrored_from=clip.uid.removesuffix("~mirrored")) if clip.uid.endswith("~mirrored") else clip
         for clip in database.clips

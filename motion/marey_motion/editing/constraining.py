@@ -13,7 +13,7 @@ import numpy as np
 
 from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Floats, Ints
-from marey_motion.editing.allowance import PER_MEETING, PER_MET_NUMBER, Allowance
+from marey_motion.editing.compute_budget import PER_MEETING, PER_MET_NUMBER, ComputeBudget
 from marey_motion.editing.displacement import displace, windows_around
 from marey_motion.editing.inverse_kinematics.solving import Solver, TwoBoneLimb, limb_targets, measure_residuals, solve
 from marey_motion.editing.inverse_kinematics.targets import (
@@ -79,7 +79,7 @@ def constrain_motion(
     freedom: Freedom | None = None,
     solver: Solver = "auto",
     options: SolverOptions | None = None,
-    allowance: Allowance | None = None,
+    budget: ComputeBudget | None = None,
 ) -> ConstrainedMotion:
     """Meet constraints in their frames and blend the change in and out before and after them.
 
@@ -93,7 +93,7 @@ def constrain_motion(
         may turn
     solver : str    "auto" takes the two-bone solver for limbs and least squares for everything else
     options : SolverOptions, optional    tolerances and iterations
-    allowance : budget, optional    the work that this may take, spent as it goes
+    budget : budget, optional    the work that this may take, spent as it goes
 
     Returns
     -------
@@ -101,7 +101,7 @@ def constrain_motion(
 
     Raises
     ------
-    EditError    naming the constraint that is invalid, and where the allowance is too small
+    EditError    naming the constraint that is invalid, and where the budget is too small
     """
     freedom = freedom or Freedom()
     for number, constraint in enumerate(constraints):
@@ -109,7 +109,7 @@ def constrain_motion(
     before = tuple(_residuals(skeleton, motion, constraint) for constraint in constraints)
     changed = motion
     for cluster in _clusters(skeleton, constraints, freedom.root_moves):
-        solving = _Cluster(skeleton, cluster, freedom, solver, options or SolverOptions(), allowance or Allowance())
+        solving = _Cluster(skeleton, cluster, freedom, solver, options or SolverOptions(), budget or ComputeBudget())
         changed = solving.constrained(changed, blend_frames)
     after = tuple(_residuals(skeleton, changed, constraint) for constraint in constraints)
     return ConstrainedMotion(changed, before, after)
@@ -182,7 +182,7 @@ class _Cluster:
     freedom: Freedom
     solver: Solver
     options: SolverOptions
-    allowance: Allowance
+    budget: ComputeBudget
 
     def constrained(self, motion: Motion, blend_frames: int) -> Motion:
         """The motion with these constraints met and blended in and out.
@@ -201,7 +201,7 @@ class _Cluster:
         return self._met(motion, self.constraints, blend_frames)
 
     def _met(self, motion: Motion, constraints: Sequence[Constraint], blend_frames: int) -> Motion:
-        self.allowance.spend(PER_MEETING + PER_MET_NUMBER * motion.rotations.size)
+        self.budget.spend(PER_MEETING + PER_MET_NUMBER * motion.rotations.size)
         frames = np.unique(np.concatenate([np.arange(one.start, one.stop) for one in constraints]))
         active = np.array([(frames >= one.start) & (frames < one.stop) for one in constraints])
         given = motion.at_frames(frames)
@@ -219,7 +219,7 @@ class _Cluster:
         """Those frames of a motion with constraints met that count in all of them."""
         limb = constraints[0].limb if all(one.limb == constraints[0].limb for one in constraints) else None
         joints = tuple(sorted({joint for one in constraints for joint in one.joints}))
-        self.allowance.spend(self._work(len(frames), constraints, limb, joints))
+        self.budget.spend(self._work(len(frames), constraints, limb, joints))
         return solve(
             self.skeleton,
             given,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.editing.allowance import PER_NUMBER, PER_PLANTED_NUMBER, PER_RIG
+from marey_motion.editing.compute_budget import PER_NUMBER, PER_PLANTED_NUMBER, PER_RIG
 from marey_motion.editing.constraining import Constraint, constrain_motion, current_values
 from marey_motion.editing.foot_plants import Foot, FootContacts, PlantOptions, find_contacts
 from marey_motion.editing.foot_plants import plant_feet as plant
@@ -66,7 +66,7 @@ def constrain(
     MappingError    where limits or a look need axes that cannot be determined
     EditError    naming the constraint that is invalid
     """
-    take.allowance.spend(PER_RIG)
+    take.budget.spend(PER_RIG)
     rig = _Rig(take)
     wanted = [_named(number, _constraint, rig, tree) for number, tree in enumerate(constraints)]
     freedom = Freedom(
@@ -76,7 +76,7 @@ def constrain(
     )
     made = constrain_motion(
         take.skeleton, take.motion, wanted, blend_frames=take.count_frames(blend_s), freedom=freedom, solver=solver,
-        allowance=take.allowance,
+        budget=take.budget,
     )  # fmt: skip
     found = [
         _finding(tree, constraint, before, after)
@@ -115,7 +115,7 @@ def plant_feet(
     MappingError    where legs are not known
     EditError    where the frames do not exist
     """
-    take.allowance.spend(PER_RIG + PER_PLANTED_NUMBER * take.size)
+    take.budget.spend(PER_RIG + PER_PLANTED_NUMBER * take.size)
     rig = _Rig(take)
     feet = [_foot(rig, side) for side in ("left", "right")]
     options = PlantOptions(blend_s=blend_s, speed_m_s=speed_m_s, knee_damping_rad=knee_damping_rad)
@@ -178,7 +178,7 @@ def _named(number: int, make: Any, *arguments: Any) -> Any:
 
 def _constraint(rig: _Rig, tree: Tree) -> Constraint:
     start, stop = rig.take.frames(tree.get("frames"))
-    rig.take.allowance.spend(PER_NUMBER * (stop - start) * rig.take.size / rig.take.frame_count)
+    rig.take.budget.spend(PER_NUMBER * (stop - start) * rig.take.size / rig.take.frame_count)
     joint, top = rig.joint(tree["joint"]), tree.get("top")
     skeleton = rig.take.skeleton
     target = _target(rig, joint, tree, start, stop)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from marey_motion.clip import Clip
-from marey_motion.editing.allowance import PER_COMMAND, PER_NUMBER, Allowance
+from marey_motion.editing.compute_budget import PER_COMMAND, PER_NUMBER, ComputeBudget
 from marey_motion.editing.constraint_commands import constrain, plant_feet
 from marey_motion.editing.frames import concatenate, resample, retime, split, trim
 from marey_motion.editing.ground import find_contacts, find_ground, move_to_ground
@@ -98,7 +98,7 @@ def edit_clip(
     body : EditedBody, optional    joints of the skeleton; by default inferred from names and build
     sources : mapping of str to Clip, optional    other clips by the names that the commands use
     most_numbers : int    largest size of the motion
-    most_work : float    largest work of all commands together, in nanoseconds of one thread (`allowance`)
+    most_work : float    largest work of all commands together, in nanoseconds of one thread (`compute_budget`)
 
     Returns
     -------
@@ -111,7 +111,7 @@ def edit_clip(
     body = body or EditedBody(clip.skeleton)
     first = Take(
         motion_of(clip), clip.frame_rate_hz, body, sources or {}, most_numbers=most_numbers,
-        allowance=Allowance(most_work),
+        budget=ComputeBudget(most_work),
     )  # fmt: skip
     takes: tuple[Take, ...] = (first,)
     for number, (name, parameters) in enumerate(commands):
@@ -173,7 +173,7 @@ def apply_command(take: Take, name: str, parameters: Mapping[str, Any]) -> tuple
         inspect.signature(command).bind(take, **parameters)
     except TypeError as error:
         raise EditError(f"{error}", code="command-invalid") from None
-    take.allowance.spend(PER_COMMAND + PER_NUMBER * _size_for(take, parameters))
+    take.budget.spend(PER_COMMAND + PER_NUMBER * _size_for(take, parameters))
     made = command(take, **parameters)
     return tuple(_settled(one, take.motion) for one in (made if isinstance(made, tuple) else (made,)))
 

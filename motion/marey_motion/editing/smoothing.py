@@ -9,8 +9,8 @@ import numpy as np
 
 from marey_motion import quaternions
 from marey_motion.arrays import Floats
-from marey_motion.editing.allowance import MOST_OF_TAPS, PER_TAP
 from marey_motion.editing.borders import blended, range_weights
+from marey_motion.editing.compute_budget import MOST_OF_TAPS, PER_TAP
 from marey_motion.editing.take import Take
 from marey_motion.errors import EditError
 
@@ -67,7 +67,7 @@ def smooth(
     chosen = list(every) if joints is None else sorted({take.joint(one) for one in joints})
     columns = slice(None) if joints is None else chosen
     weights = _weights(take, method, window_s, order)
-    take.allowance.spend(take.size * min(PER_TAP * len(weights), MOST_OF_TAPS))
+    take.budget.spend(take.size * min(PER_TAP * len(weights), MOST_OF_TAPS))
     root, rotations, translations = motion.root_translations.copy(), motion.rotations.copy(), motion.translations.copy()
     if root_translation:
         root[span] += shares[:, None] * (_smooth_positions(root, weights) - root)[span]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
-from marey_motion.editing.allowance import PER_NUMBER, Allowance
+from marey_motion.editing.compute_budget import PER_NUMBER, ComputeBudget
 from marey_motion.errors import EditError, MappingError
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
@@ -97,7 +97,7 @@ class Take:
     findings : what commands found out so far
     pieces : for each split that this take went through, which of its pieces it is, from 1
     most_numbers : numbers that its motion may grow to
-    allowance : the work that the whole edit may still be
+    budget : the work that the whole edit may still be
     """
 
     motion: Motion
@@ -107,7 +107,7 @@ class Take:
     findings: tuple[EditFinding, ...] = ()
     pieces: tuple[int, ...] = ()
     most_numbers: int = MOST_NUMBERS
-    allowance: Allowance = field(default_factory=Allowance)
+    budget: ComputeBudget = field(default_factory=ComputeBudget)
 
     @property
     def skeleton(self) -> Skeleton:
@@ -242,7 +242,7 @@ class Take:
                 f"the result would have {frames:,} frames; of this skeleton {most:,} are possible",
                 code="edit-too-large",
             )
-        self.allowance.spend(PER_NUMBER * width * frames)
+        self.budget.spend(PER_NUMBER * width * frames)
 
 
 def motion_of(clip: Clip) -> Motion:

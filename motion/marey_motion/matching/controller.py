@@ -18,7 +18,7 @@ from marey_motion.matching.search import SearchIndex
 from marey_schemas.options.matching import ControllerOptions
 
 
-class Guide(Protocol):
+class Trajectory(Protocol):
     """A trajectory to follow, sampled at every tick: `marey_motion.evaluation.scenario.Reference` is one."""
 
     @property
@@ -46,7 +46,7 @@ class Guide(Protocol):
         """(T + L,)."""
 
 
-class Wish(NamedTuple):
+class TrajectoryArrays(NamedTuple):
     """A guide as compiled code takes it."""
 
     positions: Floats
@@ -56,7 +56,7 @@ class Wish(NamedTuple):
     tick_s: float
 
 
-class Rules(NamedTuple):
+class ControllerConstants(NamedTuple):
     """Options as compiled code takes them: durations in ticks, what happens in one tick worked out."""
 
     follow: int
@@ -73,7 +73,7 @@ class Rules(NamedTuple):
     tick_s: float
 
 
-class Playback(NamedTuple):
+class DatabaseArrays(NamedTuple):
     """What a controller needs of a database beside the index: its course, pose joints, normaliser and look-ahead."""
 
     successors: NDArray[np.int64]
@@ -95,7 +95,9 @@ class _Arrays(NamedTuple):
     continuing_cost: Floats
 
 
-def run_trial(database: MatchingDatabase, index: SearchIndex, guide: Guide, options: ControllerOptions) -> TrialRecord:
+def run_trial(
+    database: MatchingDatabase, index: SearchIndex, guide: Trajectory, options: ControllerOptions
+) -> TrialRecord:
     """Play motion matching along a trajectory from its first tick on.
 
     The same arguments give the same record, to the last bit.
@@ -117,7 +119,11 @@ def run_trial(database: MatchingDatabase, index: SearchIndex, guide: Guide, opti
     """
     from marey_motion.matching import controller_kernels as kernels
 
-    wish, rules, playback = wish_of(guide), rules_of(options, guide.rate_hz), playback_of(database)
+    wish, rules, playback = (
+        trajectory_arrays(guide),
+        controller_constants(options, guide.rate_hz),
+        database_arrays(database),
+    )
     if guide.rate_hz != database.options.rate_hz:
         raise MotionError(
             f"the trajectory has {guide.rate_hz:g} ticks per second, the database {database.options.rate_hz:g}"
@@ -142,7 +148,7 @@ def run_trial(database: MatchingDatabase, index: SearchIndex, guide: Guide, opti
     return TrialRecord(rate_hz=guide.rate_hz, pose_cost=costs, **arrays._asdict())
 
 
-def rules_of(options: ControllerOptions, rate_hz: float) -> Rules:
+def controller_constants(options: ControllerOptions, rate_hz: float) -> ControllerConstants:
     """Convert options to constants per tick.
 
     Parameters
@@ -160,7 +166,7 @@ def rules_of(options: ControllerOptions, rate_hz: float) -> Rules:
     """
     if options.search_every_s * rate_hz < 0.5:
         raise MotionError("a search period is one tick or longer", where="search_every_s")
-    return Rules(
+    return ControllerConstants(
         follow=("time", "path", "open_loop").index(options.follow),
         by_distance=options.selection == "pose_distance",
         period=round(options.search_every_s * rate_hz),
@@ -176,7 +182,7 @@ def rules_of(options: ControllerOptions, rate_hz: float) -> Rules:
     )
 
 
-def wish_of(guide: Guide) -> Wish:
+def trajectory_arrays(guide: Trajectory) -> TrajectoryArrays:
     """Collect the arrays of a trajectory.
 
     Parameters
@@ -195,10 +201,10 @@ def wish_of(guide: Guide) -> Wish:
     positions, headings, speeds, turn_rates = (np.ascontiguousarray(array, dtype=np.float64) for array in arrays)
     if not 1 <= guide.tick_count <= min(map(len, arrays)):
         raise MotionError(f"{guide.tick_count} ticks of a trajectory with {min(map(len, arrays))} samples")
-    return Wish(positions, headings, speeds, turn_rates, 1.0 / guide.rate_hz)
+    return TrajectoryArrays(positions, headings, speeds, turn_rates, 1.0 / guide.rate_hz)
 
 
-def playback_of(database: MatchingDatabase) -> Playback:
+def database_arrays(database: MatchingDatabase) -> DatabaseArrays:
     """Collect the arrays of a database.
 
     Parameters
@@ -211,7 +217,7 @@ def playback_of(database: MatchingDatabase) -> Playback:
     """
     rate_hz = database.options.rate_hz
     ticks = np.round(np.array(database.options.horizons_s) * rate_hz)
-    return Playback(
+    return DatabaseArrays(
         successors=database.root_motion.successors,
         steps=database.root_motion.steps,
         starts=database.starts,

@@ -10,7 +10,15 @@ import numpy as np
 
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
-from marey_motion.matching.controller import Guide, Playback, Rules, Wish, playback_of, rules_of, wish_of
+from marey_motion.matching.controller import (
+    ControllerConstants,
+    DatabaseArrays,
+    Trajectory,
+    TrajectoryArrays,
+    controller_constants,
+    database_arrays,
+    trajectory_arrays,
+)
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import TrialRecord
 from marey_motion.matching.search import SearchIndex
@@ -66,7 +74,7 @@ class Explanation:
 def explain_choice(
     database: MatchingDatabase,
     index: SearchIndex,
-    guide: Guide,
+    guide: Trajectory,
     options: ControllerOptions,
     record: TrialRecord,
     tick: int,
@@ -104,7 +112,11 @@ def explain_choice(
     for row in others:
         if not 0 <= row < database.row_count:
             raise MotionError(f"row {row} is none of the database's {database.row_count}", where="others")
-    wish, rules, playback = wish_of(guide), rules_of(options, guide.rate_hz), playback_of(database)
+    wish, rules, playback = (
+        trajectory_arrays(guide),
+        controller_constants(options, guide.rate_hz),
+        database_arrays(database),
+    )
     shown = int(record.rows[tick])
     query = _query_at(index, playback, wish, rules, record, tick)
     costs = _Costs(database, index, rules, query, shown, starting=tick == 0)
@@ -125,7 +137,12 @@ def explain_choice(
 
 
 def _query_at(
-    index: SearchIndex, playback: Playback, wish: Wish, rules: Rules, record: TrialRecord, tick: int
+    index: SearchIndex,
+    playback: DatabaseArrays,
+    wish: TrajectoryArrays,
+    rules: ControllerConstants,
+    record: TrialRecord,
+    tick: int,
 ) -> Floats:
     from marey_motion.matching import controller_kernels as kernels
 
@@ -138,7 +155,12 @@ def _query_at(
 
 
 def _chosen(
-    index: SearchIndex, playback: Playback, rules: Rules, query: Floats, record: TrialRecord, tick: int
+    index: SearchIndex,
+    playback: DatabaseArrays,
+    rules: ControllerConstants,
+    query: Floats,
+    record: TrialRecord,
+    tick: int,
 ) -> tuple[int, float, Reason]:
     """The row that was chosen, its cost, and the reason."""
     from marey_motion.matching import controller_kernels as kernels
@@ -177,7 +199,7 @@ class _Costs:
         self,
         database: MatchingDatabase,
         index: SearchIndex,
-        rules: Rules,
+        rules: ControllerConstants,
         query: Floats,
         shown: int,
         *,

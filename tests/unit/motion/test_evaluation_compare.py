@@ -5,9 +5,9 @@ from statistics import NormalDist
 
 import numpy as np
 import pytest
-from tests.support.made_databases import arc_track, made_database
 from tests.support.smaller_databases import without_sources
 from tests.support.suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
+from tests.support.synthetic_databases import arc_track, synthetic_database
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.compare import compare_results, paired_change
@@ -17,7 +17,7 @@ from marey_motion.matching.building import union_normaliser, with_normaliser
 
 @pytest.fixture(scope="module")
 def database():
-    return made_database(wandering_tracks())
+    return synthetic_database(wandering_tracks())
 
 
 @pytest.fixture(scope="module")
@@ -66,9 +66,9 @@ def test_a_trial_that_differs_in_anything_at_one_tick_is_told_with_that_tick(res
 
 def test_a_copy_under_a_lower_uid_is_told_as_the_same_motion():
     tracks = named(wandering_tracks()[:4])
-    database = made_database(tracks)
+    database = synthetic_database(tracks)
     copies = [tracks[number]._replace(uid=f"a_{number}") for number in range(4)]
-    before, after = evaluated(database), evaluated(joined(database, made_database(copies)))
+    before, after = evaluated(database), evaluated(joined(database, synthetic_database(copies)))
     found = compare_results(before, after)
     assert len(found.changed) == len(before.trials)
     assert all(change.same_motion and change.first_tick == 0 for change in found.changed)
@@ -158,7 +158,7 @@ def test_a_verdict_needs_an_interval_without_zero_and_a_metric_with_a_direction(
 
 
 def test_evaluations_under_other_conditions_are_refused_by_name(database, result):
-    fitted_anew = made_database(wandering_tracks()[:5])
+    fitted_anew = synthetic_database(wandering_tracks()[:5])
     with pytest.raises(MotionError, match="normaliser"):
         compare_results(result, evaluated(fitted_anew))
     other = OPTIONS.replace(controller=OPTIONS.controller.replace(follow="path"))
@@ -172,7 +172,10 @@ def test_evaluations_under_other_conditions_are_refused_by_name(database, result
 
 def test_one_normaliser_makes_two_databases_comparable():
     tracks = wandering_tracks()
-    before, after = made_database(tracks[:6]), made_database([*tracks[2:6], arc_track(1.0, 50.0, 6.0, uid="turn")])
+    before, after = (
+        synthetic_database(tracks[:6]),
+        synthetic_database([*tracks[2:6], arc_track(1.0, 50.0, 6.0, uid="turn")]),
+    )
     for normaliser in (before.normaliser, union_normaliser((before, after))):
         one, other = with_normaliser(before, normaliser), with_normaliser(after, normaliser)
         found = compare_results(evaluated(one), evaluated(other))

@@ -5,8 +5,8 @@ from math import radians
 
 import numpy as np
 import pytest
-from tests.support.made_databases import made_database
 from tests.support.suggestion_cases import named, wandering_tracks
+from tests.support.synthetic_databases import synthetic_database
 
 from marey_motion.alignment.dtw import warped_distance
 from marey_motion.evaluation.improvement.duplicates import find_near_duplicates, frame_points, spared_sources
@@ -67,7 +67,7 @@ def test_a_mirror_image_counts_only_where_clips_are_mirrored():
 
 
 def test_no_pair_within_the_threshold_is_passed_over():
-    database = made_database(named(wandering_tracks(10)[:10]))
+    database = synthetic_database(named(wandering_tracks(10)[:10]))
     points = frame_points(database)
     clips = database.clips
     distances = {
@@ -85,7 +85,7 @@ def test_no_pair_within_the_threshold_is_passed_over():
 
 def test_equal_documents_are_told_apart_from_others_that_are_alike():
     tracks = named(wandering_tracks()[:3])
-    database = made_database([*tracks, tracks[0]._replace(uid="copy"), tracks[1]._replace(uid="other_take")])
+    database = synthetic_database([*tracks, tracks[0]._replace(uid="copy"), tracks[1]._replace(uid="other_take")])
     contents = {"clip_000": "a", "copy": "a", "clip_001": "b", "other_take": "c"}
     clips = tuple(replace(clip, content=contents.get(clip.uid, "")) for clip in database.clips)
     found = find_near_duplicates(replace(database, clips=clips), threshold_cm=0.1)
@@ -98,7 +98,7 @@ def test_equal_documents_are_told_apart_from_others_that_are_alike():
 def test_of_each_pair_the_clip_that_is_used_less_goes_and_no_pair_is_left():
     tracks = named(wandering_tracks()[:2])
     copies = [tracks[0]._replace(uid="copy_1"), tracks[0]._replace(uid="copy_2")]
-    database = made_database([*tracks, *copies])
+    database = synthetic_database([*tracks, *copies])
     found = find_near_duplicates(database, threshold_cm=0.1)
     gone = dict(spared_sources(database, found, {"clip_000": 5, "copy_1": 90, "copy_2": 5}))
     assert set(gone) == {"clip_000", "copy_2"}
@@ -108,13 +108,13 @@ def test_of_two_clips_used_alike_the_shorter_goes_and_of_two_as_long_that_of_the
     track = named(wandering_tracks()[:1])[0]
     cut = track._replace(positions=track.positions[1:], headings=track.headings[1:], pose=track.pose[1:])
     for other, gone in ((track, "clip_001"), (cut, "clip_000")):
-        database = made_database([(track if other is track else cut), (track._replace(uid="clip_001"))])
+        database = synthetic_database([(track if other is track else cut), (track._replace(uid="clip_001"))])
         found = find_near_duplicates(database, threshold_cm=20.0)
         assert [uid for uid, _ in spared_sources(database, found, {})] == [gone]
 
 
 def test_the_search_can_be_stopped_and_tells_its_progress():
-    database = made_database(named(wandering_tracks()[:4]))
+    database = synthetic_database(named(wandering_tracks()[:4]))
     told = []
     find_near_duplicates(database, threshold_cm=3.0, progress=lambda *step: told.append(step))
     assert [step[:2] for step in told] == [(1, 4), (2, 4), (3, 4), (4, 4)]

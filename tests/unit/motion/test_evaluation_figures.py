@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.support.drawn_figures import is_sound, rows_of
-from tests.support.evaluation_results import SMALL, evaluated, made_up, some_coverage, wandering
+from tests.support.evaluation_results import SMALL, evaluated, some_coverage, synthetic_result, wandering
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import Windows, coverage_of
@@ -31,12 +31,12 @@ SWITCHING = "switching v=2 w=50"
 
 @pytest.fixture(scope="module")
 def result():
-    return made_up()
+    return synthetic_result()
 
 
 @pytest.fixture(scope="module")
 def other():
-    return made_up(seed=5, clips=9, sway_m=0.05)
+    return synthetic_result(seed=5, clips=9, sway_m=0.05)
 
 
 @pytest.mark.slow
@@ -85,7 +85,7 @@ def test_the_files_of_a_figure_are_its_pictures_and_its_data(result):
 def test_all_figures_of_a_result_are_drawn_but_those_it_has_no_trials_or_records_for(result):
     assert list(draw_figures(result)) == list(FIGURES)
     assert not set(draw_figures(replace(result, records=()))) & set(ONE_TRIAL)
-    circles = made_up(SMALL.replace(families=("circle",)))
+    circles = synthetic_result(SMALL.replace(families=("circle",)))
     assert set(FIGURES) - set(draw_figures(circles)) == {"scenario-switching"}
 
 
@@ -102,7 +102,7 @@ def test_points_are_the_windows_of_the_coverage(result):
 
 
 def test_of_very_many_windows_evenly_spaced_ones_are_drawn():
-    big = made_up(clips=300, frames=500)
+    big = synthetic_result(clips=300, frames=500)
     figure = draw_figure("points", big)
     drawn = figure.data["tables"]["points"]["speed_m_s"]
 
@@ -276,7 +276,7 @@ def test_the_dots_hold_all_displayed_frames_and_the_lines_all_jumps(result):
 
 
 def test_lines_of_many_clips_are_joined_rather_than_left_out():
-    big = made_up(clips=40, unused=0, seed=3)
+    big = synthetic_result(clips=40, unused=0, seed=3)
     figure = draw_figure("clip-graph", big)
     shown = set(figure.data["tables"]["frames"]["clip"])
     uids = [clip.uid for clip in big.clips]
@@ -385,24 +385,26 @@ def without_transitions(result):
 LITTLE = {
     "one clip": lambda: tiny((DatabaseClip("only", "only", "", 0, 900),)),
     "clips of one frame": lambda: tiny(tuple(DatabaseClip(f"c{i}", f"c{i}", "", i, i + 1) for i in range(3))),
-    "no transitions": lambda: without_transitions(made_up(clips=1, unused=0)),
+    "no transitions": lambda: without_transitions(synthetic_result(clips=1, unused=0)),
     "no windows": lambda: tiny((DatabaseClip("short", "short", "", 0, 30),), covered=False),
-    "one trial": lambda: made_up(
+    "one trial": lambda: synthetic_result(
         EvaluationOptions(speeds_m_s=(1.5,), turn_rates_deg_s=(0.0,), duration_s=3.0, families=("circle",))
     ),
-    "one speed": lambda: made_up(EvaluationOptions(speeds_m_s=(1.5,), turn_rates_deg_s=(-50.0, 50.0), duration_s=6.0)),
+    "one speed": lambda: synthetic_result(
+        EvaluationOptions(speeds_m_s=(1.5,), turn_rates_deg_s=(-50.0, 50.0), duration_s=6.0)
+    ),
     "no tick moved": lambda: replace(
-        (still := made_up()), records=tuple(replace(r, positions=0.0 * r.positions) for r in still.records)
+        (still := synthetic_result()), records=tuple(replace(r, positions=0.0 * r.positions) for r in still.records)
     ),
     "unknown numbers": lambda: replace(
-        (known := made_up()),
+        (known := synthetic_result()),
         trials=tuple(
             replace(each, metrics=dict.fromkeys(each.metrics)) if index % 2 else each
             for index, each in enumerate(known.trials)
         ),
     ),
     "costs unknown": lambda: replace(
-        (known := made_up()), records=tuple(replace(r, pose_cost=np.nan * r.pose_cost) for r in known.records)
+        (known := synthetic_result()), records=tuple(replace(r, pose_cost=np.nan * r.pose_cost) for r in known.records)
     ),
 }
 
@@ -444,7 +446,7 @@ def test_of_a_clip_that_stands_rounding_is_not_shown_as_motion():
 
 def test_names_of_clips_are_drawn_as_they_are_but_for_signs_that_cannot_be():
     names = (r"cost $5 and \frac{1}{0} ^_ {", "<b>bold</b> & more", "line\nbreak \x00\x1b", "x" * 5000, "")
-    for figure in draw_figures(made_up(names=names)).values():
+    for figure in draw_figures(synthetic_result(names=names)).values():
         is_sound(figure)
         assert "<b>" not in figure.svg
     assert shortened("a" * 20 + "b" * 20, 11) == "aaaaa…bbbbb"[:11]
@@ -473,7 +475,7 @@ def test_labels_tell_clips_apart_however_long_their_names_are():
 
 def test_a_clip_has_the_same_label_in_the_graphs_of_both_results():
     takes = [f"set/walks/dataset-1_walk-left_feminine_{take:03d}" for take in range(10)]
-    before = made_up(names=takes)
+    before = synthetic_result(names=takes)
     other = replace(before.clips[0], uid="new@1", name="more/dataset-2_walk-turn-left_active_001")
     svg = draw_figure("clip-graph", before, other=replace(before, clips=(other, *before.clips[1:]))).svg
     labels = re.findall(r">([^<>]+)</text>", svg)
@@ -486,7 +488,7 @@ def test_bars_of_usage_are_called_by_what_tells_their_clips_apart():
     names = [
         f"set/walks/walk-{side}_feminine_before_noon_{take:03d}" for side in ("left", "right") for take in range(5)
     ]
-    drawn = draw_figure("usage", made_up(names=names)).svg
+    drawn = draw_figure("usage", synthetic_result(names=names)).svg
     assert ">left_feminine_before_noon_000<" in drawn
     assert ">right_feminine_before_noon_000<" in drawn
     assert ">Transitions<" in drawn

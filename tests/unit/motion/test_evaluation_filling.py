@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.made_databases import arc_track, made_database
 from tests.support.smaller_databases import without_sources
 from tests.support.suggestion_cases import OPTIONS, evaluated, named, with_mirrored
+from tests.support.synthetic_databases import arc_track, synthetic_database
 
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.improvement.filling import plan_fillings, rank_fillings
@@ -18,11 +18,11 @@ THRESHOLD = 1.5
 
 def straight_set():
     """Walks straight ahead at both speeds of the grid, and no turns."""
-    return made_database(named([arc_track(1.0, 0.0, 6.0), arc_track(2.0, 0.0, 6.0)]))
+    return synthetic_database(named([arc_track(1.0, 0.0, 6.0), arc_track(2.0, 0.0, 6.0)]))
 
 
 def others(**tracks):
-    return made_database([track._replace(uid=uid) for uid, track in sorted(tracks.items())])
+    return synthetic_database([track._replace(uid=uid) for uid, track in sorted(tracks.items())])
 
 
 def ranked(database, **collections):
@@ -63,7 +63,7 @@ def test_a_cell_that_is_filled_to_the_last_frame_is_full_however_its_seconds_are
     names = ("positions", "headings", "pose")
     part, rest = (turn._replace(**{name: getattr(turn, name)[:frames] for name in names}) for frames in (80, 100))
     assert 1.0 - 20 / 60 > 40 / 60
-    database = made_database(named([arc_track(1.0, 0.0, 6.0), arc_track(2.0, 0.0, 6.0), part]))
+    database = synthetic_database(named([arc_track(1.0, 0.0, 6.0), arc_track(2.0, 0.0, 6.0), part]))
     outside = others(rest=rest)
     (filling,) = ranked(database, outside=outside)
     coverage = measure_coverage(database, OPTIONS)
@@ -100,7 +100,7 @@ def test_clips_of_another_skeleton_need_a_retarget_and_come_last():
 
 def test_clips_that_the_set_has_already_are_no_candidates():
     turn = arc_track(1.0, 50.0, 1.5)
-    database = made_database([arc_track(1.0, 0.0, 6.0, uid="a"), turn._replace(uid="left")])
+    database = synthetic_database([arc_track(1.0, 0.0, 6.0, uid="a"), turn._replace(uid="left")])
     assert ranked(database, outside=others(left=turn)) == ()
 
 

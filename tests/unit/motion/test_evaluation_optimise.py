@@ -4,9 +4,9 @@ import json
 from itertools import pairwise
 
 import pytest
-from tests.support.made_databases import arc_track, made_database
 from tests.support.smaller_databases import without_sources
 from tests.support.suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
+from tests.support.synthetic_databases import arc_track, synthetic_database
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.objective import headline_means, objective_value
@@ -24,7 +24,7 @@ AIM = OptimisationOptions(objective=ObjectiveOptions(seconds=0.002), max_steps=6
 def pool():
     """A set of wandering clips, and two turns that may be added."""
     turns = [arc_track(2.0, turn_rate, 6.0, uid=uid) for uid, turn_rate in zip(TURNS, (50.0, -50.0), strict=True)]
-    return made_database([*wandering_tracks(), *turns])
+    return synthetic_database([*wandering_tracks(), *turns])
 
 
 @pytest.fixture
@@ -81,7 +81,9 @@ def test_no_candidate_would_have_been_better_at_any_step(pool):
 
 
 def test_a_clip_that_helps_is_added_where_the_budget_of_data_allows(pool):
-    straight = made_database(named([arc_track(1.0, 0.0, 6.0), arc_track(2.0, 0.0, 6.0), arc_track(2.0, 50.0, 6.0)]))
+    straight = synthetic_database(
+        named([arc_track(1.0, 0.0, 6.0), arc_track(2.0, 0.0, 6.0), arc_track(2.0, 50.0, 6.0)])
+    )
     aim = OptimisationOptions(objective=ObjectiveOptions(seconds=0.0))
     free = optimise(Resimulation(straight, OPTIONS), aim, absent=["clip_002"])
     assert ("add", ("clip_002",)) in [(step.action, step.sources) for step in free.steps]

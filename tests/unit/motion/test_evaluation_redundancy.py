@@ -2,9 +2,9 @@
 
 import pytest
 from pydantic import ValidationError
-from tests.support.made_databases import made_database
 from tests.support.smaller_databases import without_sources
 from tests.support.suggestion_cases import OPTIONS, evaluated, named, wandering_tracks, with_mirrored
+from tests.support.synthetic_databases import synthetic_database
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.objective import HEADLINES, headline_means, objective_value
@@ -16,7 +16,7 @@ from marey_schemas.options.improvement import ObjectiveOptions
 
 @pytest.fixture(scope="module")
 def database():
-    return made_database(wandering_tracks())
+    return synthetic_database(wandering_tracks())
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_a_clip_and_its_mirrored_twin_go_together():
 
 
 def test_the_last_clip_is_never_taken():
-    simulation = Resimulation(made_database(named(wandering_tracks(2)[:2])), OPTIONS)
+    simulation = Resimulation(synthetic_database(named(wandering_tracks(2)[:2])), OPTIONS)
     assert len(plan_removals(simulation, 5, ObjectiveOptions())) <= 1
 
 

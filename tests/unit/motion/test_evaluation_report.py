@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.evaluation_results import made_up
+from tests.support.evaluation_results import synthetic_result
 from tests.support.report_pages import HOSTILE, is_sound
 
 from marey_motion.evaluation.compare import compare_results
@@ -31,7 +31,7 @@ from marey_schemas.wording import counted
 
 @pytest.fixture(scope="module")
 def result():
-    return made_up(seed=4, turns_deg_s=(-90.0, 20.0))
+    return synthetic_result(seed=4, turns_deg_s=(-90.0, 20.0))
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_pictures_and_tables_can_be_read_aloud(result, figures):
 
 @pytest.mark.slow
 def test_names_of_clips_and_titles_are_shown_and_never_run(result):
-    hostile = made_up(names=HOSTILE, unused=10, seed=2)
+    hostile = synthetic_result(names=HOSTILE, unused=10, seed=2)
     page = is_sound(render_report(hostile, title=HOSTILE[1]))
 
     for name in HOSTILE[:3]:
@@ -112,7 +112,7 @@ def test_all_trials_and_clips_are_listed_with_their_numbers(page, result):
 
 
 def test_the_suite_s_numbers_stand_beside_the_baseline_s(result, figures):
-    base = replace(made_up(seed=9, sway_m=0.02), records=())
+    base = replace(synthetic_result(seed=9, sway_m=0.02), records=())
     page = is_sound(render_report(replace(result, baseline=base), title="t", figures=figures))
 
     assert "generated baseline" in page.text
@@ -135,7 +135,7 @@ def test_clips_that_were_never_used_are_named(page, result):
 
     assert len(unused) == 2
     assert all(name in told for name in unused)
-    assert "Every clip was used" in is_sound(render_report(made_up(unused=0), title="t", figures={})).text
+    assert "Every clip was used" in is_sound(render_report(synthetic_result(unused=0), title="t", figures={})).text
 
 
 def test_digests_and_options_are_there_to_repeat_it(page, result):
@@ -147,7 +147,7 @@ def test_digests_and_options_are_there_to_repeat_it(page, result):
 
 @pytest.mark.slow
 def test_a_report_of_a_thousand_clips_stays_small():
-    big = made_up(clips=1_000, frames=1_000, unused=300)
+    big = synthetic_result(clips=1_000, frames=1_000, unused=300)
     source = render_report(big, title="big")
 
     assert len(source.encode()) < 5_000_000
@@ -306,7 +306,7 @@ def test_a_comparison_says_whether_it_helped(result):
 
 @pytest.mark.slow
 def test_a_comparison_shows_what_came_went_and_changed(result):
-    after = made_up(seed=4, clips=10, turns_deg_s=(-90.0, 20.0), sway_m=0.05)
+    after = synthetic_result(seed=4, clips=10, turns_deg_s=(-90.0, 20.0), sway_m=0.05)
     after = replace(after, clips=(replace(after.clips[0], uid="new@1", name="newcomer"), *after.clips[1:]))
     page = is_sound(render_comparison(result, after, title="Change", labels=("old", "new")))
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.made_databases import made_database
 from tests.support.smaller_databases import without_rows, without_sources
 from tests.support.suggestion_cases import named, same_to_the_bit, simulated, wandering_tracks, with_mirrored
+from tests.support.synthetic_databases import synthetic_database
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.selection import clips_by_source, joined, rows_of_sources, same_skeleton
@@ -22,12 +22,12 @@ def assert_equal(one, other):
 
 def test_a_database_without_clips_is_the_one_made_without_them():
     tracks = wandering_tracks()
-    whole = made_database(tracks)
-    expected = made_database([*tracks[:2], *tracks[3:]], normaliser=whole.normaliser)
+    whole = synthetic_database(tracks)
+    expected = synthetic_database([*tracks[:2], *tracks[3:]], normaliser=whole.normaliser)
     assert_equal(without_sources(whole, ["clip_002"]), expected)
 
 
-def test_a_clip_goes_with_its_mirrored_twin():
+def test_a_clip_goes_with_its_mirrored_copy():
     tracks = wandering_tracks(3)
     whole = with_mirrored(tracks)
     assert clips_by_source(whole.clips)["clip_001"] == (2, 3)
@@ -41,15 +41,15 @@ def test_a_clip_goes_with_its_mirrored_twin():
 
 def test_two_databases_joined_are_the_one_made_of_all_clips():
     tracks = wandering_tracks()
-    whole = made_database(tracks)
-    first, second = (made_database(tracks[start::2], normaliser=whole.normaliser) for start in (0, 1))
+    whole = synthetic_database(tracks)
+    first, second = (synthetic_database(tracks[start::2], normaliser=whole.normaliser) for start in (0, 1))
     assert_equal(joined(first, second), whole)
-    assert joined(first, made_database(tracks[1::2])).normaliser is first.normaliser
+    assert joined(first, synthetic_database(tracks[1::2])).normaliser is first.normaliser
 
 
 def test_a_clip_without_translations_joins_one_that_has_them_by_its_offsets():
     tracks = wandering_tracks()
-    first, second = made_database(tracks[:2]), made_database(tracks[2:])
+    first, second = synthetic_database(tracks[:2]), synthetic_database(tracks[2:])
     moved = np.random.default_rng(0).normal(size=(second.row_count, 1, 3)).astype(np.float32)
     both = joined(first, replace(second, translations=moved, translated_joints=(4,)))
     assert both.translated_joints == (4,)
@@ -58,7 +58,7 @@ def test_a_clip_without_translations_joins_one_that_has_them_by_its_offsets():
 
 
 def test_rows_taken_out_of_a_clip_leave_two_clips_that_end_where_they_were():
-    database = made_database(named(wandering_tracks()[:3]))
+    database = synthetic_database(named(wandering_tracks()[:3]))
     clip = database.clips[1]
     removed = np.zeros(database.row_count, dtype=bool)
     removed[clip.start + 40 : clip.start + 90] = True
@@ -72,20 +72,20 @@ def test_rows_taken_out_of_a_clip_leave_two_clips_that_end_where_they_were():
 
 
 def test_taking_nothing_away_changes_no_trial():
-    database = made_database(wandering_tracks(4))
+    database = synthetic_database(wandering_tracks(4))
     same = without_rows(database, np.zeros(database.row_count, dtype=bool))
     assert same_to_the_bit(database, simulated(database), same, simulated(same))
 
 
 def test_what_does_not_belong_together_is_refused():
     tracks = wandering_tracks()
-    database = made_database(tracks)
+    database = synthetic_database(tracks)
     with pytest.raises(MotionError, match="no clip nobody"):
         rows_of_sources(database.clips, ["nobody"])
     with pytest.raises(MotionError, match="no clip is left"):
         without_sources(database, list(clips_by_source(database.clips)))
     with pytest.raises(MotionError, match="both databases have the clip clip_000"):
-        joined(database, made_database(tracks[:1]))
+        joined(database, synthetic_database(tracks[:1]))
     with pytest.raises(MotionError, match="same options"):
         joined(database, replace(database, options=database.options.replace(end_policy="trim")))
     skeleton = replace(database.body.skeleton, offsets=database.body.skeleton.offsets * 1.1)

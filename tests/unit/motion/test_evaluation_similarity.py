@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.made_databases import arc_track, made_database
 from tests.support.suggestion_cases import OPTIONS, evaluated, named, wandering_tracks, with_mirrored
+from tests.support.synthetic_databases import arc_track, synthetic_database
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import measure_coverage
@@ -36,7 +36,7 @@ def brute_force(database, rows):
 
 
 def test_the_nearest_pose_of_another_clip_is_found_for_every_frame():
-    database = made_database(wandering_tracks())
+    database = synthetic_database(wandering_tracks())
     coverage = measure_coverage(database, OPTIONS)
     rows = np.unique(window_rows(database, coverage))[::3]
     sources = source_of_rows(database)[rows]
@@ -45,7 +45,7 @@ def test_the_nearest_pose_of_another_clip_is_found_for_every_frame():
 
 
 def test_each_cell_is_measured_by_its_own_frames_alone():
-    database = made_database(wandering_tracks(12))
+    database = synthetic_database(wandering_tracks(12))
     coverage = measure_coverage(database, OPTIONS)
     found = measure_similarity(database, coverage, threshold_m=4.0)
     rows, cells = window_rows(database, coverage), window_cells(coverage)
@@ -66,13 +66,13 @@ def test_each_cell_is_measured_by_its_own_frames_alone():
 
 
 def test_a_window_belongs_to_the_frame_it_begins_with():
-    database = made_database(named([arc_track(1.0, 0.0, 3.0), arc_track(2.0, 50.0, 4.0)]))
+    database = synthetic_database(named([arc_track(1.0, 0.0, 3.0), arc_track(2.0, 50.0, 4.0)]))
     rows = window_rows(database, measure_coverage(database, OPTIONS))
     assert rows.tolist() == [*range(120), *range(180, 180 + 180)]
 
 
 def test_frames_within_the_threshold_are_counted_as_blendable():
-    database = made_database(straight_walks())
+    database = synthetic_database(straight_walks())
     coverage = measure_coverage(database, OPTIONS)
     cell = np.unravel_index(np.argmax(coverage.seconds), coverage.seconds.shape)
     assert measure_similarity(database, coverage, threshold_m=1e3).blendable_share[cell] == 1.0
@@ -83,8 +83,8 @@ def test_frames_within_the_threshold_are_counted_as_blendable():
     )
 
 
-def test_a_cell_with_one_clip_has_nothing_to_blend_with_and_neither_has_its_mirrored_twin():
-    alone = made_database(straight_walks(1))
+def test_a_cell_with_one_clip_has_nothing_to_blend_with_and_neither_has_its_mirrored_copy():
+    alone = synthetic_database(straight_walks(1))
     twins = with_mirrored(straight_walks(1))
     for database in (alone, twins):
         found = measure_similarity(database, measure_coverage(database, OPTIONS), threshold_m=1e3)
@@ -98,14 +98,14 @@ def test_dense_data_that_does_not_meet_is_told_from_data_that_does():
     threshold = 1.5
     shares = []
     for tracks in (near, far):
-        database = made_database(tracks)
+        database = synthetic_database(tracks)
         shares.append(measure_similarity(database, measure_coverage(database, OPTIONS), threshold).share)
     assert shares[0] == 1.0
     assert shares[1] == 0.0
 
 
 def test_of_a_huge_cell_evenly_chosen_frames_are_measured_against_all():
-    database = made_database(straight_walks(3))
+    database = synthetic_database(straight_walks(3))
     coverage = measure_coverage(database, OPTIONS)
     few, all_frames = (measure_similarity(database, coverage, 1.0, most_frames=most) for most in (100, 10_000))
     cell = np.unravel_index(np.argmax(all_frames.frames), all_frames.frames.shape)
@@ -117,7 +117,7 @@ def test_of_a_huge_cell_evenly_chosen_frames_are_measured_against_all():
 
 
 def test_the_usual_threshold_is_the_median_cost_of_the_switches_that_were_made():
-    result = evaluated(made_database(wandering_tracks()))
+    result = evaluated(synthetic_database(wandering_tracks()))
     costs = [
         record.pose_cost[tick - 1]
         for record in result.records
@@ -130,7 +130,7 @@ def test_the_usual_threshold_is_the_median_cost_of_the_switches_that_were_made()
 
 
 def test_thresholds_that_are_no_distance_are_refused_and_the_work_can_be_stopped():
-    database = made_database(straight_walks())
+    database = synthetic_database(straight_walks())
     coverage = measure_coverage(database, OPTIONS)
     with pytest.raises(MotionError, match="threshold_m"):
         measure_similarity(database, coverage, 0.0)

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.made_databases import arc_track, made_database
 from tests.support.smaller_databases import without_rows, without_sources
 from tests.support.suggestion_cases import (
     UNWANTED,
@@ -15,6 +14,7 @@ from tests.support.suggestion_cases import (
     simulated,
     wandering_tracks,
 )
+from tests.support.synthetic_databases import arc_track, synthetic_database
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.compare import compare_results
@@ -39,12 +39,12 @@ from marey_schemas.options.improvement import SuggestionOptions
 @pytest.fixture(scope="module")
 def database():
     tracks = wandering_tracks()
-    return made_database([*tracks, tracks[0]._replace(uid="copy_of_clip_000")])
+    return synthetic_database([*tracks, tracks[0]._replace(uid="copy_of_clip_000")])
 
 
 @pytest.fixture(scope="module")
 def outside():
-    return made_database(named([arc_track(1.0, 50.0, 5.0), arc_track(2.0, -50.0, 5.0)], "turn"))
+    return synthetic_database(named([arc_track(1.0, 50.0, 5.0), arc_track(2.0, -50.0, 5.0)], "turn"))
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.made_databases import arc_track, made_database
 from tests.support.smaller_databases import without_rows, without_sources
 from tests.support.suggestion_cases import (
     OPTIONS,
@@ -15,6 +14,7 @@ from tests.support.suggestion_cases import (
     wandering_tracks,
     with_mirrored,
 )
+from tests.support.synthetic_databases import arc_track, synthetic_database
 
 from marey_motion.evaluation.improvement.resimulation import needed_rows
 from marey_motion.evaluation.improvement.unused import find_unused
@@ -41,7 +41,7 @@ def unused_of(database, options=OPTIONS):
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_removing_all_that_is_unused_leaves_every_record_bit_identical(variant):
     options = OPTIONS.replace(controller=OPTIONS.controller.replace(**VARIANTS[variant]))
-    database = made_database(wandering_tracks())
+    database = synthetic_database(wandering_tracks())
     records, unused = unused_of(database, options)
     assert unused.clips
     assert unused.ranges
@@ -59,7 +59,7 @@ def test_frames_that_a_search_may_not_choose_stay_in_one_clip_with_the_frame_tha
     track = arc_track(1.0, 0.0, 12.0)
     frames = np.arange(len(track.headings))
     pose = np.sin(2 * np.pi * frames[:, None] / 110 + 0.7 * np.arange(15))
-    database = made_database([track._replace(pose=pose)])
+    database = synthetic_database([track._replace(pose=pose)])
     farther = np.where(frames < 300, 1e-3 * (2 - frames / 300), np.where(frames < 420, 0.0, 0.3))
     features = database.features.copy()
     features[:, 15:21] += farther[:, None]
@@ -77,7 +77,7 @@ def test_frames_that_a_search_may_not_choose_stay_in_one_clip_with_the_frame_tha
 
 
 def test_clips_that_no_trial_displays_are_told_with_their_length():
-    database = made_database(wandering_tracks())
+    database = synthetic_database(wandering_tracks())
     records, unused = unused_of(database)
     assert {clip.source for clip in unused.clips} >= set(UNWANTED)
     assert all(clip.seconds == 4.0 for clip in unused.clips if clip.source in UNWANTED)
@@ -89,7 +89,7 @@ def test_clips_that_no_trial_displays_are_told_with_their_length():
 
 
 def test_ranges_keep_their_distance_from_every_frame_that_is_needed():
-    database = made_database(wandering_tracks())
+    database = synthetic_database(wandering_tracks())
     records, unused = unused_of(database)
     index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
     needed = np.unique(
@@ -113,7 +113,7 @@ def test_ranges_keep_their_distance_from_every_frame_that_is_needed():
 
 
 def test_the_times_of_a_range_are_those_of_the_recording_and_not_of_its_first_row():
-    database = made_database(wandering_tracks())
+    database = synthetic_database(wandering_tracks())
     later = replace(database, clips=tuple(replace(clip, first_s=2.5) for clip in database.clips))
     parts, moved = (
         find_unused(one, suite_trials(OPTIONS), simulated(one), OPTIONS).ranges for one in (database, later)
@@ -141,7 +141,7 @@ def places_of(database, record):
 
 def test_a_loop_that_wraps_is_never_cut():
     tracks = [arc_track(1.5, 0.0, 12.0, loop=True), arc_track(1.5, 50.0, 12.0, loop=True), arc_track(2.0, 0.0, 8.0)]
-    database = made_database(named(tracks), DatabaseOptions(end_policy="loop"))
+    database = synthetic_database(named(tracks), DatabaseOptions(end_policy="loop"))
     records, unused = unused_of(database)
     assert not {part.source for part in unused.ranges} & {"clip_000", "clip_001"}
     if unused.rows.any():
@@ -151,7 +151,7 @@ def test_a_loop_that_wraps_is_never_cut():
 
 def test_what_only_the_last_search_chose_is_needed_too():
     """A trial that ends with a switch never displays what was chosen, but its cost is recorded."""
-    database = made_database(wandering_tracks())
+    database = synthetic_database(wandering_tracks())
     index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
     trial = suite_trials(OPTIONS)[0]
     (record,) = run_suite(database, OPTIONS, trials=[trial])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.made_databases import arc_track, index_of, made_database, random_tracks
+from tests.support.synthetic_databases import arc_track, index_of, random_tracks, synthetic_database
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.scenario import Trial, reference
@@ -13,7 +13,7 @@ from marey_motion.matching.explain import Explanation, explain_choice
 from marey_motion.matching.record import Status, TrialRecord
 from marey_schemas.options.matching import ControllerOptions
 
-DATABASE = made_database(random_tracks(12, seed=21))
+DATABASE = synthetic_database(random_tracks(12, seed=21))
 INDEX = index_of(DATABASE)
 PATH = reference(Trial("circle", 2.0, 1.0, duration_s=10.0))
 
@@ -107,7 +107,7 @@ def test_between_searches_the_clip_just_goes_on():
 
 
 def test_the_end_of_a_clip_leaves_nothing_to_go_on():
-    database = made_database([arc_track(2.0, 0.0, 5.0)])
+    database = synthetic_database([arc_track(2.0, 0.0, 5.0)])
     options = ControllerOptions(continuing_bias=-1000.0)
     path = reference(Trial("circle", 2.0, 0.0))
     record = run_trial(database, index_of(database), path, options)
@@ -156,7 +156,7 @@ def test_ticks_and_rows_that_there_are_not_are_refused():
 
 def test_a_record_of_another_database_is_refused():
     options, record = played()
-    smaller = made_database(random_tracks(1, seed=1))
+    smaller = synthetic_database(random_tracks(1, seed=1))
     far = replace(record, rows=record.rows + 10_000)
 
     with pytest.raises(MotionError, match="another database"):

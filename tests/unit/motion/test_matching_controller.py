@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from tests.support.made_databases import (
+from tests.support.plain_controller import run_plainly
+from tests.support.synthetic_databases import (
     EXACT,
     arc_track,
     circle,
     database_clips,
     index_of,
-    made_database,
     offsets,
     play,
     random_tracks,
     switches,
+    synthetic_database,
 )
-from tests.support.plain_controller import run_plainly
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.scenario import Reference, Trial, reference
@@ -40,7 +40,7 @@ from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
     ids=["default", "biased", "eager"],
 )
 def test_the_compiled_loop_does_what_a_plain_one_does(options, follow):
-    database = made_database(random_tracks(12, seed=5))
+    database = synthetic_database(random_tracks(12, seed=5))
     options = options.replace(follow=follow)
     for trial in (circle(2.2, 60.0), Trial("switching", 1.5, -0.4, approach_s=1.05, switch_every_s=1.35)):
         record = play(database, trial, options)
@@ -60,7 +60,7 @@ def test_the_compiled_loop_does_what_a_plain_one_does(options, follow):
 
 def test_loops_and_ends_are_played_as_a_plain_loop_plays_them():
     tracks = [track._replace(loop=number % 2 == 0) for number, track in enumerate(random_tracks(5, seed=8))]
-    database = made_database(tracks, DatabaseOptions(end_policy="loop"))
+    database = synthetic_database(tracks, DatabaseOptions(end_policy="loop"))
     options = ControllerOptions(continuing_bias=-50.0)
 
     record = play(database, circle(2.0, 40.0), options)
@@ -85,7 +85,7 @@ def searched(record: TrialRecord) -> list[int]:
 
 def test_a_trial_starts_on_the_row_whose_trajectory_fits_whatever_its_pose():
     slow, fast = arc_track(1.0, 0.0, 10.0), arc_track(3.0, 0.0, 10.0)
-    database = made_database([slow, fast._replace(pose=fast.pose + 100.0)])
+    database = synthetic_database([slow, fast._replace(pose=fast.pose + 100.0)])
 
     record = play(database, circle(3.0, 0.0))
 
@@ -95,7 +95,7 @@ def test_a_trial_starts_on_the_row_whose_trajectory_fits_whatever_its_pose():
 
 
 def test_searches_come_at_multiples_of_the_period():
-    database = made_database([arc_track(2.0, 0.0, 60.0)])
+    database = synthetic_database([arc_track(2.0, 0.0, 60.0)])
 
     record = play(database, circle(2.0, 0.0, duration_s=2.0), EXACT.replace(search_every_s=0.25))
 
@@ -104,7 +104,7 @@ def test_searches_come_at_multiples_of_the_period():
 
 
 def test_a_jump_of_the_wished_speed_is_searched_for_at_once():
-    database = made_database([arc_track(1.0, 0.0, 60.0), arc_track(4.0, 0.0, 60.0)])
+    database = synthetic_database([arc_track(1.0, 0.0, 60.0), arc_track(4.0, 0.0, 60.0)])
     trial = Trial("switching", 1.0, 0.0, approach_s=1.0, duration_s=4.0, switch_every_s=1.25)
 
     record = play(database, trial, EXACT.replace(search_every_s=0.5, follow="open_loop"))
@@ -116,7 +116,7 @@ def test_a_jump_of_the_wished_speed_is_searched_for_at_once():
 
 @pytest.mark.parametrize(("turn_deg", "at_once"), [(29.0, []), (31.0, [100])])
 def test_a_jump_of_the_wished_direction_is_searched_for_at_once_however_slow(turn_deg, at_once):
-    database = made_database([arc_track(0.3, 0.0, 60.0)])
+    database = synthetic_database([arc_track(0.3, 0.0, 60.0)])
     path = reference(circle(0.3, 0.0, duration_s=1.0))
     turned = path.headings + np.where(np.arange(len(path.headings)) >= 100, np.radians(turn_deg), 0.0)
 
@@ -126,7 +126,7 @@ def test_a_jump_of_the_wished_direction_is_searched_for_at_once_however_slow(tur
 
 
 def test_jumps_are_searched_for_at_most_once_in_a_period():
-    database = made_database([arc_track(1.0, 0.0, 60.0), arc_track(4.0, 0.0, 60.0)])
+    database = synthetic_database([arc_track(1.0, 0.0, 60.0), arc_track(4.0, 0.0, 60.0)])
     trial = Trial("switching", 1.0, 0.0, approach_s=1.0, duration_s=1.0, switch_every_s=5 / 60)
 
     record = play(database, trial, EXACT.replace(search_every_s=0.5))
@@ -136,7 +136,7 @@ def test_jumps_are_searched_for_at_most_once_in_a_period():
 
 
 def test_at_the_end_of_a_clip_another_row_must_be_chosen():
-    database = made_database([arc_track(2.0, 0.0, 5.05)])
+    database = synthetic_database([arc_track(2.0, 0.0, 5.05)])
     options = EXACT.replace(search_every_s=0.5, continuing_bias=-1000.0)
 
     record = play(database, circle(2.0, 0.0, duration_s=7.0), options)
@@ -151,7 +151,7 @@ def test_at_the_end_of_a_clip_another_row_must_be_chosen():
 
 def test_a_loop_goes_round_without_being_forced_to_search():
     track = arc_track(1.0, 90.0, 4.0, loop=True)
-    database = made_database([track], DatabaseOptions(end_policy="loop"))
+    database = synthetic_database([track], DatabaseOptions(end_policy="loop"))
     options = EXACT.replace(follow="open_loop", continuing_bias=-1000.0)
 
     record = play(database, circle(1.0, 90.0, approach_s=0.0, duration_s=20.0), options)
@@ -164,7 +164,7 @@ def test_a_loop_goes_round_without_being_forced_to_search():
 
 
 def test_a_clip_not_marked_as_a_loop_ends_even_where_loops_go_round():
-    database = made_database([arc_track(1.0, 90.0, 4.0)], DatabaseOptions(end_policy="loop"))
+    database = synthetic_database([arc_track(1.0, 90.0, 4.0)], DatabaseOptions(end_policy="loop"))
 
     record = play(database, circle(1.0, 90.0, approach_s=0.0), EXACT.replace(continuing_bias=-1000.0))
 
@@ -173,7 +173,7 @@ def test_a_clip_not_marked_as_a_loop_ends_even_where_loops_go_round():
 
 
 def test_going_on_wins_unless_a_switch_is_cheaper_by_more_than_the_margin():
-    database = made_database([arc_track(2.0, 0.0, 60.0), arc_track(2.0, 50.0, 60.0)])
+    database = synthetic_database([arc_track(2.0, 0.0, 60.0), arc_track(2.0, 50.0, 60.0)])
     trial = circle(2.0, 50.0)
     eager = play(database, trial, EXACT.replace(follow="open_loop"))
     assert switches(eager) >= 1
@@ -190,7 +190,7 @@ def test_going_on_wins_unless_a_switch_is_cheaper_by_more_than_the_margin():
 
 
 def test_a_bias_towards_going_on_is_a_margin_and_its_opposite_makes_restless():
-    database = made_database(random_tracks(20, seed=7))
+    database = synthetic_database(random_tracks(20, seed=7))
     trial = circle(2.0, 60.0)
 
     margin = play(database, trial, EXACT.replace(switch_margin=0.5))
@@ -202,7 +202,7 @@ def test_a_bias_towards_going_on_is_a_margin_and_its_opposite_makes_restless():
 
 
 def test_rows_near_the_current_one_are_left_out_of_the_search_on_request():
-    database = made_database(random_tracks(12, seed=9))
+    database = synthetic_database(random_tracks(12, seed=9))
     trial = circle(2.0, 60.0)
 
     free = play(database, trial, EXACT)
@@ -225,7 +225,7 @@ def test_rows_near_the_current_one_are_left_out_of_the_search_on_request():
 def test_the_window_bars_as_many_frames_on_either_side_and_none_of_another_clip(choosable, chosen):
     """Ten frames are barred about the row 206. All rows are alike: of those not barred the lowest is chosen."""
     first = 199 if chosen == 196 else 190
-    database = made_database([arc_track(2.0, 0.0, frames / 60) for frames in (first, 600 - first)])
+    database = synthetic_database([arc_track(2.0, 0.0, frames / 60) for frames in (first, 600 - first)])
     features = np.ones_like(database.features)
     features[200, 15:] = database.features[200, 15:]
     selectable = np.isin(np.arange(600), [200, *choosable])
@@ -237,7 +237,7 @@ def test_the_window_bars_as_many_frames_on_either_side_and_none_of_another_clip(
 
 
 def test_a_window_wider_than_the_whole_dataset_still_leaves_a_way_on():
-    database = made_database([arc_track(2.0, 0.0, 4.0)])
+    database = synthetic_database([arc_track(2.0, 0.0, 4.0)])
 
     record = play(database, circle(2.0, 0.0), EXACT.replace(reselect_window_s=10.0))
 
@@ -246,7 +246,7 @@ def test_a_window_wider_than_the_whole_dataset_still_leaves_a_way_on():
 
 
 def test_among_equal_rows_the_lowest_is_chosen():
-    database = made_database([arc_track(2.0, 0.0, 10.0, uid=uid) for uid in ("b", "a", "c")])
+    database = synthetic_database([arc_track(2.0, 0.0, 10.0, uid=uid) for uid in ("b", "a", "c")])
 
     assert play(database, circle(2.0, 0.0)).rows[0] == 0
 
@@ -255,7 +255,7 @@ def test_among_equal_rows_the_lowest_is_chosen():
 
 
 def test_by_pose_distance_the_cost_is_metres_over_the_pose_joints_beside_the_trajectory():
-    database = made_database(random_tracks(12, seed=11))
+    database = synthetic_database(random_tracks(12, seed=11))
     trial = circle(2.0, 60.0, duration_s=4.0)
 
     record = play(database, trial, EXACT.replace(selection="pose_distance"))
@@ -284,7 +284,7 @@ def trajectory_costs(database: MatchingDatabase, record: TrialRecord, path: Refe
 
 
 def test_blended_root_velocity_does_not_jump_at_a_switch():
-    database = made_database([arc_track(1.0, 0.0, 60.0), arc_track(4.0, 0.0, 60.0)])
+    database = synthetic_database([arc_track(1.0, 0.0, 60.0), arc_track(4.0, 0.0, 60.0)])
     trial = Trial("switching", 1.0, 0.0, approach_s=1.0, duration_s=4.0, switch_every_s=2.0)
 
     plain = play(database, trial, EXACT.replace(follow="open_loop"))
@@ -303,7 +303,7 @@ def test_blended_root_velocity_does_not_jump_at_a_switch():
 
 
 def test_a_pull_towards_the_reference_and_a_clamp_keep_the_character_near():
-    database = made_database([arc_track(1.0, 0.0, 60.0)])
+    database = synthetic_database([arc_track(1.0, 0.0, 60.0)])
     trial = circle(1.0, 50.0)
 
     free = offsets(play(database, trial), trial).max()
@@ -316,7 +316,7 @@ def test_a_pull_towards_the_reference_and_a_clamp_keep_the_character_near():
 
 
 def test_a_pull_turns_the_character_the_short_way_round():
-    database = made_database([arc_track(1.0, 0.0, 60.0)])
+    database = synthetic_database([arc_track(1.0, 0.0, 60.0)])
     path = reference(circle(1.0, 50.0))
     rounds = replace(path, headings=path.headings + np.where(np.arange(len(path.headings)) > 0, 4 * np.pi, 0.0))
     options = EXACT.replace(root_adjustment=1.0, continuing_bias=-1000.0)
@@ -331,7 +331,7 @@ def test_a_pull_turns_the_character_the_short_way_round():
 
 
 def test_following_the_path_a_slow_character_is_not_hurried_along():
-    database = made_database([arc_track(1.0, w, 60.0) for w in (-60.0, -30.0, 0.0, 30.0, 60.0)])
+    database = synthetic_database([arc_track(1.0, w, 60.0) for w in (-60.0, -30.0, 0.0, 30.0, 60.0)])
     trial = circle(2.0, 30.0)
 
     by_time = play(database, trial, EXACT)
@@ -347,7 +347,7 @@ def test_following_the_path_a_slow_character_is_not_hurried_along():
 
 def test_the_path_is_looked_at_from_the_nearest_point_also_where_that_lies_between_two_ticks():
     """At 0.9 m/s beside a straight path that is asked for at 2 m/s: every tick wishes for the same way ahead."""
-    database = made_database([arc_track(0.9, 0.0, 60.0)])
+    database = synthetic_database([arc_track(0.9, 0.0, 60.0)])
     path = reference(circle(2.0, 0.0, duration_s=1.0))
     beside = path.positions + np.array([0.25, 0.0])
     beside[0] = path.positions[0]  # where the character begins
@@ -362,7 +362,7 @@ def test_the_path_is_looked_at_from_the_nearest_point_also_where_that_lies_betwe
 
 
 def test_a_character_faster_than_the_path_goes_on_round_it_past_its_end():
-    database = made_database([arc_track(3.0, w, 60.0) for w in (0.0, 45.0, 90.0, 135.0)])
+    database = synthetic_database([arc_track(3.0, w, 60.0) for w in (0.0, 45.0, 90.0, 135.0)])
     trial = circle(1.5, 45.0, duration_s=20.0)
 
     record = play(database, trial, EXACT.replace(follow="path"))
@@ -394,28 +394,28 @@ def test_options_that_make_no_sense_are_named(options, where):
 
 
 def test_a_search_period_of_less_than_a_tick_is_refused():
-    database = made_database([arc_track(1.0, 0.0, 5.0)])
+    database = synthetic_database([arc_track(1.0, 0.0, 5.0)])
 
     with pytest.raises(MotionError, match="search_every_s: a search period is one tick"):
         play(database, circle(1.0, 0.0), EXACT.replace(search_every_s=0.004))
 
 
 def test_a_trajectory_of_another_rate_is_refused():
-    database = made_database([arc_track(1.0, 0.0, 5.0)])
+    database = synthetic_database([arc_track(1.0, 0.0, 5.0)])
 
     with pytest.raises(MotionError, match="30 ticks per second, the database 60"):
         play(database, reference(circle(1.0, 0.0), rate_hz=30.0))
 
 
 def test_an_index_of_other_rows_is_refused():
-    database, other = made_database([arc_track(1.0, 0.0, 5.0)]), made_database([arc_track(1.0, 0.0, 6.0)])
+    database, other = synthetic_database([arc_track(1.0, 0.0, 5.0)]), synthetic_database([arc_track(1.0, 0.0, 6.0)])
 
     with pytest.raises(MotionError, match="360 rows, the database 300"):
         run_trial(database, index_of(other), reference(circle(1.0, 0.0)), EXACT)
 
 
 def test_a_row_that_nothing_follows_may_not_be_choosable():
-    database = made_database([arc_track(1.0, 0.0, 5.0)])
+    database = synthetic_database([arc_track(1.0, 0.0, 5.0)])
     everything = replace(database, selectable=np.ones(300, dtype=bool))
 
     with pytest.raises(MotionError, match="row 299"):

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from tests.support.made_databases import (
+from tests.support.synthetic_databases import (
     EXACT,
     FOLLOWS,
     arc_track,
     circle,
     database_clips,
-    made_database,
     mirrored_track,
     offsets,
     on_the_circle,
@@ -16,6 +15,7 @@ from tests.support.made_databases import (
     play,
     random_tracks,
     switches,
+    synthetic_database,
 )
 
 from marey_motion.evaluation.scenario import Trial
@@ -28,7 +28,7 @@ from marey_schemas.options.matching import ControllerOptions
 @pytest.mark.parametrize(("speed", "turn_rate_deg"), [(2.0, 50.0), (1.0, -100.0), (3.0, 25.0)])
 def test_a_clip_that_is_the_trajectory_is_played_from_its_start_to_its_end(speed, turn_rate_deg, follow):
     trial = circle(speed, turn_rate_deg)
-    record = play(made_database([path_track(trial)]), trial, EXACT.replace(follow=follow))
+    record = play(synthetic_database([path_track(trial)]), trial, EXACT.replace(follow=follow))
 
     speeds, turn_rates = on_the_circle(record)
     # Where other rows are played than those of the tick, the rounding of a turn's steps adds up instead of repeating.
@@ -47,7 +47,7 @@ def test_a_clip_that_is_the_trajectory_is_played_from_its_start_to_its_end(speed
 @pytest.mark.parametrize("follow", FOLLOWS)
 def test_a_straight_line_and_a_circle_give_the_wished_speeds(follow):
     for speed, turn_rate_deg, bound in ((1.0, 25.0, 0.5), (2.0, 50.0, 1.0), (3.0, 100.0, 1.5)):
-        database = made_database([arc_track(speed, 0.0, 40.0), arc_track(speed, turn_rate_deg, 40.0)])
+        database = synthetic_database([arc_track(speed, 0.0, 40.0), arc_track(speed, turn_rate_deg, 40.0)])
         trial = circle(speed, turn_rate_deg)
 
         record = play(database, trial, EXACT.replace(follow=follow))
@@ -63,7 +63,7 @@ def test_a_straight_line_and_a_circle_give_the_wished_speeds(follow):
 
 def test_a_circle_without_approach_is_followed_exactly():
     for speed, turn_rate_deg in ((1.0, 25.0), (2.0, 50.0), (3.0, 100.0)):
-        database = made_database([arc_track(speed, 0.0, 40.0), arc_track(speed, turn_rate_deg, 40.0)])
+        database = synthetic_database([arc_track(speed, 0.0, 40.0), arc_track(speed, turn_rate_deg, 40.0)])
         trial = circle(speed, turn_rate_deg, approach_s=0.0, duration_s=30.0)
 
         assert offsets(play(database, trial), trial).max() < 1e-9
@@ -77,7 +77,7 @@ def grid() -> dict[tuple[float, float], object]:
 
 def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(grid):
     # Gaits of both sides in step, so that mirroring changes the roots alone.
-    database = made_database(list(grid.values()))
+    database = synthetic_database(list(grid.values()))
     for speed, turn_rate_deg in ((1.0, 25.0), (1.75, 75.0), (3.0, 100.0)):
         left, right = circle(speed, turn_rate_deg), circle(speed, -turn_rate_deg)
         difference = offsets(play(database, left), left) - offsets(play(database, right), right)
@@ -85,8 +85,8 @@ def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(grid
 
 
 def test_without_tight_turns_tight_circles_are_missed_and_wide_ones_are_not(grid):
-    whole = made_database(list(grid.values()))
-    holed = made_database([track for (_, w), track in grid.items() if abs(w) <= 70.0])
+    whole = synthetic_database(list(grid.values()))
+    holed = synthetic_database([track for (_, w), track in grid.items() if abs(w) <= 70.0])
     for speed in (1.0, 2.0, 3.0):
         for turn_rate_deg in (75.0, -100.0):
             trial = circle(speed, turn_rate_deg)
@@ -102,7 +102,7 @@ def test_without_tight_turns_tight_circles_are_missed_and_wide_ones_are_not(grid
 
 def test_the_mirrored_dataset_mirrors_the_result():
     tracks = random_tracks(25, seed=1)
-    database, mirrored = made_database(tracks), made_database([mirrored_track(track) for track in tracks])
+    database, mirrored = synthetic_database(tracks), synthetic_database([mirrored_track(track) for track in tracks])
     for number, follow in enumerate(FOLLOWS * 4):
         trial, opposite = circle(1.0 + number / 6, 20.0 + 6 * number), circle(1.0 + number / 6, -20.0 - 6 * number)
         options = ControllerOptions(follow=follow)
@@ -117,14 +117,14 @@ def test_the_mirrored_dataset_mirrors_the_result():
 @pytest.mark.parametrize("selection", ["features", "pose_distance"])
 def test_removing_rows_that_are_never_shown_changes_no_bit(selection):
     tracks = random_tracks(20, seed=2)
-    database = made_database(tracks)
+    database = synthetic_database(tracks)
     options = ControllerOptions(selection=selection)
     trials = [circle(1.5, 40.0), circle(2.5, -70.0), Trial("switching", 2.0, 0.3, duration_s=12.0)]
     records = [play(database, trial, options) for trial in trials]
     used = np.unique(database_clips(database, np.concatenate([record.rows for record in records])))
     assert 1 <= len(used) < len(tracks)
 
-    smaller = made_database([tracks[clip] for clip in used], normaliser=database.normaliser)
+    smaller = synthetic_database([tracks[clip] for clip in used], normaliser=database.normaliser)
 
     for trial, record in zip(trials, records, strict=True):
         again = play(smaller, trial, options)
@@ -137,8 +137,8 @@ def test_removing_rows_that_are_never_shown_changes_no_bit(selection):
 
 def test_a_duplicated_clip_changes_no_trajectory_and_the_lower_uid_is_used():
     tracks = random_tracks(8, seed=3)
-    database = made_database(tracks)
-    doubled = made_database([track for track in tracks for _ in range(2)], normaliser=database.normaliser)
+    database = synthetic_database(tracks)
+    doubled = synthetic_database([track for track in tracks for _ in range(2)], normaliser=database.normaliser)
     for trial in (circle(1.5, 40.0), circle(2.5, -70.0)):
         record, again = play(database, trial), play(doubled, trial)
 
@@ -149,7 +149,7 @@ def test_a_duplicated_clip_changes_no_trajectory_and_the_lower_uid_is_used():
 
 def test_duplicating_the_whole_dataset_leaves_even_a_fitted_normaliser():
     tracks = random_tracks(8, seed=3)
-    database, doubled = made_database(tracks), made_database(tracks + tracks)
+    database, doubled = synthetic_database(tracks), synthetic_database(tracks + tracks)
     trial = circle(1.5, 40.0)
 
     np.testing.assert_allclose(doubled.normaliser.scale, database.normaliser.scale, rtol=1e-14)
@@ -167,14 +167,14 @@ def test_where_a_clip_was_recorded_does_not_matter():
         moved.append(track._replace(positions=turned + np.array([3.0 * number, -7.0]), headings=track.headings + angle))
     trial = circle(2.0, -60.0)
 
-    record, again = play(made_database(tracks), trial), play(made_database(moved), trial)
+    record, again = play(synthetic_database(tracks), trial), play(synthetic_database(moved), trial)
 
     assert np.array_equal(record.rows, again.rows)
     np.testing.assert_allclose(again.positions, record.positions, atol=1e-9)
 
 
 def test_a_turn_rate_near_zero_ends_up_next_to_zero():
-    database = made_database([arc_track(2.0, w, 40.0) for w in (-25.0, 0.0, 25.0)])
+    database = synthetic_database([arc_track(2.0, w, 40.0) for w in (-25.0, 0.0, 25.0)])
 
     straight, nearly = play(database, circle(2.0, 0.0)), play(database, circle(2.0, 1e-5))
 
@@ -182,7 +182,7 @@ def test_a_turn_rate_near_zero_ends_up_next_to_zero():
 
 
 def test_the_same_trial_gives_the_same_bytes():
-    database = made_database(random_tracks(6, seed=6))
+    database = synthetic_database(random_tracks(6, seed=6))
     records = [play(database, circle(2.0, 60.0), ControllerOptions()) for _ in range(2)]
 
     for name in ("rows", "positions", "headings", "status", "match_cost", "continuing_cost", "pose_cost"):

@@ -25,12 +25,12 @@ from marey_server.store.jobs.failure import ENDING_COLUMNS, apply_outcome, decid
 from marey_server.store.jobs.fan_out import release_tasks
 from marey_server.store.jobs.fencing import (
     HELD,
-    earlier_answer,
     held,
     held_parameters,
     hold,
     lease_lost,
     require_attempt,
+    stored_answer,
 )
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.jobs.propagation import propagate_ends
@@ -164,7 +164,7 @@ def _pass_fault_points(tx: Transaction) -> None:
 
 
 def _same_answer(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswer:
-    earlier = earlier_answer(tx, *place, write_id)
+    earlier = stored_answer(tx, *place, write_id)
     if earlier is None or earlier["state"] != JobState.SUCCEEDED:
         raise lease_lost(*place)
     return CompleteAnswer(**earlier)
@@ -220,7 +220,7 @@ def fail(
     Raises `LeaseLostProblem` if the attempt does not hold the job, or has ended with another `write_id`.
     """
     require_attempt(tx.principal, job_id, fence)
-    earlier = earlier_answer(tx, job_id, fence, request.write_id)
+    earlier = stored_answer(tx, job_id, fence, request.write_id)
     if earlier is not None:
         if earlier["state"] == JobState.SUCCEEDED:
             raise lease_lost(job_id, fence)

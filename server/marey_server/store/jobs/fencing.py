@@ -76,7 +76,7 @@ def lease_lost(job_id: str, fence: int) -> LeaseLostProblem:
     return LeaseLostProblem(f"Attempt {fence} does not hold {job_id} any more. Stop working on it.")
 
 
-def earlier_answer(tx: Transaction, job_id: str, fence: int, write_id: str) -> dict[str, Any] | None:
+def stored_answer(tx: Transaction, job_id: str, fence: int, write_id: str) -> dict[str, Any] | None:
     """Return the stored answer for this `write_id`, or None."""
     statement = select(attempt.c.answer).where(
         attempt.c.job_id == job_id, attempt.c.fence == fence, attempt.c.write_id == write_id

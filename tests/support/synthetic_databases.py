@@ -88,7 +88,7 @@ def mirrored_track(track: Track) -> Track:
     return track._replace(positions=track.positions * mirror, headings=-track.headings, pose=pose)
 
 
-def made_database(
+def synthetic_database(
     tracks: Sequence[Track],
     options: DatabaseOptions | None = None,
     *,

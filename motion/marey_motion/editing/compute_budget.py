@@ -22,7 +22,7 @@ PER_MEETING, PER_MET_NUMBER = 1_000_000, 10
 
 
 @dataclass
-class Allowance:
+class ComputeBudget:
     """Remaining work that an edit may take.
 
     Parameters
