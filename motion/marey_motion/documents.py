@@ -102,6 +102,32 @@ def clip_to_document(clip: Clip, skeleton: RevisionRef | OutputRef) -> clips.Mot
     )
 
 
+def clip_to_tree(clip: Clip, skeleton: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert a clip to part `motion` as plain values and arrays, which whoever stores it checks against its schema.
+
+    Parameters
+    ----------
+    clip : Clip    poses in metres and unit quaternions
+    skeleton : mapping    reference to the stored skeleton
+
+    Returns
+    -------
+    dict    the same as `clip_to_document` gives, dumped
+    """
+    names = clip.skeleton.joint_names
+    tree = {
+        "schema": "marey/motion@1",
+        "skeleton": dict(skeleton),
+        "frame_rate_hz": float(clip.frame_rate_hz),
+        "joints": names,
+        "poses": np.ascontiguousarray(clip.poses),
+        "translated_joints": tuple(names[joint] for joint in clip.translated_joints),
+    }
+    if clip.translations is not None:
+        tree["translations"] = np.ascontiguousarray(clip.translations)
+    return tree
+
+
 def clip_from_document(document: clips.MotionDocument, skeleton: Skeleton) -> Clip:
     """Convert a `motion` part to a clip, with its rotations in the skeleton's order.
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, FormatError, SkeletonError
 from marey_motion.importing import checks
+from marey_motion.importing.anatomy import anatomy_of
 from marey_motion.importing.checks import CheckWarning
-from marey_motion.importing.landmarks import find_landmarks
 from marey_motion.importing.source import ImportedMotion, ImportOptions, SourceInfo, SourceMotion, UpAxis
 from marey_motion.importing.units import infer_conversion
 from marey_motion.skeleton import EndSite, Skeleton
@@ -50,12 +50,12 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
     """
     _check_range(source, file)
     try:
-        landmarks = find_landmarks(source.skeleton)
+        landmarks = anatomy_of(source.skeleton).landmarks
         found = infer_conversion(source, landmarks, file, options)
         axes = np.array(_TO_Y_UP[found.up_axis], np.float64)
         if found.handedness == "left":
             axes[0] = -axes[0]
-        skeleton = _converted_skeleton(source, axes, found.unit_scale_m)
+        skeleton = anatomy_of(_converted_skeleton(source, axes, found.unit_scale_m)).skeleton
         warnings = [*source.warnings, *found.warnings, *_notices(source, found.up_axis)]
         clip = _converted_clip(source, skeleton, axes, found.unit_scale_m)
     except (SkeletonError, ClipError) as error:

@@ -8,22 +8,23 @@ so that a caller may run it in a process of its own.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
 
 from marey_motion.clip import Clip
-from marey_motion.documents import clip_to_document, mapping_to_document, skeleton_from_document, skeleton_to_document
-from marey_motion.errors import FormatError, MappingError, MotionError
+from marey_motion.documents import clip_from_document, clip_to_tree, skeleton_from_document
+from marey_motion.errors import FormatError, MotionError
 from marey_motion.formats import read_source
 from marey_motion.formats.conversion import convert
 from marey_motion.formats.predecessor.graph import PredecessorGraph
+from marey_motion.importing.anatomy import anatomy_of
 from marey_motion.importing.plan import PlannedFile
 from marey_motion.importing.source import ImportedMotion, ImportOptions, SourceDocument
 from marey_motion.importing.units import unit_in_metres
-from marey_motion.rigs import JointAxes, JointMapping, guess_axes, map_joints
 from marey_motion.skeleton import Skeleton
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, Refusal, refused_entry, skeleton_output
 from marey_schemas.kinds import Kind
@@ -112,7 +113,8 @@ class ImportedFile:
 
     Parameters
     ----------
-    items : a skeleton, then a clip or a model that uses it; a skeleton alone; a clip or a model alone
+    items : a skeleton, then a clip or a model that uses it; a skeleton alone; a clip or a model alone. The skeleton has
+        no part `mapping` yet: see `mapping_part`
     checks : findings about the motion, as documents
     frames : of the clip
     graph : what a file of a graph holds instead of items
@@ -199,9 +201,9 @@ def _imported(file: FileToImport) -> ImportedFile:
         clip = _on_skeleton(clip, given_skeleton(file.skeleton), file.planned.name)
         reference = file.skeleton.ref
     else:
-        items.append(skeleton_item(file, imported.skeleton, clip))
+        items.append(skeleton_item(file, imported.skeleton))
     if clip is not None:
-        motion = as_tree(clip_to_document(clip, reference))  # type: ignore[arg-type]
+        motion = clip_to_tree(clip, reference)
         parts = {"motion": motion, "info": _info(imported, file, checks)}
         items.append(main_item(file, Kind.CLIP, file.planned.item_name, parts))
     return ImportedFile(file.planned.name, tuple(items), checks, None if clip is None else clip.frame_count)
@@ -238,27 +240,43 @@ def given_skeleton(given: GivenSkeleton) -> Skeleton:
     return skeleton_from_document(SkeletonHierarchy.model_validate(given.hierarchy))
 
 
-def skeleton_item(file: FileToImport, skeleton: Skeleton, clip: Clip | None) -> ImportedItem:
+def skeleton_item(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
     """Make the item of a file's own skeleton; an equal skeleton of the project is used instead.
 
     Parameters
     ----------
     file : FileToImport    the file
     skeleton : Skeleton    its joints
-    clip : Clip or None    motion to read the joints' axes from
 
     Returns
     -------
-    ImportedItem    an item with hierarchy and mapping
+    ImportedItem    an item with its hierarchy
     """
-    mapping, axes = _anatomy(skeleton, clip)
-    parts = {
-        "hierarchy": as_tree(skeleton_to_document(skeleton)),
-        "mapping": as_tree(mapping_to_document(mapping, axes)),
-    }
+    anatomy = anatomy_of(skeleton)
+    parts = {"hierarchy": anatomy.hierarchy}
     name = skeleton_output(file.planned.name)
-    item_name = mapping.rig or "skeleton"
+    item_name = anatomy.mapping.rig or "skeleton"
     return ImportedItem(name, Kind.SKELETON, item_name, SKELETON_COLLECTION, parts, reuse="by_content")
+
+
+def mapping_part(found: ImportedFile) -> Tree:
+    """Make the part `mapping` of the skeleton that a file brings, with the axes that its clip shows.
+
+    Importing leaves it out, since it takes long and only a skeleton that is new to the project needs one.
+
+    Parameters
+    ----------
+    found : ImportedFile    its first item is a skeleton
+
+    Returns
+    -------
+    dict    part `mapping`
+    """
+    skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(found.items[0].parts["hierarchy"]))
+    motion = next((item.parts["motion"] for item in found.items if item.kind is Kind.CLIP), None)
+    anatomy = anatomy_of(skeleton)
+    clip = None if motion is None else clip_from_document(MotionDocument.model_validate(motion), anatomy.skeleton)
+    return anatomy.mapping_part(clip)
 
 
 def main_item(file: FileToImport, kind: Kind, item_name: str, parts: Mapping[str, Tree]) -> ImportedItem:
@@ -276,30 +294,6 @@ def main_item(file: FileToImport, kind: Kind, item_name: str, parts: Mapping[str
     ImportedItem    the item
     """
     return ImportedItem(file.planned.name, kind, item_name, file.collection, parts, file.options.tags)
-
-
-def _anatomy(skeleton: Skeleton, clip: Clip | None) -> tuple[JointMapping, dict[str, JointAxes]]:
-    """Find mapping and axes; no axes, and a note, where too little of a body is recognised."""
-    mapping = map_joints(skeleton)
-    try:
-        return mapping, guess_axes(skeleton, mapping, clip)
-    except MappingError as error:
-        return replace(mapping, notes=(*mapping.notes, f"no axes: {error.message}")), {}
-
-
-def as_tree(document: Any) -> Tree:
-    """Convert a document to plain values and arrays.
-
-    Parameters
-    ----------
-    document : model    a document of `marey_schemas`
-
-    Returns
-    -------
-    dict    plain values and arrays
-    """
-    tree: Tree = document.model_dump(by_alias=True, exclude_none=True)
-    return tree
 
 
 def _check_document(warning: Tree) -> Tree:

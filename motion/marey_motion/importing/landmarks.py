@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.rigs import map_joints
+from marey_motion.rigs import JointMapping, map_joints
 from marey_motion.skeleton import Skeleton
 
 
@@ -32,18 +32,19 @@ class Landmarks:
         return self.toes or self.feet or ()
 
 
-def find_landmarks(skeleton: Skeleton) -> Landmarks:
+def find_landmarks(skeleton: Skeleton, mapping: JointMapping | None = None) -> Landmarks:
     """Find the landmarks among the standard joints.
 
     Parameters
     ----------
     skeleton : Skeleton    joints; lengths may be in any unit and axes in any order
+    mapping : JointMapping, optional    its standard joints, where they are known already
 
     Returns
     -------
     Landmarks    joint indices
     """
-    mapping = map_joints(skeleton)
+    mapping = mapping or map_joints(skeleton)
 
     def pair(part: str) -> tuple[int, int] | None:
         names = [mapping.joints.get(f"{side}_{part}") for side in ("left", "right")]

@@ -65,7 +65,7 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
         raise FormatError(message, code="skeleton-mismatch", file=name)
     ref = {"output": skeleton_output(name)} if file.skeleton is None else file.skeleton.ref
     item = main_item(file, Kind.MODEL, model_name(file.planned.item_name), _parts(file, found, ref))
-    return ImportedFile(name, (item,) if given is not None else (skeleton_item(file, own, None), item))
+    return ImportedFile(name, (item,) if given is not None else (skeleton_item(file, own), item))
 
 
 def _parts(file: FileToImport, found: PredecessorModel, skeleton: Tree) -> dict[str, Tree]:

@@ -163,12 +163,17 @@ class ProjectImports(Resource):
                 ready.append(await ahead.popleft())
             if storing is not None:
                 entries += await storing
-            storing = asyncio.ensure_future(self.change(importing.publish, project, ready))
+            storing = asyncio.ensure_future(self._store(project, ready))
         if storing is not None:
             entries += await storing
         for entry in entries:
             self.services.metrics.imports.labels(entry.status).inc()
         return entries
+
+    async def _store(self, project: str, files: list[PreparedImport]) -> list[ImportEntry]:
+        if new := await self.look_up(importing.new_skeletons, project, files):
+            files = await self.compute(importing.add_mappings, files, new)
+        return await self.change(importing.publish, project, files)
 
     async def _prepare(
         self,

@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from marey_schemas.documents.clips import Check
+from marey_schemas.encoding.codecs import JSON, encode_tree
 from marey_schemas.imports import ImportEntry, Refusal, refused_entry
 from marey_schemas.kinds import Kind
+from marey_schemas.lru import LruCache
 from marey_schemas.options.imports import ImportOptions
 from marey_server.errors import ApiProblem, InvalidProblem
 from marey_server.store import blobs, items, projects
 from marey_server.store.blobs import Spool
-from marey_server.store.documents import prepare_document
+from marey_server.store.documents import PreparedDocument, prepare_document
 from marey_server.store.items import Draft, ItemFilters, Published
 from marey_server.store.projects import ProjectRow
 from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:  # numeric modules take a second to load: only who imports files pays for them
-    from marey_motion.importing.files import GivenSkeleton, ImportedGraph, ImportedItem
+    from marey_motion.importing.files import GivenSkeleton, ImportedFile, ImportedGraph, ImportedItem
     from marey_motion.importing.plan import PlannedFile
 
 REFUSED_ALTOGETHER = (401, 403, 404, 503, 507)
 """Refusals that concern the request, not one of its files."""
+
+_SKELETONS: LruCache[bytes, PreparedDocument] = LruCache(max_entries=64)
+"""Checked and encoded hierarchies, by their JSON."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +53,7 @@ class PreparedImport:
     name: str
     sources: tuple[SourceFile, ...] = ()
     drafts: tuple[Draft, ...] = ()
+    found: ImportedFile | None = None
     checks: tuple[Check, ...] = ()
     frames: int | None = None
     graph: ImportedGraph | None = None
@@ -101,11 +107,52 @@ def prepare(
     except ApiProblem as error:
         return PreparedImport(planned.name, entry=_refused(planned.name, error))
     checks = tuple(map(Check.model_validate, found.checks))
-    return PreparedImport(planned.name, tuple(sources), drafts, checks, found.frames, graph=found.graph)
+    return PreparedImport(planned.name, tuple(sources), drafts, found, checks, found.frames, graph=found.graph)
+
+
+def new_skeletons(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> set[str]:
+    """Find the digests of the files' skeletons that the project does not have yet."""
+    digests = {_hierarchy(draft).digest for file in files for draft in file.drafts if draft.kind is Kind.SKELETON}
+    return digests - items.find_contents(tx, project, Kind.SKELETON, "hierarchy", digests)
+
+
+def add_mappings(files: Sequence[PreparedImport], new: Collection[str]) -> list[PreparedImport]:
+    """Add joint mapping and axes to skeletons that are new: those that the first file of each skeleton shows."""
+    mappings: dict[str, PreparedDocument] = {}
+    return [_with_mapping(file, new, mappings) for file in files]
+
+
+def _with_mapping(file: PreparedImport, new: Collection[str], mappings: dict[str, PreparedDocument]) -> PreparedImport:
+    from marey_motion.importing.files import mapping_part
+
+    drafts = []
+    for draft in file.drafts:
+        if draft.kind is Kind.SKELETON and (digest := _hierarchy(draft).digest) in new:
+            assert file.found is not None
+            if digest not in mappings:
+                mappings[digest] = prepare_document(mapping_part(file.found))
+            draft = replace(draft, parts={**draft.parts, "mapping": mappings[digest]})
+        drafts.append(draft)
+    return replace(file, drafts=tuple(drafts))
+
+
+def _hierarchy(draft: Draft) -> PreparedDocument:
+    document = draft.parts["hierarchy"]
+    assert isinstance(document, PreparedDocument)
+    return document
 
 
 def _draft(item: ImportedItem) -> Draft:
-    parts = {part: prepare_document(tree, schema=tree["schema"]) for part, tree in item.parts.items()}
+    def prepared(tree: dict[str, Any]) -> PreparedDocument:
+        return prepare_document(tree, schema=tree["schema"])
+
+    if item.kind is Kind.SKELETON:  # many files of an upload have the same one
+        parts = {
+            part: _SKELETONS.get_or_make(encode_tree(tree, JSON), lambda tree=tree: prepared(tree))  # type: ignore[misc]
+            for part, tree in item.parts.items()
+        }
+    else:
+        parts = {part: prepared(tree) for part, tree in item.parts.items()}
     return Draft(item.name, item.kind, item.item_name, parts, item.collection, item.tags, reuse=item.reuse)
 
 

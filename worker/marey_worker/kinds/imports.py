@@ -12,12 +12,14 @@ from marey_motion.importing.files import (
     ImportedGraph,
     ImportedItem,
     import_file,
+    mapping_part,
     planned_entry,
     refusal_of,
 )
 from marey_motion.importing.graphs import FEW, NamedModel, graph_item
 from marey_motion.importing.plan import PlannedFile, plan_imports
 from marey_schemas.documents.clips import Check
+from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.imports import ImportEntry, Refusal, refused_entry
 from marey_schemas.job_params import ImportParams
 from marey_schemas.kinds import Kind
@@ -42,6 +44,8 @@ class _Importing:
         self._digests = {file.name: file.blob for file in params.files}
         self._skeleton = self._read_skeleton()
         self._results = StagedResults(context)
+        self._mappings: dict[bytes, Any] = {}
+        """Parts `mapping` of the skeletons so far, by the skeletons' content."""
         self._models: list[tuple[str, str, NamedModel]] = []
         """Models of this job: collection, name, and how a graph refers to them."""
 
@@ -74,7 +78,7 @@ class _Importing:
         if found.refusal is not None:
             return refused_entry(planned.name, found.refusal)
         for item in items:
-            self._stage(item)
+            self._stage(item, found)
         checks = tuple(map(Check.model_validate, found.checks))
         return ImportEntry(name=planned.name, status="created", frames=found.frames, warnings=checks)
 
@@ -115,7 +119,13 @@ class _Importing:
                 found[model.path] = model
         return len(found), list(found.values())[:FEW]
 
-    def _stage(self, item: ImportedItem) -> None:
+    def _stage(self, item: ImportedItem, found: ImportedFile) -> None:
+        parts = dict(item.parts)
+        if item.kind is Kind.SKELETON:
+            content = canonical_json(parts["hierarchy"])
+            if content not in self._mappings:
+                self._mappings[content] = mapping_part(found)
+            parts["mapping"] = self._mappings[content]
         self._results.add(
             StagedOutput(
                 name=item.name,
@@ -123,7 +133,7 @@ class _Importing:
                 item_name=item.item_name,
                 collection=item.collection,
                 tags=tuple(item.tags),
-                parts=dict(item.parts),
+                parts=parts,
                 reuse=item.reuse,
             )
         )

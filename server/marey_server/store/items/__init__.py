@@ -18,7 +18,16 @@ from marey_server.store.items.drafts import Draft, Published, StoredDocument
 from marey_server.store.items.history import list_revisions, read_lineage, read_revision, read_staleness
 from marey_server.store.items.listing import ItemFilters, list_items
 from marey_server.store.items.publishing import publish
-from marey_server.store.items.reading import FoundPart, Part, find_part, load_part, load_parts, read_item, read_part
+from marey_server.store.items.reading import (
+    FoundPart,
+    Part,
+    find_contents,
+    find_part,
+    load_part,
+    load_parts,
+    read_item,
+    read_part,
+)
 
 __all__ = [
     "Draft",
@@ -32,6 +41,7 @@ __all__ = [
     "delete_item",
     "find_annotated_clip",
     "find_annotation",
+    "find_contents",
     "find_part",
     "list_items",
     "list_revisions",

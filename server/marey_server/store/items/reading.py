@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Row, Select, bindparam, select
+from sqlalchemy import Row, Select, and_, bindparam, select
 
 from marey_schemas.items import Item, PartPlace, PartSummary
 from marey_schemas.kinds import Kind
@@ -18,6 +18,23 @@ from marey_server.store.items.slices import slice_motion
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import collection, document, item, item_tag, revision_part
 from marey_server.store.transaction import Transaction
+
+
+def find_contents(tx: Transaction, project: str, kind: Kind, part: str, digests: Collection[str]) -> set[str]:
+    """Find those of the digests that are the part of an item of the project as it is now."""
+    row = projects.require(tx, project)
+    statement = (
+        select(revision_part.c.document_digest)
+        .join(item, and_(item.c.id == revision_part.c.item_id, item.c.head == revision_part.c.number))
+        .where(
+            item.c.project_id == row.id,
+            item.c.kind == kind.value,
+            item.c.deleted_us.is_(None),
+            revision_part.c.part == part,
+            revision_part.c.document_digest.in_(sorted(digests)),
+        )
+    )
+    return set(tx.execute(statement).scalars())
 
 
 def read_item(tx: Transaction, project: str, kind: Kind, item_id: str) -> Item:

@@ -1,0 +1,85 @@
+"""Anatomy of a skeleton: standard joints, landmarks, axes and document, found once for files of equal skeletons."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from marey_motion.clip import Clip
+from marey_motion.documents import mapping_to_document, skeleton_to_document
+from marey_motion.errors import MappingError
+from marey_motion.importing.landmarks import Landmarks, find_landmarks
+from marey_motion.rigs import JointMapping, guess_axes, map_joints, rest_pose_doubts
+from marey_motion.skeleton import Skeleton
+from marey_schemas.lru import LruCache
+
+KEPT_SKELETONS = 64
+
+
+class Anatomy:
+    """Everything that follows from a skeleton alone, found when it is asked for and kept."""
+
+    def __init__(self, skeleton: Skeleton) -> None:
+        self.skeleton = skeleton
+
+    @cached_property
+    def mapping(self) -> JointMapping:
+        """The standard joints."""
+        return map_joints(self.skeleton)
+
+    @cached_property
+    def landmarks(self) -> Landmarks:
+        """The joints that give the upward direction, the stature and the ground."""
+        return find_landmarks(self.skeleton, self.mapping)
+
+    @cached_property
+    def hierarchy(self) -> dict[str, Any]:
+        """Part `hierarchy` of the skeleton."""
+        return skeleton_to_document(self.skeleton).model_dump(by_alias=True, exclude_none=True)
+
+    @cached_property
+    def _resting(self) -> dict[str, Any] | None:
+        """Part `mapping`; None where the rest pose leaves axes open that a motion can show."""
+        try:
+            if rest_pose_doubts(self.skeleton, self.mapping):
+                return None
+        except MappingError:
+            pass  # no motion helps where the joints are missing: `_mapping_part` notes it
+        return _mapping_part(self, None)
+
+    def mapping_part(self, clip: Clip | None) -> dict[str, Any]:
+        """Make the part `mapping`: joints, and axes that the rest pose shows, else a clip of the skeleton."""
+        return self._resting or _mapping_part(self, clip)
+
+
+def _mapping_part(anatomy: Anatomy, clip: Clip | None) -> dict[str, Any]:
+    """Make the part `mapping`; without axes, and with a note, where too little of a body is recognised."""
+    mapping = anatomy.mapping
+    try:
+        document = mapping_to_document(mapping, guess_axes(anatomy.skeleton, mapping, clip))
+    except MappingError as error:
+        document = mapping_to_document(replace(mapping, notes=(*mapping.notes, f"no axes: {error.message}")), {})
+    return document.model_dump(by_alias=True, exclude_none=True)
+
+
+_KNOWN: LruCache[bytes, Anatomy] = LruCache(max_entries=KEPT_SKELETONS)
+
+
+def anatomy_of(skeleton: Skeleton) -> Anatomy:
+    """Find the anatomy of a skeleton among those of equal skeletons seen last, or begin a new one."""
+    return _KNOWN.get_or_make(_content_key(skeleton), lambda: Anatomy(skeleton))
+
+
+def _content_key(skeleton: Skeleton) -> bytes:
+    """Digest of everything that a skeleton consists of, to the bit."""
+    digest = hashlib.sha256(repr((skeleton.joint_names, skeleton.display_names)).encode())
+    for array in (skeleton.parents, skeleton.offsets, skeleton.rest_rotations):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    for site in skeleton.end_sites:
+        digest.update(b"%d:" % site.joint)
+        digest.update(site.offset.tobytes())
+    return digest.digest()

@@ -1,0 +1,123 @@
+"""Import of one file does each piece of work once."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.support import predecessor_models as models
+from tests.support.motion_files import ARM, bvh
+
+from marey_motion import formats
+from marey_motion.documents import clip_to_document, clip_to_tree
+from marey_motion.exporting import write_clip_file
+from marey_motion.formats import write_bvh, write_predecessor_skeleton
+from marey_motion.formats.predecessor import clips, documents
+from marey_motion.gait import generate_gait
+from marey_motion.importing import anatomy
+from marey_motion.importing.files import FileToImport, ImportedFile, import_file, mapping_part
+from marey_motion.importing.plan import PlannedFile, plan_imports
+from marey_schemas.documents.references import OutputRef
+from marey_schemas.options.imports import ImportOptions
+
+DIGEST = f"sha256:{'1' * 64}"
+Count = Callable[[Any, str], Counter[str]]
+
+
+@pytest.fixture
+def count(monkeypatch: pytest.MonkeyPatch) -> Count:
+    """Counts the calls of functions of modules, by name."""
+    calls: Counter[str] = Counter()
+
+    def watch(module: Any, name: str) -> Counter[str]:
+        real = getattr(module, name)
+
+        def counting(*args: Any, **kwargs: Any) -> Any:
+            calls[name] += 1
+            return real(*args, **kwargs)
+
+        monkeypatch.setattr(module, name, counting)
+        return calls
+
+    return watch
+
+
+def read(name: str, data: bytes, **given: Any) -> ImportedFile:
+    (planned,) = plan_imports([name])
+    found = import_file(FileToImport(planned, data, DIGEST, **given))
+    assert found.refusal is None, found.refusal
+    return found
+
+
+def test_a_compressed_clip_of_the_predecessor_is_detected_and_decoded_once(count: Count) -> None:
+    clip = generate_gait(1.2, 0.0, 1.0, 30.0)
+    written = write_clip_file(clip, "predecessor")
+    count(formats, "detect_format")
+    count(documents, "decode_document")
+    calls = count(clips, "decode_document")  # the skeleton document is the second file
+    planned = PlannedFile("take.bson.bz2", "motion", "", "take", companion="take.skeleton")
+    companion = write_predecessor_skeleton(clip.skeleton)
+    found = import_file(FileToImport(planned, written.data, DIGEST, companion=companion, companion_digest=DIGEST))
+    assert found.frames == clip.frame_count
+    assert calls == {"detect_format": 1, "decode_document": 2}
+
+
+def test_a_model_of_the_predecessor_is_decoded_once(count: Count) -> None:
+    calls = count(documents, "decode_document")
+    read("walk_mm.json", json.dumps(models.layout_3()).encode())
+    assert calls == {"decode_document": 1}
+
+
+def test_the_anatomy_of_equal_skeletons_is_found_once(count: Count, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(anatomy, "_KNOWN", anatomy.LruCache(max_entries=8))
+    takes = [generate_gait(speed, 0.0, 1.0, 30.0) for speed in (1.0, 1.4)]
+    count(anatomy, "map_joints")
+    calls = count(anatomy, "find_landmarks")
+    first, second = (read(f"take{number}.bvh", write_bvh(take)) for number, take in enumerate(takes))
+    assert first.items[0].parts["hierarchy"] == second.items[0].parts["hierarchy"]
+    # Of the skeleton in the file's centimetres, and in metres.
+    assert calls["find_landmarks"] == 1
+    assert calls["map_joints"] <= 2
+
+
+def test_what_is_kept_of_one_file_changes_nothing_about_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same file after others of its skeleton gives the same documents as in a process that has seen no other."""
+    takes = [write_bvh(generate_gait(speed, 0.0, 1.0, 30.0)) for speed in (1.0, 1.4)]
+
+    def documents_of(data: bytes) -> Any:
+        found = read("take.bvh", data)
+        return mapping_part(found), found.items[0].parts["hierarchy"], found.checks
+
+    monkeypatch.setattr(anatomy, "_KNOWN", anatomy.LruCache(max_entries=8))
+    alone = documents_of(takes[1])
+    monkeypatch.setattr(anatomy, "_KNOWN", anatomy.LruCache(max_entries=8))
+    documents_of(takes[0])
+    assert documents_of(takes[1]) == alone
+
+
+def test_a_clip_becomes_the_same_document_without_the_schemas_objects() -> None:
+    clip = generate_gait(1.2, 0.0, 1.0, 30.0)
+    reference = OutputRef(output="rig")
+    tree = clip_to_tree(clip, reference.model_dump())
+    wanted = clip_to_document(clip, reference).model_dump(by_alias=True, exclude_none=True)
+    np.testing.assert_array_equal(tree.pop("poses"), wanted.pop("poses"))
+    assert tree == wanted
+
+
+def test_a_file_that_cannot_be_read_is_a_refusal_with_its_line() -> None:
+    (planned,) = plan_imports(["take.bvh"])
+    found = import_file(FileToImport(planned, bvh(["0 0 x 0 0 0 0 0 0"], hierarchy=ARM), DIGEST))
+    assert found.refusal is not None
+    assert (found.refusal.code, found.refusal.line, found.items) == ("bad-number", 19, ())
+
+
+def test_a_collection_that_is_too_long_is_a_refusal() -> None:
+    (planned,) = plan_imports([f"{'a' * 250}/take.bvh"])
+    options = ImportOptions(collection="/".join(["b" * 200] * 5))
+    found = import_file(FileToImport(planned, bvh(), DIGEST, options=options))
+    assert found.refusal is not None
+    assert found.refusal.code == "name-invalid"
