@@ -88,7 +88,8 @@ def require(
     required = tx.required_role
     need = at_least if roles.includes(at_least, required.role) else required.role
     me = tx.principal.user_id or ""
-    row = tx.first(_DELETED_BY_NAME if deleted else _ALIVE_BY_NAME, {"name": name, "me": me})
+    who = {"name": name, "me": me}
+    row = tx.execute(_DELETED_BY_NAME, who).one_or_none() if deleted else tx.first(_ALIVE_BY_NAME, who)
     seen = None if row is None else _as_seen(tx.principal, row)
     if seen is None or (seen.guest and deleted):
         raise NotFoundProblem(f"There is no project {name!r} that you may see.", code="no-project")
@@ -112,10 +113,10 @@ def _with_role_of(user_id: str | BindParameter[str]) -> Select[Any]:
     return select(project, member.c.role).select_from(project.outerjoin(member, mine))
 
 
-# Almost every request runs one of these.
+# Almost every request runs `_ALIVE_BY_NAME`.
 _BY_NAME = _with_role_of(bindparam("me")).where(project.c.name == bindparam("name"))
 _ALIVE_BY_NAME = Prepared(_BY_NAME.where(project.c.deleted_us.is_(None)))
-_DELETED_BY_NAME = Prepared(
+_DELETED_BY_NAME = (
     _BY_NAME.where(project.c.deleted_us.is_not(None)).order_by(project.c.deleted_us.desc()).limit(literal_column("1"))
 )
 

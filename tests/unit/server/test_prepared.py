@@ -1,9 +1,15 @@
 """Prepared statements give what SQLAlchemy itself gives, and fail as it does."""
 
+import importlib
+import pkgutil
+import re
+from pathlib import Path
+
 import psycopg
 import pytest
 from sqlalchemy import bindparam, delete, exc, false, insert, select, tuple_, update
 
+from marey_server import store
 from marey_server.access.principal import SYSTEM
 from marey_server.store.database import prepared
 from marey_server.store.database.connections import Database
@@ -148,3 +154,19 @@ def test_a_broken_connection_is_told_as_such(database: Database):
             SOME.run(connection, {"kinds": ["made"]})
     assert failed.value.connection_invalidated
     assert isinstance(failed.value.orig, psycopg.OperationalError)
+
+
+def prepared_statements():
+    """The names of all prepared statements of the store, by module."""
+    for module in pkgutil.walk_packages(store.__path__, "marey_server.store."):
+        for name, value in vars(importlib.import_module(module.name)).items():
+            kept = value.values() if isinstance(value, dict) else (value,)
+            if any(isinstance(one, Prepared) for one in kept):
+                yield f"{module.name.removeprefix('marey_server.store.')}.{name}"
+
+
+def test_only_statements_with_a_measured_gain_are_prepared():
+    """The record lists them; whoever prepares another statement measures it and adds its row."""
+    record = Path("docs/decisions/0012-prepared-statements.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^\| `([\w.]+)` \|", record, re.MULTILINE)
+    assert sorted(set(prepared_statements())) == sorted(listed)

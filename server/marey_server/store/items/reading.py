@@ -54,7 +54,7 @@ _THIS_ITEM = (
     item.c.kind == bindparam("kind"),
 )
 _ITEM = Prepared(item_rows().where(*_THIS_ITEM, item.c.deleted_us.is_(None)))
-_DELETED_ITEM = Prepared(item_rows().where(*_THIS_ITEM, item.c.deleted_us.is_not(None)))
+_DELETED_ITEM = item_rows().where(*_THIS_ITEM, item.c.deleted_us.is_not(None))
 _TAGS = Prepared(
     select(item_tag.c.item_id, item_tag.c.tag).where(item_tag.c.item_id.in_(bindparam("items", expanding=True)))
 )
@@ -94,9 +94,9 @@ _PART_OF_REVISION = Prepared(_PART.where(revision_part.c.number == bindparam("nu
 
 
 def find_item(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, *, deleted: bool = False) -> Any:
-    """Row of an item. Raises `NotFoundProblem`."""
+    """Return the row of an item. Raises `NotFoundProblem`."""
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value}
-    row = tx.first(_DELETED_ITEM if deleted else _ITEM, which)
+    row = tx.execute(_DELETED_ITEM, which).one_or_none() if deleted else tx.first(_ITEM, which)
     if row is None:
         raise no_item(kind, item_id)
     return row
