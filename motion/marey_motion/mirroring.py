@@ -25,7 +25,7 @@ SPREAD = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class _Mirror:
-    """What to do to the joints of a skeleton.
+    """Constants of mirroring the joints of a skeleton.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""What travels between the parts of Marey: documents and their codecs."""
+"""Documents that travel between the parts of Marey, and their codecs."""

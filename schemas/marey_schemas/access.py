@@ -11,7 +11,7 @@ from marey_schemas.names import ProjectName, UserName
 
 
 class Role(StrEnum):
-    """What a member may do; each role includes the ones before it."""
+    """Permission of a member; each role includes the ones before it."""
 
     READER = "reader"
     CONTRIBUTOR = "contributor"
@@ -27,7 +27,7 @@ class Visibility(StrEnum):
 
 
 class Scope(StrEnum):
-    """What a token may be used for. A token never allows more than its user may do."""
+    """Permission of a token, which never exceeds that of its user."""
 
     READ = "read"
     WRITE = "write"

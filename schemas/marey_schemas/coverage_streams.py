@@ -100,7 +100,7 @@ class CoverageFrames(Request):
 
     @property
     def frame_count(self) -> int:
-        """How many frames these are."""
+        """Number of these frames."""
         return sum(len(frames) for frames in (self.poses, self.roots) if frames is not None)
 
 
@@ -114,7 +114,7 @@ class CoverageCell(Answer):
 
 
 class CoverageTarget(CoverageCell):
-    """What to record next: a cell that lacks data, and the way to walk for it."""
+    """A cell that lacks data, and the path to walk to fill it."""
 
     path: tuple[tuple[float, float, float], ...] = Field(
         description="Where to be, each `path_step_s` from the last: metres to the left and ahead, and radians to the "
@@ -124,7 +124,7 @@ class CoverageTarget(CoverageCell):
 
 
 class Performer(Answer):
-    """Where the performer is in the newest frame, and how he moved in the newest second that is measured."""
+    """Position of the performer in the newest frame, and motion in the newest second that is measured."""
 
     x_m: float
     z_m: float
@@ -136,7 +136,7 @@ class Performer(Answer):
 
 
 class CoverageNow(Answer):
-    """What is covered, what to record next, and the performer, who is null between takes."""
+    """Coverage so far, targets to record next, and the performer, who is null between takes."""
 
     index: float = Field(description="Share of the cells with enough.")
     missing_s: float = Field(description="What all cells lack together.")
@@ -145,7 +145,7 @@ class CoverageNow(Answer):
 
 
 class CoverageProgress(CoverageNow):
-    """What the frames of a request changed."""
+    """Changes made by the frames of a request."""
 
     offset: int = Field(description="Frames received so far.")
     windows: int = Field(description="Windows of a second that these frames completed, in whatever cell.")

@@ -38,7 +38,7 @@ class Refusal(Answer):
 
 
 class ImportEntry(Answer):
-    """What became of one file."""
+    """Result of importing one file."""
 
     name: str
     status: Literal["created", "unchanged", "failed", "companion"]
@@ -56,7 +56,7 @@ def refused_entry(name: str, refusal: Refusal) -> ImportEntry:
 
 
 def skeleton_output(file_name: str) -> str:
-    """What an import job calls the skeleton of a file among its outputs; the clip has the file's own name."""
+    """Name the output of an import job for a file's skeleton; the clip has the file's own name."""
     return f"{file_name}#skeleton"
 
 

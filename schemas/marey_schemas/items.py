@@ -52,7 +52,7 @@ class ItemChange(Request):
 
 
 class PartSummary(Answer):
-    """Which document a part is."""
+    """Part of an item: one document."""
 
     document: str
     schema_: str = Field(alias="schema")
@@ -60,7 +60,7 @@ class PartSummary(Answer):
 
 
 class PartPlace(Request):
-    """Which document to read: a part of a revision of an item."""
+    """Address of a document to read: a part of a revision of an item."""
 
     kind: Kind
     item: str = Field(max_length=64)
@@ -123,7 +123,7 @@ class LineageEdge(Answer):
 
 
 class Lineage(Answer):
-    """Where a revision comes from and what was made of it."""
+    """Lineage of a revision: its inputs and its results."""
 
     item: str
     revision: int
@@ -175,7 +175,7 @@ class UploadCreate(Request):
 
 
 class Upload(Answer):
-    """How far a resumable upload is."""
+    """Progress of a resumable upload."""
 
     id: str
     length: int

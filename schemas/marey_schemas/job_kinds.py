@@ -1,4 +1,4 @@
-"""What each kind of job takes and makes, declared once for server, client and worker.
+"""Kinds of jobs with their inputs, parameters and outputs, declared once for server, client and worker.
 
 The server checks submissions against these declarations and publishes their JSON Schema; only the worker imports the
 function behind one. Other distributions add kinds with an entry point of the group `marey.job_kinds` that names a
@@ -108,7 +108,7 @@ class KindDeclaration:
 
     @property
     def code_version(self) -> str:
-        """What results are cached and recorded under."""
+        """Name and version under which results are cached and recorded."""
         return f"{self.name}@{self.version}"
 
     def document(self) -> JobKind:

@@ -139,7 +139,7 @@ class EvaluateParams(EvaluationOptions, TaggedResults):
 
     @property
     def trial_count(self) -> int:
-        """How many trajectories are followed."""
+        """Number of trajectories."""
         return len(self.families) * len(self.speeds_m_s) * len(self.turn_rates_deg_s)
 
     @model_validator(mode="after")
@@ -160,7 +160,7 @@ class EvaluateParams(EvaluationOptions, TaggedResults):
 
 
 def count_evaluation_tasks(params: EvaluateParams) -> int:
-    """How many tasks the trials are spread over: a few trials each, so that a lost task loses little."""
+    """Number of tasks for the trials: a few trials each, so that a lost task loses little."""
     per_task = max(TRIALS_PER_TASK, -(-params.trial_count // MOST_EVALUATION_TASKS))
     return -(-params.trial_count // per_task)
 

@@ -52,7 +52,7 @@ class InputSpec(Answer):
 
 
 class JobKind(Answer):
-    """What a kind of job takes and makes."""
+    """Inputs, parameters and outputs of a kind of job."""
 
     name: str
     description: str
@@ -128,7 +128,7 @@ class JobCreate(Request):
 
 
 class Progress(Request):
-    """How far an attempt is."""
+    """Progress of an attempt."""
 
     done: float = Field(ge=0)
     total: float | None = Field(None, gt=0)
@@ -192,7 +192,7 @@ class Job(Answer):
 
 
 class TaskResult(Answer):
-    """What one task of a fan-out brought, as far as it has ended."""
+    """Result of one task of a fan-out; None until the task has ended."""
 
     job: str
     position: int

@@ -14,7 +14,7 @@ Inputs = tuple[ItemInput | CollectionInput, ...]
 
 
 class ModelPlan(Request):
-    """What a model is made of, and how.
+    """Inputs and options of a model.
 
     Takes are files to import or clips that are there. They are carried over to a skeleton where one is named, cut into
     examples along annotations, which are proposed or there already, and aligned; a model is learned of them, and a tree

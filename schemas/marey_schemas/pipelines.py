@@ -123,7 +123,7 @@ def job_of_step(pipeline: PipelineCreate, name: str, ids: Mapping[str, str]) -> 
 
 
 def _needed(name: str, step: PipelineStep) -> Iterator[tuple[str, str]]:
-    """Where a step names another one, and which."""
+    """List the references of a step to others: place in the document, and name of the other step."""
     for index, other in enumerate(step.after):
         yield f"/steps/{name}/after/{index}", other
     for role, choices in step.inputs.items():

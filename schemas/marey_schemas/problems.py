@@ -18,7 +18,7 @@ class FieldError(Answer):
 
 
 class Problem(Answer):
-    """What went wrong, for people (`title`, `detail`) and for programs (`code`)."""
+    """Description of an error, for people (`title`, `detail`) and for programs (`code`)."""
 
     type: str
     title: str

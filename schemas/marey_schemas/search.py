@@ -109,7 +109,7 @@ SearchConstraints = Annotated[tuple[SearchConstraint, ...], Field(max_length=MOS
 
 
 class StartPlacement(Request):
-    """Where a motion begins: the model's canonical frame in the world."""
+    """Start of a motion: the model's canonical frame in the world."""
 
     x: Coordinate = Field(0.0, description="Metres.")
     z: Coordinate = Field(0.0, description="Metres.")
@@ -169,7 +169,7 @@ class SearchRequest(Request):
 
 
 class ConstraintError(Answer):
-    """How far a constraint is missed, in the unit that its name ends in."""
+    """Error of a constraint, in the unit at the end of its name."""
 
     step: int = Field(description="From 0.")
     constraint: int = Field(description="Within the step, from 0.")
@@ -202,7 +202,7 @@ class FoundStep(Answer):
 
 
 class SearchAnswer(Answer):
-    """What was found."""
+    """Result of a search."""
 
     steps: tuple[FoundStep, ...]
     errors: tuple[ConstraintError, ...]

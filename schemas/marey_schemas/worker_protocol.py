@@ -40,7 +40,7 @@ class PinnedInput(Answer):
 
     @property
     def folder(self) -> str:
-        """Where below the job's `into` results go that keep the place of this input."""
+        """Path below the job's `into` for results that keep the place of this input."""
         return self.collection if self.below is None else self.below
 
     @property
@@ -91,7 +91,7 @@ class Heartbeat(Request):
 
 
 class HeartbeatAnswer(Answer):
-    """How long the lease lasts now, and whether to stop."""
+    """Remaining lease, and whether to stop."""
 
     lease_ttl_s: float
     cancel_requested: bool
@@ -165,7 +165,7 @@ class CompleteAnswer(Answer):
 
 
 class FailAnswer(Answer):
-    """What becomes of the job after the failed attempt."""
+    """State of the job after the failed attempt."""
 
     job: str
     state: JobState
@@ -173,7 +173,7 @@ class FailAnswer(Answer):
 
 
 class BatchCompletionResult(Answer):
-    """What became of one completion of a batch: an answer, or the reason why there is none."""
+    """Result of one completion of a batch: an answer, or the reason why there is none."""
 
     job: str
     fence: int
@@ -189,13 +189,13 @@ class BatchCompleteAnswer(Answer):
 
 
 class StageAnswer(Answer):
-    """How many results the attempt has staged."""
+    """Number of results that the attempt has staged."""
 
     staged: int
 
 
 class LogAnswer(Answer):
-    """How long the attempt's log is now."""
+    """Length of the attempt's log."""
 
     offset: int = Field(description="Where the next piece goes.")
     capped: bool = Field(default=False, description="The log is full; nothing more is kept.")

@@ -71,7 +71,7 @@ class SourceExample:
 
 @dataclass(frozen=True, eq=False)
 class AlignOptions:
-    """How examples are aligned.
+    """Options of an alignment.
 
     Parameters
     ----------
@@ -226,14 +226,14 @@ class _Aligning:
             )
 
     def _attempt(self, work: Callable[..., Any], *arguments: Any) -> Any:
-        """What the work makes, or the `MotionError` that it raises."""
+        """Run the work, and return its result or the `MotionError` that it raises."""
         try:
             return work(*arguments)
         except MotionError as error:
             return error
 
     def _kept(self, examples: Sequence[SourceExample], tries: Sequence[Any]) -> list[Any]:
-        """What could be made; the others are refused."""
+        """Keep the results, and report the errors of the others."""
         for example, made in zip(examples, tries, strict=True):
             if isinstance(made, MotionError):
                 if self.on_refusal is None or example.uid == self._options.reference:

@@ -18,7 +18,7 @@ LONGEST_WINDOW = 61
 
 @dataclass(frozen=True, eq=False)
 class CostOptions:
-    """What makes poses differ.
+    """Options of the cost.
 
     Parameters
     ----------

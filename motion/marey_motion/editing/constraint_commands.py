@@ -167,7 +167,7 @@ class _Rig:
 
 
 def _named(number: int, make: Any, *arguments: Any) -> Any:
-    """What `make` makes of its arguments; its errors name the constraint."""
+    """Call `make`; its errors name the constraint."""
     try:
         return make(*arguments)
     except MotionError as error:
@@ -233,7 +233,7 @@ def _limit(rig: _Rig, tree: Tree) -> JointLimit:
 
 
 def _finding(tree: Tree, constraint: Constraint, before: Any, after: Any) -> dict[str, Any]:
-    """What a constraint was and is missed by at most, in metres or radians, and in how many frames it is reached."""
+    """Describe the largest errors of a constraint, in metres or radians, and count the frames that reach it."""
     is_position = isinstance(constraint.target, PositionTarget)
     unit = "m" if is_position else "rad"
     tolerance = _OPTIONS.tolerance_m if is_position else _OPTIONS.tolerance_rad

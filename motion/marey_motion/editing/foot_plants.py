@@ -42,7 +42,7 @@ class Foot:
 
 @dataclass(frozen=True)
 class PlantOptions:
-    """How feet are planted.
+    """Options of foot plants.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class PlantedMotion:
 
 
 class _Plan(NamedTuple):
-    """Where a foot should be: ankle (F, 3), the ankle's rotation in the world (F, 4), how firmly it stands (F,)."""
+    """Target of a foot: ankle (F, 3), the ankle's rotation in the world (F, 4), weight of the plant (F,)."""
 
     ankle: Floats
     rotation: Floats
@@ -193,7 +193,7 @@ def _slide(positions: Floats, feet: Sequence[Foot], contacts: Sequence[FootConta
 
 
 def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, blend: int) -> _Plan:
-    """Where ankle and toe go: the toe to its places, the ankle with it, and to its own while the heel stands."""
+    """Compute ankle and toe: the toe at its targets, the ankle with it, and at its own while the heel is planted."""
     ankle, toe = positions[:, foot.leg.end], positions[:, foot.toe]
     places = toe.copy()
     for start, stop in runs(contacts.toe):
@@ -257,7 +257,7 @@ def _turn_between(before: Floats, after: Floats) -> Floats:
 
 
 def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], zone: float, blend: int) -> Floats:
-    """How far the root must come down (F,), metres, so that standing feet are in reach without stretching knees."""
+    """Compute how far to lower the root (F,), metres, so that planted feet are in reach without stretching knees."""
     from marey_motion.editing.inverse_kinematics import two_bone_kernels
 
     wanted = np.zeros(len(positions))

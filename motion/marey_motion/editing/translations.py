@@ -1,4 +1,4 @@
-"""What joints other than the root move by, made comparable between motions."""
+"""Translations of joints other than the root, made comparable between motions."""
 
 from __future__ import annotations
 

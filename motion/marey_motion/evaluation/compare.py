@@ -37,7 +37,7 @@ LESS_IS_BETTER = (
 
 @dataclass(frozen=True)
 class MetricChange:
-    """How one metric of the suite changed.
+    """Change of one metric of the suite.
 
     Parameters
     ----------

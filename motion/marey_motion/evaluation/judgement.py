@@ -25,7 +25,7 @@ TOLERANCE = 1e-12
 
 
 class Strain(NamedTuple):
-    """How much of each of the three limits a trial takes up; more than 1 is too much, endless where not defined."""
+    """Ratio of a trial's errors to each of the three limits; above 1 is too much, infinite where not defined."""
 
     place: float
     speed: float

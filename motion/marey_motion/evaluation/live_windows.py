@@ -30,7 +30,7 @@ LEAST_RATE_HZ, MOST_RATE_HZ = 10.0, 240.0
 
 
 class LiveTake(NamedTuple):
-    """What is remembered of the take under way: rings in which frame f of the take is at f modulo their length.
+    """State of the current take: ring buffers in which frame f of the take is at f modulo their length.
 
     Parameters
     ----------

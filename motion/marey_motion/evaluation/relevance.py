@@ -18,7 +18,7 @@ TREADING_S = 1 / 3
 
 
 class Jumps(NamedTuple):
-    """Where a character left the course of a clip.
+    """Jumps of a character from one place in the clips to another.
 
     Parameters
     ----------

@@ -28,7 +28,7 @@ class TrialResult:
 
 @dataclass(frozen=True, eq=False)
 class ClipUsage:
-    """How much the suite used one clip; `clip` is None for no clip, indices are into `EvaluationResult.clips`.
+    """Use of one clip in the suite; indices are into `EvaluationResult.clips`.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class ClipUsage:
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """What speeds and turn rates the clips hold, by windows of one second.
+    """Speeds and turn rates of the clips, by windows of one second.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class Coverage:
 
 @dataclass(frozen=True)
 class Provenance:
-    """What has to agree before two results may be compared, and where they come from. All digests are "sha256:…"."""
+    """Conditions that must agree to compare two results, and their origin. All digests are "sha256:…"."""
 
     dataset: str
     clips: Mapping[str, str]

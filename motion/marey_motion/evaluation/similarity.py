@@ -33,7 +33,7 @@ class PoseSimilarity:
     Parameters
     ----------
     threshold_m : up to where a frame can be blended: summed distance of the pose joints, metres
-    frames, sources : (V, O) int64    in the cell; a clip and its mirrored twin are one source
+    frames, sources : (V, O) int64    in the cell; a clip and its mirrored copy are one source
     measured : (V, O) int64    how many frames were compared, evenly chosen where there are more than `MOST_FRAMES`
     distance_m : (V, O) median distance; NaN where there are no two sources
     blendable_share : (V, O) share of the measured frames within the threshold; 0 with one source, NaN without frames

@@ -31,7 +31,7 @@ _PRINTED_DIGITS = 1e-6
 
 @dataclass(frozen=True)
 class ChannelColumns:
-    """Which column of the numbers is what.
+    """Columns of the numbers by channel.
 
     `turns` and `axes` are (J, 3): column and axis of each joint's turns; `positions` is (J, 3): column of x, y, z.
     `NO_COLUMN` stands where a joint has no such channel. `labels` name each column for messages.

@@ -138,7 +138,7 @@ def _turned(rotations: NDArray[Real], axes: NDArray[np.float64]) -> NDArray[Real
 
 
 def _notices(source: SourceMotion, up_axis: UpAxis) -> list[CheckWarning]:
-    """What the reader and the conversion did that a user should know."""
+    """List the changes by reader and conversion that a user should know."""
     notices = []
     if up_axis != "y":
         message = f"the file has {up_axis} up; it was turned to y up"

@@ -123,7 +123,7 @@ def read_npz(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
 
 
 def _foreign(data: bytes, file: str) -> FormatError:
-    """What to say of an archive of another kind: AMASS and its like are npz files, too."""
+    """Explain the error for an archive of another kind: AMASS and its like are npz files, too."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = [excerpt(name.removesuffix(".npy").encode()) for name in archive.namelist()[:_MEMBERS_SHOWN]]
     if {"poses", "trans"} <= set(members):

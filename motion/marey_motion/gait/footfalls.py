@@ -239,7 +239,7 @@ class Footfalls:
 
     @cached_property
     def _leaving_pitch_rates(self) -> AnyFloats:
-        """How fast each foot pitches at the end of its push-off, radians per second."""
+        """Pitch rate of each foot at the end of its push-off, radians per second."""
         return np.asarray(self._leaving_pitches / ((1.0 - PUSH_OFF_START) * (self.leaves_s - self.strikes_s)))
 
     def _standing(self, times_s: AnyFloats, stance: NDArray[np.intp]) -> _Foot:
@@ -258,7 +258,7 @@ class Footfalls:
         )
 
     def _rolled(self, pitches: AnyFloats, stance: NDArray[np.intp]) -> Complexes:
-        """Where the ball is over the floor when the foot has rolled about its heel by positive `pitches`."""
+        """Compute the ground position of the ball after the foot has rolled about its heel by positive `pitches`."""
         back = self.shape.heel_length_m * (1.0 - np.cos(np.maximum(pitches, 0.0)))
         return np.asarray(self.footholds[stance] - back * np.exp(1j * self.middles.headings[stance]))
 

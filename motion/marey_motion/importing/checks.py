@@ -93,7 +93,7 @@ class CheckWarning:
 
 @dataclass(frozen=True)
 class _Tracks:
-    """Where the points that the checks look at are.
+    """Positions of the points that the checks use.
 
     `positions` (F, k, 3) in metres; `column` finds a joint in them; `soles` are the columns of each foot: the joints
     and end sites from the ankle down.
@@ -247,7 +247,7 @@ def _rest_poses(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
 
 
 def _rest_pose_frames(clip: Clip, tracks: _Tracks) -> tuple[int, int]:
-    """How many frames at the start and at the end are a rest pose: every joint at rest, or arms held out in a T."""
+    """Count the frames of a rest pose at the start and at the end: every joint at rest, or arms held out in a T."""
     resting = _at_rest(clip) | _in_t_pose(clip, tracks)
     if resting.all():
         return clip.frame_count, 0

@@ -60,7 +60,7 @@ def unit_in_metres(unit: str | float) -> float:
 
 @dataclass(frozen=True)
 class Conversion:
-    """How a file's lengths and axes become metres with Y up, and why."""
+    """Conversion of a file's lengths and axes to metres with Y up, with the evidence."""
 
     unit_scale_m: float
     up_axis: UpAxis
@@ -71,7 +71,7 @@ class Conversion:
 
 @dataclass
 class _Measurements:
-    """What is measured on the file, in its own unit and axes.
+    """Measures of the file's body, in its own unit and axes.
 
     `positions` (F, J, 3) of sampled frames and `rest` (J, 3); `leg` is None without two feet.
     """
@@ -319,7 +319,7 @@ def _is_leg(length_m: float) -> bool:
 
 
 def _hip_height(body: _Measurements, up_axis: UpAxis) -> float:
-    """How high the hips mostly are above the ground, in the file's unit; 0 without feet."""
+    """Median height of the hips above the ground, in the file's unit; 0 without feet."""
     if body.leg is None:
         return 0.0
     return float(np.median(hip_heights(body.positions, body.landmarks, up_axis)))

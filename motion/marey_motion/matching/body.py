@@ -20,7 +20,7 @@ POSE_JOINTS = ("pelvis", "spine_2", "head", "left_wrist", "right_wrist", "left_a
 
 @dataclass(frozen=True, eq=False)
 class MatchingBody:
-    """Which joint indices of `skeleton` play which part.
+    """Joints of a skeleton that motion matching uses, by index.
 
     Parameters
     ----------

@@ -62,7 +62,7 @@ def _wished(wish, when):  # type: ignore[no-untyped-def]
 
 @compiled
 def _progress(wish, when, x, z):  # type: ignore[no-untyped-def]
-    """Where on the wished path, in ticks, its nearest point to (x, z) lies, near the last one `when`."""
+    """Find the point of the desired path nearest to (x, z), in ticks, near the last one `when`."""
     window = int(PATH_WINDOW_S / wish.tick_s)
     best, best_square = 0, np.inf
     for tick in range(max(0, int(when) - window), int(when) + window + 1):

@@ -48,7 +48,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Explanation:
-    """What happened at one tick of a trial.
+    """Explanation of one tick of a trial.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def _sentence(reason: Reason, cost: float, going_on: Candidate | None, options: 
 
 
 class _Costs:
-    """What every row costs at one tick."""
+    """Compute the cost of every row at one tick."""
 
     def __init__(
         self,

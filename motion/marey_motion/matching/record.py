@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 class Status(IntEnum):
-    """What happened to the displayed clip at a tick."""
+    """Status of the displayed clip at a tick."""
 
     KEPT = 0
     """The next frame of the clip follows."""

@@ -107,7 +107,7 @@ def _limit(query, best):  # type: ignore[no-untyped-def]
 
 @inlined
 def _lane_of_least(sums, lanes):  # type: ignore[no-untyped-def]
-    """Which of the lanes, given as bits, holds the least sum."""
+    """Find the lane, among those given as bits, that holds the least sum."""
     best = -1
     for lane in range(LANES):
         if lanes >> lane & 1 and (best < 0 or sums[lane] < sums[best]):
@@ -237,7 +237,7 @@ def all_costs(index, query, weights, costs):  # type: ignore[no-untyped-def]
 
 @compiled
 def boxes_within(index, query, cost):  # type: ignore[no-untyped-def]
-    """How many blocks have a box as near as `cost`: what the quickest order of search still has to look at."""
+    """Count the blocks with a box as near as `cost`: the least that any order of search must visit."""
     prepared = _prepared(index, query, np.ones(query.shape[0]), 0, 0)
     limit = _limit(prepared, cost)
     count = 0

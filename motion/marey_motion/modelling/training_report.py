@@ -61,7 +61,7 @@ class Durations:
 
 @dataclass(frozen=True, eq=False)
 class TrainingReport:
-    """How good a model is.
+    """Quality of a model.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def _examples(
 
 
 def _at(errors: ReconstructionErrors, components: int) -> int:
-    """Where the curve is at so many components, or at its end."""
+    """Look up the curve at so many components, or at its end."""
     return min(components, len(errors.components) - 1)
 
 

@@ -198,7 +198,7 @@ class _PosedBody:
         return _unit(self.positions[:, self.joints[end]] - self.positions[:, self.joints[start]])
 
     def coinciding(self, start: str, end: str) -> MappingError:
-        """What to raise where a direction is needed between joints that stand in one place."""
+        """Make the error for a direction between joints at the same position."""
         names = [self.skeleton.joint_names[self.joints[standard]] for standard in (start, end)]
         return MappingError(
             f"{names[0]} ({start}) and {names[1]} ({end}) stand in one place, so no axis can be told from the bone "

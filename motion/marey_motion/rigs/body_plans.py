@@ -155,7 +155,7 @@ def _worth(tree: BoneTree, pair: LimbPair, places: tuple[int, int, int], build: 
 
 
 def _worth_of_joints_between(tree: BoneTree, pair: LimbPair, start: int, stop: int) -> float:
-    """What joints inside a long bone cost: less where they do not bend it, nothing where they have no length."""
+    """Score the joints inside a long bone: less where they do not bend it, nothing where they have no length."""
     count = sum(bone > SHORTEST_BONE_M for bone in pair.bones[start:stop]) - 1
     if count < 1:
         return 0.0

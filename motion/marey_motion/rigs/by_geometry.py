@@ -95,7 +95,7 @@ def find_body(skeleton: Skeleton) -> GeometryMatch | None:
 
 
 def _doubts(skeleton: Skeleton, plan: BodyPlan, rivals: list[BodyPlan]) -> tuple[str, ...]:
-    """What else the legs or arms may be by proportions that are hardly less common."""
+    """List other candidates for the legs or arms whose proportions are hardly less common."""
     doubts = []
     for limb, joints, reading, others in (
         ("legs", "hip, knee and ankle", plan.legs, [one.legs for one in rivals]),
@@ -109,7 +109,7 @@ def _doubts(skeleton: Skeleton, plan: BodyPlan, rivals: list[BodyPlan]) -> tuple
 
 
 def _neck(tree: BoneTree, plan: BodyPlan) -> tuple[float, list[int]]:
-    """What goes on where the arms branch off from the neck's first joint to the head's, and how common it is."""
+    """Find the chain from the neck's first joint to the head's where the arms branch off, and how common it is."""
     skeleton, arms, legs = tree.skeleton, plan.arms.pair, plan.legs.pair
     limbs = {limb.chain[0] for limb in arms.limbs} | set(skeleton.path_to_root(legs.parent))
     chains = [_neck_chain(tree, joint) for joint in skeleton.children[arms.parent] if joint not in limbs]
@@ -133,7 +133,7 @@ def _neck_chain(tree: BoneTree, start: int) -> list[int]:
 
 
 def _looks_like_neck(tree: BoneTree, plan: BodyPlan, chain: list[int]) -> float:
-    """How common a neck of such a length and direction is; what has a twin beside it is none."""
+    """Score the length and direction of a neck; a chain with a mirrored copy beside it is none."""
     positions = tree.skeleton.rest_global_positions
     parent = plan.arms.pair.parent
     length = float(np.sum(tree.lengths[chain]))

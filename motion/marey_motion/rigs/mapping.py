@@ -209,7 +209,7 @@ def _spine(skeleton: Skeleton, joints: Mapping[str, int]) -> dict[str, int]:
 
 
 def _animal_signs(skeleton: Skeleton, joints: Mapping[str, int]) -> str:
-    """What speaks for four legs, in words; nothing for a human."""
+    """Describe the evidence for four legs, in words; empty for a human."""
     for index, name in enumerate(skeleton.display_names):
         is_animal = any(word in parse_name(name).base for word in _ANIMAL_WORDS)
         # Hair in a pony tail grows on heads.

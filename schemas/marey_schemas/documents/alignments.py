@@ -25,7 +25,7 @@ class ExampleRef(Request):
 
 
 class AlignedPlacement(Request):
-    """Where the body stood in the first frame of the source; a point p stood at R(heading) p + (x, y, z)."""
+    """Place of the body in the first frame of the source; a point p was at R(heading) p + (x, y, z)."""
 
     heading_rad: Metres = 0.0
     x: Metres = 0.0

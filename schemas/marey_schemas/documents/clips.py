@@ -66,7 +66,7 @@ class Check(Request):
 
 
 class ClipSource(Request):
-    """Where a clip came from and what the importer did to it."""
+    """Origin of a clip, and the changes made by the importer."""
 
     file: Digest | None = Field(None, description="The file exactly as it came.")
     file_name: str | None = None

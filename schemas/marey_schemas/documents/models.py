@@ -80,13 +80,13 @@ class MixtureDocument(Request):
 
 
 class Noted(Request):
-    """What is written down beside a model: some of it is read again, anything else may stand there too."""
+    """Record of the training of a model: some members are read again, any others are allowed."""
 
     model_config = ConfigDict(extra="allow")
 
 
 class PredecessorOrigin(Noted):
-    """Where a model that was imported from the predecessor comes from."""
+    """Origin of a model that was imported from the predecessor."""
 
     animated_joints: tuple[JointName, ...] = Field((), max_length=MOST_JOINTS, description="Those that it moves.")
     original: StoredOriginal | None = Field(None, description="The file of the model.")
@@ -100,7 +100,7 @@ class ModelProvenance(Noted):
 
 
 class ExampleNotes(Noted):
-    """How well a model knows one of its examples."""
+    """Likelihood and error of one example under a model."""
 
     log_likelihood: float | None = Field(
         None, allow_inf_nan=False, description="Natural logarithm of the density of the example."
@@ -108,7 +108,7 @@ class ExampleNotes(Noted):
 
 
 class TrainingNotes(Noted):
-    """How good a model is, in numbers."""
+    """Quality of a model, in numbers."""
 
     examples: tuple[ExampleNotes, ...] = Field((), description="One by one.")
 
@@ -171,7 +171,7 @@ def checked_model(part: Mapping[str, Any]) -> MotionPrimitiveDocument:
 
 
 def predecessor_origin(model: Mapping[str, Any]) -> PredecessorOrigin:
-    """Where a stored part `model` was imported from; nothing where an older document says it in a way of its own."""
+    """Origin of an imported part `model`; None where an older document records it in another form."""
     try:
         return ModelProvenance.model_validate(model.get("provenance", {})).predecessor or PredecessorOrigin()
     except ValidationError:

@@ -35,6 +35,6 @@ def content_digest(part: str, document: Mapping[str, Any]) -> str:
 
 
 def original_of(part: str, document: Mapping[str, Any], file: str, digest: str) -> dict[str, Any]:
-    """What to keep of the file that a part was imported from."""
+    """Record of the file that a part was imported from."""
     name = file.replace("\\", "/").rpartition("/")[2]
     return StoredOriginal(name=name, blob=digest, content=content_digest(part, document)).model_dump()

@@ -1,4 +1,4 @@
-"""How documents refer to revisions of items."""
+"""References from documents to revisions of items."""
 
 from __future__ import annotations
 

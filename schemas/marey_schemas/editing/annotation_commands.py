@@ -135,5 +135,5 @@ class AnnotationImport(Request):
 
 
 def command_arguments(command: Request) -> dict[str, Any]:
-    """What a command says besides its name."""
+    """Parameters of a command."""
     return command.model_dump(exclude={"command"})

@@ -1,4 +1,4 @@
-"""What an edit would make of a clip, looked at before anything is stored."""
+"""Previews of edits, before anything is stored."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from marey_schemas.jobs import ItemInput
 
 
 class EditPreviewRequest(Request):
-    """What an edit would make of a clip; nothing is stored."""
+    """Preview of the result of an edit; nothing is stored."""
 
     commands: tuple[EditCommand, ...] = Field((), max_length=MOST_COMMANDS, description="Absent: those of `edit`.")
     edit: ItemInput | None = Field(None, description="An edit, where `commands` are not given; default: its newest.")

@@ -1,4 +1,4 @@
-"""Which arrays may travel: the dtypes, shapes and sizes that every codec accepts."""
+"""Limits of arrays: the dtypes, shapes and sizes that every codec accepts."""
 
 import math
 from collections.abc import Sequence

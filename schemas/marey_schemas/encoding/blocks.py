@@ -31,7 +31,7 @@ class BlockError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """How an array is cut into tiles: blocks of frames, and each block into groups of columns."""
+    """Division of an array into tiles: blocks of frames, and each block into groups of columns."""
 
     spec: ArraySpec
     block_frames: int

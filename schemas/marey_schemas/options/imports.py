@@ -12,7 +12,7 @@ from marey_schemas.names import CollectionPath, Tag
 
 
 class ImportOptions(Request):
-    """What the caller knows and the files do not say. Absent: inferred from evidence, or asked for when ambiguous."""
+    """Facts that the user knows better than the files. Absent: inferred from evidence, or refused when ambiguous."""
 
     collection: CollectionPath = Field("", description="Folder of the project that the clips go to.")
     skeleton: str | None = Field(

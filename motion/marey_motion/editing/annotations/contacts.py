@@ -21,7 +21,7 @@ SMOOTHING_S = 0.045
 
 @dataclass(frozen=True)
 class ContactOptions:
-    """What counts as standing.
+    """Limits of a foot contact.
 
     Parameters
     ----------

@@ -82,7 +82,7 @@ class Layer:
         return self._changed((*self.segments[:first], *segments, *self.segments[stop:]), self.keyframes)
 
     def _place_of(self, keyframe: Keyframe) -> int:
-        """Where a keyframe stands, or would."""
+        """Find the place of a keyframe in order."""
         return bisect_left(self.keyframes, _moment(keyframe), key=_moment)
 
     def _with_keyframes(self, first: int, stop: int, *keyframes: Keyframe) -> Layer:

@@ -29,7 +29,7 @@ OUT_OF_REST = 0.25
 
 @dataclass(frozen=True)
 class PauseOptions:
-    """What counts as a pause.
+    """Limits of a pause.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: PauseOptions
 
 @dataclass(frozen=True)
 class ReachOptions:
-    """What counts as a reach of a hand.
+    """Limits of a reach of a hand.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def propose_reaches(clip: Clip, body: MatchingBody, options: ReachOptions | None
 
 
 def _distance_from_rest(clip: Clip, body: MatchingBody, side: str) -> Floats:
-    """How far (F,) the wrist of a side is from where it was when the clip began, in metres."""
+    """Distance (F,) of a wrist from its position at the start of the clip, in metres."""
     wrist = body.standard_joints.get(f"{side}_wrist")
     if wrist is None:
         raise MappingError("the skeleton's mapping has no such joint", where=f"{side}_wrist")

@@ -24,7 +24,7 @@ SHORTEST_FLIGHT_S = 0.04
 
 @dataclass(frozen=True)
 class StepOptions:
-    """What counts as a step.
+    """Limits of a step.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def _label(step: _Step, has_flight: bool) -> str | None:
 
 
 class _Travel(NamedTuple):
-    """Where hips (F, 2) and ankles (F, 2, 2) are on the ground, where the body heads (F,), and frames per second."""
+    """Ground positions of hips (F, 2) and ankles (F, 2, 2), headings (F,) of the body, and frames per second."""
 
     hips: NDArray[np.float64]
     ankles: NDArray[np.float64]

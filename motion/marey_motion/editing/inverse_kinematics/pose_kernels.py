@@ -67,7 +67,7 @@ def look_error(gaze, wished):  # type: ignore[no-untyped-def]
 
 @compiled
 def target_error(targets, c, frame, tip, turn):  # type: ignore[no-untyped-def]
-    """What target `c` is missed by: metres along its axes, or a rotation vector in radians, both in the world."""
+    """Error of target `c`: metres along its axes, or a rotation vector in radians, both in the world."""
     values = targets.values[frame]
     if targets.kinds[c] == POSITION:
         off = minus(tip, vector_at(values, c))

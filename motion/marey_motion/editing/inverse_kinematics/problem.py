@@ -52,7 +52,7 @@ class Targets(NamedTuple):
 
 
 class SolverResult(NamedTuple):
-    """What a solver tells: residuals (F, C), iterations and whether all targets are reached (F,)."""
+    """Results of a solver: residuals (F, C), iterations and whether all targets are reached (F,)."""
 
     before: Floats
     after: Floats

@@ -38,7 +38,7 @@ _STILL = np.array([[1.0, 0.0, 0.0, 0.0]])
 
 @dataclass(frozen=True, eq=False)
 class SolvedPoses:
-    """What a solver found for F frames and C targets.
+    """Result of a solver for F frames and C targets.
 
     Parameters
     ----------

@@ -101,7 +101,7 @@ Target = PositionTarget | OrientationTarget | LookAtTarget
 
 @dataclass(frozen=True, eq=False)
 class JointLimit:
-    """How far a joint turns from a reference: a twist about an axis, then a swing of the axis.
+    """Limits of a joint's rotation from a reference: a twist about an axis, then a swing of the axis.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ class SolverOptions:
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """What a solver may turn.
+    """Joints that a solver may turn.
 
     Parameters
     ----------

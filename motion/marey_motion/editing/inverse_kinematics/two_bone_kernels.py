@@ -78,7 +78,7 @@ def _bent(upper, fore, wished, hinge):  # type: ignore[no-untyped-def]
 
 @compiled
 def _turn_from_hinge(along, across, cosine, wished):  # type: ignore[no-untyped-def]
-    """How far from its hinge, about the upper bone, the axis is that a limb shall bend by `wished` radians about.
+    """Angle about the upper bone from a limb's hinge to the axis that it bends about by `wished` radians.
 
     A limb that is nearly straight is taken to bend as its hinge says, even where it is a little beyond straight; what
     it is bent aside stays, what is added is about the hinge. One that is bent tells its axis itself.
@@ -154,7 +154,7 @@ def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):
 
 @compiled
 def undamped_reach(starts, firsts, seconds, zone):  # type: ignore[no-untyped-def]
-    """How far (F,) limbs that span `starts` can come before damping takes anything from their stretching."""
+    """Largest span (F,) of limbs that span `starts` before damping reduces their stretching."""
     reach = np.empty(starts.shape[0])
     for f in range(starts.shape[0]):
         first, second = firsts[f], seconds[f]

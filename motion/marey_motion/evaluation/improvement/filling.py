@@ -35,7 +35,7 @@ class FilledCell:
 
 @dataclass(frozen=True)
 class Filling:
-    """A source (with its mirrored twin, where its collection has it) that would fill holes.
+    """A source (with its mirrored copy, where its collection has it) that would fill holes.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def source_seconds(
 
 
 def _less(missing: Floats, seconds: Floats, options: EvaluationOptions) -> Floats:
-    """What is missing of each cell once `seconds` are there; half a frame is rounding."""
+    """Deficit of each cell with `seconds` of data; half a frame is rounding."""
     left = np.maximum(missing - seconds, 0.0)
     left[left < 0.5 / options.database.rate_hz] = 0.0
     return left

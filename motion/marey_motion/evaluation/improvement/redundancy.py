@@ -15,7 +15,7 @@ ProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Removal:
-    """What leaving out one source (a clip and its mirrored twin) does.
+    """Effect of leaving out one source (a clip and its mirrored copy).
 
     Parameters
     ----------

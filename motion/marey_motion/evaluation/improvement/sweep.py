@@ -37,7 +37,7 @@ class SweepRow:
 
 @dataclass(frozen=True)
 class Influence:
-    """How much the objective depends on one group, among the settings that differ from the first in it alone.
+    """Influence of one group on the objective, among the settings that differ from the first in it alone.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a suite of trials never needs: whole clips, and stretches of clips that are used elsewhere.
+"""Clips that a suite of trials never needs, and unneeded ranges of clips that are used elsewhere.
 
 Both can go without changing any trial, to the last bit, as long as the normaliser stays: `resimulation` says why for
 clips. Of a used clip those frames are unneeded that lie farther than `MARGIN_BEFORE_S` before and the look-ahead plus

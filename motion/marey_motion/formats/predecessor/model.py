@@ -138,7 +138,7 @@ def model_of_document(document: Document, file: str, *, skeleton: Skeleton | Non
 
 @dataclass(frozen=True, eq=False)
 class _Parts:
-    """What every layout holds, under one name each."""
+    """The contents of every layout, under one name each."""
 
     name: str
     space: Document

@@ -50,7 +50,7 @@ def _pose(chains, latent, channels, local, positions, rotations):  # type: ignor
 
 @compiled
 def _items(chains, placement, positions, rotations, points, turns):  # type: ignore[no-untyped-def]
-    """What is tracked, in the world: sums of joint positions, and the rotation of one joint of each."""
+    """Compute the tracked points in the world: sums of joint positions, and the rotation of one joint of each."""
     cos, sin = math.cos(placement[0]), math.sin(placement[0])
     yaw = (math.cos(0.5 * placement[0]), 0.0, math.sin(0.5 * placement[0]), 0.0)
     for item in range(points.shape[0]):
@@ -112,7 +112,7 @@ def _rotation_error(turn, target, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def _aims(kind, row, rows, points, turns, pointing, wanted):  # type: ignore[no-untyped-def]
-    """Where a joint's axis points, where it should, both of length 1, and how far the point to look at is."""
+    """Compute the unit directions of a joint's axis and of its target; return the distance of the point to look at."""
     item = rows.items[row]
     axis, target = rows.axes[row], rows.targets[row]
     pointing[0], pointing[1], pointing[2] = rotate_vector(turns[item], axis[0], axis[1], axis[2])

@@ -27,7 +27,7 @@ LEAST_GAIN = 1e-12
 
 @dataclass(frozen=True)
 class RefineOptions:
-    """How latent vectors are refined.
+    """Options of refinement.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ DEFAULT_REFINING = RefineOptions()
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """Where refining ended.
+    """Result of a refinement.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAUL
 
 
 def _step(curvature: Floats, gradient: Floats) -> Floats | None:
-    """Where a quadratic is least; None where rounding leaves no such place, so that it must be damped more."""
+    """Minimise a quadratic; None where rounding leaves no minimum, so that it must be damped more."""
     try:
         step = np.asarray(np.linalg.solve(curvature, -gradient))
     except np.linalg.LinAlgError:

@@ -126,7 +126,7 @@ def _best(tree: SampleTree, samples: Indices, costs: Floats, top: int, evaluatio
 
 
 def _smallest(costs: Floats, places: Indices, count: int) -> Indices:
-    """Where the smallest costs are, in order; of equal costs the first places."""
+    """Find the places of the smallest costs, in order; of equal costs the first places."""
     order: Indices = np.lexsort((places, costs))[:count]
     return order
 

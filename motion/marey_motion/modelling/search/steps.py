@@ -48,7 +48,7 @@ class Step:
 
 @dataclass(frozen=True)
 class TransitionOptions:
-    """How steps hang together.
+    """Continuity between steps.
 
     Parameters
     ----------
@@ -65,14 +65,14 @@ DEFAULT_TRANSITIONS = TransitionOptions()
 
 
 class CarriedOn(NamedTuple):
-    """Where a step begins: its canonical frame, and where the transition joints stand, by standard name."""
+    """Start of a step: its canonical frame, and the positions of the transition joints by standard name."""
 
     placement: Placement
     joints: Mapping[str, Floats]
 
 
 class Measured(NamedTuple):
-    """What latent vectors come to.
+    """Errors of latent vectors.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ class SeveralSteps:
 
 
 def _ends(step: Step, joints: Sequence[str]) -> tuple[Tracked, ...]:
-    """What is tracked where a step begins, and then where it ends. Raises `MappingError`."""
+    """List the points tracked at the start and then at the end of a step. Raises `MappingError`."""
     return tuple(
         one
         for frame in (0.0, float(step.primitive.frame_count - 1))
@@ -295,7 +295,7 @@ def _carry_on(points: Floats, slopes: Floats, link: _Link, stacked: Floats) -> t
 
 
 def _heading(across: Floats) -> float:
-    """Where a body faces whose axis from right to left is this."""
+    """Compute the heading of a body from its axis from right to left."""
     return float(np.arctan2(-across[2], across[0]))
 
 

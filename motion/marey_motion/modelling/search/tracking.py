@@ -35,7 +35,7 @@ class Tracked(NamedTuple):
 
 
 class Chains(NamedTuple):
-    """What has to be computed for n tracked points: V joints at some moments, with X channels in all.
+    """Arrays for n tracked points: V joints at some moments, with X channels in all.
 
     Parameters
     ----------
