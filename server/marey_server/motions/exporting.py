@@ -34,7 +34,7 @@ class ExportSource:
 
 
 @dataclass(frozen=True, slots=True)
-class ExportedFile:
+class ServedFile:
     """A file to hand out."""
 
     name: str
@@ -106,7 +106,7 @@ def find_original(
 
 def write_file(
     source: ExportSource, file_format: ExportFormat, unit: str, time: ExportTime, options: PredecessorOptions
-) -> ExportedFile:
+) -> ServedFile:
     """The file of an item. Raises `InvalidProblem` where the format cannot hold it."""
     if time == "source" and source.item.kind is not Kind.PROCESSED:
         raise InvalidProblem(
@@ -115,9 +115,9 @@ def write_file(
     beside = source.item.kind is Kind.PROCESSED and options.part == "alignment"
     if file_format == "predecessor" and (beside or source.item.kind not in WITH_MOTION):
         name, data = write_predecessor(source.item.kind, source.item.name, source.parts, source.hierarchy, options)
-        return ExportedFile(name, codecs.JSON, data)
+        return ServedFile(name, codecs.JSON, data)
     if file_format == "json":
-        return ExportedFile(f"{source.item.name}.json", codecs.JSON, codecs.encode_tree(_as_tree(source), codecs.JSON))
+        return ServedFile(f"{source.item.name}.json", codecs.JSON, codecs.encode_tree(_as_tree(source), codecs.JSON))
     if source.item.kind not in WITH_MOTION or source.hierarchy is None:
         raise InvalidProblem(f"A {source.item.kind} is exported as json.", code="no-such-export")
     from marey_motion.alignment.aligned_documents import restored_clip
@@ -133,7 +133,7 @@ def write_file(
         written = write_clip_file(clip, file_format, unit=unit, info=source.parts.get("info"))
     except MotionError as error:
         raise InvalidProblem(str(error), code="cannot-be-exported") from error
-    return ExportedFile(source.item.name + written.suffix, written.media_type, written.data)
+    return ServedFile(source.item.name + written.suffix, written.media_type, written.data)
 
 
 def _as_tree(source: ExportSource) -> dict[str, Any]:
