@@ -52,7 +52,16 @@ class Anatomy:
         return _mapping_part(self, None)
 
     def mapping_part(self, clip: Clip | None) -> dict[str, Any]:
-        """Make the part `mapping`: joints, and axes that the rest pose shows, else a clip of the skeleton."""
+        """Make the part `mapping`: joints, and axes that the rest pose shows, else a clip of the skeleton.
+
+        Parameters
+        ----------
+        clip : Clip or None    motion of this skeleton, whose poses show axes that the rest pose leaves open
+
+        Returns
+        -------
+        dict    the document's tree, of plain values
+        """
         return self._resting or _mapping_part(self, clip)
 
 
@@ -70,7 +79,16 @@ _KNOWN: LruCache[bytes, Anatomy] = LruCache(max_entries=KEPT_SKELETONS)
 
 
 def anatomy_of(skeleton: Skeleton) -> Anatomy:
-    """Find the anatomy of a skeleton among those of equal skeletons seen last, or begin a new one."""
+    """Find the anatomy of a skeleton among those of equal skeletons seen last, or begin a new one.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints; skeletons are equal when every name and number is
+
+    Returns
+    -------
+    Anatomy    shared by all equal skeletons
+    """
     return _KNOWN.get_or_make(_content_key(skeleton), lambda: Anatomy(skeleton))
 
 
