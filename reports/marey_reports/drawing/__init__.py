@@ -1,1 +1,1 @@
-"""What pictures and reports share: paper and ink, bodies as lines, figures with their numbers, pages and tables."""
+"""Shared drawing code: paper and ink, bodies as lines, figures with their numbers, pages and tables."""

@@ -1,4 +1,4 @@
-"""Pictures of motion: contact sheets that show takes and what became of them side by side.
+"""Pictures of motion: contact sheets that show takes and their results side by side.
 
 Matplotlib is loaded when the first picture is drawn, and only its object interface is used, so that threads may draw
 at the same time.

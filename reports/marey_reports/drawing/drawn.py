@@ -24,7 +24,7 @@ Tables = Mapping[str, Mapping[str, Column]]
 
 
 class Sketch(NamedTuple):
-    """What a module of figures draws: the page, the numbers on it, and what it shows in one or two sentences."""
+    """Result of drawing a figure: the page, the numbers on it, and a description in one or two sentences."""
 
     figure: Figure
     tables: Tables

@@ -181,7 +181,7 @@ def shortened(name: str, longest: int = LONGEST_NAME) -> str:
 
 
 def reach(values: NDArray[np.floating[Any]], wanted: float) -> float:
-    """How far an axis of magnitudes goes: all values, unless a few lie beyond twice what is wanted to be seen."""
+    """Choose the end of an axis of magnitudes: all values, unless a few lie beyond twice the range of interest."""
     if not len(values):
         return wanted
     most = float(np.quantile(values, 0.98))

@@ -37,7 +37,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class StickFigure:
-    """What to draw of a skeleton.
+    """Lines and points that represent a skeleton.
 
     Parameters
     ----------

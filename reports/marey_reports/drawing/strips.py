@@ -37,7 +37,7 @@ LINE_POINTS = 1.7
 
 @dataclass(frozen=True, eq=False)
 class StripRow:
-    """What one row shows.
+    """Content of one row.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def _draw_label(axes: Axes, row: StripRow, middle: float) -> None:
 
 
 class _Look(NamedTuple):
-    """How a body is drawn; without a colour in those of its sides, with a rim set off from what is behind."""
+    """Style of a body; without a colour in those of its sides, with a rim set off from the background."""
 
     width: float
     alpha: float = 1.0

@@ -52,7 +52,7 @@ def headline(result: EvaluationResult) -> Html:
 
 
 def coverage_chapter(result: EvaluationResult, figures: Figures) -> Section:
-    """What the clips hold."""
+    """Write the chapter on the coverage of the clips."""
     coverage = result.coverage
     short = [result.clips[index].name for index in coverage.too_short]
     text = element(
@@ -66,7 +66,7 @@ def coverage_chapter(result: EvaluationResult, figures: Figures) -> Section:
 
 
 def error_chapter(result: EvaluationResult, figures: Figures) -> Section:
-    """Where the character goes wrong, the worst trials first."""
+    """Write the chapter on the errors of the character, the worst trials first."""
     worst = sorted(result.trials, key=lambda each: (-strain(each).worst, each.trial.name))[:WORST_TRIALS]
     lost = sum(not is_followed(each) for each in result.trials)
     text = (
@@ -86,7 +86,7 @@ def error_chapter(result: EvaluationResult, figures: Figures) -> Section:
 
 
 def load_chapter(result: EvaluationResult, figures: Figures) -> Section:
-    """Which clips carry the load."""
+    """Write the chapter on the most used clips."""
     used = _by_use(result)
     half, total = 0, 0.0
     while half < len(used) and total < 0.5:
@@ -107,7 +107,7 @@ def load_chapter(result: EvaluationResult, figures: Figures) -> Section:
 
 
 def unused_chapter(result: EvaluationResult) -> Section:
-    """Which clips were never displayed."""
+    """Write the chapter on the clips that were never displayed."""
     sources = sum_by_source(result.clips, result.usage)
     unused = [source for source in sources if not source.ticks]
     if not unused:
@@ -126,7 +126,7 @@ def unused_chapter(result: EvaluationResult) -> Section:
 
 
 def recording_chapter(result: EvaluationResult, figures: Figures) -> Section:
-    """What to record next, in words."""
+    """Describe the data to record next."""
     holes = find_holes(result.coverage)
     if not holes:
         text = element("p", "Nothing: every speed and turn rate that the trials ask for has enough data.")
@@ -259,7 +259,7 @@ def _listed(names: Iterable[str], most: int = 12) -> str:
 
 
 def notes(result: EvaluationResult) -> Html | None:
-    """What the evaluation had to say about its clips."""
+    """Write the chapter on the notes of the evaluation about its clips."""
     if not result.notes:
         return None
     listing = element("ul", [element("li", note) for note in result.notes])

@@ -72,7 +72,7 @@ def headline_of_two(before: EvaluationResult, after: EvaluationResult, labels: t
 def metric_chapter(
     before: EvaluationResult, after: EvaluationResult, comparison: Comparison | None, labels: tuple[str, str]
 ) -> Section:
-    """How the suite's numbers changed, with intervals where they were computed."""
+    """Write the chapter on the changes of the suite's numbers, with intervals where they were computed."""
     changes = {change.metric: change for change in comparison.metrics} if comparison is not None else {}
     heads = ["measure", *labels, "change", *(["between", "verdict"] if comparison else []), "unit"]
     rows: list[Sequence[Cell]] = []
@@ -104,7 +104,7 @@ def metric_chapter(
 def trial_chapter(
     before: EvaluationResult, after: EvaluationResult, comparison: Comparison | None, figures: Figures
 ) -> Section:
-    """Where it changed: trials gained and lost, the largest changes first."""
+    """Write the chapter on changed trials: gained and lost, the largest changes first."""
     pairs = [(old, new) for old, new in paired(before, after) if old.metrics != new.metrics]
     pairs.sort(key=lambda pair: (-abs(_shift(*pair)), pair[0].trial.name))
     changed = sum(not each.same_motion for each in comparison.changed) if comparison is not None else len(pairs)
@@ -124,7 +124,7 @@ def trial_chapter(
 
 
 def clip_chapter(before: EvaluationResult, after: EvaluationResult, figures: Figures) -> Section:
-    """Which clips came, went, and lost or found use."""
+    """Write the chapter on clips that were added, removed, or lost or found use."""
     names = {clip.uid: clip.name for result in (after, before) for clip in result.clips}
     held = [{clip.uid for clip in result.clips} for result in (before, after)]
     used = [{result.clips[usage.clip].uid for usage in result.usage if usage.ticks} for result in (before, after)]
@@ -141,7 +141,7 @@ def clip_chapter(before: EvaluationResult, after: EvaluationResult, figures: Fig
 
 
 def coverage_of_two_chapter(figures: Figures) -> Section:
-    """What is covered now."""
+    """Write the chapter on the change of coverage."""
     return Section("coverage", "Coverage", shown(figures, "density", "points", "holes", "directions"))
 
 

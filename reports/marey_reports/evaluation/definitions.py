@@ -1,4 +1,4 @@
-"""What the numbers of a report are called for people, and what exactly they mean."""
+"""Names and definitions of the numbers of a report."""
 
 from __future__ import annotations
 

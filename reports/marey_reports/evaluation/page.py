@@ -96,7 +96,7 @@ def render_comparison(
 
 
 def verdict(result: EvaluationResult) -> str:
-    """How good the dataset is, what goes worst, how much is covered and how much unused, in one sentence."""
+    """Summarise quality, largest errors, coverage and unused data in one sentence."""
     judgement = judge(result)
     if judgement.worst is None:
         return "Not judged: the evaluation has no trials."
@@ -114,7 +114,7 @@ def verdict(result: EvaluationResult) -> str:
 
 
 def _failing(outcome: TrialResult) -> str:
-    """Which limit a trial breaks most, and by what."""
+    """Describe the limit that a trial breaks most, and by how much."""
     kind = max(zip(strain(outcome), ("offset_mean", "se_v", "se_omega_deg"), strict=True))
     value = outcome.metrics.get(kind[1])
     if value is None or math.isinf(kind[0]):

@@ -1,4 +1,4 @@
-"""Where a report's numbers come from."""
+"""Origin of a report's numbers."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class CoverageGap(NamedTuple):
 
 
 def find_holes(coverage: Coverage) -> list[CoverageGap]:
-    """What is missing as few rectangles of cells, the largest deficit first.
+    """Combine the missing cells to few rectangles, the largest deficit first.
 
     Cells are joined along the turn rate within one side (left, straight on, right), then runs that are alike along the
     speed. A rectangle is named by the centres of its outermost cells: they are the trials that it stands for.

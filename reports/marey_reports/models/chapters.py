@@ -60,7 +60,7 @@ def _sliding(samples: FootQuality | None, examples: FootQuality | None) -> tuple
 
 
 def warning_chapter(trained: TrainedPrimitive) -> Section:
-    """What somebody should look at before using the model."""
+    """Write the chapter on the warnings about the model."""
     if not trained.warnings:
         text = element("p", "Nothing stands out.")
         return Section("look", "What to look at", text)
@@ -72,7 +72,7 @@ def warning_chapter(trained: TrainedPrimitive) -> Section:
 
 
 def motion_chapter(subject: ModelSubject, figures: Figures) -> Section:
-    """What the model makes, and how far it reaches."""
+    """Write the chapter on the samples of the model and their reach."""
     text = element(
         "p",
         "Left and right are those of the body: blue is its left side, orange its right. All motions begin where the "
@@ -104,7 +104,7 @@ def _reach_row(reach: Reach) -> list[Cell]:
 
 
 def variation_chapter(subject: ModelSubject, figures: Figures) -> Section:
-    """What each of the first components does."""
+    """Write the chapter on the effect of each of the first components."""
     spatial, temporal = subject.primitive.spatial.count, subject.primitive.temporal.count
     if not spatial + temporal:
         text = "Nothing: all examples are the same motion, and so are all samples."
@@ -120,7 +120,7 @@ def variation_chapter(subject: ModelSubject, figures: Figures) -> Section:
 
 
 def example_chapter(subject: ModelSubject, figures: Figures) -> Section:
-    """How well each example fits, the oddest first."""
+    """Write the chapter on the fit of each example, the least likely first."""
     examples = subject.report.examples
     order = sorted(range(len(examples)), key=lambda place: (-_oddness(examples[place]), examples[place].uid))
     rows = [_example_row(examples[place], subject.names[place]) for place in order]
@@ -153,7 +153,7 @@ def _example_row(example: ExampleReport, name: str) -> list[Cell]:
 
 
 def making_chapter(subject: ModelSubject, figures: Figures) -> Section:
-    """How the examples were aligned."""
+    """Write the chapter on the alignment of the examples."""
     aligned = subject.examples
     reference = next(clip.name for clip in aligned.clips if clip.uid == aligned.reference)
     text = (
@@ -171,6 +171,6 @@ def making_chapter(subject: ModelSubject, figures: Figures) -> Section:
 
 
 def numbers_chapter(figures: Figures) -> Section:
-    """How much the model keeps, and what it costs."""
+    """Write the chapter on the variance that the model keeps, and its cost."""
     pictures = shown(figures, "variance", "reconstruction", "latent-space", "mixture")
     return Section("numbers", "How much it keeps", pictures)

@@ -1,4 +1,4 @@
-"""What the words and numbers of a model's report mean."""
+"""Definitions of the words and numbers in a model's report."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ def render_model_report(
 
 
 def provenance(trained: TrainedPrimitive, origin: Mapping[str, Any]) -> Html:
-    """What the model was made of, by which options and which code."""
+    """Describe the origin of the model: examples, options and code version."""
     known = [
         (label, element("code", str(origin[name]))) for name, label in _ORIGINS.items() if origin.get(name) is not None
     ]

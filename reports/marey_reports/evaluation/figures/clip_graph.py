@@ -89,7 +89,7 @@ def _most_used(popularity: Sequence[dict[str, Ints]], most: int) -> list[str]:
 
 
 def _links(subjects: Sequence[Subject], switches: Sequence[Ints]) -> dict[tuple[str, str], int]:
-    """How often the character went from clip to clip, by both uids."""
+    """Count the transitions from clip to clip, by both uids."""
     links: dict[tuple[str, str], int] = {}
     for subject, each in zip(subjects, switches, strict=True):
         clips = subject.result.clips

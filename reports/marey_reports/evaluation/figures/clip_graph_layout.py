@@ -1,4 +1,4 @@
-"""Where figure 10 puts clips, frames and transitions: circles on a ring, so that no line has to cross a circle."""
+"""Layout of clips, frames and transitions in figure 10: circles on a ring, so that no line crosses a circle."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Circle:
     dots: int
 
     def dot_of(self, frames: Ints) -> Ints:
-        """Which dot holds each frame."""
+        """Find the dot that holds each frame."""
         return np.asarray(np.minimum(frames * self.dots // max(self.frames, 1), self.dots - 1), dtype=np.int64)
 
     def coarser(self, factor: int) -> Circle:

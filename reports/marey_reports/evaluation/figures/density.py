@@ -138,7 +138,7 @@ def _edges(subjects: Sequence[Subject], plane: _Plane) -> tuple[Floats, Floats]:
 
 
 def _target(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float], tuple[float, float]]:
-    """What has to be seen even without data there, along both axes."""
+    """Choose the range that is shown even without data, along both axes."""
     fastest = float(coverage.speed_edges_m_s[-1])
     if plane is DIRECTIONS:
         return (-1.0, 1.0), (-1.0, fastest)

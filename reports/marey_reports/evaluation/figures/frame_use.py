@@ -1,4 +1,4 @@
-"""Which stretches of the most used clips the character displayed, and how often."""
+"""Figure of the displayed ranges of the most used clips, with their counts."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def _draw(subjects: Sequence[Subject], name: str | None, family: Family) -> Sket
 
 
 def _followed(subject: Subject, trial: Trial) -> Floats | None:
-    """Where the character went, when the record was kept."""
+    """Look up the path of the character, where the record was stored."""
     return find_record(subject, trial.name).positions if subject.result.records else None
 
 

@@ -1,4 +1,4 @@
-"""What figures are drawn of: one result, or two under their names, and one trial of them."""
+"""Subjects of figures: one result, or two under their names, and one trial of them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from marey_schemas.options.evaluation import Family
 
 @dataclass(frozen=True)
 class FigureOptions:
-    """What can be chosen about how figures are drawn.
+    """Options of drawing figures.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class Subject:
 
     @property
     def prefix(self) -> str:
-        """What a sentence about one of two subjects begins with."""
+        """Make the beginning of a sentence about one of two subjects."""
         return f"{self.label}: " if self.label else ""
 
     def column(self, name: str) -> str:

@@ -1,4 +1,4 @@
-"""What an alignment weighed: how unlike moments of a clip are to moments of the reference, and the way it took."""
+"""Figure of an alignment's costs: differences between moments of a clip and of the reference, and the path."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each component of a model does: motions from two deviations below to two above the mean."""
+"""Figure of the components of a model: motions from two deviations below to two above the mean."""
 
 from __future__ import annotations
 

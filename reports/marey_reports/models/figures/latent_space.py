@@ -129,7 +129,7 @@ def ellipse(mean: Floats, covariance: Floats) -> Floats:
 
 
 def draw_likelihood(subject: ModelSubject) -> Sketch:
-    """How likely each example is, compared with the others, the least likely first."""
+    """Compare the likelihoods of the examples, the least likely first."""
     examples = subject.report.examples
     order = sorted(range(len(examples)), key=lambda place: (_judged(examples[place]), examples[place].uid))
     below = _deviations(np.array([_judged(example) for example in examples]))

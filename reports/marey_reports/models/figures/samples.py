@@ -1,4 +1,4 @@
-"""What the model makes beside what it was made of: bodies on top of each other, and the ways of hands and feet."""
+"""Figure of samples beside the examples: bodies on top of each other, and the paths of hands and feet."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Reach(NamedTuple):
 
 
 def reach_of(subject: ModelSubject) -> list[Reach]:
-    """Where wrists and ankles are in 98 of 100 moments, of the examples and of as many samples, at least 200."""
+    """Compute the range of wrists and ankles in 98 of 100 moments, of examples and as many samples, at least 200."""
     frames = evenly(subject.primitive.frame_count, FRAMES)
     drawn = subject.primitive.sample(max(LEAST_REACHING, len(subject.poses)), subject.seed)
     sets = [subject.points(poses) for poses in (subject.poses[:, frames], subject.primitive.poses(drawn, frames))]
@@ -84,7 +84,7 @@ def _spread_cm(subject: ModelSubject, points: Floats) -> float:
 
 
 def draw_paths(subject: ModelSubject) -> Sketch:
-    """Where wrists and ankles go, from the side and from above, examples on the left and samples on the right."""
+    """Draw the paths of wrists and ankles, from the side and above, examples on the left and samples on the right."""
     chosen = evenly(len(subject.poses), SHOWN)
     frames = evenly(subject.primitive.frame_count, FRAMES)
     joints = _followed(subject)

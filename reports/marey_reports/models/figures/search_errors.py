@@ -1,4 +1,4 @@
-"""How well constraints are met: the errors of a search over targets that the model should reach."""
+"""Figure of the errors of a search, over targets that the model should reach."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How many numbers a model needs: what components hold, what they cannot rebuild, and the choice of the mixture."""
+"""Figure of the size of a model: variance of the components, errors of reconstruction, choice of the mixture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What figures of a model are drawn of: the model, the examples it was made of, and what drawing needs of both."""
+"""Subjects of the figures of a model: the model, its examples, and the data that drawing needs of both."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ModelSubject:
 
     @cached_property
     def body(self) -> StickFigure:
-        """What to draw of the skeleton."""
+        """Lines and points that represent the skeleton."""
         return body_of(self.primitive.skeleton)
 
     @cached_property
@@ -72,7 +72,7 @@ class ModelSubject:
 
     @cached_property
     def seen_from_rad(self) -> float:
-        """Where strips look from: motions that travel are seen more from the side than those that stay in place."""
+        """View of strips: motions that travel are seen more from the side than those that stay in place."""
         way = self.mean_poses[[0, -1], :3]
         return FROM_ASIDE_RAD if np.linalg.norm((way[1] - way[0])[[0, 2]]) > TRAVELS_M else FROM_AHEAD_RAD
 

@@ -1,4 +1,4 @@
-"""How an alignment plays its clips: every time function, and where each of them is faster or slower."""
+"""Figure of the time functions of an alignment, with the places where each is faster or slower."""
 
 from __future__ import annotations
 

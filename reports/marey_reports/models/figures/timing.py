@@ -1,4 +1,4 @@
-"""What the model knows of time: how each time component plays a motion, and how long motions last."""
+"""Figure of the time model: the effect of each time component, and the durations of motions."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _rates(passed_s: Floats, frame_rate_hz: float) -> Floats:
 
 
 def draw_durations(subject: ModelSubject) -> Sketch:
-    """How long examples and samples last."""
+    """Draw the durations of examples and samples."""
     primitive = subject.primitive
     examples = subject.examples.time_functions[:, -1] / primitive.frame_rate_hz
     samples = primitive.durations_s(primitive.sample(COUNTED_SAMPLES, subject.seed))
