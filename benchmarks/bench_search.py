@@ -19,7 +19,7 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search.constraints import JointPosition
 from marey_motion.modelling.search.objective import build_objective
-from marey_motion.modelling.search.optimise import RefineOptions, refine
+from marey_motion.modelling.search.optimise import refine
 from marey_motion.modelling.search.samples import search_closely
 from marey_motion.modelling.search.steps import SeveralSteps, Step
 from marey_motion.modelling.search.tree import END_EFFECTORS, SampleTree, build_tree
@@ -28,6 +28,7 @@ from marey_motion.modelling.training import train_primitive
 from marey_motion.rigs import map_joints
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 from marey_schemas.options.modelling import ModelOptions, TreeOptions
+from marey_schemas.options.searching import RefineOptions
 
 Floats = NDArray[np.float64]
 

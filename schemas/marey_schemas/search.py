@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, StringConstraints, model_validator
 
 from marey_schemas.base import Answer, Request
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
+from marey_schemas.options.searching import RefineOptions
 
 MOST_CONSTRAINTS = 64
 MOST_STEPS = 16
@@ -26,8 +27,32 @@ Component = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Positive = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
 Tolerance = Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)]
 """No motion was ever captured so exactly, and squares of errors in smaller ones cannot be computed with."""
+Distance = Annotated[float, Field(ge=1e-5, le=1e4, allow_inf_nan=False)]
 Degrees = Annotated[float, Field(ge=-36_000, le=36_000, allow_inf_nan=False)]
 ItemId = Annotated[str, StringConstraints(min_length=1, max_length=64)]
+
+
+def _in_centimetres(name: str) -> Any:
+    """Declare the field of release 0.1 that says in centimetres what `name` says in metres."""
+    return Field(
+        None,
+        exclude=True,
+        json_schema_extra={"deprecated": True},
+        description=f"Deprecated: `{name}` in centimetres, as release 0.1 spelt it.",
+    )
+
+
+def _read_old_unit(model: Request, name: str, old: str) -> None:
+    """Move a value in centimetres to the field in metres. Raises `ValueError` where both are given."""
+    centimetres = getattr(model, old)
+    if centimetres is None:
+        return
+    if name in model.model_fields_set:
+        raise ValueError(f"{old}: give {name} alone")
+    object.__setattr__(model, name, centimetres * 0.01)
+    object.__setattr__(model, old, None)
+    model.model_fields_set.discard(old)
+    model.model_fields_set.add(name)
 
 
 # --- constraints -----------------------------------------------------------------------------------------------------
@@ -38,7 +63,17 @@ class _SearchConstraint(Request):
     weight: Positive = Field(1.0, description="How much it counts.")
 
 
-class JointPositionConstraint(_SearchConstraint):
+class _PlaceConstraint(_SearchConstraint):
+    tolerance_m: Distance = Field(0.01, description="The error that counts as 1, in metres.")
+    tolerance_cm: Tolerance | None = _in_centimetres("tolerance_m")
+
+    @model_validator(mode="after")
+    def _read_centimetres(self) -> Self:
+        _read_old_unit(self, "tolerance_m", "tolerance_cm")
+        return self
+
+
+class JointPositionConstraint(_PlaceConstraint):
     """A joint is at a place."""
 
     type: Literal["joint_position"]
@@ -46,7 +81,6 @@ class JointPositionConstraint(_SearchConstraint):
     target_m: tuple[Coordinate | None, Coordinate | None, Coordinate | None] = Field(
         description="(x, y, z) in the world; null where it is free."
     )
-    tolerance_cm: Tolerance = Field(1.0, description="The error that counts as 1.")
 
 
 class JointOrientationConstraint(_SearchConstraint):
@@ -55,7 +89,7 @@ class JointOrientationConstraint(_SearchConstraint):
     type: Literal["joint_orientation"]
     joint: JointLabel = Field(description="Its own name, or its standard name.")
     rotation: tuple[Component, Component, Component, Component] = Field(description="(w, x, y, z) in the world.")
-    tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1.")
+    tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1, in degrees.")
 
 
 class LookDirectionConstraint(_SearchConstraint):
@@ -66,15 +100,14 @@ class LookDirectionConstraint(_SearchConstraint):
     direction: tuple[Component, Component, Component] | None = Field(None, description="(x, y, z) in the world.")
     point_m: tuple[Coordinate, Coordinate, Coordinate] | None = Field(None, description="In place of a direction.")
     axis: tuple[Component, Component, Component] = Field((0.0, 0.0, 1.0), description="In the joint's own frame.")
-    tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1.")
+    tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1, in degrees.")
 
 
-class RootPositionConstraint(_SearchConstraint):
+class RootPositionConstraint(_PlaceConstraint):
     """The body stands over a place on the ground."""
 
     type: Literal["root_position"]
     target_m: tuple[Coordinate | None, Coordinate | None] = Field(description="(x, z); null where it is free.")
-    tolerance_cm: Tolerance = Field(1.0, description="The error that counts as 1.")
 
 
 class RootHeadingConstraint(_SearchConstraint):
@@ -82,7 +115,7 @@ class RootHeadingConstraint(_SearchConstraint):
 
     type: Literal["root_heading"]
     heading_deg: Degrees = Field(description="0 along +z, positive to the left.")
-    tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1.")
+    tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1, in degrees.")
 
 
 class KeyframeTimeConstraint(_SearchConstraint):
@@ -90,7 +123,7 @@ class KeyframeTimeConstraint(_SearchConstraint):
 
     type: Literal["keyframe_time"]
     seconds: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
-    tolerance_s: Tolerance = Field(0.05, description="The error that counts as 1.")
+    tolerance_s: Tolerance = Field(0.05, description="The error that counts as 1, in seconds.")
 
 
 SearchConstraint = Annotated[
@@ -123,7 +156,7 @@ class SearchStep(Request):
     constraints: SearchConstraints = ()
 
 
-class SearchRequest(Request):
+class SearchRequest(RefineOptions):
     """Ask for a motion, or for several that follow one another, that meet constraints."""
 
     constraints: SearchConstraints = Field((), description="On one motion.")
@@ -136,19 +169,18 @@ class SearchRequest(Request):
         2, ge=1, le=4, description="1: the tree's samples alone; each further one looks closer around the best so far."
     )
     refine: bool = Field(True, description="Improve what the tree has by numerical optimisation.")
-    likelihood_weight: float = Field(
-        1.0,
-        ge=0,
-        le=1e6,
-        allow_inf_nan=False,
-        alias="lambda",
-        description="What a likely motion is worth; the less, the nearer it comes to the targets.",
+    transition_tolerance_m: Distance = Field(
+        0.02, description="Error of hands, feet and height from step to step that counts as 1, in metres."
     )
-    iterations: int = Field(50, ge=1, le=200, description="Of the optimisation, at most.")
-    transition_tolerance_cm: Tolerance = Field(2.0, description="For hands, feet and height from step to step.")
+    transition_tolerance_cm: Tolerance | None = _in_centimetres("transition_tolerance_m")
     finish: bool = Field(False, description="Remove what is left of joint positions by inverse kinematics.")
     seed: int = Field(0, ge=0, lt=2**63, description="Of the samples, where the model has no tree of its own.")
     motion: bool = Field(True, description="Send the motion, too.")
+
+    @model_validator(mode="after")
+    def _read_centimetres(self) -> Self:
+        _read_old_unit(self, "transition_tolerance_m", "transition_tolerance_cm")
+        return self
 
     @model_validator(mode="after")
     def _check_steps(self) -> Self:

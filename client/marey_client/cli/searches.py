@@ -70,8 +70,8 @@ def search(
     face: Annotated[Many, typer.Option(help="The body faces: WHEN=degrees from +z, positive to the left.")] = None,
     time: Annotated[Many, typer.Option(help="A moment comes: WHEN=seconds.")] = None,
     start: Annotated[str | None, typer.Option(help="Where the motion begins: x,z,degrees.")] = None,
-    tolerance_cm: Annotated[float | None, typer.Option(help="Of places; default 1.")] = None,
-    tolerance_deg: Annotated[float | None, typer.Option(help="Of turns and directions; default 5.")] = None,
+    tolerance_cm: Annotated[float | None, typer.Option(help="Of places, in centimetres; default 1.")] = None,
+    tolerance_deg: Annotated[float | None, typer.Option(help="Of turns and directions, in degrees; default 5.")] = None,
     request: Annotated[
         Path | None, typer.Option(help="File with the whole request as JSON, for several steps.")
     ] = None,
@@ -87,12 +87,13 @@ def search(
     if format not in MOTION_FORMATS:
         raise WrongUsage(f"{format!r} is no format; there are {', '.join(MOTION_FORMATS)}")
     asked: dict[str, Any] = _read_request(request)
+    tolerance_m = None if tolerance_cm is None else tolerance_cm * 0.01
     constraints = [
-        *_joint_constraints("joint_position", at, "target_m", 3, {"tolerance_cm": tolerance_cm}),
+        *_joint_constraints("joint_position", at, "target_m", 3, {"tolerance_m": tolerance_m}),
         *_joint_constraints("joint_orientation", turned, "rotation", 4, {"tolerance_deg": tolerance_deg}),
         *_joint_constraints("look_direction", look, "direction", 3, {"tolerance_deg": tolerance_deg}),
         *_joint_constraints("look_direction", look_at, "point_m", 3, {"tolerance_deg": tolerance_deg}),
-        *_body_constraints("root_position", stand, "target_m", 2, {"tolerance_cm": tolerance_cm}),
+        *_body_constraints("root_position", stand, "target_m", 2, {"tolerance_m": tolerance_m}),
         *_body_constraints("root_heading", face, "heading_deg", 1, {"tolerance_deg": tolerance_deg}),
         *_body_constraints("keyframe_time", time, "seconds", 1, {}),
     ]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from marey_schemas import search as wire
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.formats import MotionFormat
+from marey_schemas.options.searching import RefineOptions
 from marey_schemas.problems import FieldError
 from marey_schemas.search import ConstraintError, FoundStep, SearchAnswer, SearchRequest, StartPlacement
 from marey_server.errors import InvalidProblem, TooLargeProblem
@@ -66,18 +67,17 @@ def search(searchables: Sequence[Searchable], request: SearchRequest) -> SearchR
     from marey_motion.modelling.search import work as search_work
     from marey_motion.modelling.search.finishing import finish_motion
     from marey_motion.modelling.search.found_motions import found_motion
-    from marey_motion.modelling.search.optimise import RefineOptions
     from marey_motion.modelling.search.step_search import search_steps
     from marey_motion.modelling.search.steps import SeveralSteps, TransitionOptions
 
     steps, trees = _steps_of(searchables, request), [one.tree for one in searchables]
-    refining = RefineOptions(request.likelihood_weight, request.iterations) if request.refine else None
+    refining = RefineOptions.of(request) if request.refine else None
     effort = {"candidates": request.candidates, "passes": request.passes}
     try:
         work = search_work.searching_work(SeveralSteps.of(steps), trees, refining=refining, **effort)
         _require_quick(work)
-        start, tolerance_m = placement_of(request.start), request.transition_tolerance_cm * CM
-        transitions = TransitionOptions(tolerance_m=tolerance_m)
+        start = placement_of(request.start)
+        transitions = TransitionOptions(tolerance_m=request.transition_tolerance_m)
         sequel = search_steps(steps, trees, start=start, refining=refining, transitions=transitions, **effort)
         _require_room(steps, sequel)
         found, finished = found_motion(steps, sequel), None
@@ -189,11 +189,18 @@ def _errors(result: SearchResult, request: SearchRequest) -> tuple[ConstraintErr
                     joint=getattr(constraint, "joint", None),
                     searched_error=_in_unit(float(sampled[place]), unit),
                     finished_error=None if finished is None else left,
-                    reached=left <= getattr(constraint, f"tolerance_{unit}"),
+                    reached=left <= _tolerance(constraint, unit),
                     **{f"error_{unit}": error},
                 )
             )
     return tuple(told)
+
+
+def _tolerance(constraint: wire.SearchConstraint, unit: str) -> float:
+    """Give a constraint's tolerance in the unit of its error."""
+    if isinstance(constraint, wire.JointPositionConstraint | wire.RootPositionConstraint):
+        return constraint.tolerance_m / CM
+    return float(getattr(constraint, f"tolerance_{unit}"))
 
 
 def _in_unit(value: float, unit: str) -> float:
@@ -226,14 +233,14 @@ def constraint_of(one: wire.SearchConstraint) -> Constraint:
 
     match one:
         case wire.JointPositionConstraint():
-            return known.JointPosition(one.joint, one.at, one.target_m, one.tolerance_cm * CM, one.weight)
+            return known.JointPosition(one.joint, one.at, one.target_m, one.tolerance_m, one.weight)
         case wire.JointOrientationConstraint():
             return known.JointOrientation(one.joint, one.at, one.rotation, radians(one.tolerance_deg), one.weight)
         case wire.LookDirectionConstraint():
             tolerance = radians(one.tolerance_deg)
             return known.LookDirection(one.joint, one.at, one.direction, one.point_m, one.axis, tolerance, one.weight)
         case wire.RootPositionConstraint():
-            return known.RootPosition(one.at, one.target_m, one.tolerance_cm * CM, one.weight)
+            return known.RootPosition(one.at, one.target_m, one.tolerance_m, one.weight)
         case wire.RootHeadingConstraint():
             return known.RootHeading(one.at, radians(one.heading_deg), radians(one.tolerance_deg), one.weight)
         case wire.KeyframeTimeConstraint():

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from tests.support.search_primitives import FRAMES, sliding, standard_joints, walking
 
 from marey_motion.errors import MotionError
@@ -11,11 +12,12 @@ from marey_motion.kinematics import forward_kinematics
 from marey_motion.modelling.mixture import LatentMixture
 from marey_motion.modelling.search.constraints import JointPosition, KeyframeTime, RootHeading, RootPosition
 from marey_motion.modelling.search.objective import build_objective
-from marey_motion.modelling.search.optimise import RefineOptions, _Prior, refine
+from marey_motion.modelling.search.optimise import _Prior, refine
 from marey_motion.modelling.search.samples import search_tree
 from marey_motion.modelling.search.steps import SeveralSteps, Step
 from marey_motion.modelling.search.tree import build_tree
 from marey_schemas.options.modelling import TreeOptions
+from marey_schemas.options.searching import RefineOptions
 
 WRIST = (JointPosition("left_wrist", "middle", (0.35, 1.0, 0.6)),)
 
@@ -51,7 +53,7 @@ def test_with_one_gaussian_and_linear_constraints_the_result_is_that_of_ridge_re
     primitive = sliding(2)
     constraints = (RootPosition("middle", (0.25, None), 0.02, 3.0),)
     problem = SeveralSteps.of([Step(primitive, constraints, {})])
-    found = refine(problem, np.array([2.0, -3.0]), RefineOptions(weight))
+    found = refine(problem, np.array([2.0, -3.0]), RefineOptions(likelihood_weight=weight))
     # The root's x is 0.1 times the first score.
     slope = np.array([[0.1, 0.0]]) * np.sqrt(3.0) / 0.02
     precision = weight * np.linalg.inv(primitive.mixture.covariances[0])
@@ -77,7 +79,9 @@ def test_where_it_ends_nothing_nearby_is_better(weight, mixtures):
     primitive, _ = walking(mixtures=mixtures)
     constraints = (*WRIST, RootHeading("end", 0.2), KeyframeTime("end", 0.9))
     cost = posterior(primitive, constraints, standard_joints(), weight)
-    found = refine(on_walks(constraints, mixtures=mixtures), primitive.mixture.means[0], RefineOptions(weight))
+    found = refine(
+        on_walks(constraints, mixtures=mixtures), primitive.mixture.means[0], RefineOptions(likelihood_weight=weight)
+    )
     np.testing.assert_allclose(found.cost, cost(found.latents), rtol=1e-9)
     np.testing.assert_allclose(slopes_of(cost, found.latents), 0.0, atol=1e-4)
 
@@ -101,7 +105,7 @@ def test_the_result_is_never_worse_than_the_start():
 
 def test_no_iterations_return_the_start():
     start = walking()[0].sample(1, 1)[0]
-    found = refine(on_walks(WRIST), start, RefineOptions(iterations=0))
+    found = refine(on_walks(WRIST), start, RefineOptions.model_construct(likelihood_weight=1.0, iterations=0))
     assert np.array_equal(found.latents, start)
 
 
@@ -115,7 +119,7 @@ def test_what_a_motion_does_already_is_met_within_a_millimetre():
         objective = objective_of(primitive, wanted, standard_joints())
         sample = search_tree(objective, tree, candidates=8)
         assert sample.costs[0] < 3.0
-        refined = refine(on_walks(wanted), sample.latents[0], RefineOptions(0.01))
+        refined = refine(on_walks(wanted), sample.latents[0], RefineOptions(likelihood_weight=0.01))
         assert objective.errors(refined.latents[None])[0, 0] < 1e-3
         assert primitive.log_density(refined.latents[None])[0] > primitive.log_density(latents).min()
 
@@ -126,9 +130,11 @@ def test_out_of_reach_a_smaller_weight_comes_nearer_and_a_larger_one_stays_likel
     objective = objective_of(primitive, wanted, standard_joints())
     errors, densities = [], []
     for weight in (100.0, 10.0, 1.0, 0.1, 0.01):
-        found = refine(on_walks(wanted, mixtures=1), primitive.mixture.means[0], RefineOptions(weight, 200)).latents[
-            None
-        ]
+        found = refine(
+            on_walks(wanted, mixtures=1),
+            primitive.mixture.means[0],
+            RefineOptions(likelihood_weight=weight, iterations=200),
+        ).latents[None]
         errors.append(objective.errors(found)[0, 0])
         densities.append(primitive.log_density(found)[0])
     assert (np.diff(errors) < 0).all()
@@ -150,17 +156,17 @@ def test_a_model_that_never_varies_stays_as_it_is():
     assert found.cost == found.start_cost
 
 
-@pytest.mark.parametrize("options", [{"likelihood_weight": -1.0}, {"likelihood_weight": np.nan}, {"iterations": -1}])
+@pytest.mark.parametrize("options", [{"lambda": -1.0}, {"lambda": np.nan}, {"iterations": -1}])
 def test_options_out_of_range_are_refused(options):
-    with pytest.raises(MotionError):
-        RefineOptions(**options)
+    with pytest.raises(ValidationError, match=next(iter(options))):
+        RefineOptions.model_validate(options)
 
 
 @pytest.mark.parametrize("weight", [0.0, 1.0])
 def test_a_target_out_of_all_reach_and_all_proportion_is_approached_as_far_as_rounding_allows(weight):
     constraints = (JointPosition("head", "end", (1e6, 1e6, 1e6), 1e-8, 1e6),)
     start = walking()[0].mixture.means[0]
-    found = refine(on_walks(constraints), start, RefineOptions(weight))
+    found = refine(on_walks(constraints), start, RefineOptions(likelihood_weight=weight))
     assert np.isfinite(found.latents).all()
     assert np.isfinite(found.cost)
     assert found.cost <= found.start_cost
@@ -175,7 +181,7 @@ def test_slopes_without_any_curvature_are_damped_instead_of_failing():
         def linearise(self, stacked):
             return np.ones(1), np.array([[1e20, 1e20]]) * (1.0 + 0.0 * stacked)
 
-    found = refine(Flat(), np.zeros(2), RefineOptions(0.0))
+    found = refine(Flat(), np.zeros(2), RefineOptions(likelihood_weight=0.0))
     np.testing.assert_array_equal(found.latents, 0.0)
 
 

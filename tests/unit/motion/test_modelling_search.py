@@ -15,12 +15,13 @@ from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.modelling.search.constraints import JointPosition, RootPosition
 from marey_motion.modelling.search.objective import build_objective
-from marey_motion.modelling.search.optimise import RefineOptions, refine
+from marey_motion.modelling.search.optimise import refine
 from marey_motion.modelling.search.samples import FoundSamples, search_closely, search_tree
 from marey_motion.modelling.search.steps import SeveralSteps, Step
 from marey_motion.modelling.search.tree import END_EFFECTORS, SampleTree, build_tree
 from marey_motion.modelling.training import train_primitive
 from marey_schemas.options.modelling import ModelOptions, TreeOptions
+from marey_schemas.options.searching import RefineOptions
 
 EVERYTHING = 10**6
 
@@ -203,7 +204,9 @@ def test_a_model_that_keeps_more_finds_it_within_millimetres_and_refined_within_
         found = search_closely(objective, tree).latents
         problem = SeveralSteps.of([Step(objective.primitive, constraints, standard_joints())])
         searched.append(objective.errors(found)[0, 0])
-        refined.append(objective.errors(refine(problem, found[0], RefineOptions(0.01)).latents[None])[0, 0])
+        refined.append(
+            objective.errors(refine(problem, found[0], RefineOptions(likelihood_weight=0.01)).latents[None])[0, 0]
+        )
     assert np.median(searched) < 1e-3
     assert max(searched) < 5e-3
     assert max(refined) < 1e-3

@@ -11,7 +11,6 @@ from marey_motion.kinematics import forward_kinematics
 from marey_motion.matching.body import MatchingBody
 from marey_motion.modelling.search.constraints import JointPosition
 from marey_motion.modelling.search.objective import build_objective
-from marey_motion.modelling.search.optimise import RefineOptions
 from marey_motion.modelling.search.step_search import search_steps
 from marey_motion.modelling.search.steps import Step
 from marey_motion.modelling.search.tree import END_EFFECTORS, build_tree
@@ -20,6 +19,7 @@ from marey_motion.retargeting import plan_retarget, retarget
 from marey_motion.rigs import guess_axes, map_joints
 from marey_motion.skeleton import same_hierarchy
 from marey_schemas.options.modelling import ModelOptions
+from marey_schemas.options.searching import RefineOptions
 
 TARGETS = 200
 HELD_OUT_EVERY = 4
@@ -76,7 +76,7 @@ def _search_all(trained, unseen, body):
         pose = primitive.poses(latents[[random.integers(len(latents))]], [frame])[:, 0]
         x, y, z = forward_kinematics(primitive.skeleton, pose)[0, joints["right_wrist"]].tolist()
         step = Step(primitive, (JointPosition("right_wrist", frame, (x, y, z)),), joints)
-        sequel = search_steps([step], [tree], refining=RefineOptions(0.01))
+        sequel = search_steps([step], [tree], refining=RefineOptions(likelihood_weight=0.01))
         searched.append(100.0 * sequel.sampled.errors[0][0])
         refined.append(100.0 * sequel.measured.errors[0][0])
         objective = build_objective(primitive, step.constraints, joints)

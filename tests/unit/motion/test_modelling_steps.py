@@ -19,13 +19,13 @@ from marey_motion.modelling.search.constraints import (
 )
 from marey_motion.modelling.search.finishing import finish_motion
 from marey_motion.modelling.search.found_motions import found_motion
-from marey_motion.modelling.search.optimise import RefineOptions
 from marey_motion.modelling.search.step_search import search_steps
 from marey_motion.modelling.search.steps import MOST_STEPS, Step, TransitionOptions
 from marey_motion.modelling.search.tree import build_tree
 from marey_motion.quaternions import from_axis_angle
 from marey_motion.rigs import map_joints
 from marey_schemas.options.modelling import TreeOptions
+from marey_schemas.options.searching import RefineOptions
 
 START = Placement(0.5, 1.0, -2.0)
 
@@ -79,14 +79,14 @@ def rotated(positions, placement):
 
 def test_refining_brings_hands_and_feet_together_at_the_seams():
     sampled, _ = found_three(refining=None)
-    refined, _ = found_three(refining=RefineOptions(0.1))
+    refined, _ = found_three(refining=RefineOptions(likelihood_weight=0.1))
     for before, after in zip(sampled.measured.jumps_m, refined.measured.jumps_m, strict=True):
         assert after.sum() < 0.7 * before.sum()
     assert max(jumps[1:].max() for jumps in refined.measured.jumps_m) < 0.12
 
 
 def test_both_hands_and_both_feet_go_on_within_centimetres_of_where_they_were():
-    sequel, _ = found_three(refining=RefineOptions(0.01))
+    sequel, _ = found_three(refining=RefineOptions(likelihood_weight=0.01))
     assert set(sequel.joints) == {"left_wrist", "right_wrist", "left_ankle", "right_ankle"}
     for jumps in sequel.measured.jumps_m:
         assert jumps.shape == (5,)
@@ -132,7 +132,7 @@ def test_one_step_needs_no_hips_and_shoulders():
     primitive = sliding(2)
     step = Step(primitive, (RootPosition("end", (0.3, None)),), {})
     one = build_tree(primitive, 0, TreeOptions(samples=500, features="latent"))
-    sequel = search_steps([step], [one], start=Placement(0.0, 0.1, 0.0), refining=RefineOptions(1e-4))
+    sequel = search_steps([step], [one], start=Placement(0.0, 0.1, 0.0), refining=RefineOptions(likelihood_weight=1e-4))
     assert sequel.measured.errors[0][0] < 1e-3
     with pytest.raises(MotionError, match="left_hip"):
         search_steps([step, step], [one, one])

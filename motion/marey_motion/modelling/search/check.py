@@ -13,12 +13,12 @@ from marey_motion.arrays import Floats
 from marey_motion.modelling.reconstruction import CM_PER_M
 from marey_motion.modelling.sample_quality import toe_positions
 from marey_motion.modelling.search.constraints import JointPosition
-from marey_motion.modelling.search.optimise import RefineOptions
 from marey_motion.modelling.search.step_search import search_steps
 from marey_motion.modelling.search.steps import Step
 from marey_motion.modelling.search.tree import build_tree
 from marey_motion.modelling.training import train_primitive
 from marey_schemas.options.modelling import ModelOptions, TreeOptions
+from marey_schemas.options.searching import RefineOptions
 
 REACHING = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
 """Standard joints."""

@@ -17,32 +17,12 @@ import numpy as np
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.modelling.mixture import LatentMixture
+from marey_schemas.options.searching import RefineOptions
 
-MOST_ITERATIONS = 50
 FIRST_DAMPING = 1e-3
 LEAST_DAMPING, MOST_DAMPING = 1e-12, 1e12
 EASING, TIGHTENING = 10.0, 4.0
 LEAST_GAIN = 1e-12
-
-
-@dataclass(frozen=True)
-class RefineOptions:
-    """Options of refinement.
-
-    Parameters
-    ----------
-    likelihood_weight : λ, not negative; 0 asks for the constraints alone
-    iterations : at most
-    """
-
-    likelihood_weight: float = 1.0
-    iterations: int = MOST_ITERATIONS
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.likelihood_weight) and self.likelihood_weight >= 0):
-            raise MotionError("the weight of the likelihood is not negative", where="likelihood_weight")
-        if self.iterations < 0:
-            raise MotionError("the number of iterations is not negative", where="iterations")
 
 
 DEFAULT_REFINING = RefineOptions()

@@ -13,10 +13,10 @@ from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search.constraints import JointOrientation, JointPosition, LookDirection
 from marey_motion.modelling.search.found_motions import FoundMotion
 from marey_motion.modelling.search.objective import Objective
-from marey_motion.modelling.search.optimise import RefineOptions
 from marey_motion.modelling.search.steps import SeveralSteps, Step
 from marey_motion.modelling.search.tree import DEFAULT_TREE, SampleTree, feature_frames
 from marey_schemas.options.modelling import TreeOptions
+from marey_schemas.options.searching import RefineOptions
 
 # Nanoseconds, measured on one thread of a server of 2020 and rounded up.
 _PER_NODE, _PER_ROW, _PER_STEP_OF_TIME = 50, 50, 20

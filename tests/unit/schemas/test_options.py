@@ -1,0 +1,59 @@
+"""Options are declared once: each with a default, a description, and its unit in words."""
+
+import importlib
+import pkgutil
+
+import pytest
+from pydantic import BaseModel, ValidationError
+
+import marey_schemas.options as room
+from marey_schemas.base import Options
+from marey_schemas.job_kinds import BUILT_IN, KindDeclaration
+
+UNITS = {
+    "_m_s": "metres per second", "_deg_s": "degrees per second", "_s": "second", "_hz": "hertz", "_cm": "centimetre",
+    "_m": "metre",
+}  # fmt: skip
+
+
+def declared() -> list[type[Options]]:
+    """Every set of options that the room declares."""
+    modules = [importlib.import_module(f"{room.__name__}.{one.name}") for one in pkgutil.iter_modules(room.__path__)]
+    found = {
+        value
+        for module in modules
+        for value in vars(module).values()
+        if isinstance(value, type) and issubclass(value, Options) and value is not Options
+    }
+    return sorted(found, key=lambda one: one.__name__)
+
+
+@pytest.mark.parametrize("options", declared(), ids=lambda one: one.__name__)
+def test_every_option_has_a_default_and_a_description_with_its_unit(options: type[Options]) -> None:
+    for name, field in options.model_fields.items():
+        assert not field.is_required(), name
+        assert field.description, name
+        unit = next((ending for ending in UNITS if name.endswith(ending)), None)
+        assert unit is None or UNITS[unit] in field.description.lower(), name
+
+
+@pytest.mark.parametrize("options", declared(), ids=lambda one: one.__name__)
+def test_options_are_frozen_and_misspelt_ones_are_refused(options: type[Options]) -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        setattr(options(), next(iter(options.model_fields)), None)
+    with pytest.raises(ValidationError, match="no_such_option"):
+        options.model_validate({"no_such_option": 1})
+
+
+@pytest.mark.parametrize("kind", BUILT_IN, ids=lambda one: one.name)
+def test_parameters_of_a_job_repeat_no_option_that_they_extend(kind: KindDeclaration) -> None:
+    for model in kind.params.__mro__:
+        own = vars(model).get("__annotations__", {}).keys()
+        for base in model.__mro__[1:]:
+            if issubclass(base, BaseModel):
+                assert not own & base.model_fields.keys(), f"{model.__name__} declares fields of {base.__name__} again"
+
+
+@pytest.mark.parametrize("kind", BUILT_IN, ids=lambda one: one.name)
+def test_every_parameter_of_a_job_has_a_description(kind: KindDeclaration) -> None:
+    assert [name for name, field in kind.params.model_fields.items() if not field.description] == []
