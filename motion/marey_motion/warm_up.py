@@ -21,7 +21,7 @@ from marey_motion.clip import Clip
 
 PACKAGE = Path(__file__).parent
 # Either numba itself or the options of a decorator that kernels share, at the outer level of the module.
-_IMPORTS_COMPILER = re.compile(r"^(?:import numba|from (?:numba|[\w.]*kernels) import)\b", re.MULTILINE)
+_IMPORTS_COMPILER = re.compile(r"^(?:import numba|from (?:numba[\w.]*|[\w.]*kernels) import)\b", re.MULTILINE)
 STAMP = Path(os.environ.get("NUMBA_CACHE_DIR") or PACKAGE / "__pycache__") / "kernels-compiled"
 
 _ASF = b""":version 1.10

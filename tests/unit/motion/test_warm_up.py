@@ -36,6 +36,22 @@ def test_every_module_with_a_compiled_function_is_a_source_of_kernels() -> None:
     assert sources <= set(warm_up.kernel_sources())
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "import numba",
+        "from numba import njit",
+        "from numba.extending import intrinsic",
+        "from marey_motion.kernels import product",
+    ],
+)
+def test_a_module_that_imports_the_compiler_or_kernels_is_a_source_of_kernels(line, tmp_path, monkeypatch) -> None:
+    (tmp_path / "lanes.py").write_text(f"{line}\n")
+    (tmp_path / "clips.py").write_text("import numpy\n")
+    monkeypatch.setattr(warm_up, "PACKAGE", tmp_path)
+    assert [source.name for source in warm_up.kernel_sources()] == ["lanes.py"]
+
+
 def test_compiled_code_is_discarded_after_any_source_of_kernels_has_changed(tmp_path: Path, monkeypatch) -> None:
     source = tmp_path / "euler.py"
     source.write_text("from numba import njit\n")
