@@ -20,21 +20,21 @@ from marey_schemas.access import (
 )
 
 ANY_STATE = {"If-Match": "*"}
-"""A change that replaces whatever stands there."""
+"""The header of a change that replaces any state."""
 
 
 @dataclass(frozen=True)
 class Users:
-    """Who can sign in; for administrators."""
+    """The users of a server; for administrators."""
 
     transport: Transport
 
     def list(self) -> Iterator[User]:
-        """Every user."""
+        """List the users."""
         return pages(self.transport, User, "/users")
 
     def get(self, name: str) -> User:
-        """One user."""
+        """Return a user by name."""
         return self.transport.get(User, f"/users/{name}")
 
     def create(self, user: UserCreate) -> User:
@@ -48,11 +48,11 @@ class Users:
         )
 
     def disable(self, name: str) -> None:
-        """Take a user's access away; what they made stays."""
+        """Disable a user; the data that they made stays."""
         self.transport.send("DELETE", f"/users/{name}", headers=ANY_STATE)
 
     def enable(self, name: str) -> User:
-        """Let a user who was disabled in again, with the password and the tokens they had."""
+        """Enable a disabled user again, with their password and tokens."""
         return self.change(name, UserChange(disabled=False))
 
 
@@ -63,7 +63,7 @@ class Tokens:
     transport: Transport
 
     def list(self) -> Iterator[Token]:
-        """Every token, without secrets."""
+        """List the tokens, without secrets."""
         return pages(self.transport, Token, "/tokens")
 
     def create(self, token: TokenCreate) -> NewToken:
@@ -71,19 +71,19 @@ class Tokens:
         return self.transport.post(NewToken, "/tokens", token, repeatable=False)
 
     def revoke(self, token_id: str) -> None:
-        """Make a token useless, now."""
+        """Revoke a token, at once."""
         self.transport.send("DELETE", f"/tokens/{token_id}")
 
 
 @dataclass(frozen=True)
 class Members:
-    """Who may do what in a project."""
+    """The members of a project and their roles."""
 
     transport: Transport
     project: str
 
     def list(self) -> Iterator[Member]:
-        """Every member with their role."""
+        """List the members with their roles."""
         return pages(self.transport, Member, f"/projects/{self.project}/members")
 
     def put(self, user: str, role: Role) -> Member:
@@ -100,5 +100,5 @@ class Members:
         )
 
     def remove(self, user: str) -> None:
-        """Take a user's role away."""
+        """Remove a user from the project."""
         self.transport.send("DELETE", f"/projects/{self.project}/members/{user}", headers=ANY_STATE, repeatable=False)

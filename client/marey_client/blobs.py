@@ -24,12 +24,12 @@ TRIES_PER_PIECE = 5
 
 
 def digest_of(data: bytes) -> str:
-    """The name of bytes: `sha256:` and 64 hexadecimal digits."""
+    """Return the name of bytes: `sha256:` and 64 hexadecimal digits."""
     return f"sha256:{hashlib.sha256(data).hexdigest()}"
 
 
 def digest_of_file(path: Path) -> str:
-    """The name of a file's bytes, without holding them."""
+    """Return the name of a file's bytes, without holding them in memory."""
     with path.open("rb") as file:
         return f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
 
@@ -41,7 +41,7 @@ class Blobs:
     transport: Transport
 
     def missing(self, digests: str | Iterable[str]) -> set[str]:
-        """Those of `digests` that must be sent."""
+        """Return those of `digests` that the server lacks."""
         wanted = list(dict.fromkeys(several(digests)))
         lacking: set[str] = set()
         for start in range(0, len(wanted), DIGESTS_PER_QUESTION):
@@ -51,13 +51,13 @@ class Blobs:
         return lacking
 
     def put(self, data: bytes, *, digest: str | None = None) -> str:
-        """Send bytes, whether the server has them or not; their digest."""
+        """Send bytes, whether the server has them or not; return their digest."""
         name = digest or digest_of(data)
         self.transport.send("PUT", f"/blobs/{name}", content=data, media_type=OCTETS)
         return name
 
     def put_file(self, path: Path, *, digest: str | None = None) -> str:
-        """Stream a file to the server; its digest. A large one goes in pieces, and no piece twice.
+        """Stream a file to the server and return its digest; a large file in pieces, each piece once.
 
         Raises `FileChanged` where its length changes meanwhile.
         """
@@ -75,7 +75,7 @@ class Blobs:
         return name
 
     def fetch(self, digest: str) -> bytes:
-        """The bytes of a blob. Raises `DigestMismatch` where others arrived."""
+        """Return the bytes of a blob. Raises `DigestMismatch` if other bytes arrived."""
         data: bytes = self.transport.send("GET", f"/blobs/{digest}", headers={"Accept": "*/*"}).content
         if digest_of(data) != digest:
             raise DigestMismatch(f"asked for {digest}, but {digest_of(data)} arrived")
@@ -116,7 +116,7 @@ def _chunks(path: Path, size_bytes: int) -> Iterator[bytes]:
 
 
 def send_in_pieces(transport: Transport, path: Path, digest: str) -> str:
-    """Send a file as a resumable upload; the digest of the blob it became.
+    """Send a file as a resumable upload; return the digest of its blob.
 
     Raises `Unreachable` where the server stays away, `FileChanged` where the file becomes shorter, `Invalid` where the
     bytes that arrived are not what `digest` says.
@@ -138,7 +138,7 @@ def send_in_pieces(transport: Transport, path: Path, digest: str) -> str:
 
 
 def _send_piece(transport: Transport, upload: Upload, file: BinaryIO) -> Upload:
-    """How far the upload is after one more piece; the last one, perhaps empty, makes a blob of it."""
+    """Send one more piece and return the state of the upload; the last piece, perhaps empty, completes the blob."""
     file.seek(upload.offset)
     piece = file.read(min(PIECE_BYTES, upload.length - upload.offset))
     if not piece and upload.offset < upload.length:

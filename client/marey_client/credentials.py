@@ -1,4 +1,4 @@
-"""Where the server is and which token to use.
+"""Finds the server's address and the token to use.
 
 A token is looked for in this order: a file named on the command line, `MAREY_TOKEN`, the file `marey login` writes, and
 `admin.token` in the data folder of a server on this machine.
@@ -33,7 +33,7 @@ class Credential:
     url: str
     token: str | None = field(repr=False)
     origin: str = ""
-    """Where the token was found, for people."""
+    """The place where the token was found, for people."""
 
 
 def resolve(

@@ -52,7 +52,7 @@ def safe_file_name(name: str) -> str:
 
 
 class TakenPaths:
-    """Where the files of one download go: of two that would get one name, the later gets a number."""
+    """The paths of the files of one download: of two files with one name, the later gets a number."""
 
     def __init__(self) -> None:
         self._taken: set[str] = set()

@@ -34,7 +34,7 @@ class BadCredentialFile(MareyError):
 
 
 class BadToken(MareyError):
-    """What was given as a token is none."""
+    """A given token does not have the form of a token."""
 
 
 class BadAddress(MareyError):
@@ -112,12 +112,12 @@ class RequestFailed(MareyError):
 
     @property
     def detail(self) -> str:
-        """What went wrong, for people."""
+        """The explanation of the error, for people."""
         return self.problem.detail
 
     @property
     def request_id(self) -> str:
-        """What to quote when asking for help."""
+        """The id of the request, to quote when asking for help."""
         return self.problem.instance
 
     @property
@@ -178,7 +178,7 @@ class TooLarge(RequestFailed):
 
 
 class Invalid(RequestFailed):
-    """What was asked for makes no sense."""
+    """The request is well formed but not valid."""
 
     status = 422
 

@@ -1,4 +1,4 @@
-"""Why a job is where it is, in sentences."""
+"""Explanations of the state of a job, in sentences."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def explain_job(marey: Marey, job_id: str, *, now: datetime | None = None) -> list[str]:
-    """What a job waits for, who works on it, or how it ended; the most telling reason first."""
+    """Explain what a job waits for, who works on it, or how it ended; the main reason first."""
     job = marey.jobs.get(job_id)
     attempts = list(marey.jobs.attempts(job_id))
     running = list(marey.jobs.list(job.project, filters={"state": JobState.RUNNING.value}))
@@ -20,7 +20,7 @@ def explain_job(marey: Marey, job_id: str, *, now: datetime | None = None) -> li
 
 
 def explain(job: Job, attempts: list[Attempt], running: list[Job], now: datetime) -> list[str]:
-    """The same from what is known of the job, its attempts, and the project's running jobs."""
+    """Explain a job, given its attempts and the project's running jobs."""
     if job.size is not None and not job.state.terminal and job.children != {"succeeded": job.size}:
         told = ", ".join(f"{count} {state}" for state, count in sorted(job.children.items()))
         return [f"{job.state}: it gathers {job.size} tasks, of which {told or 'none has begun'}."]

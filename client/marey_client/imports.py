@@ -36,7 +36,7 @@ UPLOADS_AT_ONCE = 8
 _FILE_NAME: TypeAdapter[str] = TypeAdapter(FileName)
 
 Notice = Callable[[str, int, int], None]
-"""Told what is going on: `hashing`, `sending` or `importing`, how many files are done, and of how many."""
+"""Called with the stage `hashing`, `sending` or `importing`, the number of files done, and their total number."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ class LocalFile:
 
 @dataclass(frozen=True)
 class FoundFiles:
-    """What stands in the places somebody named: files to import, and others that are left out."""
+    """The files in the given places: those to import, and those that are left out."""
 
     files: tuple[LocalFile, ...]
     left_out: tuple[Path, ...]
 
 
 def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
-    """Motion files in folders and below, hidden ones left out; files named themselves are taken whatever they are.
+    """Find motion files in folders and below, without hidden ones; files that are named directly are always taken.
 
     Raises `NothingToUpload` where a place does not exist or none holds a motion file, `SameName` where files of two
     places would get one name, `OSError` where a folder cannot be read.
@@ -212,7 +212,7 @@ class Imports:
 
 
 def _may_travel(name: str) -> bool:
-    """Whether a file's name is one that a request can hold; file systems allow more."""
+    """Return whether a request can hold a file's name; file systems allow more."""
     try:
         _FILE_NAME.validate_python(name)
     except ValidationError:
@@ -238,7 +238,7 @@ def _with_item(entry: ImportEntry, outputs: Mapping[str, JobOutput]) -> ImportEn
 
 
 def refusal_text(entry: ImportEntry) -> str:
-    """Why a file was refused, in a line that begins with its name."""
+    """Write the reason why a file was refused, in a line that begins with its name."""
     assert entry.error is not None
     detail = entry.error.detail
     if detail.startswith(entry.name):
@@ -249,7 +249,7 @@ def refusal_text(entry: ImportEntry) -> str:
 
 
 def left_out_text(paths: Sequence[Path]) -> str:
-    """What is said about files in folders that are no motion."""
+    """Write a line about files in folders that are not motion files."""
     others = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
     return f"left out what is no motion: {paths[0].name}{others}"
 

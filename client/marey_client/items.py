@@ -48,11 +48,11 @@ class ItemHandle:
         return f"/projects/{self.project}/{self.item.kind.plural}/{self.item.id}"
 
     def as_input(self) -> ItemInput:
-        """The revision that was read, as an input of jobs."""
+        """Return the revision that was read, as an input of jobs."""
         return ItemInput(item=self.id, revision=self.item.revision)
 
     def part(self, part: str, *, revision: int | None = None, **query: str | None) -> dict[str, Any]:
-        """The document of a part; arrays are numpy arrays."""
+        """Return the document of a part; arrays are numpy arrays."""
         tree, _ = self.transport.get_tree(f"{self.url}/parts/{part}", {"revision": revision, **query})
         return dict(tree)
 
@@ -77,19 +77,19 @@ class ItemHandle:
         return self._renewed(self.transport.post(Item, f"{self.url}/restore"))
 
     def revisions(self) -> Iterator[Revision]:
-        """Every state of the item, newest first."""
+        """List the revisions of the item, newest first."""
         return pages(self.transport, Revision, f"{self.url}/revisions")
 
     def revision(self, number: int) -> Revision:
-        """One state of the item."""
+        """Return one revision of the item."""
         return self.transport.get(Revision, f"{self.url}/revisions/{number}")
 
     def lineage(self) -> Lineage:
-        """What the newest revision was made from, and what was made of it."""
+        """Return the inputs of the newest revision, and the results that were made from it."""
         return self.transport.get(Lineage, f"{self.url}/lineage")
 
     def staleness(self) -> Staleness:
-        """Whether something it was made from has changed."""
+        """Return whether an input that it was made from has changed."""
         return self.transport.get(Staleness, f"{self.url}/stale")
 
     def export(
@@ -149,7 +149,7 @@ class Items(Generic[Handle]):
         filters: Params | None = None,
         page_size: int = 500,
     ) -> Iterator[Handle]:
-        """Items in order, fetched page by page.
+        """List items in order, fetched page by page.
 
         `collection` names a folder, with everything below it; `directly_in` one without, of which "" is the root;
         `path` one item; `deleted` those that `restore` brings back; `filters` are the server's, such as
@@ -162,11 +162,11 @@ class Items(Generic[Handle]):
         return (self._handle(item) for item in pages(self.transport, Item, self.url, params))
 
     def get(self, item_id: str) -> Handle:
-        """One item by its id."""
+        """Return an item by its id."""
         return self._handle(self.transport.get(Item, f"{self.url}/{item_id}"))
 
     def count(self, *, collection: str | None = None, filters: Params | None = None) -> int:
-        """How many there are, in a folder and below it; of the whole project without one."""
+        """Count the items in a folder and below it, or in the whole project."""
         params = {"collection": collection or None, "count": "exact", "limit": 1, **(filters or {})}
         return self.transport.get(Page, self.url, params).count or 0
 

@@ -1,4 +1,4 @@
-"""Jobs as users see them: submit, wait, cancel, retry, read the log."""
+"""Jobs: submit, wait, cancel, retry, read the log."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from marey_schemas.jobs import Attempt, Job, JobCreate, JobInput, JobKind, JobOu
 OnProgress = Callable[[Job], None]
 
 LONGEST_WAIT_S = 20.0
-"""How long one question may stay open at the server."""
+"""Longest time that the server holds one request open."""
 
 SHORTEST_PAUSE_S = 0.05
 FOLLOW_EVERY_S = 0.5
@@ -34,7 +34,7 @@ class Jobs:
     transport: Transport
 
     def kinds(self) -> Iterator[JobKind]:
-        """What can be asked for, with the parameters it takes."""
+        """List the kinds of jobs, with their inputs and parameters."""
         return pages(self.transport, JobKind, "/job-kinds")
 
     def submit(self, project: str, job: JobCreate) -> Job:
@@ -46,12 +46,12 @@ class Jobs:
         return self.wait(self.submit(project, job).id, on_progress=on_progress)
 
     def list(self, project: str, *, limit: int = 100, filters: Params | None = None) -> Iterator[Job]:
-        """Jobs of a project, newest first."""
+        """List the jobs of a project, newest first."""
         params = {"limit": limit, **(filters or {})}
         return pages(self.transport, Job, f"/projects/{project}/jobs", params)
 
     def get(self, job_id: str, *, wait_s: float = 0.0) -> Job:
-        """How a job stands; with `wait_s` the server answers later if the job ends within that time."""
+        """Return a job as it is now; with `wait_s` the server answers when the job ends, or after that time."""
         if wait_s <= 0:
             return self.transport.get(Job, f"/jobs/{job_id}")
         return self.transport.get(
@@ -92,19 +92,19 @@ class Jobs:
         return self.transport.post(Job, f"/jobs/{job_id}/cancel")
 
     def retry(self, job_id: str) -> Job:
-        """Submit a job that ended without success again; the new job."""
+        """Submit a job that ended without success again; return the new job."""
         return self.transport.post(Job, f"/jobs/{job_id}/retry")
 
     def attempts(self, job_id: str) -> Iterator[Attempt]:
-        """Every try at a job."""
+        """List the attempts of a job."""
         return pages(self.transport, Attempt, f"/jobs/{job_id}/attempts")
 
     def outputs(self, job_id: str) -> Iterator[JobOutput]:
-        """The revisions a job made."""
+        """List the revisions that a job made."""
         return pages(self.transport, JobOutput, f"/jobs/{job_id}/outputs")
 
     def log(self, job_id: str, *, follow: bool = False) -> Iterator[bytes]:
-        """What the job's attempts wrote, piece by piece; with `follow` until there will be no more."""
+        """Yield the log of the job's attempts, piece by piece; with `follow` until the job has ended."""
         offset = 0
         while True:
             response = self.transport.send(

@@ -1,4 +1,4 @@
-"""The way in: one server, one token."""
+"""The session with one server, for one token."""
 
 from __future__ import annotations
 
@@ -63,19 +63,19 @@ class Marey:
         self.transport.close()
 
     def sign_in(self, login: Login) -> NewToken:
-        """A token for a name and a password."""
+        """Return a token for a name and a password."""
         return self.transport.post(NewToken, "/login", login, repeatable=False)
 
     def me(self) -> Me:
-        """Whom the token belongs to, and what it allows."""
+        """Return the user and the scopes of the token."""
         return self.transport.get(Me, "/me")
 
     def project(self, name: str) -> ProjectHandle:
-        """A project by its name; nothing is asked yet."""
+        """Return a project by its name, without a request."""
         return ProjectHandle(self.transport, name)
 
     def projects(self) -> Iterator[Project]:
-        """Every project the token allows to see."""
+        """List the projects that the token may read."""
         return pages(self.transport, Project, "/projects")
 
     def create_project(self, project: ProjectCreate) -> ProjectHandle:
@@ -94,7 +94,7 @@ class Marey:
 
     @cached_property
     def users(self) -> Users:
-        """Who can sign in."""
+        """The users of the server."""
         return Users(self.transport)
 
     @cached_property

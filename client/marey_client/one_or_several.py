@@ -1,4 +1,4 @@
-"""Where callers may give one thing or several: a text is one name, not its letters; a document one, not its keys."""
+"""Arguments that are one thing or several: a text is one name, not its letters; a document is one, not its keys."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ from pydantic import BaseModel
 
 
 def several(given: str | Path | Mapping[str, Any] | BaseModel | Iterable[Any]) -> tuple[Any, ...]:
-    """What was given, as several: a text, a path, a document or a model is one."""
+    """Return what was given as a tuple; a text, a path, a document or a model is one thing."""
     return (given,) if isinstance(given, str | Path | Mapping | BaseModel) else tuple(given)

@@ -10,7 +10,7 @@ from marey_schemas.items import Page
 
 
 def pages(transport: Transport, entry: type[Model], path: str, params: Params | None = None) -> Iterator[Model]:
-    """Every entry of a list, fetched page by page as the caller goes on."""
+    """Yield every entry of a list, fetched page by page as the caller goes on."""
     query: dict[str, Any] = dict(params or {})
     while True:
         page = transport.get(Page, path, query)

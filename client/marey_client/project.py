@@ -50,7 +50,7 @@ class ProjectHandle(ProjectItems):
         return f"/projects/{self.name}"
 
     def read(self) -> Project:
-        """Title, visibility and the caller's role."""
+        """Return title, visibility and the caller's role."""
         return self.transport.get(Project, self.url)
 
     def change(self, change: ProjectChange) -> Project:
@@ -71,22 +71,22 @@ class ProjectHandle(ProjectItems):
 
     @cached_property
     def coverage_streams(self) -> CoverageStreams:
-        """Performances that are being measured while they are recorded."""
+        """Its coverage streams: performances that are measured while they are recorded."""
         return CoverageStreams(self.transport, self.name)
 
     @cached_property
     def members(self) -> Members:
-        """Who may do what."""
+        """Its members and their roles."""
         return Members(self.transport, self.name)
 
     # -- jobs ----------------------------------------------------------------------------------------------------------
 
     def submit(self, job: JobCreate) -> Job:
-        """Hand in a job."""
+        """Submit a job."""
         return Jobs(self.transport).submit(self.name, job)
 
     def pipeline(self, pipeline: PipelineCreate) -> PipelineRun:
-        """Hand in jobs that work on what others of them make: all, or none."""
+        """Submit jobs that work on the results of others: all of them, or none."""
         return submit_pipeline(self.transport, self.name, pipeline)
 
     def build_model(
@@ -99,7 +99,7 @@ class ProjectHandle(ProjectItems):
         cache: Cache = "use",
         **choices: Any,
     ) -> PipelineRun:
-        """Hand in all that leads from takes to a model: import, retarget, annotate, cut, align, model, tree.
+        """Submit the jobs from takes to a model: import, retarget, annotate, cut, align, model, tree.
 
         `takes` are clips and folders of clips, or files that `find_files` found. The `choices` are those of
         `model_building.plan_model`, for example `skeleton={"item": id}`, `annotate={"proposal": {"method": "steps"}}`,
@@ -135,7 +135,7 @@ class ProjectHandle(ProjectItems):
         cache: Cache = "use",
         **options: Any,
     ) -> Job:
-        """Hand in the annotation of clips, by a method or a method with its options, below the folder `into`.
+        """Submit the annotation of clips, by a method or a method with its options, below the folder `into`.
 
         Methods are `steps`, `velocity_minima` and `wrist_contact`, as in `{"method": "steps", "most_turn_deg": 45}`;
         `options` are the others of `AnnotateParams`.
@@ -147,7 +147,7 @@ class ProjectHandle(ProjectItems):
     def cut(
         self, annotations: Annotations, *, into: str, priority: int = 0, cache: Cache = "use", **options: Any
     ) -> Job:
-        """Hand in the cutting of clips along the segments of annotations, into folders below `into`.
+        """Submit the cutting of clips along the segments of annotations, into folders below `into`.
 
         `options` are those of `CutParams`, for example `labels=("step_left", "step_right")` or `by_label=True`.
         """
@@ -164,10 +164,10 @@ class ProjectHandle(ProjectItems):
         cache: Cache = "use",
         **options: Any,
     ) -> Job:
-        """Hand in the alignment of clips of one skeleton, all of which show the same action.
+        """Submit the alignment of clips of one skeleton, all of which show the same action.
 
         `options` are those of `AlignParams`, for example `rate_hz=30` or `layer="steps"`. Where a layer or labels are
-        named and no annotations are given, the annotations of the clips are gone by.
+        named and no annotations are given, the annotations of the clips are used.
         """
         request = align_request(self, clips, annotations, AlignParams.model_validate(options))
         return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
@@ -182,7 +182,7 @@ class ProjectHandle(ProjectItems):
         cache: Cache = "use",
         **options: Any,
     ) -> Job:
-        """Hand in the editing of clips, a folder by its path, or folders and clips, by commands or a stored edit.
+        """Submit the editing of clips, a folder by its path, or folders and clips, by commands or a stored edit.
 
         The results go to the folder `into`, or get a `suffix`, or with `in_place=True` are the next revisions of the
         clips themselves. `options` are those of `EditParams`.
@@ -200,7 +200,7 @@ class ProjectHandle(ProjectItems):
         cache: Cache = "use",
         **options: Any,
     ) -> Job:
-        """Hand in the evaluation of clips of one skeleton: a folder by its path, or folders and clips.
+        """Submit the evaluation of clips of one skeleton: a folder by its path, or folders and clips.
 
         `options` are those of `EvaluateParams`, for example `name="walks-eval"` or `database={"mirroring": "add"}`;
         `normaliser` is an evaluation, or its id, that the result shall be comparable with.
@@ -222,7 +222,7 @@ class ProjectHandle(ProjectItems):
         cache: Cache = "use",
         **options: Any,
     ) -> Job:
-        """Hand in the training of a model on clips that were aligned with each other: a folder, or several of them.
+        """Submit the training of a model on clips that were aligned with each other: a folder, or several of them.
 
         `options` are those of `ModelParams`, for example `name="step"` or `spatial_share=0.98`.
         """
@@ -235,7 +235,7 @@ class ProjectHandle(ProjectItems):
         return self.models.get(self._made_by(job, on_progress))
 
     def jobs(self, *, filters: Params | None = None) -> Iterator[Job]:
-        """Its jobs, newest first."""
+        """List its jobs, newest first."""
         return Jobs(self.transport).list(self.name, filters=filters)
 
     def _made_by(self, job: Job, on_progress: OnProgress | None) -> str:

@@ -106,12 +106,12 @@ class Collections:
     def list(
         self, *, path: str | None = None, deleted: bool = False, filters: Params | None = None
     ) -> Iterator[Collection]:
-        """Every folder, by path; with `path` that one and those below it, with `deleted` those that can be restored."""
+        """List the folders by path: all, those at and below `path`, or with `deleted` those that can be restored."""
         params = {"path": path or None, "deleted": "true" if deleted else None, **(filters or {})}
         return pages(self.transport, Collection, self.url, params)
 
     def at(self, path: str, *, deleted: bool = False) -> Collection | None:
-        """The folder with this path, or None; of several that were deleted, the one that was last."""
+        """Return the folder with this path, or None; of several deleted ones, the one that was deleted last."""
         found = [one for one in self.list(path=path, deleted=deleted) if one.path == path]
         return max(found, key=lambda one: one.deleted_at or one.created_at, default=None)
 

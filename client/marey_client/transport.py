@@ -55,7 +55,7 @@ class BearerToken(httpx.Auth):
 
 
 def trusted_authorities() -> ssl.SSLContext:
-    """Who may vouch for servers: the public authorities, this machine's, and those that `SSL_CERT_FILE` names."""
+    """Trust the public certificate authorities, those of this machine, and those that `SSL_CERT_FILE` names."""
     context = httpx.create_ssl_context(trust_env=False)
     context.load_default_certs()
     return context
@@ -217,7 +217,7 @@ class Transport:
 
 
 def _quoted(path: str) -> str:
-    """A path whose names may hold anything, as it stands in an address."""
+    """Return a path, whose names may hold any character, in the form of an address."""
     return quote(path, safe="/:@!$&'()*+,;=~")
 
 
@@ -257,7 +257,7 @@ def read_tree(response: httpx.Response) -> Any:
 
 
 def raise_for_problem(response: httpx.Response) -> None:
-    """Raise the error an answer stands for, if it stands for one."""
+    """Raise the error of an answer, if it is one."""
     if response.status_code < 400:
         return
     circumstances: dict[str, Any] = {

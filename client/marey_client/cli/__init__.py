@@ -40,7 +40,7 @@ def _take_any_text() -> None:
 
 
 def with_global_options_first(arguments: list[str]) -> list[str]:
-    """Options of `marey` itself may stand anywhere, as in `marey ls lab --server URL`; typer wants them in front."""
+    """Move options of `marey` itself to the front, as typer needs them: `marey ls lab --server URL` works, too."""
     first: list[str] = []
     rest: list[str] = []
     left = iter(arguments)

@@ -129,7 +129,7 @@ def list_tokens(context: typer.Context, as_json: AsJson = False) -> None:
 def revoke_token(
     context: typer.Context, token_id: Annotated[str, typer.Argument(help="The token's id; marey token ls shows them.")]
 ) -> None:
-    """Make a token useless, now."""
+    """Revoke a token, at once."""
     with connect(context) as marey:
         marey.tokens.revoke(token_id)
     tell(f"{token_id} is revoked")
@@ -214,7 +214,7 @@ def change_password(
 
 @user.command("disable")
 def disable_user(context: typer.Context, name: UserName) -> None:
-    """Take a user's access away; what they made stays."""
+    """Disable a user; the data that they made stays."""
     with connect(context) as marey:
         marey.users.disable(name)
     tell(f"{name} is disabled; marey user enable {name} undoes it")
@@ -222,7 +222,7 @@ def disable_user(context: typer.Context, name: UserName) -> None:
 
 @user.command("enable")
 def enable_user(context: typer.Context, name: UserName) -> None:
-    """Let a user who was disabled in again, with the password and tokens they had."""
+    """Enable a disabled user again, with their password and tokens."""
     with connect(context) as marey:
         marey.users.enable(name)
     tell(f"{name} is enabled")

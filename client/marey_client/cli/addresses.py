@@ -48,7 +48,7 @@ class Address:
 
     @property
     def has_id(self) -> bool:
-        """Whether the last name is an id rather than a name."""
+        """True if the last name is an id."""
         return _ID.fullmatch(self.name) is not None
 
 
@@ -120,7 +120,7 @@ class Thing(Protocol):
     def place(self) -> str: ...
 
     def count(self) -> int:
-        """How many items would go with it."""
+        """Count the items that are removed with it."""
 
     def move(self, folder: str, name: str) -> Collection | Item:
         """Put it into a folder under a name; what it is then."""
@@ -151,7 +151,7 @@ class Folder:
         return f"{self.project.name}/{self.collection.path}"
 
     def count(self) -> int:
-        """How many items it holds, at any depth."""
+        """Count its items, at any depth."""
         from marey_schemas.kinds import Kind
 
         with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
@@ -183,7 +183,7 @@ class SingleItem:
 
     @property
     def kind(self) -> str:
-        """What it is."""
+        """Its kind."""
         return self.handle.item.kind.value
 
     @property
@@ -240,7 +240,7 @@ def require_apart(things: Sequence[Thing]) -> None:
 
 
 def _things(project: ProjectHandle, address: Address, kind: str | None, *, deleted: bool) -> Iterator[Thing]:
-    """What is at an address: folders first, and of each kind the one that was deleted last."""
+    """Yield the things at an address: folders first; of each kind, the one that was deleted last comes first."""
     from marey_schemas.kinds import Kind
 
     if kind in (None, FOLDER) and (folder := _folder(project, address, deleted=deleted)) is not None:

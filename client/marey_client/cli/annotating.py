@@ -34,7 +34,7 @@ Label = Annotated[str, typer.Argument(help="The label.")]
 
 
 class Neighbour(StrEnum):
-    """Which segment to merge with."""
+    """The segment to merge with."""
 
     NEXT = "next"
     PREVIOUS = "previous"
@@ -42,7 +42,7 @@ class Neighbour(StrEnum):
 
 
 class EndIndex(StrEnum):
-    """Whether a section of the predecessor holds its last index."""
+    """The meaning of the last index of a section of the predecessor."""
 
     INCLUSIVE = "inclusive"
     EXCLUSIVE = "exclusive"
@@ -120,7 +120,7 @@ def add(
     frames: Annotated[str, typer.Argument(help="first:end; the last frame is the one before the end.")],
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Segments that are there give way.")] = False,
 ) -> None:
-    """Put frames under a label."""
+    """Add a segment: frames under a label."""
     _, start, end = _segment(f"{label}={frames}")
     _apply(context, place, command="create_segment", label=label, start=start, end=end, overwrite=overwrite)
 
@@ -143,7 +143,7 @@ def merge(
     at: At,
     neighbour: Annotated[Neighbour, typer.Option("--with", help="Which neighbour.")] = Neighbour.NEXT,
 ) -> None:
-    """Make one of a segment and its neighbour, with the gap between them."""
+    """Merge a segment with its neighbour and the gap between them."""
     _apply(context, place, command="merge_segment", at=at, neighbour=neighbour.value)
 
 
@@ -155,7 +155,7 @@ def move(
     start: Annotated[int | None, typer.Option(min=0, help="Where the segment shall start.")] = None,
     end: Annotated[int | None, typer.Option(min=0, help="Where the segment shall end.")] = None,
 ) -> None:
-    """Let a segment start or end at another frame; a neighbour at that edge follows or gives way."""
+    """Move the start or the end of a segment; a neighbouring segment at that edge is adapted."""
     edges = [(edge, to) for edge, to in (("start", start), ("end", end)) if to is not None]
     if len(edges) != 1:
         raise WrongUsage("give --start or --end, one of them")
@@ -170,7 +170,7 @@ def relabel(context: typer.Context, place: Place, at: At, label: Label) -> None:
 
 @annotation.command()
 def remove(context: typer.Context, place: Place, at: At) -> None:
-    """Leave the frames of a segment without a label."""
+    """Remove a segment; its frames have no label then."""
     _apply(context, place, command="remove_segment", at=at)
 
 
@@ -183,7 +183,7 @@ def mark(
     move_to: Annotated[int | None, typer.Option("--move", min=0, help="Move it to this frame.")] = None,
     remove_it: Annotated[bool, typer.Option("--remove", help="Take it away.")] = False,
 ) -> None:
-    """Mark a frame; or move a mark, or take it away."""
+    """Add, move or remove a keyframe."""
     if move_to is not None and remove_it:
         raise WrongUsage("give --move or --remove, not both")
     if move_to is not None:
@@ -194,7 +194,7 @@ def mark(
 
 @annotation.command()
 def clear(context: typer.Context, place: Place) -> None:
-    """Take every segment and keyframe away."""
+    """Remove all segments and keyframes."""
     _apply(context, place, command="clear")
 
 

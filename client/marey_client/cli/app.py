@@ -1,4 +1,4 @@
-"""The commands, gathered. Each group stands in a module of its own."""
+"""The command `marey`, with the commands of all modules."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def marey(
         str | None, typer.Option(envvar="MAREY_URL", help="Address of the server; default: where you logged in last.")
     ] = None,
     token_file: Annotated[Path | None, typer.Option(help="File that holds a token and nothing else.")] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell details, also of errors.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show details, also of errors.")] = False,
     version: Annotated[  # noqa: ARG001 - its callback does it
         bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Show the version and exit.")
     ] = False,

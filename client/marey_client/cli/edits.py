@@ -131,7 +131,7 @@ def preview_edit(
     piece: Annotated[int, typer.Option(min=1, help="Which of the results, where the clip is split.")] = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Tell what commands would make of a clip; nothing is stored. With --json, its motion too."""
+    """Show the result of commands on a clip without storing it. With --json, its motion too."""
     from marey_schemas.kinds import Kind
 
     place = Address.parse(address)
@@ -262,7 +262,7 @@ def _parameters(model: type[BaseModel]) -> dict[str, Schema]:
     return {name: schema for name, schema in parameters_of(model).items() if name != "command"}
 
 
-# -- what is told --
+# -- output --
 
 
 def _summary(model: Any) -> str:
@@ -287,7 +287,7 @@ def _print_preview(shown: EditPreview, piece: int) -> None:
 
 
 def _finding(finding: dict[str, Any]) -> str:
-    """What a command found out, in one line; segments as ranges of frames."""
+    """Write the finding of a command in one line; segments as ranges of frames."""
     told = []
     for name, value in finding.items():
         if name == "segments":

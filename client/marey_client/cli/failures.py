@@ -1,4 +1,4 @@
-"""How the command line fails: one line, with the request id; the whole story with `-v`."""
+"""Failures of commands: one line with the request id, and a traceback with `-v`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ANONYMOUS_HINT = (
 
 
 class Refused(Exception):
-    """Something was refused that has been told already; only the exit status is left to say it."""
+    """Something was refused, and the message is printed already; the exit status is 1."""
 
 
 class WrongUsage(Exception):
@@ -67,7 +67,7 @@ def sentence(error: BaseException) -> str:
 
 
 def _told(error: BaseException) -> str:
-    """What an error says; of a file, its name and what is wrong with it, without the number of the error."""
+    """Return the text of an error; of a file, its name and the reason, without the number of the error."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror is not None:
         return f"{os.fsdecode(error.filename)}: {error.strerror}"
     return str(error)

@@ -57,7 +57,7 @@ def upload(
         tell(left_out_text(found.left_out))
     with connect(context) as marey:
         to = marey.project(project)
-        to.read()  # a project that is not there is told before its bytes are sent
+        to.read()  # a missing project is an error before any bytes are sent
         try:
             with progress() as advance:
                 entries = to.imports.upload(found.files, ImportOptions.model_validate(options), notice=advance)
@@ -83,7 +83,7 @@ def _print_entries(entries: Sequence[ImportEntry]) -> None:
             found.setdefault(warning.code, []).append(f"{entry.name}: {warning.message}")
     for code, texts in found.items():
         others = len(texts) - WARNINGS_SHOWN
-        more = [f"and {counted(others, 'more file')}; --json tells them all"] if others > 0 else []
+        more = [f"and {counted(others, 'more file')}; --json shows all"] if others > 0 else []
         for text in [*texts[:WARNINGS_SHOWN], *more]:
             tell(f"warning {code}: {text}")
     counts = Counter(entry.status for entry in entries)
@@ -151,7 +151,7 @@ def _show_deleted(
 
 
 def _items_called(marey: Marey, address: Address) -> list[ItemHandle]:
-    """What has this name where no folder has it. Raises `WrongUsage` where nothing has; a project may be empty."""
+    """Return the item at an address that is no folder. Raises `WrongUsage` if there is none."""
     from marey_schemas.kinds import Kind
 
     item = find_item(marey, address, list(Kind))
@@ -215,7 +215,7 @@ def show(
 
 
 def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
-    """What people want to know about an item; a clip with its skeleton, its source and what was noticed about it."""
+    """Yield names and values that describe an item; of a clip also its skeleton, source and warnings."""
     from marey_client.handles.clips import ClipHandle
 
     yield from item.item.model_dump(mode="json", exclude={"parts", "summary", "rev", "tags"}).items()
@@ -286,7 +286,7 @@ def download(
 
 
 def _clips_at(marey: Marey, address: Address) -> tuple[list[ItemHandle], str]:
-    """What an address means to a download, and the folder that paths are told from: a clip, a folder, another item."""
+    """Return the items at an address, and the folder that their file paths are relative to."""
     from marey_schemas.kinds import Kind
 
     project = marey.project(address.project)

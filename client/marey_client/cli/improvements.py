@@ -38,7 +38,7 @@ TOLD_FIRST = (
     ("pose_cost_mean", "pose cost m"),
     ("transitions_per_s", "switches 1/s"),
 )
-"""The metrics that people are told; --json and the report have all."""
+"""The metrics that people see; --json and the report have all."""
 
 Evaluation = Annotated[str, typer.Argument(help="An evaluation: project/folder/name, or project/id.")]
 From = Annotated[

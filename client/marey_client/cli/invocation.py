@@ -1,4 +1,4 @@
-"""What the options before the command say, and the session they open."""
+"""Options of `marey` itself, and the session with the server that they name."""
 
 from __future__ import annotations
 

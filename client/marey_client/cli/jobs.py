@@ -136,7 +136,7 @@ def list_jobs(
 
 @job.command("show")
 def show_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -> None:
-    """Show how a job stands, and every try at it."""
+    """Show a job and its attempts."""
     with connect(context) as marey:
         found = marey.jobs.get(job_id)
         attempts = list(marey.jobs.attempts(job_id))
@@ -189,7 +189,7 @@ def why(
     job_id: Annotated[str, typer.Argument(help="A job that waits, runs for long, or failed.")],
     as_json: AsJson = False,
 ) -> None:
-    """Explain why a job is where it is."""
+    """Explain the state of a job."""
     from marey_client.explanations import explain_job
 
     with connect(context) as marey:

@@ -164,7 +164,7 @@ def _ask(question: str) -> None:
 
 
 def _do_each(things: Sequence[Thing], do: Callable[[Thing], Any], done: str, as_json: bool) -> None:
-    """Do something to each; what the server refuses keeps the others from nothing, and is told. Raises `Refused`."""
+    """Do something to each thing, also after a refusal, which is printed. Raises `Refused` at the end."""
     from marey_client.errors import RequestFailed
 
     results: list[Any] = []

@@ -1,4 +1,4 @@
-"""What commands print: tables for people, JSON for programs, progress on the error stream of a terminal."""
+"""Output of commands: tables for people, JSON for programs, progress on the error stream of a terminal."""
 
 from __future__ import annotations
 
@@ -67,12 +67,12 @@ def print_pairs(pairs: Iterable[tuple[str, object]]) -> None:
 
 
 def tell(text: str) -> None:
-    """Tell the person at the terminal something that is no result."""
+    """Print a message that is not a result, on the error stream."""
     typer.echo(text, err=True)
 
 
 def tell_refused(refused: Sequence[Mapping[str, Any]], *, most: int | None = None) -> None:
-    """Tell what a job refused of its inputs, and why: a line each, `most` of them."""
+    """Print the inputs that a job refused, and the reasons, on the error stream: a line each, at most `most`."""
     for one in refused[:most]:
         name, detail = str(one.get("name")), str(one.get("detail"))
         tell(f"{detail if detail.startswith(name) else f'{name}: {detail}'} ({one.get('code')})")
@@ -81,7 +81,7 @@ def tell_refused(refused: Sequence[Mapping[str, Any]], *, most: int | None = Non
 
 
 Advance = Callable[[str, float, float | None], None]
-"""Told what is going on, how much is done, and of how much."""
+"""Called with the current activity, the amount done, and the total amount."""
 
 
 @contextmanager

@@ -49,7 +49,7 @@ def pipeline(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Hand in a graph of jobs, and follow them. What was computed before is not computed again."""
+    """Submit a graph of jobs, and follow them. Results that were computed before are used again."""
     from marey_schemas.pipelines import PipelineCreate
 
     wanted = PipelineCreate.model_validate(read_json(file))
@@ -162,7 +162,7 @@ def _skeleton(marey: Marey, to: str, project: str) -> str:
 
 
 def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> None:
-    """Wait for the jobs of a pipeline, if that is wanted, and print how they stand.
+    """Wait for the jobs of a pipeline, if that is wanted, and print their states.
 
     Raises `JobUnsuccessful`, and `Refused` where jobs refused some of their inputs.
     """
@@ -185,14 +185,14 @@ def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> 
 
 
 def _refused(job: Job) -> list[Mapping[str, Any]]:
-    """What a job refused of its inputs; of an import, files."""
+    """Return the inputs that a job refused; of an import, files."""
     result = job.result or {}
     failed = [entry for entry in result.get("entries", ()) if entry["status"] == "failed"]
     return [*result.get("refused", ()), *({"name": entry["name"], **entry["error"]} for entry in failed)]
 
 
 def _tell_shortfalls(run: PipelineRun) -> None:
-    """What did not go into the results of steps, and what their makers had to remark."""
+    """Print refused and empty inputs of the steps, and the notes of their jobs."""
     for step, job in run.steps.items():
         if refused := _refused(job):
             tell(f"{step} refused {len(refused)}:")
@@ -206,7 +206,7 @@ def _tell_shortfalls(run: PipelineRun) -> None:
 
 
 def print_steps(run: PipelineRun, as_json: bool) -> None:
-    """Print how the jobs stand."""
+    """Print the state of each job."""
     if as_json:
         print_json({"jobs": dict(run.steps)})
     else:
@@ -215,7 +215,7 @@ def print_steps(run: PipelineRun, as_json: bool) -> None:
 
 @contextmanager
 def _live_table() -> Iterator[Callable[[Mapping[str, Job]], None]]:
-    """A table on the error stream that is drawn anew while the block runs; nothing where that is no terminal."""
+    """Show a table on the error stream while the block runs, if that is a terminal."""
     if not sys.stderr.isatty():
         yield lambda _steps: None
         return

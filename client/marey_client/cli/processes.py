@@ -17,7 +17,7 @@ DatabaseUrl = Annotated[str | None, typer.Option(help="postgresql://...; default
 
 
 class LogForm(StrEnum):
-    """How log lines look."""
+    """The form of log lines."""
 
     TEXT = "text"
     JSON = "json"

@@ -126,7 +126,7 @@ def put_member(
 
 @member.command("remove")
 def remove_member(context: typer.Context, project_name: ProjectName, user: UserName) -> None:
-    """Take a user's role in a project away."""
+    """Remove a user from a project."""
     with connect(context) as marey:
         marey.project(project_name).members.remove(user)
     tell(f"{user} is no member of {project_name} any more")

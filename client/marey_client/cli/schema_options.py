@@ -36,10 +36,10 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 Chosen = dict[str, Any]
-"""What was typed of the options of one model, by its fields."""
+"""The options of one model that were typed, by its fields."""
 
 NONE = "none"
-"""Stands for null where a field has another default."""
+"""The text for null, of fields that have another default."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class OptionsOf:
     short : further spellings of an option, by the name of its field
     without : fields that the command sets itself
     only : the fields that become options; all where it is empty
-    nulls : further texts that stand for null, by the name of the field
+    nulls : further texts for null, by the name of the field
     """
 
     model: str

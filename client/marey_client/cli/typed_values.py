@@ -209,7 +209,7 @@ def read_numbers(text: str, most: int | None = None) -> list[float]:
 
 
 def read_json(file: Path | str) -> Any:
-    """What a file holds, or standard input for `-`. Raises `WrongUsage` where that cannot be read, or is no JSON."""
+    """Read JSON from a file, or from standard input for `-`. Raises `WrongUsage` if that fails."""
     data = _read(str(file))
     try:
         return json.loads(data.decode("utf-8-sig"))

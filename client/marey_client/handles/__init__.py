@@ -1,1 +1,1 @@
-"""Handles of items, pipelines and streams: objects that stand for something at the server and ask it when called."""
+"""Handles of items, pipelines and streams: objects that represent things of a server, and ask it when called."""

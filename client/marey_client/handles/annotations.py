@@ -17,7 +17,7 @@ class AnnotationHandle(ItemHandle):
     """One layer of annotation over a clip."""
 
     def document(self, *, revision: int | None = None) -> Annotation:
-        """The clip it is of, its segments and its keyframes."""
+        """Return its clip, segments and keyframes."""
         return Annotation.model_validate(self.part("annotation", revision=revision))
 
     def apply(self, commands: Mapping[str, Any] | Sequence[Mapping[str, Any]], *, message: str = "") -> Item:

@@ -50,12 +50,12 @@ class ClipHandle(ItemHandle):
         joints: str | Sequence[str] | None = None,
         revision: int | None = None,
     ) -> MotionArrays:
-        """The poses as numpy arrays; only the blocks that hold `frames` and `joints` are read and sent."""
+        """Return the poses as numpy arrays; only the blocks that hold `frames` and `joints` are read and sent."""
         query = {"frames": frames_text(frames), "joints": ",".join(several(joints)) if joints is not None else None}
         return MotionArrays.model_validate(self.part("motion", revision=revision, **query))
 
     def info(self) -> ClipInfo:
-        """What people and importers say about the clip."""
+        """Return the description of the clip by people and importers."""
         return ClipInfo.model_validate(self.part("info"))
 
     def put_info(self, info: ClipInfo) -> Item:
@@ -67,7 +67,7 @@ class ClipHandle(ItemHandle):
         return self.put_part("motion", motion.model_dump(by_alias=True, exclude_none=True), message=message)
 
     def annotations(self) -> Iterator[AnnotationHandle]:
-        """What is said about any revision of the clip, oldest first."""
+        """List the annotations of all revisions of the clip, oldest first."""
         found = Items(self.transport, self.project, Kind.ANNOTATION, AnnotationHandle)
         return found.list(sort="created_at", filters={"clip": self.id})
 
@@ -84,7 +84,7 @@ class ClipHandle(ItemHandle):
         )
 
     def preview(self, commands: Commands, *, frames: slice | None = None, **options: Any) -> EditPreview:
-        """Frames of what commands would make of the clip; nothing is stored.
+        """Return frames of the result of commands on the clip, without storing it.
 
         `options` are those of `EditPreviewRequest`, such as `piece=1` or `fields=("positions",)`. `RequestFailed`
         where the commands cannot be applied, or would take too long for a preview.
@@ -105,7 +105,7 @@ class ClipHandle(ItemHandle):
 
 
 def frames_text(frames: slice | None) -> str | None:
-    """A slice as the query `a:b`; None for all frames. Raises `ValueError` for what a query cannot say."""
+    """Write a slice as the query `a:b`; None for all frames. Raises `ValueError` for steps and negative bounds."""
     if frames is None:
         return None
     if frames.step not in (None, 1):

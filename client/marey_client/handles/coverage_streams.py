@@ -1,4 +1,4 @@
-"""Coverage while a performer records: send frames, hear what to record next."""
+"""Coverage streams: measure a performance while it is recorded, and get the motions to record next."""
 
 from __future__ import annotations
 
@@ -93,11 +93,11 @@ class CoverageStreamHandle:
         return self._send({"offset": self.offset, "ends_take": ends_take, **said})
 
     def end_take(self) -> CoverageProgress:
-        """The performer pauses, or frames were lost: what comes next is measured afresh."""
+        """End the take, after a pause or lost frames; the next frames are measured as a new take."""
         return self._send({"offset": self.offset, "ends_take": True})
 
     def read(self) -> CoverageStreamState:
-        """The whole map, the performer, and what to record next."""
+        """Return the whole map, the state of the performer, and the motions to record next."""
         return self.transport.get(CoverageStreamState, self.url)
 
     def delete(self) -> None:

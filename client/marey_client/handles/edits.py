@@ -19,7 +19,7 @@ class EditHandle(ItemHandle):
     """One edit."""
 
     def document(self, *, revision: int | None = None) -> EditDocument:
-        """Its title and its commands."""
+        """Return its title and its commands."""
         return EditDocument.model_validate(self.part("edit", revision=revision))
 
     def put(self, edit: EditDocument, *, message: str | None = None) -> Item:
@@ -55,14 +55,14 @@ class Edits(Items[EditHandle]):
 
 
 def as_edit(commands: EditDocument | Command | Sequence[Command], *, title: str = "") -> EditDocument:
-    """Commands as the document of an edit; pydantic's `ValidationError` names what is wrong with which."""
+    """Return commands as the document of an edit. Raises `ValidationError`, which names the faulty command."""
     if isinstance(commands, EditDocument):
         return commands if not title else commands.model_copy(update={"title": title})
     return EditDocument.model_validate({"title": title, "commands": several(commands)})
 
 
 def preview_edit(transport: Transport, url: str, commands: Commands, **options: Any) -> EditPreview:
-    """Frames of what commands make of the clip at `url`; `options` are those of `EditPreviewRequest`."""
+    """Return frames of the result of commands on the clip at `url`; `options` are those of `EditPreviewRequest`."""
     if isinstance(commands, EditHandle):
         request = EditPreviewRequest.model_validate({"edit": commands.as_input().model_dump(), **options})
     else:

@@ -1,4 +1,4 @@
-"""Evaluations of locomotion clips: ask for one, and read what it found."""
+"""Evaluations of locomotion clips: read the results of one, and improve the clips by them."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ class EvaluationHandle(ReportedHandle):
 
     @property
     def verdict(self) -> str:
-        """How good the clips are, in a sentence."""
+        """The verdict: the quality of the clips, in a sentence."""
         return str(self.item.summary["verdict"])
 
     def summary(self) -> dict[str, Any]:
-        """The verdict and the headline numbers; units stand at the ends of the names."""
+        """Return the verdict and the headline numbers; the names end in their units."""
         return dict(self.item.summary)
 
     def document(self, *, revision: int | None = None) -> dict[str, Any]:
-        """Everything but the ticks: options, provenance, metrics, usage, coverage; arrays are numpy arrays."""
+        """Return all but the ticks: options, provenance, metrics, usage, coverage; arrays are numpy arrays."""
         return self.part("evaluation", revision=revision)
 
     def trials(self) -> list[dict[str, Any]]:
-        """One row per trial: name, what it asked for, and its metrics."""
+        """Return one row per trial: name, requested motion, and metrics."""
         return list(trial_rows(self.document()))
 
     def clips(self) -> list[dict[str, Any]]:
-        """One row per clip: name, frames, and how much the trials used it."""
+        """Return one row per clip: name, frames, and its use by the trials."""
         return list(clip_rows(self.document()))
 
     def records(self) -> dict[str, dict[str, NDArray[Any]]]:
-        """Every tick of every trial, by the trial's name: arrays by what they hold, see `record_arrays`."""
+        """Return every tick of every trial, by the trial's name; `record_arrays` describes the arrays."""
         return record_arrays(self.part("records"))
 
     def walk_graph(self, *, trial: str | None = None) -> dict[str, Any]:

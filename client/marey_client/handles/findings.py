@@ -1,4 +1,4 @@
-"""What jobs found out about evaluations: numbers, a document with everything, and sometimes a report."""
+"""Findings of jobs on evaluations: numbers, a document with all results, and sometimes a report."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from marey_schemas.jobs import Job
 
 @dataclass(frozen=True)
 class Findings:
-    """What one job found out; `job.result` counts it."""
+    """The findings of one job; `job.result` holds their counts."""
 
     transport: Transport
     job: Job
@@ -25,11 +25,11 @@ class Findings:
         return {name: value for name, value in (self.job.result or {}).items() if name not in ("document", "report")}
 
     def document(self) -> dict[str, Any]:
-        """Everything that was found; arrays are numpy arrays."""
+        """Return all results; arrays are numpy arrays."""
         return dict(decode_tree(Blobs(self.transport).fetch(self._blob("document")), JSON))
 
     def report(self) -> bytes:
-        """The report, where there is one: one page of HTML that needs nothing else."""
+        """Return the report, if there is one: one self-contained page of HTML."""
         return Blobs(self.transport).fetch(self._blob("report"))
 
     def save_report(self, path: str | Path) -> Path:

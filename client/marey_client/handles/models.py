@@ -1,4 +1,4 @@
-"""Generative models of motion: ask for one, read how good it is, and draw motions from it."""
+"""Generative models of motion: read the quality of one, and draw motions from it."""
 
 from __future__ import annotations
 
@@ -42,19 +42,19 @@ class ModelHandle(SearchableHandle):
 
     @property
     def verdict(self) -> str:
-        """How good the model is, in a sentence or two."""
+        """The verdict: the quality of the model, in a sentence or two."""
         return str(self.item.summary["verdict"])
 
     def summary(self) -> dict[str, Any]:
-        """The verdict and the headline numbers; units stand at the ends of the names."""
+        """Return the verdict and the headline numbers; the names end in their units."""
         return dict(self.item.summary)
 
     def document(self, *, revision: int | None = None) -> dict[str, Any]:
-        """All of it: functions, mixture, options, examples, training report; arrays are numpy arrays."""
+        """Return the whole model: functions, mixture, options, examples, training report; arrays are numpy arrays."""
         return self.part("model", revision=revision)
 
     def training(self) -> dict[str, Any]:
-        """How good it is, in numbers: errors, likelihoods, examples, feet, warnings."""
+        """Return the quality of the model in numbers: errors, likelihoods, examples, feet, warnings."""
         return dict(self.document()["training"] or {})
 
     def sample(self, n: int = 1, seed: int = 0, *, revision: int | None = None) -> Samples:

@@ -1,4 +1,4 @@
-"""Pipelines: jobs that work on what others of them make, handed in together and followed together."""
+"""Pipelines: jobs that work on the results of others, submitted and followed together."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class PipelineRun:
 
     @property
     def ended(self) -> bool:
-        """Whether every job has ended."""
+        """True when every job has ended."""
         return all(job.state.terminal for job in self._steps.values())
 
     def refresh(self) -> dict[str, Job]:
-        """How the jobs stand now."""
+        """Return the jobs by step, as they are now."""
         return dict(self._look(wait_s=0.0))
 
     def wait(self, *, timeout_s: float | None = None, on_progress: OnProgress | None = None) -> Mapping[str, Job]:
@@ -98,11 +98,11 @@ class PipelineRun:
 
 
 def _only_followed(job: Job) -> bool:
-    """Whether a job failed only because one it needed had."""
+    """Return whether a job failed only because one of its dependencies failed."""
     return job.failure is not None and job.failure.reason is FailureReason.DEPENDENCY_FAILED
 
 
 def submit_pipeline(transport: Transport, project: str, pipeline: PipelineCreate) -> PipelineRun:
-    """Hand in a pipeline: all of its jobs, or none."""
+    """Submit a pipeline: all of its jobs, or none."""
     answer = transport.post(Pipeline, f"/projects/{project}/pipelines", pipeline)
     return PipelineRun(transport, answer.jobs)

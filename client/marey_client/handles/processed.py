@@ -1,4 +1,4 @@
-"""Aligned clips: ask for them, and read what alignment made of each."""
+"""Aligned clips: read canonical frames, time functions and sources."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ class ProcessedHandle(ItemHandle):
     def motion(
         self, *, frames: slice | None = None, joints: str | Sequence[str] | None = None, revision: int | None = None
     ) -> MotionArrays:
-        """Its canonical frames, in the canonical frame of reference."""
+        """Return its canonical frames, in the canonical frame of reference."""
         query = {"frames": frames_text(frames), "joints": ",".join(several(joints)) if joints is not None else None}
         return MotionArrays.model_validate(self.part("motion", revision=revision, **query))
 
     def info(self, *, revision: int | None = None) -> AlignmentInfo:
-        """Which set it belongs to, its keyframes, cost and options, and where and when its frames were."""
+        """Return its set, keyframes, cost and options, and the places and times of its frames in the source."""
         return AlignmentInfo.model_validate(self.part("info", revision=revision))
 
     def time_function(self) -> NDArray[np.float64]:
-        """(N,) fractional frame of the source, counted at the set's rate, at each canonical frame."""
+        """Return (N,) fractional frames of the source, counted at the set's rate, one for each canonical frame."""
         return self.info().time_function
 
     def source(self) -> ClipHandle | None:
-        """The clip it comes from, as it is now; None where that is not in the store."""
+        """Return the clip that it comes from, as it is now; None if that is not in the store."""
         clip = self.info().clip
         if clip is None:
             return None

@@ -1,4 +1,4 @@
-"""Items with a report: a page for people, and figures of what it tells."""
+"""Items with a report: a page for people, and its figures."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ class ReportedHandle(ItemHandle):
     """An item that may have a part `report`."""
 
     def figures(self) -> tuple[StoredFigure, ...]:
-        """The figures that the report has."""
+        """Return the figures of the report."""
         return tuple(StoredFigure.model_validate(figure) for figure in self.part("report")["figures"])
 
     def report(self) -> bytes:
-        """The report: one page of HTML that needs nothing else."""
+        """Return the report: one self-contained page of HTML."""
         return self._fetch(f"{self.url}/report", "text/html")
 
     def figure(
@@ -29,7 +29,7 @@ class ReportedHandle(ItemHandle):
         trial: str | None = None,
         table: str | None = None,
     ) -> bytes:
-        """A figure as png or svg, or what it plots as json, or one table of that as csv.
+        """Return a figure as png or svg, its data as json, or one table of its data as csv.
 
         `trial` names one of an evaluation, for figures that were asked for of it.
         """

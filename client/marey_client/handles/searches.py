@@ -26,10 +26,10 @@ class SearchableHandle(ReportedHandle):
     """An item whose motions can be searched."""
 
     def search(self, constraints: Constraints = (), **options: Any) -> SearchAnswer:
-        """The motion that meets constraints best; `options` are those of `SearchRequest`.
+        """Return the motion that meets constraints best; `options` are those of `SearchRequest`.
 
         Several motions that follow one another are asked for with `steps`, each with constraints and, where it is
-        another one, the id of its model. The answer tells what is missed by how much.
+        another one, the id of its model. The answer holds the error of each constraint.
         """
         request = search_request(constraints, **options)
         response = self.transport.send(
@@ -76,5 +76,5 @@ class SearchableHandle(ReportedHandle):
 
 
 def search_request(constraints: Constraints, **options: Any) -> SearchRequest:
-    """A request with these constraints."""
+    """Return a request with these constraints."""
     return SearchRequest.model_validate({"constraints": several(constraints), **options})

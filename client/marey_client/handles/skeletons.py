@@ -11,11 +11,11 @@ class SkeletonHandle(ItemHandle):
     """One skeleton."""
 
     def hierarchy(self) -> SkeletonHierarchy:
-        """Joints, offsets and rest pose."""
+        """Return joints, offsets and rest pose."""
         return SkeletonHierarchy.model_validate(self.part("hierarchy"))
 
     def mapping(self) -> SkeletonMapping:
-        """Which joint plays which standard joint, and its axes."""
+        """Return the mapping of standard joints to joints, and the axes of joints."""
         return SkeletonMapping.model_validate(self.part("mapping"))
 
     def put_mapping(self, mapping: SkeletonMapping) -> Item:

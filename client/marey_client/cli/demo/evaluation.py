@@ -27,7 +27,7 @@ OPTIONS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class DemoEvaluation:
-    """What came of it; `summary` is None where no clip is locomotion."""
+    """The result of the evaluation; `summary` is None if no clip is locomotion."""
 
     clips: int
     chosen: int
@@ -36,14 +36,14 @@ class DemoEvaluation:
 
     @property
     def sentence(self) -> str:
-        """How good the clips are."""
+        """The quality of the clips, in a sentence."""
         if self.summary is None:
             return f"None of {self.clips} retargeted clips is locomotion, so there was nothing to evaluate."
         return str(self.summary["verdict"])
 
     @property
     def selection(self) -> str:
-        """Which clips were evaluated, and why."""
+        """The clips that were evaluated, and the reason for the choice."""
         return (
             f"of {self.clips} retargeted clips: those whose root gets {TRAVEL_M:g} m away within {WINDOW_S:g} s, "
             "in most frames"
@@ -67,7 +67,7 @@ def evaluate_locomotion(
 
 
 def travels(clip: ClipHandle, root: str) -> bool:
-    """Whether the clip's root gets `TRAVEL_M` away within `WINDOW_S`, in most frames that have so many after them."""
+    """Return whether the clip's root travels `TRAVEL_M` within `WINDOW_S`, from most frames."""
     rate_hz = float(clip.item.summary["frame_rate_hz"])
     window = round(WINDOW_S * rate_hz)
     if int(clip.item.summary["frames"]) <= window:

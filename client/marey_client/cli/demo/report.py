@@ -1,4 +1,4 @@
-"""What the demonstration found, for people and for programs."""
+"""The report of the demonstration, for people and for programs."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class DemoReport:
 
     @property
     def warnings(self) -> Counter[str]:
-        """How many files had a warning, by its code."""
+        """The number of files that had a warning, by its code."""
         return Counter(code for entry in self.entries for code in {warning.code for warning in entry.warnings})
 
     def as_dict(self) -> dict[str, Any]:
@@ -90,7 +90,7 @@ class DemoReport:
 
 
 def print_report(report: DemoReport) -> None:
-    """How good the motion is, a table of figures, the reasons of refusals, and where everything is."""
+    """Print the quality of the motion, a table of figures, the reasons of refusals, and the places of all files."""
     typer.echo(f"{report.evaluation.sentence}\n")
     print_rows(_rows(report))
     for step, reason in report.refused[:REASONS_SHOWN]:
@@ -110,7 +110,7 @@ def print_report(report: DemoReport) -> None:
 
 
 def _command() -> str:
-    """How the `marey` command is called here: it need not be on the path."""
+    """Return how to call the `marey` command here; it need not be on the path."""
     return "marey" if shutil.which("marey") else shlex.quote(sys.argv[0])
 
 

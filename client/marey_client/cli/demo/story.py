@@ -37,7 +37,7 @@ SHEET_TAKES = 8
 
 
 def demonstrate(motion: Path | None, *, data: Path, keep_serving: bool, as_json: bool) -> None:
-    """Tell the whole story, once; with the same `data` again, nothing is done twice."""
+    """Run the demonstration; with the same `data` again, nothing is done twice."""
     os.environ.setdefault("MAREY_LOG_LEVEL", "warning")
     with embedded.server_in_thread(data, workers=1) as url, Marey(url, read_secret(data / ADMIN_TOKEN)) as marey:
         files = find_files([motion]) if motion else _generated_takes(data / "generated")
