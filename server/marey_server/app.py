@@ -257,7 +257,7 @@ def greeting(settings: Settings, address: str, database: Database) -> Iterator[s
 
 
 def next_command(settings: Settings, address: str) -> str:
-    """Where to type the first command, and the command; with server and token where it would not find them itself."""
+    """Return the first command to type, with server and token if it would not find them itself."""
     reachable = address.replace("//0.0.0.0:", "//127.0.0.1:").replace("//[::]:", "//[::1]:")
     defaults = Settings.model_fields
     usual_address = f"http://{defaults['host'].default}:{defaults['port'].default}"

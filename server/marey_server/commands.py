@@ -1,4 +1,4 @@
-"""What the `marey` command runs on the server's own machine: serve, and the care of its database.
+"""Commands that `marey` runs on the server's own machine: serve, and maintenance of the database.
 
 Functions print what people should see and raise `CommandFailed` with a sentence when they cannot do what was asked.
 """
@@ -22,11 +22,11 @@ from marey_server.process.settings import Settings
 
 
 class CommandFailed(Exception):
-    """What was asked for could not be done; the text says why and what to do."""
+    """A command that failed; the text says why and what to do."""
 
 
 def serve(**settings: Any) -> None:
-    """Run a server, and the workers it is told to start, until SIGTERM or SIGINT."""
+    """Run a server, and as many workers as asked for, until SIGTERM or SIGINT."""
     from marey_server.app import CannotListen
     from marey_server.app import serve as serve_until_stopped
     from marey_server.process.computing import leave
@@ -140,7 +140,7 @@ def admin_token(*, user: str | None = None, **settings: Any) -> None:
 
 @contextmanager
 def _database_of(settings: Settings) -> Iterator[str]:
-    """The url of the database; what goes wrong with it inside the block is told in a sentence."""
+    """Give the URL of the database; a failure inside the block is reported in one sentence."""
     from marey_server.store.database.opening import DatabaseUnusable, opening
 
     try:

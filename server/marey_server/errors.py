@@ -145,7 +145,7 @@ class PreconditionRequiredProblem(ApiProblem):
 
 
 class InvalidProblem(ApiProblem):
-    """The request is well formed, but what it asks for makes no sense."""
+    """The request is well formed but not valid."""
 
     status = 422
     code = "invalid"

@@ -1,4 +1,4 @@
-"""What pydantic finds wrong, as every answer tells it: a pointer into what was sent, a code, a sentence."""
+"""Validation errors of pydantic as answers show them: a pointer into the request, a code, a sentence."""
 
 from __future__ import annotations
 

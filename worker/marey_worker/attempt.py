@@ -73,7 +73,7 @@ class LogUploader:
 
     @property
     def size_bytes(self) -> int:
-        """How much was printed so far."""
+        """Return the number of bytes printed so far."""
         return self.path.stat().st_size
 
     def send(self) -> None:

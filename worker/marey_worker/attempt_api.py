@@ -1,4 +1,4 @@
-"""What a worker says to the server about jobs, as HTTP."""
+"""Requests of a worker about its jobs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from marey_schemas.worker_protocol import (
 )
 
 PATIENT = Retries(tries=100, longest_s=10.0, total_s=600.0)
-"""For the last word of an attempt: computed results are worth waiting for."""
+"""For the final answer of an attempt: computed results are worth waiting for."""
 
 PLAIN_TEXT = "text/plain; charset=utf-8"
 
@@ -107,7 +107,7 @@ class AttemptApi:
             return [item for item in found if item.name == name]
 
     def read_results(self) -> list[dict[str, Any]]:
-        """What the tasks of the job returned, in their order."""
+        """Return the results of the job's tasks, in order."""
         with _dead_token_is_lost_lease():
             return [one.result or {} for one in pages(self._transport, TaskResult, f"/jobs/{self._job}/results")]
 

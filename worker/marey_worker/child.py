@@ -82,7 +82,7 @@ def run_job(run: Run, pipe: Connection) -> End:
     except Exception as error:  # noqa: BLE001 - whatever a kind raises ends this job, not the process
         sys.stderr.write("".join(traceback.format_exception(error)))
         what = "".join(traceback.format_exception_only(error)).strip()[:DETAIL_CHARACTERS]
-        text = f"{what}; the job's log tells where"
+        text = f"{what}; the job's log shows where"
         code = getattr(error, "code", "exception")
         return Failed(code if isinstance(code, str) else "exception", text, signatures.of_exception(error), True)
     finally:

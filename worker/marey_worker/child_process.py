@@ -81,7 +81,7 @@ class ChildProcess:
             raise EOFError from error
 
     def wait(self) -> int:
-        """How the process ended; negative: by which signal."""
+        """Return the exit status of the process; a negative one is a signal."""
         return self._process.wait()
 
     def kill(self, *, grace_s: float = TERMINATE_S) -> None:

@@ -1,4 +1,4 @@
-"""What the function behind a kind of job may use."""
+"""Context of a job: everything that the function of a kind may use."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class RequestRefused(Exception):
 
 
 class NoSuchThing(RequestRefused):
-    """What the job asked for does not exist, or the job may not see it. `code` tells what: `no-skeleton`, for one."""
+    """Something that does not exist or that the job may not see; `code` names it, as in `no-skeleton`."""
 
     def __init__(self, detail: str, code: str = "not-found") -> None:
         super().__init__(detail)
@@ -61,7 +61,7 @@ class NoSuchThing(RequestRefused):
 
 
 class Task(NamedTuple):
-    """Which of the tasks of a job this is, from 0, and of how many."""
+    """Position of a task among the tasks of its job, from 0, and their number."""
 
     position: int
     size: int
@@ -128,7 +128,7 @@ class Context:
         return found
 
     def task_results(self) -> list[dict[str, Any]]:
-        """What the tasks that this job gathers returned, in their order."""
+        """Return the results of the tasks that this job gathers, in order."""
         results: list[dict[str, Any]] = self._ask(ReadResults)
         return results
 
@@ -196,7 +196,7 @@ class Context:
         return request
 
     def _value(self, request: int, missing: str = "not-found") -> Any:
-        """What was answered. Raises `NoSuchThing` with the code `missing`, and `RequestRefused`."""
+        """Return the answer. Raises `NoSuchThing` with the code `missing`, and `RequestRefused`."""
         while request not in self._replies:
             reply: ChildReply = self._pipe.recv()
             self._replies[reply.request] = reply

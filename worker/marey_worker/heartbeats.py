@@ -56,7 +56,7 @@ class LeaseKeeper:
         self._stopped.set()
 
     def confirm(self, *, patiently: bool) -> None:
-        """Make sure that the lease is held before the last word; `patiently` where there is a result to lose.
+        """Make sure that the lease is held before the final answer; `patiently` where there is a result to lose.
 
         Raises `LeaseLost`, or why the server does not answer.
         """

@@ -1,4 +1,4 @@
-"""What a child may use, and that it does not outlive its supervisor."""
+"""Limits of a child process, and its end with its supervisor."""
 
 from __future__ import annotations
 

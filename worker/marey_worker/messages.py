@@ -1,4 +1,4 @@
-"""What the supervisor and a child say to each other over their pipe. The child never sees a token or an address."""
+"""Messages between supervisor and child over their pipe. The child never sees a token or an address."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Made:
-    """How far the job is."""
+    """Progress of the job."""
 
     progress: Progress
 

@@ -8,7 +8,7 @@ import traceback
 
 
 def of_exception(error: BaseException) -> str:
-    """Where an exception was raised and of which type, whatever its text says."""
+    """Return the type and place of an exception, without its text."""
     frames = traceback.extract_tb(error.__traceback__)
     places = [f"{frame.filename.rpartition('/')[2]}:{frame.name}:{frame.lineno}" for frame in frames]
     digest = hashlib.sha256("\n".join([type(error).__qualname__, *places]).encode()).hexdigest()
@@ -16,7 +16,7 @@ def of_exception(error: BaseException) -> str:
 
 
 def of_exit(status: int) -> str:
-    """How a process ended that should not have."""
+    """Return the signature of a process that ended unexpectedly."""
     return f"exit:{_signal_name(-status) if status < 0 else status}"
 
 

@@ -1,4 +1,4 @@
-"""One worker: slots that claim and run jobs, until it is told to stop."""
+"""One worker: slots that claim and run jobs, until it is asked to stop."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ JOBS_PER_CHILD = 1000
 
 @dataclass(frozen=True)
 class WorkerOptions:
-    """How a worker works.
+    """Options of a worker.
 
     `kinds` and `labels` say what it takes; `slots` how many jobs at a time; `threads` how many a job may use.
     """
@@ -52,12 +52,12 @@ class WorkerOptions:
 
     @property
     def threads_of_a_slot(self) -> int:
-        """How many threads one job may use."""
+        """Return the number of threads that one job may use."""
         return max(1, self.threads // self.slots)
 
 
 def default_cache(environment: Mapping[str, str]) -> Path:
-    """Where inputs are kept: below `XDG_CACHE_HOME`, or `~/.cache`."""
+    """Return the folder of cached inputs: below `XDG_CACHE_HOME`, or `~/.cache`."""
     return Path(environment.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "marey" / "inputs"
 
 

@@ -1,4 +1,4 @@
-"""How far a credential reaches: `read`, `write`, `jobs`, `work`, `admin`, alone or bound as in `write!project=walk`."""
+"""Scopes of credentials: `read`, `write`, `jobs`, `work`, `admin`, alone or bound as in `write!project=walk`."""
 
 from __future__ import annotations
 

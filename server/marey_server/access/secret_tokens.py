@@ -36,7 +36,7 @@ def issue_attempt_token() -> IssuedToken:
 
 
 def hash_secret(secret: str) -> str:
-    """What the database keeps of a secret: 64 hexadecimal digits."""
+    """Return the stored hash of a secret: 64 hexadecimal digits."""
     return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
 
 

@@ -52,7 +52,7 @@ class AnnotationCommands(Resource):
 
 
 class ClipAnnotations(Resource):
-    """What is said about a clip."""
+    """Annotations of a clip."""
 
     path = "/projects/{project}/{kind}/{item}/annotations"
     tag = "Annotations"

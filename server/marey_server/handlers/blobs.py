@@ -65,14 +65,14 @@ class Blob(BlobSender):
 
 
 class MissingBlobs(Resource):
-    """Which bytes must be sent."""
+    """Blobs that the server lacks."""
 
     path = "/blobs/missing"
     tag = "Blobs"
 
     @writes(access=Access.SIGNED_IN, scope="read", body=BlobsQuery, answer=BlobsMissing)
     async def post(self, body: BlobsQuery) -> Reply:
-        """Which of these digests the server lacks, as far as you may know."""
+        """Return the digests whose bytes the caller must send."""
         missing = await self.look_up(blobs.missing, body.digests)
         return Reply(BlobsMissing(missing=tuple(missing)))
 

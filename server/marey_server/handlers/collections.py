@@ -13,7 +13,7 @@ from marey_server.store import collections
 
 
 class CollectionsQuery(PageQuery):
-    """Which folders."""
+    """Filters of a list of folders."""
 
     path: str = Field("", max_length=1024, description="This folder and those below it.")
     deleted: bool = Field(False, description="Among the deleted ones.")

@@ -13,7 +13,7 @@ from marey_server.http.resource import Resource
 
 
 class Service(Answer):
-    """What answers at this address, and where to go from here."""
+    """The service at this address, with links to its API."""
 
     name: str = "Marey"
     version: str
@@ -31,7 +31,7 @@ class ApiRoot(Resource):
 
     @reads(access=Access.ANYONE, scope=None, answer=Service, also=((303, None),))
     async def get(self) -> Reply:
-        """What this server is and where its API is described; browsers are led to the page for people."""
+        """Return the version of this server and the addresses of its documentation; browsers are redirected."""
         if "text/html" in self.request.headers.get("Accept", ""):
             return Reply(status=303, location="/docs")
         return Reply(Service(version=version("marey")))
@@ -47,7 +47,7 @@ class ServerRoot(ApiRoot):
 
 
 class OpenApiDocument(Resource):
-    """What programs read."""
+    """The OpenAPI document."""
 
     path = "/openapi.json"
     tag = "Documentation"
@@ -60,7 +60,7 @@ class OpenApiDocument(Resource):
 
 
 class DocumentationPage(Resource):
-    """What people read."""
+    """The documentation page."""
 
     path = "/docs"
     tag = "Documentation"

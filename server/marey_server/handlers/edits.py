@@ -11,7 +11,7 @@ from marey_server.motions import previewing
 
 
 class EditPreviewResource(Resource):
-    """What an edit would make of a clip."""
+    """Preview of an edit of a clip."""
 
     path = "/projects/{project}/{kind}/{item}/edit-preview"
     tag = "Items"

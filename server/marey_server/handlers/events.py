@@ -1,4 +1,4 @@
-"""What happens in a project: asked for page by page, or followed as server-sent events."""
+"""Events of a project, page by page or as server-sent events."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WRITE_TIMEOUT_S = 30.0
 
 
 class EventsQuery(Request):
-    """Which events."""
+    """The position and number of events to read."""
 
     after: int = Field(0, ge=0, le=2**62, description="Number of the last event received; 0 from the beginning.")
     limit: int = Field(100, ge=1, le=events.MAX_EVENTS, description="Longest page.")
@@ -43,7 +43,7 @@ class Events(Resource):
         headers=("Last-Event-ID",),
     )
     async def get(self, project: str, query: EventsQuery) -> Reply | None:
-        """What happened, in the order it became visible; as text/event-stream, also what happens from now on."""
+        """Return events in the order of their commits; as text/event-stream, also those to come."""
         after = self._last_received(query)
         found = await self.look_up(events.list_events, project, after=after, limit=query.limit)
         if self.media is not EVENT_STREAM:

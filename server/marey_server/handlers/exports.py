@@ -20,7 +20,7 @@ from marey_server.motions.predecessor_exports import PredecessorOptions
 
 
 class ExportQuery(Request):
-    """Which file."""
+    """Format and options of the exported file."""
 
     format: ExportFormat = Field("original", description="original: the file exactly as it was imported.")
     unit: WrittenUnit = Field("cm", description="Unit of length of a BVH.")

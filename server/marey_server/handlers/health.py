@@ -50,7 +50,7 @@ class Readyz(Resource):
 
 
 class MetricsPage(Resource):
-    """What Prometheus scrapes."""
+    """Metrics for Prometheus."""
 
     path = "/metrics"
     root = ""

@@ -19,7 +19,7 @@ MAX_DOCUMENT_BYTES = 128 * MIB
 
 
 class ItemsQuery(CountedPageQuery):
-    """Which items, in which order, and how much of each."""
+    """Filters, order and detail of a list of items."""
 
     collection: str | None = Field(None, max_length=1024, description="In this folder or below it.")
     directly_in: str | None = Field(
@@ -38,7 +38,7 @@ class ItemsQuery(CountedPageQuery):
     fields: CommaSeparated | None = Field(None, description="Only these members of each item.")
 
     def filters(self) -> ItemFilters:
-        """What the store filters by."""
+        """Return the filters of the store."""
         return ItemFilters(
             collection=self.collection,
             directly_in=self.directly_in,
@@ -172,14 +172,14 @@ class LineageQuery(Request):
 
 
 class LineageResource(Resource):
-    """Where a revision comes from."""
+    """Lineage of a revision."""
 
     path = "/projects/{project}/{kind}/{item}/lineage"
     tag = "ItemsOfKind"
 
     @reads(access=Access.READER, query=LineageQuery, answer=Lineage)
     async def get(self, project: str, kind: str, item: str, query: LineageQuery) -> Rendered:
-        """What a revision was made from, by which job, and what was made of it."""
+        """Return the inputs of a revision, the job that made it, and the revisions made from it."""
         return await self.answer(items.read_lineage, project, kind_of(kind), item, revision_number=query.revision)
 
 

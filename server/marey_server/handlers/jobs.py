@@ -1,4 +1,4 @@
-"""Jobs: what can be done, what is asked for, and what became of it."""
+"""Kinds of jobs, submitted jobs, and their results."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _WAIT = re.compile(r"(?:^|[,;\s])wait=(\d{1,4})(?:$|[,;\s])")
 
 
 class JobKinds(Resource):
-    """What can be done."""
+    """Kinds of jobs."""
 
     path = "/job-kinds"
     tag = "Jobs"
@@ -58,7 +58,7 @@ class JobKindResource(Resource):
 
 
 class JobsQuery(CountedPageQuery):
-    """Which jobs, in which order."""
+    """Filters and order of a list of jobs."""
 
     state: CommaSeparatedOf[JobState] = Field((), description="In any of these states.")
     kind: CommaSeparated = Field((), description="Of any of these kinds.")
@@ -67,7 +67,7 @@ class JobsQuery(CountedPageQuery):
     sort: str = Field("-created_at", max_length=100, description="Of id, created_at, priority.")
 
     def filters(self) -> JobFilters:
-        """What the store filters by."""
+        """Return the filters of the store."""
         return JobFilters(self.state, self.kind, self.parent, self.author)
 
 
@@ -155,7 +155,7 @@ class JobResource(Resource):
 
 
 def wait_preferred(resource: Resource) -> float:
-    """How many seconds the caller would like to wait (RFC 7240), as far as we do that."""
+    """Return the seconds that the caller prefers to wait (RFC 7240), up to the limit of this server."""
     found = _WAIT.search(resource.request.headers.get("Prefer", ""))
     return min(float(found[1]), LONGEST_WAIT_S) if found else 0.0
 
@@ -186,7 +186,7 @@ class JobAttempts(Resource):
 
 
 class JobOutputs(Resource):
-    """What a job made."""
+    """Outputs of a job."""
 
     path = "/jobs/{job}/outputs"
     tag = "Jobs"
@@ -198,52 +198,52 @@ class JobOutputs(Resource):
 
 
 class JobResults(Resource):
-    """What the tasks of a job brought."""
+    """Results of the tasks of a job."""
 
     path = "/jobs/{job}/results"
     tag = "Jobs"
 
     @reads(access=Access.READER, query=PageQuery, answer=TaskResult, paged=True)
     async def get(self, job: str, query: PageQuery) -> Rendered:
-        """What the tasks of a gathering job brought, in their order; blobs they name stay until it is gathered."""
+        """Return the results of the tasks of a gathering job, in order; blobs they name stay until it is gathered."""
         return await self.answer(reading.list_results, job, query.cursor, query.limit)
 
 
 class JobEventsQuery(Request):
-    """Which events."""
+    """The position and number of events to read."""
 
     after: int = Field(0, ge=0, le=2**62, description="Number of the last event received; 0 from the beginning.")
     limit: int = Field(100, ge=1, le=events.MAX_EVENTS, description="Longest page.")
 
 
 class JobEvents(Resource):
-    """What happened to a job."""
+    """Events of a job."""
 
     path = "/jobs/{job}/events"
     tag = "Jobs"
 
     @reads(access=Access.READER, query=JobEventsQuery, answer=Event, paged=True, public=False)
     async def get(self, job: str, query: JobEventsQuery) -> Rendered:
-        """What happened to a job, in the order it became visible."""
+        """Return the events of a job in the order of their commits."""
         return await self.answer(reading.list_job_events, job, query.after, query.limit)
 
 
 class JobLogQuery(Request):
-    """Which piece of the log."""
+    """The piece of the log to read."""
 
     offset: int = Field(0, ge=0, le=2**53, description="First byte.")
     limit: int = Field(MOST_READ_BYTES, ge=1, le=MOST_READ_BYTES, description="Most bytes.")
 
 
 class JobLog(Resource):
-    """What a job's attempts printed."""
+    """Log of a job."""
 
     path = "/jobs/{job}/log"
     tag = "Jobs"
 
     @reads(access=Access.READER, query=JobLogQuery, answer=Bytes, answer_types=("text/plain",), public=False)
     async def get(self, job: str, query: JobLogQuery) -> Rendered:
-        """What a job's attempts printed, one after another, from a byte on.
+        """Return the output of a job's attempts, one after another, from a byte on.
 
         The header `Log-Offset` says where the next piece begins; `Log-Sealed: true` that there will be none.
         """

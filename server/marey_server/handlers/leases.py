@@ -1,4 +1,4 @@
-"""What workers say: give me work, I am alive, this is the result, this went wrong."""
+"""Requests of workers: claims, heartbeats, logs, results and failures."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class AttemptHeartbeat(Resource):
 
 
 class AttemptLog(Resource):
-    """What an attempt prints."""
+    """Log of an attempt."""
 
     path = "/jobs/{job}/attempts/{fence:int}/log"
     tag = "Work"

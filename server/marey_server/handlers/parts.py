@@ -26,7 +26,7 @@ FrameRange = Annotated[str, StringConstraints(pattern=r"^\d{0,9}:\d{0,9}$")]
 
 
 class PartQuery(Request):
-    """Which revision of a part, and how much of it."""
+    """Revision, frames and joints of a part to read."""
 
     revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Absent: the newest.")
     frames: FrameRange | None = Field(None, description="Half-open range, as in 100:200, :200 or 100:.")
@@ -41,7 +41,7 @@ class PartQuery(Request):
 
 
 class PartChange(Request):
-    """What to note about the revision that a change makes."""
+    """Message of the revision that a change makes."""
 
     message: Message = Field("", description="Shown in the history.")
 

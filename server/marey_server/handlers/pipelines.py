@@ -1,4 +1,4 @@
-"""Pipelines: jobs that work on what others of them make, handed in together."""
+"""Pipelines: jobs that work on what others of them make, submitted together."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class ProjectPipelines(Resource):
         """Submit jobs of which some work on what others make, all or none.
 
         An input `{"step": name}` is everything of the input's kind that the step makes, at the revisions it makes. What
-        was computed before is not computed again: of a pipeline handed in a second time, only what depends on a change
+        was computed before is not computed again: of a pipeline submitted a second time, only what depends on a change
         is.
         """
         return await self.answer_with(

@@ -13,7 +13,7 @@ from marey_server.store import members, projects
 
 
 class ProjectsQuery(PageQuery):
-    """Which page, in which order."""
+    """Page and order of a list of projects."""
 
     sort: str = Field("name", max_length=100, description="Of id, name, created_at, updated_at; - for falling.")
 

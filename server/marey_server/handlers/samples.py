@@ -18,7 +18,7 @@ from marey_server.motions.models import FoundModel, UsableModel
 
 
 class SampleQuery(Request):
-    """Which samples."""
+    """Number, seed and revision of samples."""
 
     n: int = Field(1, ge=1, le=MOST_SAMPLES, description="How many; the first are those of a smaller number.")
     seed: int = Field(0, ge=0, le=MOST_SEED, description="The same seed gives the same samples.")
@@ -26,7 +26,7 @@ class SampleQuery(Request):
 
 
 class SampleFileQuery(SampleQuery):
-    """Which samples, and as which files."""
+    """Samples to draw, and the format of their files."""
 
     format: MotionFormat = Field("bvh", description="Of the files; several come as one ZIP archive.")
     unit: WrittenUnit = Field("cm", description="Unit of length of a BVH.")
@@ -91,12 +91,12 @@ class SampleFiles(ModelUser):
 
 
 def _state(found: FoundModel, query: SampleQuery) -> str:
-    """What names these samples: the model by its content and by its revision, which is told, how many, and the seed."""
+    """Return the entity tag of samples: content and revision of the model, number and seed."""
     return f"{found.part.digest.removeprefix('sha256:')[:32]}.{found.part.revision}.{query.n}.{query.seed}"
 
 
 def _caching(query: SampleQuery) -> dict[str, str]:
-    """What names a revision never changes."""
+    """Return caching headers: an answer for a named revision never changes."""
     return {"Cache-Control": IMMUTABLE if query.revision is not None else "private, no-cache"}
 
 

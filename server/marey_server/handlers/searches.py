@@ -87,7 +87,7 @@ class SearchFile(Searcher):
         answer_types=MOTION_MEDIA_TYPES,
     )
     async def post(self, project: str, kind: str, item: str, query: FoundFileQuery, body: SearchRequest) -> Reply:
-        """What a search finds, as a file of motion: all steps in one."""
+        """Return the motion that a search finds as one file, with all its steps."""
         found, searchables = await self.searchables(project, kind, item, body)
 
         def written() -> Reply:

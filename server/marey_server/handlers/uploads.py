@@ -15,7 +15,7 @@ PIECE_BYTES = MIB
 
 
 def upload_reply(upload: uploads.StoredUpload) -> Reply:
-    """How far an upload is, in the body and in headers."""
+    """Return the state of an upload in body and headers."""
     shown = Upload(id=upload.id, length=upload.length, offset=upload.offset, digest=upload.digest)
     headers = {"Upload-Offset": str(upload.offset), "Upload-Length": str(upload.length), "Cache-Control": "no-store"}
     return Reply(shown, headers=headers)
@@ -30,7 +30,7 @@ def finish_upload(tx: Transaction, upload_id: str) -> uploads.StoredUpload:
 
 
 class Uploads(Resource):
-    """Where uploads begin."""
+    """Resumable uploads."""
 
     path = "/uploads"
     tag = "Blobs"
@@ -78,7 +78,7 @@ class UploadResource(Resource):
 
     @reads(access=Access.SIGNED_IN, answer=Upload)
     async def get(self, upload: str) -> Rendered:
-        """How far an upload is."""
+        """Return the state of an upload."""
         return await self.answer_with(upload_reply, uploads.read_upload, upload)
 
     @writes(

@@ -66,7 +66,7 @@ def require_access(operation: Operation, principal: Principal) -> None:
 
 @dataclass(frozen=True)
 class Call:
-    """What to do in the transaction, and how to answer."""
+    """Work of one request in its transaction, and the form of its answer."""
 
     caller: Caller
     form: AnswerForm

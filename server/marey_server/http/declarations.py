@@ -1,4 +1,4 @@
-"""What handler methods say about themselves.
+"""Declarations of handler methods.
 
 `@reads` and `@writes` attach an `Operation` to a method. Everything else follows from it: checks before the method
 runs, the OpenAPI document, the documentation page, and the table that the access test walks through.

@@ -21,7 +21,7 @@ _REV = re.compile("[0-9]{1,9}")
 
 @dataclass(frozen=True, slots=True)
 class Precondition:
-    """What a writer believes about the thing: its state, or one of several; any state (`*`); or that there is none."""
+    """Precondition of a write: one or several states, any state (`*`), or no existing resource."""
 
     expected_rev: ExpectedRev = None
     """What to require in the UPDATE."""
@@ -50,7 +50,7 @@ def parse_tags(header: str) -> list[str]:
         match = _TAG.match(header, position)
         if match is None:
             raise BadRequestProblem(
-                f'Entity tags stand in quotation marks, as in "7.json"; this does not: {header[:200]}'
+                f'Entity tags are written in quotation marks, as in "7.json"; this one is not: {header[:200]}'
             )
         tags.append(match[2])
         position = match.end()

@@ -53,7 +53,7 @@ class Exchange(RequestHandler):
 
     @property
     def services(self) -> Services:
-        """What the server holds."""
+        """Services of the process."""
         services: Services = self.application.services  # type: ignore[attr-defined]
         return services
 

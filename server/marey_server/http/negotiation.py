@@ -49,7 +49,7 @@ class _Range:
     quality: float
 
     def specificity(self, offer: MediaType) -> int:
-        """How closely this range names `offer`; 0 if it does not."""
+        """Return how specifically this range matches `offer`; 0 if it does not."""
         main, _, sub = offer.name.partition("/")
         held = {("arrays", offer.arrays)}
         if self.type == "*":

@@ -27,7 +27,7 @@ CommaSeparated = CommaSeparatedOf[Annotated[str, StringConstraints(max_length=10
 
 
 class PageQuery(Request):
-    """Which page of a list."""
+    """Page of a list."""
 
     limit: int = Field(DEFAULT_LIMIT, ge=1, le=MAX_LIMIT, description="Longest page.")
     cursor: str | None = Field(
@@ -36,6 +36,6 @@ class PageQuery(Request):
 
 
 class CountedPageQuery(PageQuery):
-    """Which page of a list, and whether to count the whole."""
+    """Page of a list, optionally with the count of all entries."""
 
     count: Literal["exact"] | None = Field(None, description="Count the whole list; it costs time on long ones.")

@@ -38,7 +38,7 @@ Content = BaseModel | Mapping[str, Any] | bytes
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """What a handler answers: a model, a document tree, bytes with their media type, or nothing.
+    """Answer of a handler: a model, a document tree, bytes with their media type, or nothing.
 
     `rev` is the state for the ETag; `location` a path below the API's root.
     """
@@ -62,7 +62,7 @@ class Rendered:
 
 @dataclass(frozen=True, slots=True)
 class AnswerForm:
-    """How the caller wants the answer: media type, what it holds already, and the status of success."""
+    """Requested form of an answer: media type, entity tag that the caller holds, and status of success."""
 
     media: MediaType
     if_none_match: str | None

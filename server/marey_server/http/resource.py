@@ -85,12 +85,12 @@ class Resource(Exchange):
     # -- for the methods of resources ---------------------------------------------------------------------------------
 
     async def look_up(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """What `function(tx, ...)` returns, on behalf of the caller, in a read-only transaction."""
+        """Run `function(tx, ...)` on behalf of the caller in a read-only transaction and return its result."""
         future = self.services.database.submit_read(ANONYMOUS, run_plain, self.caller, function, *args, **kwargs)
         return await asyncio.wrap_future(future)
 
     async def change(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """What `function(tx, ...)` returns, on behalf of the caller, committed."""
+        """Run `function(tx, ...)` on behalf of the caller, commit, and return its result."""
         future = self.services.database.submit_write(ANONYMOUS, run_plain, self.caller, function, *args, **kwargs)
         return await asyncio.wrap_future(future)
 
@@ -121,7 +121,7 @@ class Resource(Exchange):
         return await asyncio.wrap_future(submit(ANONYMOUS, run_call, call))
 
     async def compute(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """What `function` returns, computed in a thread away from the event loop."""
+        """Run `function` in a thread, away from the event loop, and return its result."""
         return await asyncio.wrap_future(self.services.compute_threads.submit(function, *args, **kwargs))
 
     async def compute_long(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
@@ -145,7 +145,7 @@ class Resource(Exchange):
 
     @property
     def answer_form(self) -> AnswerForm:
-        """How the caller wants the answer."""
+        """Requested form of the answer."""
         reading = self.request.method in ("GET", "HEAD")
         return AnswerForm(
             self.media, self.request.headers.get("If-None-Match") if reading else None, self.operation.status

@@ -45,7 +45,7 @@ class _Node:
 
 
 class UnknownPath(Resource):
-    """What every other address answers."""
+    """Answer of every other address."""
 
     root = ""
     path = "(unknown)"

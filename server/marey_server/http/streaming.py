@@ -29,7 +29,7 @@ WRITE_TIMEOUT_S = 60
 
 @dataclass(frozen=True, slots=True)
 class ByteRange:
-    """What a caller asked for: from `first` to `last`, or with `first` None the `last` bytes at the end."""
+    """Range of bytes: from `first` to `last`, or with `first` None the `last` bytes at the end."""
 
     first: int | None
     last: int | None

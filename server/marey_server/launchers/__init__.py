@@ -1,1 +1,1 @@
-"""Where workers run: beside the server, or on a cluster."""
+"""Launchers of workers: beside the server, or on a cluster."""

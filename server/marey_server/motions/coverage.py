@@ -44,7 +44,7 @@ CACHED_BODIES = 32
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """What a new stream refers to: documents and the revisions they are of."""
+    """Documents that a new stream refers to, with their revisions."""
 
     skeleton: Tree | None = None
     rig: bytes | None = None
@@ -53,7 +53,7 @@ class Given:
 
 
 def read_given(tx: Transaction, project: str, request: CoverageStreamCreate) -> Given:
-    """What a new stream refers to, for who may make one. Raises `NotFoundProblem`."""
+    """Read the documents that a new stream refers to. Raises `NotFoundProblem`."""
     projects.require(tx, project)
     skeleton = rig = evaluation = measured = None
     if request.skeleton is not None:
@@ -114,7 +114,7 @@ def look(stream: Stream) -> CoverageStreamState:
 
 
 def advance(held: Stream, frames: CoverageFrames) -> StreamStep | Tree:
-    """Where frames take a stream, or the answer to the same request before.
+    """Return the step that frames make, or the stored answer if the same request came before.
 
     Raises `CoverageOffset` where they do not go on where the stream is, `InvalidProblem` where they are no frames of
     it.
@@ -146,7 +146,7 @@ def advance(held: Stream, frames: CoverageFrames) -> StreamStep | Tree:
 
 
 def _add_poses(online: OnlineCoverage, held: Stream, frames: CoverageFrames) -> int:
-    """How many windows the poses of a request complete."""
+    """Return the number of windows that the poses of a request complete."""
     from marey_motion.documents import clip_from_document
 
     if held.rig is None:

@@ -26,7 +26,7 @@ PARTS_OF: dict[Kind, tuple[str, ...]] = {Kind.MODEL: ("model", "tree"), Kind.PRO
 
 @dataclass(frozen=True, slots=True)
 class PredecessorOptions:
-    """What the predecessor's formats leave open.
+    """Options that the predecessor's formats leave open.
 
     `end_index` and `form` are of annotations, `layout` of models; no layout is that of the file that a model was
     imported from, where it has not changed since, and else 3. `part` tells a model from its tree, and what is kept

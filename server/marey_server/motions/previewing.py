@@ -1,4 +1,4 @@
-"""What an edit would make of a clip: read in one transaction, computed in a thread, never stored."""
+"""Previews of edits: read in one transaction, computed in a thread, never stored."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class PreviewSource:
 
 
 def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, request: EditPreviewRequest) -> PreviewSource:
-    """What a preview is made from. Raises `NotFoundProblem`, and `TooLargeProblem` for what should be a job."""
+    """Read what a preview needs. Raises `NotFoundProblem`, and `TooLargeProblem` for work that needs a job."""
     if kind is not Kind.CLIP:
         raise NotFoundProblem(f"A {kind} is not edited; clips are.", code="not-a-clip")
     edit = EditDocument(commands=request.commands) if request.edit is None else _read_edit(tx, project, request)
@@ -60,7 +60,7 @@ def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, reques
         source.sources[name] = items.read_part(tx, project, Kind.CLIP, name, "motion").tree
         numbers += _size(source.sources[name])
     if numbers > MOST_NUMBERS:
-        raise TooLargeProblem("The motions are too long for a preview; hand in a job.", code="preview-too-large")
+        raise TooLargeProblem("The motions are too long for a preview; submit a job.", code="preview-too-large")
     for one in (motion, *source.sources.values()):
         skeleton, revision = one["skeleton"]["item"], one["skeleton"]["revision"]
         hierarchy = items.read_part(tx, project, Kind.SKELETON, skeleton, "hierarchy", revision=revision)
@@ -87,7 +87,7 @@ def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
         made = edit_clip(clip, commands, body=body, sources=sources, most_numbers=MOST_NUMBERS, most_work=MOST_WORK)
     except MotionError as error:
         if error.code in ("edit-too-large", "edit-too-long"):
-            raise TooLargeProblem(f"{error}; hand in a job.", code="preview-too-large") from error
+            raise TooLargeProblem(f"{error}; submit a job.", code="preview-too-large") from error
         raise _invalid("/commands", error.code, str(error)) from error
     if request.piece >= len(made):
         raise _invalid("/piece", "no-piece", f"The edit makes {counted(len(made), 'clip')}, counted from 0.")

@@ -1,4 +1,4 @@
-"""What a search found, as it is told: motions, and how far each constraint is missed."""
+"""Answers of searches: motions, and the error of each constraint."""
 
 from __future__ import annotations
 
@@ -228,7 +228,7 @@ def _found_step(result: SearchResult, number: int, one: Searchable, found: Found
 
 
 def constraint_of(one: wire.SearchConstraint) -> Constraint:
-    """Metres and radians for centimetres and degrees. Raises `MotionError` for what makes no sense."""
+    """Convert centimetres and degrees to metres and radians. Raises `MotionError` for values that are not valid."""
     from marey_motion.modelling.search import constraints as known
 
     match one:
@@ -248,7 +248,7 @@ def constraint_of(one: wire.SearchConstraint) -> Constraint:
 
 
 def placement_of(start: wire.StartPlacement) -> Placement:
-    """Where the canonical frame lies."""
+    """Return the place of the canonical frame."""
     from marey_motion.alignment.aligned import Placement
 
     return Placement(radians(start.heading_deg), start.x, start.z)

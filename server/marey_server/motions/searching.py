@@ -38,7 +38,7 @@ class FoundSearchable:
     mapping: FoundPart | None
 
     def key(self, seed: int) -> SearchableKey:
-        """What names it, with a tree drawn with `seed` where it has none of its own."""
+        """Return its cache key; a model without a tree of its own has one drawn with `seed`."""
         tree = f"seed {seed}" if self.tree is None else self.tree.digest
         return self.model.part.digest, tree, "" if self.mapping is None else self.mapping.digest
 

@@ -21,7 +21,7 @@ def make_first_administrator(tx: Transaction, token_file: Path) -> None:
 def give_token(tx: Transaction, administrator: str | None, token_file: Path, *, name: str) -> None:
     """A new token of an administrator (None: who was made first), of every scope and without end, in a private file.
 
-    The file is written before the transaction commits: if the process dies in between, the next one makes both anew.
+    The file is written before the transaction commits: if the process dies in between, the next one makes both again.
     Raises `NotFoundProblem` where no active administrator has that name.
     """
     tx.principal = users.administrator_principal(tx, administrator)

@@ -1,4 +1,4 @@
-"""What the server does by itself: takes back overdue leases, serves waiting results, collects garbage.
+"""Housekeeping of the server: reclaims overdue leases, serves waiting results, collects garbage.
 
 One process at a time leads; what it does is safe beside others all the same, since every step repeats its conditions
 in the statement that takes it. Each chore is a task of its own, so that one that fails keeps no other from being done.
@@ -66,7 +66,7 @@ async def _give_up_lead(services: Services, holder: str) -> None:
 
 
 async def _repeat(services: Services, holder: str, first_s: float, every_s: float, chore: Chore) -> None:
-    """Do a chore now and then. A failure is told and is no reason to stop."""
+    """Do a chore again and again. A failure is logged and does not stop it."""
     await asyncio.sleep(first_s)
     while True:
         try:

@@ -90,7 +90,7 @@ class Settings(BaseSettings):
 
     @property
     def resolved_database_threads(self) -> int:
-        """How many threads read. On SQLite they compute and never wait: more of them only take turns."""
+        """Return the number of reading threads. On SQLite they never wait, so more of them bring nothing."""
         return self.database_threads or (2 if self.resolved_database_url.startswith("sqlite") else 8)
 
     @property

@@ -1,4 +1,4 @@
-"""Where the bytes of blobs lie. Rows of `blob` say which blobs exist; a backing only keeps their bytes.
+"""Backings that store the bytes of blobs. Rows of `blob` say which blobs exist; a backing only keeps their bytes.
 
 A backing is called inside the transaction that inserts or deletes the blob's row. That row is the lock: nobody else can
 write or remove the same bytes before the transaction ends.

@@ -37,7 +37,7 @@ class CoverageOffset(ConflictProblem):
 
 @dataclass(frozen=True, slots=True)
 class NewStream:
-    """What a stream begins with.
+    """First state of a stream.
 
     `settings` are the members of `CoverageStream` that never change; `rig` the skeleton of its poses.
     """
@@ -77,7 +77,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class StreamStep:
-    """Where a request takes a stream: the digest of what it said, its answer, and what is kept from then on."""
+    """A step of a stream: digest of the request, its answer, and the state after it."""
 
     said: str
     answer: Tree
@@ -142,7 +142,7 @@ def advance_stream(tx: Transaction, project: str, held: Stream, step: StreamStep
 
 
 def answered_before(stream: Stream, said: str) -> Tree | None:
-    """What the last request was answered, if this is the same again."""
+    """Return the stored answer if this request repeats the last one."""
     return stream.answer if stream.said == said else None
 
 

@@ -134,7 +134,7 @@ def _members(value: Any, pointer: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def references_of(schema: str, body: Tree) -> tuple[dict[str, Tree], dict[str, str]]:
-    """What a stored document refers to, by JSON Pointer: its array leaves, and digests of blobs that it names.
+    """References of a stored document by JSON Pointer: its array leaves, and digests of blobs that it names.
 
     Blobs are named in the fields that the schema has for them, and in members called `blob`.
     """

@@ -75,7 +75,7 @@ def _check_page(
 
 
 def _check_file(tx: Transaction) -> list[StoreDefect]:
-    """What the database can tell of itself: Postgres holds its foreign keys; SQLite is asked."""
+    """Check the database file itself; Postgres enforces its foreign keys, SQLite is asked to check them."""
     if tx.is_postgres:
         return []
     pages = [row[0] for row in tx.execute(text("PRAGMA integrity_check(100)")) if row[0] != "ok"]
@@ -210,7 +210,7 @@ def _check_upload(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def find_faults(tx: Transaction) -> list[str]:
-    """What keeps the server from serving, in words for its operator; empty where all is well."""
+    """Return the faults that keep the server from serving, as sentences for its operator; empty if there are none."""
     faults = []
     if not schema_at_head(tx.connection):
         faults.append("the database's tables are not those of this version: run `marey db upgrade`")

@@ -41,7 +41,7 @@ MOST_UPLOADS = 10_000
 
 @dataclass(frozen=True, slots=True)
 class Collected:
-    """How much was deleted."""
+    """Numbers of deleted rows."""
 
     documents: int
     blobs: int
@@ -134,7 +134,7 @@ def _sweep_strays(database: Database, grace_us: int) -> int:
 
 
 def _remove_stray(tx: Transaction, digest: str) -> int:
-    """Remove the bytes if there is no row; while we hold the row's place, nobody can store them anew."""
+    """Remove the bytes if there is no row; while we hold the row's place, nobody can store them again."""
     row = {"digest": digest, "size_bytes": 0, "created_us": tx.now_us}
     if tx.execute(tx.insert_or_ignore(blob, row).returning(blob.c.digest)).first() is None:
         return 0

@@ -22,7 +22,7 @@ LIFETIME_US = 7 * 86400 * 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class StoredAnswer:
-    """What the first request was answered."""
+    """Answer of the first request."""
 
     status: int
     headers: dict[str, str]
@@ -32,7 +32,7 @@ class StoredAnswer:
 def begin(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
     """Claim `key` for a request (None), or tell what the same request was answered.
 
-    `fingerprint` tells requests apart; one that was sent with a token of another reach is another request, so that no
+    `fingerprint` distinguishes requests; one that was sent with a token of another reach is another request, so that no
     narrower token hears what it may not ask for. Raises `InvalidProblem` where the key stands for another request. The
     caller says `finish` in the same transaction.
     """

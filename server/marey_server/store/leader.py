@@ -1,4 +1,4 @@
-"""Which of several server processes does what only one should: a row that is held for a while, under a fence."""
+"""Leader election among server processes: a row that is held for a while, under a fence."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ MAX_LIMIT = 1000
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """How a list is sorted: columns with their direction, the last one unique."""
+    """Order of a list: columns with their direction, the last one unique."""
 
     text: str
     columns: tuple[tuple[ColumnElement[Any], bool], ...]
@@ -112,7 +112,7 @@ def read_page(
 ) -> tuple[Sequence[Row[Any]], str | None]:
     """At most `limit` rows of `statement` behind the cursor, and the cursor of the next page.
 
-    `identity` is JSON that tells this list from every other: what it lists, by which filters.
+    `identity` is JSON that distinguishes this list from every other: what it lists, by which filters.
     """
     if not 1 <= limit <= MAX_LIMIT:
         raise BadRequestProblem(f"limit must lie between 1 and {MAX_LIMIT}.", code="bad-limit")

@@ -48,7 +48,7 @@ def change_row(
 
 
 def moved_on(current_rev: int) -> PreconditionFailedProblem:
-    """Somebody else was faster; `context.rev` tells the state now."""
+    """Somebody else changed it first; `context.rev` is the present state."""
     return PreconditionFailedProblem(
         f"This has changed since you read it (it is at rev {current_rev} now). Read it again, then repeat the change.",
         context={"rev": current_rev},

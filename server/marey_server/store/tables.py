@@ -342,7 +342,7 @@ attempt = Table(
     Column("outcome", String(16)),
     Column("detail", Text),
     Column("signature", String(255)),
-    Column("write_id", String(64)),  # of the worker's last word
+    Column("write_id", String(64)),  # of the final answer
     Column("answer", Document),  # what it was answered, for the same write_id again
     Column("log_bytes", BigInteger, nullable=False, default=0),
 )

@@ -27,7 +27,7 @@ class Transaction:
         """What the request's operation declares; `projects.require` enforces it."""
         self.blobs = blobs
         self.shared_outputs = 0
-        """How many results of earlier jobs it has published anew."""
+        """Number of results of earlier jobs that it has published again."""
         self._clock = clock
         self._now_us: int | None = None
         self._after_commit: list[Callable[[], None]] = []

@@ -33,7 +33,7 @@ LIFETIME_US = 7 * 86400 * 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class StoredUpload:
-    """How far an upload is; `digest` once it is complete."""
+    """State of an upload; `digest` once it is complete."""
 
     id: str
     length: int
@@ -56,7 +56,7 @@ def create_upload(tx: Transaction, length: int, *, digest: str | None = None) ->
 
 
 def read_upload(tx: Transaction, upload_id: str) -> StoredUpload:
-    """How far an upload of the caller is. Raises `NotFoundProblem`."""
+    """Return the state of an upload of the caller. Raises `NotFoundProblem`."""
     return _shown(_find(tx, upload_id))
 
 

@@ -54,7 +54,7 @@ class InputCache:
         return held if len(fetched) == len(missing) else held[: missing[len(fetched)]]
 
     def _read(self, path: Path) -> bytes | None:
-        """What is kept, or None; another worker may remove it at any moment."""
+        """Return the stored bytes, or None; another worker may remove them at any moment."""
         try:
             sealed = path.read_bytes()
             os.utime(path)

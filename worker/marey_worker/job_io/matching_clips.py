@@ -54,7 +54,7 @@ _cache: LruCache[bytes, MatchingClips] = LruCache(max_entries=MOST_KEPT)
 
 @dataclass(frozen=True)
 class ClipSet:
-    """Which clips, and what of them: all that decides a database beside its options and normaliser."""
+    """Clips of a database, with their trims and loops: all that decides it beside options and normaliser."""
 
     clips: tuple[PinnedInput, ...]
     rig: PinnedInput | None = None
@@ -72,7 +72,7 @@ class ClipSet:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> ClipSet:
-        """What `as_tree` wrote."""
+        """Read the result of `as_tree`."""
         return cls(
             clips=tuple(map(PinnedInput.model_validate, tree["clips"])),
             rig=None if tree["rig"] is None else PinnedInput.model_validate(tree["rig"]),
@@ -166,7 +166,7 @@ def build_clips(
 
 
 def uid_of(pin: PinnedInput) -> str:
-    """What a database calls a clip."""
+    """Return the name of a clip in a database."""
     return f"{pin.item}@{pin.revision}"
 
 

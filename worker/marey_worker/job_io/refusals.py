@@ -1,4 +1,4 @@
-"""What a job of many inputs could not use, and why; the others are made all the same."""
+"""Inputs that a job of many could not use, with reasons; the others are processed."""
 
 from __future__ import annotations
 

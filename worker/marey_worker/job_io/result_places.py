@@ -1,4 +1,4 @@
-"""Where results of a job go: each to a place of its own, and none to that of what it was made of."""
+"""Places of a job's results: each has its own, and none replaces an input."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def read_rigged(context: Context, rig: Rig) -> Rigged:
 
 
 def plan_between(context: Context, source: Rig, target: Rig, scale: float | None) -> RetargetPlan:
-    """How clips of one skeleton get onto the other. Raises `MotionError`."""
+    """Return the plan of retargeting from one skeleton to another. Raises `MotionError`."""
 
     def plan() -> RetargetPlan:
         return plan_retarget(*read_rigged(context, source), *read_rigged(context, target), scale=scale)

@@ -23,7 +23,7 @@ class StagedResults:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Return their number."""
         return len(self.names)
 
     def add(self, output: StagedOutput) -> None:

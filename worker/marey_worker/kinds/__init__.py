@@ -1,1 +1,1 @@
-"""What the worker can do: one module per kind of job, each with `run(context, params)`."""
+"""Kinds of jobs: one module each, with `run(context, params)`."""

@@ -195,7 +195,7 @@ class _Job:
         return found
 
     def _cuts(self, clip: _Clip, annotations: Mapping[str, Sequence[_ClipAnnotation]]) -> tuple[Cut, ...]:
-        """Where an annotation cuts a clip; one of the clip's own revision goes before those of others."""
+        """Return the boundaries that an annotation gives a clip; annotations of the clip's own revision come first."""
         known = annotations.get(clip.pin.item, ())
         known = [one for one in known if one.clip.revision == clip.pin.revision] or known
         if len(known) != 1:
@@ -318,7 +318,7 @@ class _Job:
 
 
 def _row(one: AlignedClip) -> dict[str, Any]:
-    """What a table of the examples shows."""
+    """Return the rows of the table of examples."""
     slopes = np.diff(one.time_function)
     return {
         "name": one.name,

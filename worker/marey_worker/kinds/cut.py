@@ -94,7 +94,7 @@ class _Cutting:
         return found
 
     def _clip_of(self, clip: RevisionRef) -> Item | PinnedInput:
-        """The annotated clip with its name and place: as it was when the job was handed in, where clips were given.
+        """The annotated clip with its name and place: as it was when the job was submitted, where clips were given.
 
         Only what is pinned may decide the results then, since they are kept for jobs with the same inputs.
         Raises `MotionError`, `NoSuchThing`.
@@ -181,7 +181,7 @@ class _Cutting:
         return max(0, segment.start - before), min(len(motion.poses), segment.end + after)
 
     def _info(self, clip: RevisionRef) -> ClipInfo:
-        """What is known of the clip and holds for its pieces."""
+        """Return the facts about the clip that hold for its pieces."""
         try:
             stored = self._context.document(Kind.CLIP, clip.item, clip.revision, "info")
         except NoSuchThing:

@@ -57,7 +57,7 @@ class _Editing:
         self._source_pins = _wanted_sources(context, self._edit)
 
     def run(self) -> dict[str, Any]:
-        """All clips; what became of them."""
+        """Edit all clips; return a summary."""
         pins = self._context.inputs["clips"]
         started = time.monotonic()
         sources = self._read_sources()
@@ -150,7 +150,7 @@ class _Editing:
         return self._bodies[used]
 
     def _info(self, pin: PinnedInput, stored: dict[str, Any] | None) -> ClipInfo:
-        """What was known of the clip and still holds, and what was done to it."""
+        """Return the facts about the clip that still hold, and the edit that was applied."""
         edit = None if self._edit_pin is None else self._edit_pin.as_input().model_dump()
         done = {"clip": pin.as_input().model_dump(), "edit": edit, "commands": [name for name, _ in self._commands]}
         if stored is None:
@@ -176,7 +176,7 @@ class _Editing:
         if (now.collection, now.name) != (pin.collection, pin.name):
             raise EditError("it was moved or renamed while the job waited; try again", code="clip-changed")
 
-    # -- what is told --
+    # -- messages --
 
     def _note(self, pin: PinnedInput, name: str, made: EditedClip) -> None:
         self._frames += made.clip.frame_count

@@ -114,7 +114,7 @@ def _aligned(
 def _provenance(
     context: Context, pins: Sequence[PinnedInput], aligned: AlignedSet, infos: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
-    """Where the examples come from."""
+    """Return the origin of the examples."""
     return {
         "aligned": [{"item": pin.item, "revision": pin.revision, "name": pin.path} for pin in pins],
         "set": infos[0].get("set"),

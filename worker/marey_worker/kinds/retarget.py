@@ -48,7 +48,7 @@ class _Retargeting:
             raise JobRefused(error.code, f"skeleton {self._target_pin.name}: {error}") from error
 
     def run(self) -> dict[str, Any]:
-        """All clips; what became of them."""
+        """Retarget all clips; return a summary."""
         pins = self._context.inputs["clips"]
         started = time.monotonic()
         for done, (pin, (motion, info)) in enumerate(self._context.documents_of_each(pins, "motion", "info")):
@@ -95,7 +95,7 @@ class _Retargeting:
         )
 
     def _info(self, stored: dict[str, Any] | None, plan: RetargetPlan, checks: tuple[Check, ...]) -> ClipInfo:
-        """What was known of the source and holds for the result, and how it was made."""
+        """Return the facts about the source that hold for the result, and how it was made."""
         details = {
             "scale": plan.scale,
             "mapped": len(plan.pairs),

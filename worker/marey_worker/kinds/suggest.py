@@ -1,4 +1,4 @@
-"""What an evaluated set of clips could do without, and what would fill its holes."""
+"""Suggests clips to remove from an evaluated set, and candidates that fill its holes."""
 
 from __future__ import annotations
 

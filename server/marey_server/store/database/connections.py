@@ -1,7 +1,7 @@
 """Connections and transactions, for SQLite and Postgres.
 
 A read sees one snapshot and cannot write. A write is READ COMMITTED on Postgres, so that an UPDATE's conditions are
-checked against what stands there when it gets the row. SQLite has one writer lane: writes run one after another, each
+checked against the present row when it gets the lock. SQLite has one writer lane: writes run one after another, each
 starting with `BEGIN IMMEDIATE`, and reads run beside it.
 """
 
@@ -85,7 +85,7 @@ class Database:
 
     @property
     def shown(self) -> str:
-        """Where it is, without any password."""
+        """Return the address of the database without its password."""
         if self.is_sqlite:
             return str(self.url.database)
         return self.url.set(query={}).render_as_string(hide_password=True)
@@ -164,7 +164,7 @@ class Database:
         return answer
 
     def _keep_wal_short(self, connection: Connection) -> None:
-        """Write a long log back to the file: under steady reads SQLite itself never finds a moment to start it anew.
+        """Write a long log back to the file: under steady reads SQLite itself never finds a moment to begin it again.
 
         Where somebody reads for long, it is tried again later.
         """

@@ -86,7 +86,7 @@ class _Form:
 
     text: str
     constants: Mapping[str, Any]
-    """Values that stand in the statement itself."""
+    """Values that are part of the statement itself."""
     expansion: Mapping[str, Sequence[str]]
     """Of lists: the names of their members."""
     converts: Mapping[str, Convert]
@@ -128,7 +128,7 @@ def _compile(statement: Statement, dialect: Dialect, parameters: Parameters) -> 
     for column in compiled.insert_prefetch:
         assert isinstance(column.default, ScalarElementColumnDefault), f"{column} has no fixed value"
         fixed[column.key] = column.default.arg
-    for name in fixed.keys() & state.parameter_expansion.keys():  # lists that stand in the statement itself
+    for name in fixed.keys() & state.parameter_expansion.keys():  # lists that are part of the statement itself
         fixed.update(_members(state.parameter_expansion[name], fixed.pop(name)))
     return _Form(
         state.statement,

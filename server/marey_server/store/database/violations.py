@@ -1,4 +1,4 @@
-"""What the database says when a unique name is taken."""
+"""Recognises the error of a database about a name that is taken."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ MOST_TOGETHER = 16
 
 @dataclass(frozen=True, slots=True)
 class _Write:
-    """What somebody wants written, and where he waits for what becomes of it."""
+    """A queued write and the future of its result."""
 
     principal: Principal
     function: Callable[[Transaction], Any]

@@ -1,4 +1,4 @@
-"""What is about to become revisions, and what became of it."""
+"""Drafts of revisions, and the revisions published from them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Draft:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """What a draft became. `created`: this revision was made now, by this draft."""
+    """Revision published from a draft. `created`: this revision was made now, by this draft."""
 
     name: str
     item: str

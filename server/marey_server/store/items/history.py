@@ -67,7 +67,7 @@ def _shown(tx: Transaction, rows: Collection[Row[Any]]) -> list[Revision]:
 def read_lineage(
     tx: Transaction, project_name: str, kind: Kind, item_id: str, *, revision_number: int | None = None
 ) -> Lineage:
-    """What a revision was made from, how, and what was made of it, as far as the caller may see; newest by default."""
+    """Return the inputs, job and uses of a revision, the newest by default, as far as the caller may see them."""
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
     number = revision_number or found.head
     made = _find_revision(tx, item_id, number)

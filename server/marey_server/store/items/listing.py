@@ -28,7 +28,7 @@ SORT_KEYS: dict[str, ColumnElement[Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class ItemFilters:
-    """Which items a list holds; what is None does not matter."""
+    """Filters of a list of items; None matches every item."""
 
     collection: str | None = None
     """A folder, with those below it."""

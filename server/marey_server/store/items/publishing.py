@@ -40,10 +40,10 @@ def publish(
     """Turn drafts into items and revisions; all of them or none. Answers in the order of the drafts.
 
     `{"output": name}` in a document refers to another draft and becomes its item and revision; the `model_digest` of a
-    tree may name the model of its own draft. Content that stands there already makes no new revision. The caller has
+    tree may name the model of its own draft. Content that is stored already makes no new revision. The caller has
     authorised the write.
 
-    Raises `InvalidProblem` where a draft makes no sense, `ConflictProblem` where a name is taken.
+    Raises `InvalidProblem` for a draft that is not valid, `ConflictProblem` for a name that is taken.
     """
     by_name = {draft.name_in_batch: draft for draft in drafts}
     if len(by_name) != len(drafts):

@@ -1,4 +1,4 @@
-"""What lists show and filter by, taken from the documents of a revision."""
+"""Summaries of revisions, which lists show and filter by."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
             detail = f"The input {name!r} takes one {spec.kind}; {sources} made {len(chosen)}."
             raise LateInputError("one-item", detail)
         pins[name] = list(chosen.values())
-        if len(entries) == 1 and "job" in entries[0]:  # of several makers, things of one name may stand in like places
+        if len(entries) == 1 and "job" in entries[0]:  # of several makers, items of one name may be in like places
             pins[name] = [one | {"below": made[entries[0]["job"]].below(one)} for one in pins[name]]
     total = sum(map(len, pins.values()))
     if total > MOST_INPUTS:
@@ -149,8 +149,9 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
 def _resolved(
     tx: Transaction, project_id: str, name: str, spec: InputSpec, entry: dict[str, Any], made: dict[str, _Made]
 ) -> list[Pin]:
-    """What one entry of an input stands for: itself, or what the job it names made, which may be nothing only where the
-    input is not required.
+    """Return the pins of one entry of an input: itself, or the outputs of the job it names.
+
+    The outputs may be none only if the input is not required.
     """
     if "job" not in entry:
         return [entry]

@@ -3,7 +3,7 @@
 Jobs are identical when kind, version of the kind, parameters, seed and inputs are; an input counts with its item, its
 name, its place and the content of those of its documents that the kind reads, since results are named after inputs and
 refer to them. A kind declares what counts besides: the place of the results, the newest revision of an item that the
-parameters name. Jobs that go by how things are while they run have no key. Results are published anew for each job,
+parameters name. Jobs that go by how things are while they run have no key. Results are published again for each job,
 into the collection it names. Caching stays within a project.
 """
 
@@ -57,7 +57,7 @@ def cache_key(
     into: str = "",
     newest: Mapping[str, int] = MappingProxyType({}),
 ) -> str:
-    """The name of a computation. `inputs` as `input_contents` tells them; `task` is which of how many has them; `into`
+    """The name of a computation. `inputs` as `input_contents` has them; `task` is which of how many has them; `into`
     is where the results go; `newest` holds the newest revisions of `named_items`.
     """
     tree = {"kind": kind.code_version, "params": params, "seed": seed, "inputs": inputs}

@@ -24,9 +24,7 @@ class Clash(NamedTuple):
 
 
 def find_clash(kind: KindDeclaration, params: Any, pins: PinnedInputs, into: str) -> Clash | None:
-    """What is wrong with the places of a job's results; `params` are checked. Inputs that are yet to be made are not
-    looked at.
-    """
+    """Return the clash among the places of a job's results, or None; late inputs are not checked."""
     unclear = kind.unclear_place(params, into) if kind.unclear_place is not None else None
     if unclear is not None:
         return Clash("/into", "ambiguous-place", f"It is not clear where results should go: {unclear}.")

@@ -47,7 +47,7 @@ class Upstream(NamedTuple):
 def submit(tx: Transaction, project: str, requests: Sequence[JobCreate]) -> list[Job]:
     """Submit jobs to a project, all or none; return them in the order of the requests.
 
-    Raises `InvalidProblem` with a pointer for each thing that makes no sense, and what `require` raises.
+    Raises `InvalidProblem` with a pointer to each fault, and what `require` raises.
     """
     row = require(tx, project)
     many = len(requests) > 1
@@ -191,7 +191,7 @@ def lock_jobs(tx: Transaction, project: ProjectRow, ids: Iterable[str]) -> dict[
 
 
 def _check_makers(submission: Submission, upstream: Mapping[str, Upstream], to_be: Collection[str], at: str) -> None:
-    """Jobs that are to make an input must be of a kind that makes such things; those to be are told of as steps."""
+    """Check that jobs which are to make an input are of a kind that can; jobs to be submitted are named as steps."""
     for place, name, maker in late_inputs(submission.request, at):
         wanted = submission.kind.inputs[name].kind
         try:
@@ -234,7 +234,7 @@ def _insert_dependencies(tx: Transaction, submissions: Sequence[Submission], ups
 def submit_pipeline(tx: Transaction, project: str, pipeline: PipelineCreate) -> Pipeline:
     """Submit a job for each step. Those that work on what others make get their inputs when these have succeeded.
 
-    Raises `InvalidProblem` with a pointer for each thing that makes no sense, and what `require` raises.
+    Raises `InvalidProblem` with a pointer to each fault, and what `require` raises.
     """
     row = require(tx, project)
     try:
