@@ -23,6 +23,10 @@ def fit_log_slopes(basis: SplineBasis, time_functions: Floats) -> Floats:
     Returns
     -------
     (m, n, 1) float64    coefficients
+
+    Raises
+    ------
+    MotionError    naming the example whose time function does not rise strictly
     """
     slopes = np.diff(time_functions, axis=1)
     if not (np.isfinite(slopes).all() and (slopes > 0.0).all()):
