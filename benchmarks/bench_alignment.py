@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from benchmarks.timing import Row, Timing, time_in_turn
 from marey_motion import quaternions
-from marey_motion.alignment.aligning import AlignOptions, SourceExample, align_clips
-from marey_motion.alignment.cost import CostOptions, frame_costs
+from marey_motion.alignment.aligning import AlignmentSettings, SourceExample, align_clips
+from marey_motion.alignment.cost import PoseCostSettings, frame_costs
 from marey_motion.alignment.dtw import align
 from marey_motion.alignment.warp import warped
 from marey_motion.gait import generate_gait
@@ -79,7 +79,7 @@ def _clouds(frames: int, points: int, seed: int) -> Floats:
 def _pair(frames: int, others: int, points: int, repeats: int, calls: int) -> list[Row]:
     a, b = _clouds(frames, points, 1), _clouds(others, points, 2)
     size = f"{frames} x {others}, {points} points"
-    plain = CostOptions("plain")
+    plain = PoseCostSettings("plain")
     costs = frame_costs(a, b, plain)
     given = _peers_given_costs(costs)
     of_points = _peers_of_points(a.reshape(frames, -1), b.reshape(others, -1))
@@ -142,7 +142,7 @@ def _published_pair() -> Row:
 
 def _published_set() -> Row:
     examples, body = _examples(30, (42, 53))
-    options = AlignOptions(reference=examples[0].uid)
+    options = AlignmentSettings(reference=examples[0].uid)
     (ours,) = time_in_turn(lambda: align_clips(examples, body, options), repeats=5)
     return Row(
         "aligning clips with a given reference",

@@ -10,7 +10,7 @@ from skfda.representation.basis import BSplineBasis
 from sklearn.mixture import GaussianMixture
 
 from benchmarks.timing import Row, Timing, time_in_turn
-from marey_motion.alignment.aligning import AlignOptions, SourceExample, align_clips
+from marey_motion.alignment.aligning import AlignmentSettings, SourceExample, align_clips
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.modelling.fpca import Keep, find_components
@@ -107,7 +107,7 @@ def _mixtures() -> Row:
 
 def _whole_model() -> Row:
     examples, body = _examples(30)
-    options = AlignOptions(reference=examples[0].uid)
+    options = AlignmentSettings(reference=examples[0].uid)
     (ours,) = time_in_turn(lambda: train_primitive(align_clips(examples, body, options), WITHOUT_REPORT), repeats=5)
     return Row(
         "alignment, principal functions, mixture",
@@ -122,7 +122,7 @@ def _whole_model() -> Row:
 
 def _report() -> Row:
     examples, body = _examples(200)
-    aligned = align_clips(examples, body, AlignOptions(reference=examples[0].uid))
+    aligned = align_clips(examples, body, AlignmentSettings(reference=examples[0].uid))
     (ours,) = time_in_turn(lambda: train_primitive(aligned), repeats=3)
     return Row(
         "training with its report, every example left out once",

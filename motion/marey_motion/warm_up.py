@@ -182,16 +182,21 @@ def _compare(points: NDArray[np.float32]) -> None:
 
 def _align(clip: Clip) -> None:
     """Align a clip with itself by every cost, as quickly and as slowly as it likes."""
-    from marey_motion.alignment.aligning import AlignOptions, SourceExample, align_clips
-    from marey_motion.alignment.cost import CostOptions
+    from marey_motion.alignment.aligning import AlignmentSettings, SourceExample, align_clips
+    from marey_motion.alignment.cost import PoseCostSettings
     from marey_motion.matching.body import MatchingBody
     from marey_motion.rigs import map_joints
 
     body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
     examples = [SourceExample(uid, uid, clip) for uid in ("one", "other")]
-    for cost in (CostOptions(), CostOptions("plain"), CostOptions(window=3), CostOptions("plain", window=3)):
+    for cost in (
+        PoseCostSettings(),
+        PoseCostSettings("plain"),
+        PoseCostSettings(window=3),
+        PoseCostSettings("plain", window=3),
+    ):
         for max_run in (None, 3):
-            align_clips(examples, body, AlignOptions(cost=cost, max_run=max_run))
+            align_clips(examples, body, AlignmentSettings(cost=cost, max_run=max_run))
 
 
 def _measure(clip: Clip) -> None:

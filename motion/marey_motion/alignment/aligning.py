@@ -13,7 +13,7 @@ import numpy as np
 
 from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Placement
 from marey_motion.alignment.canonical import placed, to_canonical
-from marey_motion.alignment.cost import CostOptions, CostPoints, cost_points, costs_between
+from marey_motion.alignment.cost import CostPoints, PoseCostSettings, cost_points, costs_between
 from marey_motion.alignment.dtw import align
 from marey_motion.alignment.reference import medoid, nearest_mean_length, pairwise_totals
 from marey_motion.alignment.segments import (
@@ -70,7 +70,7 @@ class SourceExample:
 
 
 @dataclass(frozen=True, eq=False)
-class AlignOptions:
+class AlignmentSettings:
     """Options of an alignment.
 
     Parameters
@@ -87,7 +87,7 @@ class AlignOptions:
     reference: str = MEDOID
     rate_hz: float | None = None
     max_run: int | None = 3
-    cost: CostOptions = field(default_factory=CostOptions)
+    cost: PoseCostSettings = field(default_factory=PoseCostSettings)
     keep_height: bool = True
 
 
@@ -131,7 +131,7 @@ def with_mirrored(examples: Sequence[SourceExample], body: MatchingBody) -> list
 def align_clips(
     clips: Sequence[SourceExample],
     body: MatchingBody,
-    options: AlignOptions | None = None,
+    options: AlignmentSettings | None = None,
     *,
     threads: int = 1,
     progress: Progress | None = None,
@@ -145,7 +145,7 @@ def align_clips(
     ----------
     clips : sequence of SourceExample    clips of one skeleton
     body : MatchingBody    body of that skeleton
-    options : AlignOptions, optional    options
+    options : AlignmentSettings, optional    options
     threads : int    threads to use
     progress : callable, optional    called as progress(done, total, note)
     on_refusal : callable, optional    called with each example that does not fit and its error, and the example is
@@ -159,7 +159,7 @@ def align_clips(
     ------
     MotionError    for options that do not fit the clips, and where fewer than two examples are left
     """
-    run = _Aligning(body, options or AlignOptions(), threads, progress or (lambda _done, _total, _note: None))
+    run = _Aligning(body, options or AlignmentSettings(), threads, progress or (lambda _done, _total, _note: None))
     run.on_refusal = on_refusal
     return run.align(sorted(clips, key=lambda one: (one.name, one.uid)))
 
@@ -169,7 +169,7 @@ class _Aligning:
 
     on_refusal: OnRefusal | None = None
 
-    def __init__(self, body: MatchingBody, options: AlignOptions, threads: int, progress: Progress) -> None:
+    def __init__(self, body: MatchingBody, options: AlignmentSettings, threads: int, progress: Progress) -> None:
         self._body = body
         self._options = options
         self._cost = options.cost

@@ -17,7 +17,7 @@ LONGEST_WINDOW = 61
 
 
 @dataclass(frozen=True, eq=False)
-class CostOptions:
+class PoseCostSettings:
     """Options of the cost.
 
     Parameters
@@ -60,7 +60,7 @@ class CostPoints(NamedTuple):
     centres: Floats
 
 
-def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None) -> Floats:
+def frame_costs(a: Floats, b: Floats, options: PoseCostSettings | None = None) -> Floats:
     """Compute the cost of each pair of frames of two motions.
 
     The weighted mean over points of their squared distances (and over the frames of the window, if there is one).
@@ -69,7 +69,7 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None) -> Flo
     ----------
     a : (n, P, 3) float64    points in metres, Y up
     b : (m, P, 3) float64    the same points
-    options : CostOptions, optional    options
+    options : PoseCostSettings, optional    options
 
     Returns
     -------
@@ -85,19 +85,19 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None) -> Flo
     about their weighted centre, the least sum over all turns and shifts is Σ w|z_a|² + Σ w|z_b|² - 2 |Σ w z_a z̄_b|;
     the differences of heights are added as they are.
     """
-    options = options or CostOptions()
+    options = options or PoseCostSettings()
     if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
         raise MotionError(f"points must be (frames, points, 3), the same points in both, not {a.shape} and {b.shape}")
     return costs_between(cost_points(a, options), cost_points(b, options), options)
 
 
-def cost_points(points: Floats, options: CostOptions) -> CostPoints:
+def cost_points(points: Floats, options: PoseCostSettings) -> CostPoints:
     """Prepare the points of a motion for comparison.
 
     Parameters
     ----------
     points : (n, P, 3) float64    metres, Y up
-    options : CostOptions    options
+    options : PoseCostSettings    options
 
     Returns
     -------
@@ -126,13 +126,13 @@ def cost_points(points: Floats, options: CostOptions) -> CostPoints:
     return CostPoints(np.ascontiguousarray(columns.transpose(2, 0, 1)), columns, energies, centres.T.copy())
 
 
-def costs_between(a: CostPoints, b: CostPoints, options: CostOptions) -> Floats:
+def costs_between(a: CostPoints, b: CostPoints, options: PoseCostSettings) -> Floats:
     """Compute `frame_costs` for prepared points.
 
     Parameters
     ----------
     a, b : CostPoints    n and m frames, prepared with the same options
-    options : CostOptions    options
+    options : PoseCostSettings    options
 
     Returns
     -------

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from marey_motion.alignment.cost import CostOptions, CostPoints, costs_between
+from marey_motion.alignment.cost import CostPoints, PoseCostSettings, costs_between
 from marey_motion.alignment.dtw import least_total
 from marey_motion.arrays import Floats
 
@@ -55,7 +55,7 @@ def medoid(totals: Floats) -> int:
 def pairwise_totals(
     points: Sequence[CostPoints],
     bounds: Sequence[Sequence[int]],
-    options: CostOptions,
+    options: PoseCostSettings,
     *,
     max_run: int | None,
     threads: int = 1,
@@ -69,7 +69,7 @@ def pairwise_totals(
     ----------
     points : sequence of CostPoints    points of each motion
     bounds : sequence of sequences of int    bounds of each motion's sections, equally many
-    options : CostOptions    options of the cost
+    options : PoseCostSettings    options of the cost
     max_run : int or None    slope limit of `dtw.align`
     threads : int    threads to use
     progress : callable, optional    called as progress(done, total)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from marey_motion.alignment.cost import CostOptions, cost_points, frame_costs
+from marey_motion.alignment.cost import PoseCostSettings, cost_points, frame_costs
 from marey_motion.alignment.dtw import align
 from marey_motion.alignment.reference import medoid, nearest_mean_length, pairwise_totals
 from marey_motion.alignment.segments import align_sections
@@ -47,7 +47,7 @@ def clouds(seed=0):
 @pytest.mark.parametrize("max_run", [None, 3, 1])
 @pytest.mark.parametrize("threads", [1, 2])
 def test_costs_of_pairs_are_those_of_aligning_each_section_of_each_two(max_run, threads):
-    points, options = clouds(), CostOptions()
+    points, options = clouds(), PoseCostSettings()
     bounds = [(0, len(cloud) // 3, len(cloud) - 1) for cloud in points]
     ready = [cost_points(cloud, options) for cloud in points]
     told = []

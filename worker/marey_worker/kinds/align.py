@@ -15,13 +15,13 @@ from marey_motion.alignment.aligning import (
     MEDOID,
     MIRRORED,
     NEAREST_MEAN_LENGTH,
-    AlignOptions,
+    AlignmentSettings,
     SourceExample,
     align_clips,
     body_weights,
     with_mirrored,
 )
-from marey_motion.alignment.cost import CostOptions
+from marey_motion.alignment.cost import PoseCostSettings
 from marey_motion.alignment.segments import Cut, cuts_of
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
@@ -227,7 +227,7 @@ class _Job:
 
     # -- options --
 
-    def _options(self, body: MatchingBody) -> AlignOptions:
+    def _options(self, body: MatchingBody) -> AlignmentSettings:
         params = self._params
         reference = params.reference
         if reference not in (MEDOID, NEAREST_MEAN_LENGTH):
@@ -238,11 +238,11 @@ class _Job:
         weights = body_weights(body)
         for name, weight in params.weights.items():
             weights[_joint(name, body)] = weight
-        return AlignOptions(
+        return AlignmentSettings(
             reference=reference,
             rate_hz=params.rate_hz,
             max_run=params.slope_limit,
-            cost=CostOptions(params.cost, params.window, weights),
+            cost=PoseCostSettings(params.cost, params.window, weights),
             keep_height=params.keep_height,
         )
 
