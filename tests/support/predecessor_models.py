@@ -6,7 +6,8 @@ import numpy as np
 
 from marey_motion.formats.predecessor.skeleton import skeleton_document
 from marey_motion.gait import generate_gait
-from marey_motion.importing.files import FileToImport, import_file
+from marey_motion.importing.files import import_file
+from marey_motion.importing.items import FileToImport
 from marey_motion.importing.plan import plan_imports
 from marey_motion.modelling.splines import SplineBasis
 

@@ -7,9 +7,7 @@ so that a caller may run it in a process of its own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from dataclasses import fields
 
 import numpy as np
 
@@ -18,8 +16,17 @@ from marey_motion.documents import clip_from_document, clip_to_tree, skeleton_fr
 from marey_motion.errors import FormatError, MotionError
 from marey_motion.formats import read_source
 from marey_motion.formats.conversion import convert
-from marey_motion.formats.predecessor.graph import PredecessorGraph
 from marey_motion.importing.anatomy import anatomy_of
+from marey_motion.importing.items import (
+    SAME_OFFSET_M,
+    FileToImport,
+    ImportedFile,
+    ImportedItem,
+    Tree,
+    given_skeleton,
+    main_item,
+    skeleton_item,
+)
 from marey_motion.importing.plan import PlannedFile
 from marey_motion.importing.source import ImportedMotion, ImportOptions, SourceDocument
 from marey_motion.importing.units import unit_in_metres
@@ -30,102 +37,8 @@ from marey_schemas.imports import ImportEntry, Refusal, refused_entry, skeleton_
 from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions as UserOptions
 
-SKELETON_COLLECTION = "skeletons"
-SAME_OFFSET_M = 1e-3
 _READER_OPTIONS = tuple(option.name for option in fields(ImportOptions))
 _LONGEST_COLLECTION = 1024
-
-Tree = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class GivenSkeleton:
-    """A stored skeleton that the clips must use: its revision and its part `hierarchy`."""
-
-    item: str
-    revision: int
-    hierarchy: Mapping[str, Any]
-
-    @property
-    def ref(self) -> Tree:
-        """The reference that documents hold."""
-        return {"item": self.item, "revision": self.revision}
-
-
-@dataclass(frozen=True)
-class FileToImport:
-    """A file with everything that its import needs.
-
-    Parameters
-    ----------
-    planned : its plan
-    data, digest : its bytes and their name, for the record of where a clip comes from
-    companion, companion_digest : the same of the file that the plan names as its companion
-    options : of the user
-    skeleton : that the clips must use
-    """
-
-    planned: PlannedFile
-    data: bytes | memoryview
-    digest: str
-    options: UserOptions = field(default_factory=UserOptions)
-    companion: bytes | memoryview | None = None
-    companion_digest: str | None = None
-    skeleton: GivenSkeleton | None = None
-
-    @property
-    def collection(self) -> str:
-        """The collection of the items that the file becomes."""
-        return "/".join(part for part in (self.options.collection, self.planned.folder) if part)
-
-
-@dataclass(frozen=True)
-class ImportedItem:
-    """An item to store: its place and its documents.
-
-    `name` identifies it within the import: other items refer to it as `{"output": name}` until it is stored.
-    """
-
-    name: str
-    kind: Kind
-    item_name: str
-    collection: str
-    parts: Mapping[str, Tree]
-    tags: Sequence[str] = ()
-    reuse: Literal["by_name", "by_content"] = "by_name"
-
-
-@dataclass(frozen=True)
-class ImportedGraph:
-    """A graph whose models are not found yet, since that takes the project: see `importing.graphs`."""
-
-    name: str
-    collection: str
-    tags: Sequence[str]
-    graph: PredecessorGraph
-    file: str
-    digest: str
-
-
-@dataclass(frozen=True)
-class ImportedFile:
-    """The items of one file, or why it was refused.
-
-    Parameters
-    ----------
-    items : a skeleton, then a clip or a model that uses it; a skeleton alone; a clip or a model alone. The skeleton has
-        no part `mapping` yet: see `mapping_part`
-    checks : findings about the motion, as documents
-    frames : of the clip
-    graph : what a file of a graph holds instead of items
-    """
-
-    name: str
-    items: tuple[ImportedItem, ...] = ()
-    checks: tuple[Tree, ...] = ()
-    frames: int | None = None
-    graph: ImportedGraph | None = None
-    refusal: Refusal | None = None
 
 
 def planned_entry(planned: PlannedFile) -> ImportEntry | None:
@@ -226,39 +139,6 @@ def reader_options(given: UserOptions) -> ImportOptions:
     return ImportOptions(**chosen)
 
 
-def given_skeleton(given: GivenSkeleton) -> Skeleton:
-    """Make the skeleton of a stored hierarchy.
-
-    Parameters
-    ----------
-    given : GivenSkeleton    the stored skeleton
-
-    Returns
-    -------
-    Skeleton    J joints
-    """
-    return skeleton_from_document(SkeletonHierarchy.model_validate(given.hierarchy))
-
-
-def skeleton_item(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
-    """Make the item of a file's own skeleton; an equal skeleton of the project is used instead.
-
-    Parameters
-    ----------
-    file : FileToImport    the file
-    skeleton : Skeleton    its joints
-
-    Returns
-    -------
-    ImportedItem    an item with its hierarchy
-    """
-    anatomy = anatomy_of(skeleton)
-    parts = {"hierarchy": anatomy.hierarchy}
-    name = skeleton_output(file.planned.name)
-    item_name = anatomy.mapping.rig or "skeleton"
-    return ImportedItem(name, Kind.SKELETON, item_name, SKELETON_COLLECTION, parts, reuse="by_content")
-
-
 def mapping_part(found: ImportedFile) -> Tree:
     """Make the part `mapping` of the skeleton that a file brings, with the axes that its clip shows.
 
@@ -277,23 +157,6 @@ def mapping_part(found: ImportedFile) -> Tree:
     anatomy = anatomy_of(skeleton)
     clip = None if motion is None else clip_from_document(MotionDocument.model_validate(motion), anatomy.skeleton)
     return anatomy.mapping_part(clip)
-
-
-def main_item(file: FileToImport, kind: Kind, item_name: str, parts: Mapping[str, Tree]) -> ImportedItem:
-    """Make the main item of a file, with the file's name, in the user's collection, with the user's tags.
-
-    Parameters
-    ----------
-    file : FileToImport    the file
-    kind : Kind    kind of the item
-    item_name : str    name of the item
-    parts : mapping of str to tree    its documents
-
-    Returns
-    -------
-    ImportedItem    the item
-    """
-    return ImportedItem(file.planned.name, kind, item_name, file.collection, parts, file.options.tags)
 
 
 def _check_document(warning: Tree) -> Tree:

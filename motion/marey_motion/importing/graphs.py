@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from marey_motion.errors import FormatError
-from marey_motion.importing.files import ImportedGraph, ImportedItem
+from marey_motion.importing.items import ImportedGraph, ImportedItem
 from marey_schemas.documents.graphs import ModelGraph
 from marey_schemas.documents.originals import original_of
 from marey_schemas.kinds import Kind

@@ -11,7 +11,7 @@ from marey_motion.formats.predecessor.documents import model_name
 from marey_motion.formats.predecessor.graph import graph_of_document
 from marey_motion.formats.predecessor.model import PredecessorModel, model_of_document
 from marey_motion.formats.predecessor.tree import read_predecessor_tree
-from marey_motion.importing.files import (
+from marey_motion.importing.items import (
     SAME_OFFSET_M,
     FileToImport,
     ImportedFile,

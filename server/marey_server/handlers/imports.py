@@ -28,7 +28,7 @@ from marey_server.store.jobs import submission
 from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:
-    from marey_motion.importing.files import GivenSkeleton
+    from marey_motion.importing.items import GivenSkeleton
     from marey_motion.importing.plan import PlannedFile
 
 MAX_FILES = 1000

@@ -21,7 +21,7 @@ from marey_server.store.projects import ProjectRow
 from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:  # numeric modules take a second to load: only who imports files pays for them
-    from marey_motion.importing.files import GivenSkeleton, ImportedFile, ImportedGraph, ImportedItem
+    from marey_motion.importing.items import GivenSkeleton, ImportedFile, ImportedGraph, ImportedItem
     from marey_motion.importing.plan import PlannedFile
 
 REFUSED_ALTOGETHER = (401, 403, 404, 503, 507)
@@ -67,7 +67,7 @@ def require_importer(tx: Transaction, project: str) -> None:
 
 def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
     """Read the skeleton that an import names. Raises `NotFound`."""
-    from marey_motion.importing.files import GivenSkeleton
+    from marey_motion.importing.items import GivenSkeleton
 
     part = items.read_part(tx, project, Kind.SKELETON, item_id, "hierarchy")
     return GivenSkeleton(item_id, part.revision, part.tree)
@@ -84,7 +84,8 @@ def prepare(
     planned: PlannedFile, sources: Sequence[SourceFile], options: ImportOptions, skeleton: GivenSkeleton | None
 ) -> PreparedImport:
     """Read one file, with its companion, and encode its documents: the slow part, which needs no database."""
-    from marey_motion.importing.files import FileToImport, import_file, planned_entry
+    from marey_motion.importing.files import import_file, planned_entry
+    from marey_motion.importing.items import FileToImport
 
     if (entry := planned_entry(planned)) is not None:
         return PreparedImport(planned.name, entry=entry)

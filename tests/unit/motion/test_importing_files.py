@@ -19,7 +19,8 @@ from marey_motion.formats import write_bvh, write_predecessor_skeleton
 from marey_motion.formats.predecessor import clips, documents
 from marey_motion.gait import generate_gait
 from marey_motion.importing import anatomy
-from marey_motion.importing.files import FileToImport, ImportedFile, import_file, mapping_part
+from marey_motion.importing.files import import_file, mapping_part
+from marey_motion.importing.items import FileToImport, ImportedFile
 from marey_motion.importing.plan import PlannedFile, plan_imports
 from marey_schemas.documents.references import OutputRef
 from marey_schemas.options.imports import ImportOptions

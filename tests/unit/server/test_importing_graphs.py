@@ -4,7 +4,7 @@ import pytest
 from tests.support.predecessor_models import imported
 
 from marey_motion.formats.predecessor.graph import GraphNode, PredecessorGraph
-from marey_motion.importing.files import ImportedGraph
+from marey_motion.importing.items import ImportedGraph
 from marey_schemas.kinds import Kind
 from marey_server.errors import InvalidProblem
 from marey_server.motions.importing import graph_draft

@@ -5,18 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from marey_motion.errors import MotionError
-from marey_motion.importing.files import (
-    FileToImport,
-    GivenSkeleton,
-    ImportedFile,
-    ImportedGraph,
-    ImportedItem,
-    import_file,
-    mapping_part,
-    planned_entry,
-    refusal_of,
-)
+from marey_motion.importing.files import import_file, mapping_part, planned_entry, refusal_of
 from marey_motion.importing.graphs import FEW, NamedModel, graph_item
+from marey_motion.importing.items import FileToImport, GivenSkeleton, ImportedFile, ImportedGraph, ImportedItem
 from marey_motion.importing.plan import PlannedFile, plan_imports
 from marey_schemas.documents.clips import Check
 from marey_schemas.encoding.canonical import canonical_json

@@ -1,0 +1,162 @@
+"""Values of an import: the file with its options, and the items, graph or refusal that come of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from marey_motion.documents import skeleton_from_document
+from marey_motion.formats.predecessor.graph import PredecessorGraph
+from marey_motion.importing.anatomy import anatomy_of
+from marey_motion.importing.plan import PlannedFile
+from marey_motion.skeleton import Skeleton
+from marey_schemas.documents.skeletons import SkeletonHierarchy
+from marey_schemas.imports import Refusal, skeleton_output
+from marey_schemas.kinds import Kind
+from marey_schemas.options.imports import ImportOptions as UserOptions
+
+SKELETON_COLLECTION = "skeletons"
+SAME_OFFSET_M = 1e-3
+
+Tree = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class GivenSkeleton:
+    """A stored skeleton that the clips must use: its revision and its part `hierarchy`."""
+
+    item: str
+    revision: int
+    hierarchy: Mapping[str, Any]
+
+    @property
+    def ref(self) -> Tree:
+        """The reference that documents hold."""
+        return {"item": self.item, "revision": self.revision}
+
+
+@dataclass(frozen=True)
+class FileToImport:
+    """A file with everything that its import needs.
+
+    Parameters
+    ----------
+    planned : its plan
+    data, digest : its bytes and their name, for the record of where a clip comes from
+    companion, companion_digest : the same of the file that the plan names as its companion
+    options : of the user
+    skeleton : that the clips must use
+    """
+
+    planned: PlannedFile
+    data: bytes | memoryview
+    digest: str
+    options: UserOptions = field(default_factory=UserOptions)
+    companion: bytes | memoryview | None = None
+    companion_digest: str | None = None
+    skeleton: GivenSkeleton | None = None
+
+    @property
+    def collection(self) -> str:
+        """The collection of the items that the file becomes."""
+        return "/".join(part for part in (self.options.collection, self.planned.folder) if part)
+
+
+@dataclass(frozen=True)
+class ImportedItem:
+    """An item to store: its place and its documents.
+
+    `name` identifies it within the import: other items refer to it as `{"output": name}` until it is stored.
+    """
+
+    name: str
+    kind: Kind
+    item_name: str
+    collection: str
+    parts: Mapping[str, Tree]
+    tags: Sequence[str] = ()
+    reuse: Literal["by_name", "by_content"] = "by_name"
+
+
+@dataclass(frozen=True)
+class ImportedGraph:
+    """A graph whose models are not found yet, since that takes the project: see `importing.graphs`."""
+
+    name: str
+    collection: str
+    tags: Sequence[str]
+    graph: PredecessorGraph
+    file: str
+    digest: str
+
+
+@dataclass(frozen=True)
+class ImportedFile:
+    """The items of one file, or why it was refused.
+
+    Parameters
+    ----------
+    items : a skeleton, then a clip or a model that uses it; a skeleton alone; a clip or a model alone. The skeleton has
+        no part `mapping` yet: see `mapping_part`
+    checks : findings about the motion, as documents
+    frames : of the clip
+    graph : what a file of a graph holds instead of items
+    """
+
+    name: str
+    items: tuple[ImportedItem, ...] = ()
+    checks: tuple[Tree, ...] = ()
+    frames: int | None = None
+    graph: ImportedGraph | None = None
+    refusal: Refusal | None = None
+
+
+def given_skeleton(given: GivenSkeleton) -> Skeleton:
+    """Make the skeleton of a stored hierarchy.
+
+    Parameters
+    ----------
+    given : GivenSkeleton    the stored skeleton
+
+    Returns
+    -------
+    Skeleton    J joints
+    """
+    return skeleton_from_document(SkeletonHierarchy.model_validate(given.hierarchy))
+
+
+def skeleton_item(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
+    """Make the item of a file's own skeleton; an equal skeleton of the project is used instead.
+
+    Parameters
+    ----------
+    file : FileToImport    the file
+    skeleton : Skeleton    its joints
+
+    Returns
+    -------
+    ImportedItem    an item with its hierarchy
+    """
+    anatomy = anatomy_of(skeleton)
+    parts = {"hierarchy": anatomy.hierarchy}
+    name = skeleton_output(file.planned.name)
+    item_name = anatomy.mapping.rig or "skeleton"
+    return ImportedItem(name, Kind.SKELETON, item_name, SKELETON_COLLECTION, parts, reuse="by_content")
+
+
+def main_item(file: FileToImport, kind: Kind, item_name: str, parts: Mapping[str, Tree]) -> ImportedItem:
+    """Make the main item of a file, with the file's name, in the user's collection, with the user's tags.
+
+    Parameters
+    ----------
+    file : FileToImport    the file
+    kind : Kind    kind of the item
+    item_name : str    name of the item
+    parts : mapping of str to tree    its documents
+
+    Returns
+    -------
+    ImportedItem    the item
+    """
+    return ImportedItem(file.planned.name, kind, item_name, file.collection, parts, file.options.tags)
