@@ -45,10 +45,10 @@ def _place(rotation, origin, point):  # type: ignore[no-untyped-def]
 
 @contracted
 def _load(block, first_column, rows, row_count):  # type: ignore[no-untyped-def]
-    for c in range(row_count):
-        row = rows[c * ROW : c * ROW + ROW]
-        for f in range(block.shape[0]):
-            row[f] = block[f, first_column + c]
+    for f in range(block.shape[0]):
+        frame = block[f]
+        for c in range(row_count):
+            rows[c * ROW + f] = frame[first_column + c]
 
 
 @contracted

@@ -1,0 +1,20 @@
+"""A Tiled server with one array: a peer that serves arrays, run by an interpreter that has `tiled[server]`.
+
+`python benchmarks/tiled_server.py PORT FILE.npy`, where no other package of this repository is needed.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import uvicorn  # type: ignore[import-not-found, unused-ignore]
+from tiled.adapters.array import ArrayAdapter  # type: ignore[import-not-found, unused-ignore]
+from tiled.adapters.mapping import MapAdapter  # type: ignore[import-not-found, unused-ignore]
+from tiled.config import Authentication  # type: ignore[import-not-found, unused-ignore]
+from tiled.server.app import build_app  # type: ignore[import-not-found, unused-ignore]
+
+if __name__ == "__main__":
+    tree = MapAdapter({"poses": ArrayAdapter.from_array(np.load(sys.argv[2]))})
+    app = build_app(tree, authentication=Authentication(allow_anonymous_access=True))
+    uvicorn.run(app, host="127.0.0.1", port=int(sys.argv[1]), log_level="warning")
