@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
+from pydantic import ValidationError
+
+from marey_motion.alignment.aligned_documents import restored_clip
 from marey_motion.clip import Clip
+from marey_motion.documents import clip_from_document, skeleton_from_document
+from marey_motion.errors import MotionError
 from marey_motion.formats import write_motion
 from marey_motion.importing.source import SourceInfo
+from marey_motion.skeleton import Skeleton
+from marey_schemas.documents.alignments import AlignmentInfo
+from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.formats import format_named
+from marey_schemas.item_files import ItemToExport
 
 
 @dataclass(frozen=True)
@@ -56,6 +66,43 @@ def write_clip_file(
     if row.euler:
         options["source"] = _source(clip, info or {})
     return ExportedFile(write_motion(clip, file_format, **options), row.endings[0], row.media_type)
+
+
+def write_motion_file(
+    source: ItemToExport,
+    file_format: str,
+    *,
+    unit: str | float = "cm",
+    time: Literal["canonical", "source"] = "canonical",
+    skeleton: Skeleton | None = None,
+) -> ExportedFile:
+    """Write the motion of a clip, or of an aligned clip, as a file: the export that server and worker share.
+
+    Parameters
+    ----------
+    source : ItemToExport    its documents; `hierarchy` is needed unless `skeleton` is given
+    file_format : str    one of `marey_schemas.formats.MOTION_FORMATS`
+    unit : str or float    unit of length by name or in metres, where the format leaves it open
+    time : str    of an aligned clip: its canonical frames, or those of the clip it was made of, where that was
+    skeleton : Skeleton, optional    the skeleton, where it was made of its hierarchy before
+
+    Returns
+    -------
+    ExportedFile    the file with its suffix and media type
+
+    Raises
+    ------
+    MotionError    where the documents are not valid, or the format cannot hold the motion
+    """
+    try:
+        if skeleton is None:
+            skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(source.hierarchy))
+        clip = clip_from_document(MotionDocument.model_validate(source.parts["motion"]), skeleton)
+        if time == "source":
+            clip = restored_clip(clip, AlignmentInfo.model_validate(source.parts["info"]).model_dump())
+    except ValidationError as error:
+        raise MotionError(str(error), code="bad-document") from error
+    return write_clip_file(clip, file_format, unit=unit, info=source.parts.get("info"))
 
 
 def _source(clip: Clip, info: Mapping[str, Any]) -> SourceInfo | None:

@@ -8,6 +8,7 @@ offset is its parent's bone vector, and bones that end the hierarchy leave an en
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +21,7 @@ from marey_motion.formats.numeric_text import excerpt
 from marey_motion.formats.text_lines import TextLines, decode_name
 from marey_motion.importing.source import SourceMotion
 from marey_schemas.formats import UNITS_M
+from marey_schemas.lru import LruCache
 
 FORMAT = "asf-amc"
 ROOT = "root"
@@ -137,6 +139,11 @@ def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
     )
 
 
+_LONGEST_KEPT = 1 << 18
+_KNOWN: LruCache[bytes, AsfSkeleton] = LruCache(max_entries=32)
+"""Skeletons parsed last, by the digest of their file; nothing changes them. Many AMC files share one ASF."""
+
+
 def parse_asf(data: bytes, file: str) -> AsfSkeleton:
     """Parse an ASF file.
 
@@ -153,7 +160,9 @@ def parse_asf(data: bytes, file: str) -> AsfSkeleton:
     ------
     FormatError    with the line, and the bone where there is one
     """
-    return _AsfReader(TextLines(data, file)).read()
+    if len(data) > _LONGEST_KEPT:
+        return _AsfReader(TextLines(data, file)).read()
+    return _KNOWN.get_or_make(hashlib.sha256(data).digest(), lambda: _AsfReader(TextLines(data, file)).read())
 
 
 class _AsfReader:

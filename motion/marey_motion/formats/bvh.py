@@ -7,6 +7,7 @@ position channels are. Position channels replace the joint's OFFSET, axis by axi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +85,7 @@ def read_bvh(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
     return source
 
 
+@lru_cache(maxsize=64)
 def channel_columns(channels: tuple[tuple[str, ...], ...]) -> ChannelColumns:
     """Assign the channels of all joints to the columns of a line of numbers.
 

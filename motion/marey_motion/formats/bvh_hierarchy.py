@@ -6,13 +6,15 @@ joint or on their own, keywords in any case, end sites left out or named, channe
 
 from __future__ import annotations
 
+import hashlib
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from marey_motion.errors import FormatLimit
 from marey_motion.formats.joint_names import MAX_JOINTS, MAX_NAME_LENGTH
 from marey_motion.formats.numeric_text import excerpt
 from marey_motion.formats.text_lines import TextLines, decode_name, read_number
+from marey_schemas.lru import LruCache
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 _CHANNEL_BY_KEY = {name.lower().encode(): name for name in CHANNELS}
@@ -20,6 +22,8 @@ _FRAMES = re.compile(rb"frames\s*:?\s*(\S+)", re.IGNORECASE)
 _FRAME_TIME = re.compile(rb"frame\s*time\s*:?\s*(\S+)", re.IGNORECASE)
 _BRACES = re.compile(rb"([{}])")
 _END_SITE = -1
+_MOTION_LINE = re.compile(rb"[\r\n][ \t]*motion[ \t]*(?:\r\n|\n|\r)", re.IGNORECASE)
+_LONGEST_KEPT = 1 << 18
 
 
 @dataclass
@@ -41,6 +45,19 @@ class BvhHeader:
     data_line: int = 1
 
 
+@dataclass(frozen=True)
+class _KeptHierarchy:
+    """A HIERARCHY that was read, and the position and line number after it. Nothing changes its lists."""
+
+    header: BvhHeader
+    position: int
+    number: int
+
+
+_KNOWN: LruCache[bytes, _KeptHierarchy] = LruCache(max_entries=64)
+"""Hierarchies read last, by the digest of their text."""
+
+
 def read_header(lines: TextLines) -> BvhHeader:
     """Read a BVH file up to its first line of numbers.
 
@@ -56,12 +73,26 @@ def read_header(lines: TextLines) -> BvhHeader:
     ------
     FormatError    with the line that is wrong
     """
+    header = _read_hierarchy(lines)
+    _read_motion_header(lines, header)
+    return header
+
+
+def _read_hierarchy(lines: TextLines) -> BvhHeader:
+    """Read up to the line MOTION; files of one skeleton share what was read of the first of them."""
+    motion = _MOTION_LINE.search(lines.data, 0, _LONGEST_KEPT)
+    key = None if motion is None else hashlib.sha256(lines.data[: motion.end()]).digest()
+    kept = None if key is None else _KNOWN.get(key)
+    if kept is not None:
+        lines.position, lines.number = kept.position, kept.number
+        return replace(kept.header)
     first = next(iter(lines), b"")
     if first.upper() != b"HIERARCHY":
         shown = f"the file begins with {excerpt(first)!r}" if first else "the file is empty"
         raise lines.error(f"a BVH file begins with HIERARCHY; {shown}", code="not-bvh")
     header = _HierarchyReader(lines).read()
-    _read_motion_header(lines, header)
+    if key is not None and motion is not None and lines.position == motion.end():
+        _KNOWN.put(key, _KeptHierarchy(replace(header), lines.position, lines.number))
     return header
 
 

@@ -24,6 +24,9 @@ def array_digest(array: NDArray[Any] | EncodedArray) -> str:
     return _name(head.encode(), plain.reshape(-1).view(np.uint8).data)
 
 
+_LEAVES = (str, float, int, bool, type(None))
+
+
 def canonical_json(tree: Any) -> bytes:
     """The one JSON text of a tree without arrays: sorted keys, no spaces, UTF-8, one spelling per number.
 
@@ -46,6 +49,8 @@ def detach_arrays(tree: Any, keep: Callable[[str, NDArray[Any] | EncodedArray], 
 
     `keep(digest, array)` is called once per array, in document order.
     """
+    if type(tree) in _LEAVES:  # most members; asking whether they are mappings takes far longer
+        return tree
     if isinstance(tree, Mapping):
         return {key: detach_arrays(member, keep) for key, member in tree.items()}
     if isinstance(tree, list | tuple):
@@ -70,6 +75,8 @@ def attach_arrays(tree: Any, load: Callable[[str], NDArray[Any] | EncodedArray])
 
 
 def _canonical(value: Any) -> Any:
+    if type(value) is str or value is None:
+        return value
     if isinstance(value, Mapping):
         return {_text_key(key): _canonical(member) for key, member in value.items()}
     if isinstance(value, list | tuple):

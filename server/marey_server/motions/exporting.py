@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
-from marey_schemas.documents.alignments import AlignmentInfo
-from marey_schemas.documents.clips import MotionDocument
-from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.encoding import codecs
 from marey_schemas.formats import ExportFormat
-from marey_schemas.items import Item
+from marey_schemas.item_files import ItemToExport, OriginalFile, item_as_json, original_of_clip
 from marey_schemas.kinds import Kind
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.predecessor_exports import PredecessorOptions, unchanged_original, write_predecessor
@@ -24,16 +21,6 @@ ExportTime = Literal["canonical", "source"]
 
 
 @dataclass(frozen=True, slots=True)
-class ExportSource:
-    """An item's documents at one revision; for motions and models also the hierarchy of their skeleton."""
-
-    item: Item
-    revision: int
-    parts: dict[str, dict[str, Any]]
-    hierarchy: dict[str, Any] | None
-
-
-@dataclass(frozen=True, slots=True)
 class ServedFile:
     """A file to hand out."""
 
@@ -42,15 +29,7 @@ class ServedFile:
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class OriginalFile:
-    """The file that an item was imported from, as it came."""
-
-    name: str
-    digest: str
-
-
-def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ExportSource:
+def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ItemToExport:
     """Everything that a file of an item can need. Raises `NotFoundProblem`."""
     found = items.read_item(tx, project, kind, item_id)
     number = found.revision if revision is None else revision
@@ -60,7 +39,7 @@ def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revisio
     if kind in WITH_MOTION or kind is Kind.MODEL:
         ref = parts["model" if kind is Kind.MODEL else "motion"]["skeleton"]
         hierarchy = items.read_part(tx, project, Kind.SKELETON, ref["item"], "hierarchy", revision=ref["revision"]).tree
-    return ExportSource(found, number, parts, hierarchy)
+    return ItemToExport(item_id, kind, found.name, found.collection, number, parts, hierarchy, found.tags)
 
 
 def find_unchanged_original(
@@ -97,55 +76,32 @@ def find_original(
             return unchanged
     if kind is Kind.CLIP:
         info = items.read_part(tx, project, kind, item_id, "info", revision=revision, arrays="none").tree
-        source = info.get("source", {})
-        if source.get("file"):
-            name = str(source.get("file_name") or item_id).replace("\\", "/").rpartition("/")[2]
-            return OriginalFile(name, source["file"])
+        if (original := original_of_clip(item_id, info)) is not None:
+            return original
     raise NotFoundProblem("It was not made from a file; ask for another format, such as bvh.", code="no-original")
 
 
 def write_file(
-    source: ExportSource, file_format: ExportFormat, unit: str, time: ExportTime, options: PredecessorOptions
+    source: ItemToExport, file_format: ExportFormat, unit: str, time: ExportTime, options: PredecessorOptions
 ) -> ServedFile:
     """The file of an item. Raises `InvalidProblem` where the format cannot hold it."""
-    if time == "source" and source.item.kind is not Kind.PROCESSED:
+    if time == "source" and source.kind is not Kind.PROCESSED:
         raise InvalidProblem(
             "Only an aligned clip has a time of its own and that of its source.", code="no-such-export"
         )
-    beside = source.item.kind is Kind.PROCESSED and options.part == "alignment"
-    if file_format == "predecessor" and (beside or source.item.kind not in WITH_MOTION):
-        name, data = write_predecessor(source.item.kind, source.item.name, source.parts, source.hierarchy, options)
+    beside = source.kind is Kind.PROCESSED and options.part == "alignment"
+    if file_format == "predecessor" and (beside or source.kind not in WITH_MOTION):
+        name, data = write_predecessor(source.kind, source.name, source.parts, source.hierarchy, options)
         return ServedFile(name, codecs.JSON, data)
     if file_format == "json":
-        return ServedFile(f"{source.item.name}.json", codecs.JSON, codecs.encode_tree(_as_tree(source), codecs.JSON))
-    if source.item.kind not in WITH_MOTION or source.hierarchy is None:
-        raise InvalidProblem(f"A {source.item.kind} is exported as json.", code="no-such-export")
-    from marey_motion.alignment.aligned_documents import restored_clip
-    from marey_motion.documents import clip_from_document, skeleton_from_document
+        return ServedFile(f"{source.name}.json", codecs.JSON, item_as_json(source))
+    if source.kind not in WITH_MOTION or source.hierarchy is None:
+        raise InvalidProblem(f"A {source.kind} is exported as json.", code="no-such-export")
     from marey_motion.errors import MotionError
-    from marey_motion.exporting import write_clip_file
+    from marey_motion.exporting import write_motion_file
 
-    skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(source.hierarchy))
-    clip = clip_from_document(MotionDocument.model_validate(source.parts["motion"]), skeleton)
     try:
-        if time == "source":
-            clip = restored_clip(clip, AlignmentInfo.model_validate(source.parts["info"]).model_dump())
-        written = write_clip_file(clip, file_format, unit=unit, info=source.parts.get("info"))
+        written = write_motion_file(source, file_format, unit=unit, time=time)
     except MotionError as error:
         raise InvalidProblem(str(error), code="cannot-be-exported") from error
-    return ServedFile(source.item.name + written.suffix, written.media_type, written.data)
-
-
-def _as_tree(source: ExportSource) -> dict[str, Any]:
-    item = source.item
-    tree: dict[str, Any] = {
-        "schema": "marey/item@1",
-        "item": item.id,
-        "kind": item.kind.value,
-        "name": item.name,
-        "collection": item.collection,
-        "revision": source.revision,
-        "tags": list(item.tags),
-        "parts": source.parts,
-    }
-    return tree if source.hierarchy is None else {**tree, "skeleton": source.hierarchy}
+    return ServedFile(source.name + written.suffix, written.media_type, written.data)

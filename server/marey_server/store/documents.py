@@ -119,12 +119,17 @@ def _check(tree: Any, schema: str | None) -> str:
 
 
 def _is_reference(value: Any) -> bool:
-    return isinstance(value, Mapping) and value.keys() == _REFERENCE_KEYS
+    return type(value) not in _LEAVES and isinstance(value, Mapping) and value.keys() == _REFERENCE_KEYS
+
+
+_LEAVES = (str, float, int, bool, type(None))
 
 
 def _members(value: Any, pointer: str = "") -> Iterator[tuple[str, Any]]:
     """Every member of a tree with its JSON Pointer, containers before what they hold."""
     yield pointer, value
+    if type(value) in _LEAVES:  # most members; asking whether they are mappings takes far longer
+        return
     if isinstance(value, Mapping):
         for key, member in value.items():
             yield from _members(member, f"{pointer}/{str(key).replace('~', '~0').replace('/', '~1')}")

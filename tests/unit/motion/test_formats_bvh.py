@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.support.motion_files import ARM, POSITIONS, ZXY, bvh, nested, rows_of
 
 from marey_motion.errors import FormatError, FormatLimit
+from marey_motion.formats import bvh_hierarchy
 from marey_motion.formats.bvh import read_bvh
 from marey_motion.importing.source import SourceMotion
+from marey_schemas.lru import LruCache
 
 
 def read(data: bytes, **options: float) -> SourceMotion:
@@ -273,3 +277,31 @@ class TestRefusals:
     @pytest.mark.parametrize("missing", [5, 15, 25, 40, 60, 100, 200])
     def test_a_file_cut_off_anywhere_is_refused_with_a_line(self, missing: int) -> None:
         assert refusal(bvh([ROW])[:-missing]).line is not None
+
+
+def test_files_of_one_skeleton_read_alike_whether_its_hierarchy_was_read_before_or_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    reads = 0
+    real = bvh_hierarchy._HierarchyReader.read
+
+    def counting(self: Any) -> Any:
+        nonlocal reads
+        reads += 1
+        return real(self)
+
+    monkeypatch.setattr(bvh_hierarchy._HierarchyReader, "read", counting)
+    monkeypatch.setattr(bvh_hierarchy, "_KNOWN", LruCache(max_entries=4))
+    files = [bvh([f"{n} 2 3 10 20 30 40 50 60", f"{n} 2 3 10 20 30 40 50 61"], frame_time="0.04") for n in range(2)]
+    files.append(files[0].replace(b"\n", b"\r\n"))
+    alone = [read_bvh(data, "take.bvh") for data in files]
+    assert reads == 2
+    monkeypatch.setattr(bvh_hierarchy, "_KNOWN", LruCache(max_entries=4))
+    for data, before in zip(reversed(files), reversed(alone), strict=True):
+        again = read_bvh(data, "take.bvh")
+        assert again.joint_names == before.joint_names
+        np.testing.assert_array_equal(again.rotations, before.rotations)
+        np.testing.assert_array_equal(again.root_positions, before.root_positions)
+    with pytest.raises(FormatError) as refused:
+        read_bvh(bvh(["0 0 0 0 0 0 0 0 0", "0 0 x 0 0 0 0 0 0"]), "take.bvh")
+    assert refused.value.line == 20

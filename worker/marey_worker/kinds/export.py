@@ -5,17 +5,14 @@ from __future__ import annotations
 import zipfile
 from typing import Any, NamedTuple
 
-from pydantic import ValidationError
-
 from marey_motion import documents
 from marey_motion.errors import MotionError
-from marey_motion.exporting import write_clip_file
+from marey_motion.exporting import write_motion_file
 from marey_motion.skeleton import Skeleton
-from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.reports import StoredFile
 from marey_schemas.documents.skeletons import SkeletonHierarchy
-from marey_schemas.encoding import codecs
+from marey_schemas.item_files import ItemToExport, item_as_json, original_of_clip
 from marey_schemas.job_params import ExportParams
 from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted
@@ -27,14 +24,6 @@ EPOCH = (1980, 1, 1, 0, 0, 0)
 """The earliest time a ZIP archive can tell; every file gets it, so that the same clips make the same bytes."""
 
 READABLE_BY_ALL = 0o644 << 16
-
-
-class _Unwritable(Exception):
-    """A clip has no file in this format."""
-
-    def __init__(self, code: str, detail: str) -> None:
-        super().__init__(detail)
-        self.code = code
 
 
 class _File(NamedTuple):
@@ -55,7 +44,7 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
             context.progress(done, len(pins), f"writing {pin.name}")
             try:
                 file = exporting.file_of(pin, info or {}, *motion)
-            except (_Unwritable, MotionError, NoSuchThing) as error:
+            except (MotionError, NoSuchThing) as error:
                 refused.append({"name": _place(pin), "item": pin.item, "code": error.code, "detail": str(error)})
                 continue
             name = file.name if file.name not in written else f"{pin.item}-{file.name.rpartition('/')[2]}"
@@ -79,37 +68,25 @@ class _Exporting:
     def file_of(self, pin: PinnedInput, info: dict[str, Any], tree: Any = None) -> _File:
         """Write the file of a clip, which its original needs no motion for.
 
-        Raises `_Unwritable`, `MotionError` or `NoSuchThing` where the clip has no file in this format.
+        Raises `MotionError` or `NoSuchThing` where the clip has no file in this format.
         """
         if self._params.format == "original":
             return self._original(pin, info)
-        try:
-            motion = MotionDocument.model_validate(present(pin, tree))
-        except ValidationError as error:
-            raise _Unwritable("bad-document", str(error)) from error
-        skeleton, hierarchy = self._skeleton(RevisionRef.model_validate(motion.skeleton.model_dump()))
+        ref = RevisionRef.model_validate(present(pin, tree)["skeleton"])
+        skeleton, hierarchy = self._skeleton(ref)
+        parts = {"motion": tree, **({"info": info} if info else {})}
+        source = ItemToExport(pin.item, pin.kind, pin.name, pin.collection, pin.revision, parts, hierarchy)
         if self._params.format == "json":
-            document = {
-                "schema": "marey/item@1",
-                "item": pin.item,
-                "kind": pin.kind.value,
-                "name": pin.name,
-                "collection": pin.collection,
-                "revision": pin.revision,
-                "parts": {"motion": tree, **({"info": info} if info else {})},
-                "skeleton": hierarchy,
-            }
-            return _File(f"{_place(pin)}.json", codecs.encode_tree(document, codecs.JSON))
-        clip = documents.clip_from_document(motion, skeleton)
-        written = write_clip_file(clip, self._params.format, unit=self._params.unit, info=info)
+            return _File(f"{_place(pin)}.json", item_as_json(source))
+        written = write_motion_file(source, self._params.format, unit=self._params.unit, skeleton=skeleton)
         return _File(_place(pin) + written.suffix, written.data)
 
     def _original(self, pin: PinnedInput, info: dict[str, Any]) -> _File:
-        source = info.get("source") or {}
-        if not source.get("file"):
-            raise _Unwritable("no-original", "it was not made from a file")
-        ending = str(source.get("file_name") or "").rpartition(".")[2]
-        return _File(f"{_place(pin)}.{ending}" if ending else _place(pin), self._context.blob(source["file"]))
+        original = original_of_clip(pin.item, info)
+        if original is None:
+            raise MotionError("it was not made from a file", code="no-original")
+        ending = original.name.rpartition(".")[2] if "." in original.name else ""
+        return _File(f"{_place(pin)}.{ending}" if ending else _place(pin), self._context.blob(original.digest))
 
     def _skeleton(self, ref: RevisionRef) -> tuple[Skeleton, dict[str, Any]]:
         if ref not in self._skeletons:

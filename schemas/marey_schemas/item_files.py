@@ -1,0 +1,63 @@
+"""Parts of an export that need no numeric code: an item as one JSON document, and the file a clip was imported from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from marey_schemas.encoding import codecs
+from marey_schemas.kinds import Kind
+
+
+@dataclass(frozen=True, slots=True)
+class ItemToExport:
+    """An item's documents at one revision.
+
+    `hierarchy` is of the skeleton that its motion or model moves. `tags` None leaves them out of the file: a job does
+    not read them, since they may change while its inputs are pinned.
+    """
+
+    item: str
+    kind: Kind
+    name: str
+    collection: str
+    revision: int
+    parts: Mapping[str, Any]
+    hierarchy: Mapping[str, Any] | None = None
+    tags: Sequence[str] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class OriginalFile:
+    """The file that an item was imported from, as it came."""
+
+    name: str
+    digest: str
+
+
+def item_as_json(source: ItemToExport) -> bytes:
+    """Write an item with all its parts, and its skeleton's hierarchy, as one JSON document."""
+    tree: dict[str, Any] = {
+        "schema": "marey/item@1",
+        "item": source.item,
+        "kind": source.kind.value,
+        "name": source.name,
+        "collection": source.collection,
+        "revision": source.revision,
+    }
+    if source.tags is not None:
+        tree["tags"] = list(source.tags)
+    tree["parts"] = source.parts
+    if source.hierarchy is not None:
+        tree["skeleton"] = source.hierarchy
+    return codecs.encode_tree(tree, codecs.JSON)
+
+
+def original_of_clip(item: str, info: Mapping[str, Any] | None) -> OriginalFile | None:
+    """Find the file that a clip was imported from in its part `info`; None where it was made otherwise."""
+    source = (info or {}).get("source") or {}
+    if not source.get("file"):
+        return None
+    name = str(source.get("file_name") or item).replace("\\", "/").rpartition("/")[2]
+    return OriginalFile(name, source["file"])
