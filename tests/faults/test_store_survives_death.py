@@ -7,50 +7,20 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.support import store_writer
+from tests.support.store_writer import FILES
 
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import Principal
 from marey_server.store import blobs, fsck, garbage, items
 from marey_server.store.blobs import digest_of
 
-FILES = [f"file {number}".encode() * 1000 for number in range(3)]
-
-WRITER = """
-import sys
-from marey_server.access.principal import Principal
-from marey_server.store import blobs, garbage, items, projects
-from marey_server.store.blob_backings import DirectoryBlobs
-from marey_server.store.database import Database
-from marey_schemas.kinds import Kind
-from pathlib import Path
-
-url, user_id, user_name, work, folder = sys.argv[1:]
-database = Database(url, blobs=DirectoryBlobs(Path(folder)) if folder else None)
-who = Principal("user", user_id, user_name, scopes=("read", "write"))
-FILES = [f"file {number}".encode() * 1000 for number in range(3)]
-
-def publish(tx):
-    row = projects.require(tx, "lab")
-    trees = [{"n": n, "blob": blobs.digest_of(data)} for n, data in enumerate(FILES)]
-    drafts = [items.Draft(f"d{n}", Kind.STUDY, f"study {n}", {"study": tree}, "a/b") for n, tree in enumerate(trees)]
-    return items.publish(tx, row, drafts, author_id=user_id)
-
-if work == "send":
-    for data in FILES:
-        database.write(who, blobs.put_blob, data)
-elif work == "publish":
-    database.write(who, publish)
-else:
-    garbage.collect_garbage(database, grace_us=-1)
-database.close()
-"""
-
 
 class Writer:
     """Runs one kind of work in a process of its own, with a fault or without."""
 
     def __init__(self, lab, url, folder):
-        self._args = [sys.executable, "-c", WRITER, url, lab.owner.user_id, lab.owner.user_name]
+        self._args = [sys.executable, store_writer.__file__, url, lab.owner.user_id, lab.owner.user_name]
         self._folder = folder
 
     def run(self, work, fault=""):

@@ -1,0 +1,40 @@
+"""A process that writes to a database, for tests that kill it: `store_writer.py URL USER_ID USER_NAME WORK FOLDER`."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from marey_schemas.kinds import Kind
+from marey_server.access.principal import Principal
+from marey_server.store import blobs, garbage, items, projects
+from marey_server.store.blob_backings import DirectoryBlobs
+from marey_server.store.database.connections import Database
+from marey_server.store.transaction import Transaction
+
+FILES = [f"file {number}".encode() * 1000 for number in range(3)]
+
+
+def publish(tx: Transaction) -> Any:
+    """Publish three small studies that refer to the files."""
+    row = projects.require(tx, "lab")
+    trees = [{"n": n, "blob": blobs.digest_of(data)} for n, data in enumerate(FILES)]
+    drafts = [items.Draft(f"d{n}", Kind.STUDY, f"study {n}", {"study": tree}, "a/b") for n, tree in enumerate(trees)]
+    return items.publish(tx, row, drafts, author_id=tx.principal.user_id)
+
+
+def main(url: str, user_id: str, user_name: str, work: str, folder: str) -> None:
+    """Send the files, publish, or collect garbage; blobs are in `folder`, or in the database if that is empty."""
+    database = Database(url, blobs=DirectoryBlobs(Path(folder)) if folder else None)
+    who = Principal("user", user_id, user_name, scopes=("read", "write"))
+    if work == "send":
+        for data in FILES:
+            database.write(who, blobs.put_blob, data)
+    elif work == "publish":
+        database.write(who, publish)
+    else:
+        garbage.collect_garbage(database, grace_us=-1)
+    database.close()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
