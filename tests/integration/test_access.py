@@ -48,6 +48,7 @@ BODIES = {
     "CollectionCreate": {"path": CANARY},
     "CollectionChange": {"path": "elsewhere"},
     "ItemCreate": {"name": CANARY, "collection": CANARY, "parts": {"hierarchy": HIERARCHY}},
+    "PartsRequest": {"parts": [{"kind": "clip", "item": "item_of_nobody", "revision": 1, "part": "info"}]},
     "ItemChange": {"name": "renamed"},
     "Document": {"schema": "marey/clip-info@1", "comment": CANARY},
     "JobCreate": {"kind": "no-such-kind"},
