@@ -15,18 +15,19 @@ from pathlib import Path
 import coverage
 
 FLOORS = {
-    "marey_schemas": 0,
-    "marey_motion": 0,
+    "marey_schemas": 78,
+    "marey_motion": 20,
     "marey_reports": 0,
-    "marey_client": 0,
-    "marey_server": 0,
+    "marey_client": 37,
+    "marey_server": 65,
     "marey_worker": 0,
 }
-"""Percent of branches."""
+"""Percent of branches. Reached by the SQLite unit tests of schemas, client and server alone, so low for the other packages:
+raise each to what a whole run of `.ci/run` prints."""
 
 
 def branch_coverage() -> dict[str, float]:
-    """Percent of branches that were taken, by package."""
+    """Percent of branches that were taken, by package; 0 for a package that no test has imported."""
     measured = coverage.Coverage()
     measured.load()
     with tempfile.TemporaryDirectory() as folder:
@@ -39,7 +40,7 @@ def branch_coverage() -> dict[str, float]:
         package = next(part for part in Path(name).parts if part in FLOORS)
         taken[package] += file["summary"]["covered_branches"]
         there[package] += file["summary"]["num_branches"]
-    return {package: 100.0 * taken[package] / there[package] for package in FLOORS}
+    return {package: 100.0 * taken[package] / max(1, there[package]) for package in FLOORS}
 
 
 def main() -> int:
