@@ -22,8 +22,10 @@ FLOORS = {
     "marey_server": 65,
     "marey_worker": 0,
 }
-"""Percent of branches. Reached by the SQLite unit tests of schemas, client and server alone, so low for the other packages:
-raise each to what a whole run of `.ci/run` prints."""
+"""Percent of branches, from a run of the SQLite unit tests of schemas, client and server alone, so low for the others.
+
+Raise each to what a whole run of `.ci/run` prints.
+"""
 
 
 def branch_coverage() -> dict[str, float]:
