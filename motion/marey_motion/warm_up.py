@@ -6,6 +6,7 @@ The compiled code is kept on disk; later processes load it in a fraction of a se
 from __future__ import annotations
 
 import argparse
+import hashlib
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -23,6 +24,8 @@ PACKAGE = Path(__file__).parent
 # Either numba itself or the options of a decorator that kernels share, at the outer level of the module.
 _IMPORTS_COMPILER = re.compile(r"^(?:import numba|from (?:numba[\w.]*|[\w.]*kernels) import)\b", re.MULTILINE)
 STAMP = Path(os.environ.get("NUMBA_CACHE_DIR") or PACKAGE / "__pycache__") / "kernels-compiled"
+"""Records the origin of the compiled code, and whether all of it is there."""
+_COMPILING, _DONE = "compiling", "done"
 
 _ASF = b""":version 1.10
 :units
@@ -62,30 +65,43 @@ def kernel_sources() -> list[Path]:
 
 
 def discard_outdated_kernels() -> None:
-    """Remove compiled code that is older than any source of kernels.
+    """Remove all compiled code if it was compiled from other sources or by another compiler than those installed.
 
-    The cache compares each kernel with its own file only, and a kernel holds a copy of those that it calls.
+    The cache of the compiler compares each kernel with its own file only, but a kernel holds a copy of those that it
+    calls, and names the types of its arguments. Times of change do not help: an installed package keeps those of the
+    archive, which are the same for every version.
     """
-    changed = _changed()
-    for compiled in PACKAGE.rglob("__pycache__/*.nb[ic]"):
-        if compiled.stat().st_mtime < changed:
+    if _origin() == _recorded_origin() or not os.access(STAMP.parent, os.W_OK):
+        return
+    names = {source.stem for source in kernel_sources()}
+    for compiled in (STAMP.parent if "NUMBA_CACHE_DIR" in os.environ else PACKAGE).rglob("*.nb[ic]"):
+        if compiled.name.partition(".")[0] in names:
             compiled.unlink(missing_ok=True)
+    _record(_COMPILING)
 
 
-def _changed() -> float:
-    """Time of the last change to a source of kernels, in seconds since the epoch."""
-    return max(source.stat().st_mtime for source in kernel_sources())
+def _origin() -> str:
+    """Digest of the compiler's version and of every source of kernels."""
+    digest = hashlib.sha256(version("numba").encode())
+    for source in sorted(kernel_sources()):
+        digest.update(b"\0" + source.relative_to(PACKAGE).as_posix().encode() + b"\0" + source.read_bytes())
+    return digest.hexdigest()
+
+
+def _recorded_origin() -> str:
+    """Origin of the compiled code on disk; empty where none is recorded."""
+    return STAMP.read_text("utf-8").partition(" ")[0] if STAMP.is_file() else ""
 
 
 def _is_done() -> bool:
-    """Whether everything was compiled since, by the compiler that is installed."""
-    return STAMP.is_file() and STAMP.stat().st_mtime >= _changed() and STAMP.read_text() == version("numba")
+    """Whether everything is compiled, from the installed sources and by the installed compiler."""
+    return STAMP.is_file() and STAMP.read_text("utf-8") == f"{_origin()} {_DONE}"
 
 
-def _note_done() -> None:
-    """Note that everything is compiled, where the compiled code lies; without the right to write there, do not."""
+def _record(state: str) -> None:
+    """Record the origin of the compiled code beside it, and its state; without the right to write there, do not."""
     if os.access(STAMP.parent, os.W_OK):
-        STAMP.write_text(version("numba"))
+        STAMP.write_text(f"{_origin()} {state}", "utf-8")
 
 
 def compile_kernels(stages: Sequence[str], processes: int = 1) -> None:
@@ -280,7 +296,7 @@ def main() -> None:
     discard_outdated_kernels()
     compile_kernels(arguments.stages or tuple(STAGES), arguments.processes)
     if not arguments.stages:
-        _note_done()
+        _record(_DONE)
 
 
 if __name__ == "__main__":

@@ -52,20 +52,49 @@ def test_a_module_that_imports_the_compiler_or_kernels_is_a_source_of_kernels(li
     assert [source.name for source in warm_up.kernel_sources()] == ["lanes.py"]
 
 
-def test_compiled_code_is_discarded_after_any_source_of_kernels_has_changed(tmp_path: Path, monkeypatch) -> None:
-    source = tmp_path / "euler.py"
-    source.write_text("from numba import njit\n")
-    compiled = tmp_path / "__pycache__" / "euler.nbi"
-    compiled.parent.mkdir()
-    compiled.write_bytes(b"")
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package of one kernel that was compiled, and whose origin is recorded."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setattr(warm_up, "PACKAGE", tmp_path)
-    os.utime(source, (1_000, 1_000))
+    monkeypatch.setattr(warm_up, "STAMP", tmp_path / "__pycache__" / "kernels-compiled")
+    (tmp_path / "euler.py").write_text("from numba import njit\n")
+    (tmp_path / "__pycache__").mkdir()
     warm_up.discard_outdated_kernels()
-    assert compiled.exists()
-    os.utime(source)
-    os.utime(compiled, (1_000, 1_000))
+    compiled = tmp_path / "__pycache__" / "euler.turn-1.py311.nbi"
+    compiled.write_bytes(b"")
+    return tmp_path
+
+
+def compiled_files(package: Path) -> list[str]:
+    return [file.name for file in package.rglob("*.nb[ic]")]
+
+
+def test_compiled_code_of_the_same_sources_is_kept(package: Path) -> None:
     warm_up.discard_outdated_kernels()
-    assert not compiled.exists()
+    assert compiled_files(package) == ["euler.turn-1.py311.nbi"]
+
+
+def test_compiled_code_is_discarded_after_a_source_has_changed_whatever_its_time(package: Path) -> None:
+    source = package / "euler.py"
+    times = source.stat()
+    source.write_text("from numba import jit \n")
+    os.utime(source, ns=(times.st_atime_ns, times.st_mtime_ns))
+    warm_up.discard_outdated_kernels()
+    assert compiled_files(package) == []
+
+
+def test_compiled_code_is_discarded_for_another_compiler(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warm_up, "version", lambda _: "999")
+    warm_up.discard_outdated_kernels()
+    assert compiled_files(package) == []
+
+
+def test_compiled_code_of_other_packages_is_kept(package: Path) -> None:
+    (package / "__pycache__" / "foreign.solve-1.py311.nbi").write_bytes(b"")
+    (package / "euler.py").write_text("from numba import jit\n")
+    warm_up.discard_outdated_kernels()
+    assert compiled_files(package) == ["foreign.solve-1.py311.nbi"]
 
 
 @pytest.mark.slow
@@ -78,16 +107,15 @@ def test_a_first_file_finds_the_kernels_compiled(tmp_path: Path) -> None:
     assert {file.name for file in tmp_path.rglob("*.nbi")} == before
 
 
-@pytest.mark.slow
-def test_what_is_compiled_is_not_compiled_again_until_a_kernel_changes(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(warm_up, "STAMP", tmp_path / "kernels-compiled")
+def test_what_is_compiled_is_not_compiled_again_until_a_kernel_changes(
+    package: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     compiled: list[tuple[str, ...]] = []
     monkeypatch.setattr(warm_up, "compile_kernels", lambda stages, processes: compiled.append(tuple(stages)))
-    monkeypatch.setattr(warm_up, "discard_outdated_kernels", lambda: None)
     monkeypatch.setattr(sys, "argv", ["warm_up"])
     warm_up.main()
     warm_up.main()
     assert compiled == [tuple(warm_up.STAGES)]
-    os.utime(tmp_path / "kernels-compiled", (0, 0))
+    (package / "euler.py").write_text("from numba import jit\n")
     warm_up.main()
     assert len(compiled) == 2
