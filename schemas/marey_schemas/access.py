@@ -78,7 +78,9 @@ class Me(Answer):
 
     user: User | None
     scopes: tuple[str, ...]
-    job: str | None = Field(None, description="Set for the token of a job attempt.")
+    job: str | None = Field(
+        None, description="The id of the job whose attempt uses the token; null for tokens of users."
+    )
 
 
 class TokenCreate(Request):
@@ -86,7 +88,9 @@ class TokenCreate(Request):
 
     name: DisplayName
     scopes: tuple[ScopeText, ...] = Field(("read", "write", "jobs"), min_length=1, max_length=32)
-    expires_in_s: int | None = Field(90 * 86400, ge=60, le=10 * 365 * 86400, description="null: never.")
+    expires_in_s: int | None = Field(
+        90 * 86400, ge=60, le=10 * 365 * 86400, description="Expiry of the token; null if it never expires."
+    )
 
 
 class Token(Answer):

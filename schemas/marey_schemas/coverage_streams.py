@@ -30,24 +30,37 @@ class CoverageStreamCreate(Request):
     """A new stream: what frames will come, and which speeds and turn rates are wanted."""
 
     frame_rate_hz: float = Field(
-        ge=LEAST_FRAME_RATE_HZ, le=MOST_FRAME_RATE_HZ, allow_inf_nan=False, description="Of the frames that will come."
+        ge=LEAST_FRAME_RATE_HZ,
+        le=MOST_FRAME_RATE_HZ,
+        allow_inf_nan=False,
+        description="Frame rate of the frames that will be sent, in hertz.",
     )
-    skeleton: ItemId | None = Field(None, description="Whose poses will come; roots need none.")
-    evaluation: ItemId | None = Field(None, description="Begin with what it found covered, on its grid.")
+    skeleton: ItemId | None = Field(None, description="Skeleton of the poses that will be sent; not needed for roots.")
+    evaluation: ItemId | None = Field(None, description="Evaluation whose grid and coverage the stream starts with.")
     speeds_m_s: tuple[Speed, ...] | None = Field(
-        None, min_length=1, max_length=200, description="Absent: the evaluation's, or 1 to 3 m/s."
+        None,
+        min_length=1,
+        max_length=200,
+        description="Speeds of the grid, in metres per second. Absent: those of the evaluation, or 1 to 3 m/s.",
     )
     turn_rates_deg_s: tuple[TurnRate, ...] | None = Field(
         None,
         min_length=1,
         max_length=200,
-        description="Positive to the left. Absent: the evaluation's, or -100 to 100.",
+        description="Turn rates of the grid, in degrees per second, positive to the left. Absent: those of "
+        "the evaluation, or -100 to 100.",
     )
     least_s: float | None = Field(
-        None, gt=0, le=3600, allow_inf_nan=False, description="Wanted in each cell. Absent: the evaluation's, or 1."
+        None,
+        gt=0,
+        le=3600,
+        allow_inf_nan=False,
+        description="Seconds of data that each cell needs. Absent: those of the evaluation, or 1.",
     )
-    target_count: int = Field(3, ge=0, le=16, description="How many targets are answered.")
-    path_s: float = Field(4.0, ge=0.5, le=20, allow_inf_nan=False, description="Length of a target's path in time.")
+    target_count: int = Field(3, ge=0, le=16, description="Number of targets in each answer.")
+    path_s: float = Field(
+        4.0, ge=0.5, le=20, allow_inf_nan=False, description="Duration of a target's path, in seconds."
+    )
 
     @model_validator(mode="after")
     def _check_grid(self) -> Self:
@@ -68,19 +81,23 @@ class CoverageStreamCreate(Request):
 class CoverageFrames(Request):
     """The next frames of a performance, of type <f4 or <f8."""
 
-    offset: int = Field(ge=0, le=2**53, description="Frames sent before these.")
+    offset: int = Field(ge=0, le=2**53, description="Number of frames that were sent before these.")
     poses: Annotated[NDArray[Any], ArrayOf(ndim=2)] | None = Field(
         None, description="[frames, 3 + 4*joints]: root translation (m), then local quaternions w,x,y,z."
     )
     translations: Annotated[NDArray[Any], ArrayOf(ndim=3, columns=3)] | None = Field(
-        None, description="[frames, k, 3]: local translations (m) that replace offsets, with poses."
+        None, description="[frames, k, 3]: local translations (m) that replace the joints' offsets; only with poses."
     )
-    translated_joints: tuple[JointName, ...] = Field((), max_length=MAX_JOINTS, description="The k joints they move.")
+    translated_joints: tuple[JointName, ...] = Field(
+        (), max_length=MAX_JOINTS, description="The k joints that `translations` moves."
+    )
     roots: Annotated[NDArray[Any], ArrayOf(ndim=2, columns=3)] | None = Field(
         None,
         description="[frames, 3]: x and z of the torso on the ground (m), heading of the body (rad), not smoothed.",
     )
-    ends_take: bool = Field(False, description="The performer pauses, or frames were lost, after these.")
+    ends_take: bool = Field(
+        False, description="The take ends after these frames: the performer pauses, or frames were lost."
+    )
 
     @model_validator(mode="after")
     def _check_frames(self) -> Self:
@@ -108,17 +125,17 @@ class CoverageCell(Answer):
     """A speed and turn rate, and how much there is of it."""
 
     speed_m_s: float
-    turn_rate_deg_s: float = Field(description="Positive to the left.")
+    turn_rate_deg_s: float = Field(description="Turn rate in degrees per second, positive to the left.")
     seconds: float
-    deficit_s: float = Field(description="What it lacks of the wanted seconds.")
+    deficit_s: float = Field(description="Seconds of data that the cell still needs.")
 
 
 class CoverageTarget(CoverageCell):
     """A cell that lacks data, and the path to walk to fill it."""
 
     path: tuple[tuple[float, float, float], ...] = Field(
-        description="Where to be, each `path_step_s` from the last: metres to the left and ahead, and radians to the "
-        "left, of where the performer is and faces."
+        description="Points of the path, `path_step_s` apart, relative to the performer's place and heading: "
+        "metres to the left, metres ahead, and radians to the left."
     )
     path_step_s: float
 
@@ -129,27 +146,29 @@ class Performer(Answer):
     x_m: float
     z_m: float
     heading_rad: float
-    speed_m_s: float | None = Field(description="Null until the take has a second.")
+    speed_m_s: float | None = Field(description="Speed in metres per second; null during the first second of a take.")
     turn_rate_deg_s: float | None
     forward_m_s: float | None
-    strafe_m_s: float | None = Field(description="Positive to the left.")
+    strafe_m_s: float | None = Field(description="Speed sideways, in metres per second, positive to the left.")
 
 
 class CoverageNow(Answer):
     """Coverage so far, targets to record next, and the performer, who is null between takes."""
 
-    index: float = Field(description="Share of the cells with enough.")
-    missing_s: float = Field(description="What all cells lack together.")
-    targets: tuple[CoverageTarget, ...] = Field(description="Nearest to how the performer moves first.")
+    index: float = Field(description="Share of the cells that have enough data.")
+    missing_s: float = Field(description="Seconds of data that all cells together still need.")
+    targets: tuple[CoverageTarget, ...] = Field(
+        description="Cells to record next, the ones closest to the performer's present motion first."
+    )
     performer: Performer | None
 
 
 class CoverageProgress(CoverageNow):
     """Changes made by the frames of a request."""
 
-    offset: int = Field(description="Frames received so far.")
-    windows: int = Field(description="Windows of a second that these frames completed, in whatever cell.")
-    changed: tuple[CoverageCell, ...] = Field(description="The cells that have more now.")
+    offset: int = Field(description="Number of frames received so far.")
+    windows: int = Field(description="Number of one-second windows that these frames completed, in any cell.")
+    changed: tuple[CoverageCell, ...] = Field(description="Cells whose data increased.")
 
 
 class CoverageStream(Answer):
@@ -159,24 +178,26 @@ class CoverageStream(Answer):
     frame_rate_hz: float
     skeleton: RevisionRef | None
     evaluation: RevisionRef | None
-    speeds_m_s: tuple[float, ...] = Field(description="In ascending order.")
-    turn_rates_deg_s: tuple[float, ...] = Field(description="In ascending order.")
+    speeds_m_s: tuple[float, ...] = Field(description="Speeds of the grid in ascending order.")
+    turn_rates_deg_s: tuple[float, ...] = Field(description="Turn rates of the grid in ascending order.")
     least_s: float
     target_count: int
     path_s: float
-    offset: int = Field(description="Frames received so far; the next ones start here.")
+    offset: int = Field(description="Number of frames received so far, which is the offset of the next ones.")
     created_at: datetime
     updated_at: datetime
-    expires_at: datetime = Field(description="When it is dropped if no frames come.")
+    expires_at: datetime = Field(description="Time at which the stream is deleted if no frames arrive.")
     rev: int
 
 
 class CoverageStreamState(CoverageStream, CoverageNow):
     """A stream with its map."""
 
-    seconds: tuple[tuple[float, ...], ...] = Field(description="[speeds, turn rates]: seconds in each cell.")
-    deficit_s: tuple[tuple[float, ...], ...] = Field(description="[speeds, turn rates]: what each cell lacks.")
-    delay_s: float = Field(description="How long a frame waits until it is part of a window.")
+    seconds: tuple[tuple[float, ...], ...] = Field(description="[speeds, turn rates]: seconds of data in each cell.")
+    deficit_s: tuple[tuple[float, ...], ...] = Field(
+        description="[speeds, turn rates]: seconds of data that each cell still needs."
+    )
+    delay_s: float = Field(description="Seconds from a frame to the end of the window that measures it.")
 
 
 # --- what a stream takes of an evaluation's document -----------------------------------------------------------------

@@ -86,12 +86,15 @@ class Item(Answer):
     parts: dict[str, PartSummary] = Field(default_factory=dict)
     summary: dict[str, Any] = Field(
         default_factory=dict,
-        description="What lists show and filter by: for clips frames, frame_rate_hz, duration_s, skeleton, warnings.",
+        description="Values that lists show and filter by; for clips: frames, frame_rate_hz, duration_s, "
+        "skeleton, warnings.",
     )
     created_at: datetime
     updated_at: datetime
     deleted_at: datetime | None = None
-    rev: int = Field(description="Counts every change of name, place, tags and revision; the number in the ETag.")
+    rev: int = Field(
+        description="Number that increases with every change of name, place, tags and revision; it is part of the ETag."
+    )
 
     @property
     def path(self) -> str:
@@ -119,7 +122,7 @@ class LineageEdge(Answer):
     name: str
     revision: int
     job: str | None
-    role: str = Field(description="The job input the revision was used as.")
+    role: str = Field(description="The job input that the revision was used as.")
 
 
 class Lineage(Answer):
@@ -143,7 +146,7 @@ class Staleness(Answer):
     revision: int
     stale: bool
     because: tuple[LineageEdge, ...] = Field(
-        (), description="Inputs used, at the revision used, that have newer revisions now."
+        (), description="Inputs that have newer revisions than the ones that were used."
     )
 
 
@@ -170,8 +173,8 @@ class BlobsMissing(Answer):
 class UploadCreate(Request):
     """Announce bytes that come in pieces."""
 
-    length: int = Field(ge=1, le=16 * 2**30, description="How many bytes there will be.")
-    digest: Digest | None = Field(None, description="What they must turn out to be.")
+    length: int = Field(ge=1, le=16 * 2**30, description="Number of bytes of the whole upload.")
+    digest: Digest | None = Field(None, description="Digest that the complete upload must have.")
 
 
 class Upload(Answer):
@@ -179,8 +182,8 @@ class Upload(Answer):
 
     id: str
     length: int
-    offset: int = Field(description="Bytes received; the next piece starts here.")
-    digest: str | None = Field(None, description="The blob it became, once it is complete.")
+    offset: int = Field(description="Number of bytes received, which is where the next piece starts.")
+    digest: str | None = Field(None, description="Digest of the blob, once the upload is complete.")
 
 
 class Event(Answer):

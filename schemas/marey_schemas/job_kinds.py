@@ -134,13 +134,15 @@ def _params_schema(params: type[Request]) -> dict[str, Any]:
 _RIG = InputSpec(
     kind=Kind.SKELETON,
     required=False,
-    description="The clips' skeleton at the revision whose mapping to go by, where that was edited since.",
+    description="The clips' skeleton at the revision whose joint mapping is used; for mappings edited "
+    "after the import.",
 )
 _RIGS = InputSpec(
     kind=Kind.SKELETON,
     many=True,
     required=False,
-    description="Skeletons of the clips whose mapping was edited since, at the revision to go by.",
+    description="The clips' skeletons at the revisions whose joint mappings are used; for mappings "
+    "edited after the import.",
 )
 
 
@@ -152,7 +154,7 @@ def _may_hold_graphs(params: Mapping[str, Any]) -> bool:
 
 IMPORT = KindDeclaration(
     name="import",
-    description="Reads files the server already has and makes clips, skeletons, models and graphs of them.",
+    description="Imports clips, skeletons, models and graphs from files that the server has stored.",
     params=ImportParams,
     implementation="marey_worker.kinds.imports:run",
     version=3,
@@ -163,13 +165,13 @@ IMPORT = KindDeclaration(
 
 RETARGET = KindDeclaration(
     name="retarget",
-    description="Carries the motion of clips over to another skeleton.",
+    description="Transfers the motion of clips to another skeleton.",
     params=RetargetParams,
     implementation="marey_worker.kinds.retarget:run",
     version=2,
     inputs={
-        "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to carry over."),
-        "skeleton": InputSpec(kind=Kind.SKELETON, description="The skeleton that shall move."),
+        "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to retarget."),
+        "skeleton": InputSpec(kind=Kind.SKELETON, description="The skeleton to retarget to."),
         "rigs": _RIGS,
     },
     outputs={"clips": Kind.CLIP},
@@ -181,17 +183,17 @@ RETARGET = KindDeclaration(
 
 EXPORT = KindDeclaration(
     name="export",
-    description="Writes clips as files of one format into one archive.",
+    description="Exports clips as files of one format in one archive.",
     params=ExportParams,
     implementation="marey_worker.kinds.export:run",
     version=2,
-    inputs={"clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to write.")},
+    inputs={"clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to export.")},
     outputs={"archive": "file"},
 )
 
 EVALUATE = KindDeclaration(
     name="evaluate",
-    description="Measures how good a set of locomotion clips is, by simulated motion matching.",
+    description="Measures the quality of a set of locomotion clips by simulated motion matching.",
     params=EvaluateParams,
     implementation="marey_worker.kinds.evaluate:run",
     gathering="marey_worker.kinds.evaluate:gather",
@@ -203,7 +205,7 @@ EVALUATE = KindDeclaration(
         "normaliser": InputSpec(
             kind=Kind.EVALUATION,
             required=False,
-            description="The evaluation whose normaliser is used, so that the results may be compared.",
+            description="The evaluation whose normaliser is used, which makes the results comparable.",
         ),
     },
     outputs={"evaluation": Kind.EVALUATION},
@@ -211,25 +213,33 @@ EVALUATE = KindDeclaration(
 
 COMPARE = KindDeclaration(
     name="compare",
-    description="Tells what changed between two evaluations, trial by trial, and how sure that is.",
+    description="Compares two evaluations trial by trial, with confidence intervals of the changes.",
     params=CompareParams,
     implementation="marey_worker.kinds.compare:run",
     version=1,
     inputs={
-        "before": InputSpec(kind=Kind.EVALUATION, description="The evaluation to compare with."),
-        "after": InputSpec(kind=Kind.EVALUATION, description="One of the same trials, under the same normaliser."),
+        "before": InputSpec(kind=Kind.EVALUATION, description="The evaluation before the change."),
+        "after": InputSpec(
+            kind=Kind.EVALUATION,
+            description="The evaluation after the change, with the same trials and the same normaliser.",
+        ),
     },
     outputs={"document": "file", "report": "file"},
 )
 
-_EVALUATED = InputSpec(kind=Kind.EVALUATION, description="The evaluation; its clips are read as they were then.")
+_EVALUATED = InputSpec(
+    kind=Kind.EVALUATION, description="The evaluation; its clips are read at the revisions that it used."
+)
 _CANDIDATES = InputSpec(
-    kind=Kind.CLIP, many=True, required=False, description="Clips that may be added, those of the set left out."
+    kind=Kind.CLIP,
+    many=True,
+    required=False,
+    description="Clips that may be added; those of the evaluated set are ignored.",
 )
 
 SUGGEST = KindDeclaration(
     name="suggest",
-    description="Tells which clips of an evaluated set can go, and which others would fill its holes.",
+    description="Finds the clips of an evaluated set that can be removed, and other clips that would fill its gaps.",
     params=SuggestParams,
     implementation="marey_worker.kinds.suggest:run",
     version=1,
@@ -239,7 +249,7 @@ SUGGEST = KindDeclaration(
 
 OPTIMISE = KindDeclaration(
     name="optimise",
-    description="Takes clips away from an evaluated set and adds others, one step after another, while that helps.",
+    description="Removes clips from an evaluated set and adds others, step by step, as long as the set improves.",
     params=OptimiseParams,
     implementation="marey_worker.kinds.optimise:run",
     version=1,
@@ -249,7 +259,7 @@ OPTIMISE = KindDeclaration(
 
 SWEEP = KindDeclaration(
     name="sweep",
-    description="Evaluates a set again under other weights of the features, and tells which of them matter.",
+    description="Evaluates a set again with other weights of the features, and ranks the features by their effect.",
     params=SweepParams,
     implementation="marey_worker.kinds.sweep:run",
     gathering="marey_worker.kinds.sweep:gather",
@@ -268,10 +278,12 @@ EDIT = KindDeclaration(
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to edit."),
         "edit": InputSpec(
-            kind=Kind.EDIT, required=False, description="The commands; or give them as the parameter of that name."
+            kind=Kind.EDIT,
+            required=False,
+            description="The edit whose commands are applied; alternatively, give the parameter `commands`.",
         ),
         "sources": InputSpec(
-            kind=Kind.CLIP, many=True, required=False, description="Other clips that the commands name by their ids."
+            kind=Kind.CLIP, many=True, required=False, description="Other clips that the commands refer to by id."
         ),
         "rigs": _RIGS,
     },
@@ -308,13 +320,13 @@ CUT = KindDeclaration(
     version=2,
     inputs={
         "annotations": InputSpec(
-            kind=Kind.ANNOTATION, many=True, description="The annotations; each names its clip and that revision."
+            kind=Kind.ANNOTATION, many=True, description="The annotations; each refers to a clip and its revision."
         ),
         "clips": InputSpec(
             kind=Kind.CLIP,
             many=True,
             required=False,
-            description="The annotated clips at those revisions, so that the history of the pieces names them.",
+            description="The annotated clips at those revisions; the history of the pieces then lists them.",
         ),
     },
     outputs={"clips": Kind.CLIP, "annotations": Kind.ANNOTATION},
@@ -324,7 +336,7 @@ CUT = KindDeclaration(
 
 ALIGN = KindDeclaration(
     name="align",
-    description="Brings examples of one action into step with each other, in space and in time.",
+    description="Aligns examples of one action with each other, in space and in time.",
     params=AlignParams,
     implementation="marey_worker.kinds.align:run",
     version=1,
@@ -334,7 +346,8 @@ ALIGN = KindDeclaration(
             kind=Kind.ANNOTATION,
             many=True,
             required=False,
-            description="Annotations of these clips: what they cut apart is aligned part by part.",
+            description="Annotations of these clips; their segments and keyframes cut the clips into parts, "
+            "which are aligned one by one.",
         ),
         "rig": _RIG,
     },
@@ -349,19 +362,24 @@ MODEL = KindDeclaration(
     implementation="marey_worker.kinds.model:run",
     version=1,
     inputs={
-        "aligned": InputSpec(kind=Kind.PROCESSED, many=True, description="Examples that were aligned with each other.")
+        "aligned": InputSpec(
+            kind=Kind.PROCESSED, many=True, description="Clips of one action that were aligned with each other."
+        )
     },
     outputs={"model": Kind.MODEL},
 )
 
 TREE = KindDeclaration(
     name="tree",
-    description="Draws samples of a model and groups them, so that motions that meet constraints are found quickly.",
+    description="Draws samples of a model and groups them in a tree, which speeds up searches for "
+    "motions that meet constraints.",
     params=TreeParams,
     implementation="marey_worker.kinds.tree:run",
     version=1,
     inputs={
-        "model": InputSpec(kind=Kind.MODEL, parts=("model",), description="The model, which gets the tree as a part.")
+        "model": InputSpec(
+            kind=Kind.MODEL, parts=("model",), description="The model that the tree is added to, as a part."
+        )
     },
     outputs={"model": Kind.MODEL},
     place_counts=True,

@@ -33,13 +33,13 @@ from marey_schemas.options.modelling import ModelOptions, TreeOptions
 class TaggedResults(Request):
     """Tags of what a job makes."""
 
-    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags of the results.")
+    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags that the results get.")
 
 
 class SuffixedResults(TaggedResults):
     """Names and tags of what a job makes of the items that it takes."""
 
-    suffix: NameSuffix = Field("", description="Appended to the names of the results.")
+    suffix: NameSuffix = Field("", description="Suffix of the results' names.")
 
 
 MOST_EXAMPLES = 2000
@@ -50,12 +50,12 @@ class AlignParams(AlignOptions, SuffixedResults):
     """Parameters of `align`."""
 
     layer: LayerName | None = Field(
-        None, description="Layer of the annotations to use; absent: the only one that a clip has among the input."
+        None, description="Layer of the annotations to use; required if a clip has annotations of several layers."
     )
     labels: tuple[Label, ...] = Field(
-        (), max_length=1000, description="Labels whose segments and keyframes cut the clips; none: all of them."
+        (), max_length=1000, description="Labels whose segments and keyframes cut the clips; empty: all labels."
     )
-    mirroring: Literal["none", "add"] = Field("none", description="add: a mirrored copy of every clip beside it.")
+    mirroring: Literal["none", "add"] = Field("none", description="add: each clip and its mirrored copy.")
 
 
 _NAME_FIELD = re.compile(r"\{(clip|label|number)(?::([1-9]))?\}")
@@ -65,27 +65,34 @@ class AnnotateParams(TaggedResults):
     """Parameters of `annotate`."""
 
     proposal: Proposal = Field(description="Method that proposes segments and keyframes, with its options.")
-    layer: LayerName | None = Field(None, description="Name of the layer; default: that of the method.")
+    layer: LayerName | None = Field(None, description="Name of the layer; default: the name of the method.")
 
 
 class CutParams(TaggedResults):
     """Parameters of `cut`."""
 
-    layer: LayerName | None = Field(None, description="Only annotations of this layer.")
-    labels: tuple[Label, ...] = Field((), max_length=1000, description="Labels to cut out; none: all of them.")
-    margin_before_s: Seconds = Field(0.0, description="Time before each segment that is taken along, where there is.")
-    margin_after_s: Seconds = Field(0.0, description="Time after each segment that is taken along, where there is.")
-    shortest_s: Seconds = Field(0.0, description="Shorter segments are left out.")
+    layer: LayerName | None = Field(None, description="Layer of the annotations to use; absent: all layers.")
+    labels: tuple[Label, ...] = Field(
+        (), max_length=1000, description="Labels of the segments to cut out; empty: all labels."
+    )
+    margin_before_s: Seconds = Field(
+        0.0, description="Seconds before each segment that are included, as far as the clip has them."
+    )
+    margin_after_s: Seconds = Field(
+        0.0, description="Seconds after each segment that are included, as far as the clip has them."
+    )
+    shortest_s: Seconds = Field(0.0, description="Shortest segment to cut out, in seconds.")
     longest_s: Annotated[float, Field(gt=0, le=86400, allow_inf_nan=False)] | None = Field(
-        None, description="Longer segments are left out."
+        None, description="Longest segment to cut out, in seconds."
     )
     name: str = Field(
         "{clip}_{label}_{number:2}",
         min_length=1,
         max_length=MAX_NAME_LENGTH,
-        description="Names of the pieces; {number:2} counts the segments of a label in a clip from 1, in two digits.",
+        description="Pattern of the pieces' names; {number:2} counts the segments of a label in a clip from "
+        "1, with two digits.",
     )
-    by_label: bool = Field(False, description="Put the pieces of each label into a folder of its own.")
+    by_label: bool = Field(False, description="Put the pieces of each label into a folder of their own.")
 
     @field_validator("name")
     @classmethod
@@ -126,15 +133,17 @@ class EvaluateParams(EvaluationOptions, TaggedResults):
 
     name: ItemName = Field("evaluation", description="Name of the result.")
     loops: tuple[ItemId, ...] = Field(
-        (), max_length=100_000, description="Clips that are loops, besides those whose info has the tag `loop`."
+        (), max_length=100_000, description="Clips that are loops, in addition to those tagged `loop`."
     )
     trims: dict[ItemId, tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(gt=0)]]] = Field(
-        default_factory=dict, max_length=100_000, description="Half-open range of frames to use, by clip."
+        default_factory=dict, max_length=100_000, description="Half-open range of frames to use, by the id of the clip."
     )
-    baseline: bool = Field(True, description="Measure generated clips that own every cell, too, for comparison.")
+    baseline: bool = Field(
+        True, description="For comparison, also measure a set of generated clips that covers every cell."
+    )
     report: bool = Field(True, description="Write the report and its figures.")
     trial_figures: tuple[TrialName, ...] = Field(
-        (), max_length=16, description="Trials that get figures of their own, by name, as `circle v=1.25 w=-50`."
+        (), max_length=16, description="Names of trials that get figures of their own, such as `circle v=1.25 w=-50`."
     )
 
     @property
@@ -172,8 +181,10 @@ WEIGHT_GROUPS = len(FeatureWeights.model_fields.keys() - {"extra_joints"})
 class CompareParams(Request):
     """Parameters of `compare`."""
 
-    title: str = Field("", max_length=200, description="Of the report; default: the names of the two.")
-    report: bool = Field(True, description="Write the report, a page of HTML that needs nothing else.")
+    title: str = Field(
+        "", max_length=200, description="Title of the report; default: the names of the two evaluations."
+    )
+    report: bool = Field(True, description="Write the report, a self-contained HTML page.")
 
 
 class SuggestParams(SuggestionOptions):
@@ -196,10 +207,12 @@ def count_sweep_tasks(params: SweepParams) -> int:
 class ModelParams(ModelOptions, TaggedResults):
     """Parameters of `model`."""
 
-    name: ItemName = Field("model", description="Name of the result, and of the action.")
+    name: ItemName = Field("model", description="Name of the model and of the action.")
     report: bool = Field(True, description="Write the report and its figures.")
     search_check: bool = Field(
-        True, description="For the report: search for places that examples reached, by a model without them."
+        True,
+        description="For the report, test searches: remove each example in turn, train again, and search for "
+        "the places that it reached.",
     )
 
 
@@ -215,10 +228,12 @@ class EditParams(SuffixedResults):
     """Parameters of `edit`."""
 
     commands: tuple[EditCommand, ...] = Field(
-        (), max_length=MOST_COMMANDS, description="What to do, in order, where the input `edit` does not say it."
+        (),
+        max_length=MOST_COMMANDS,
+        description="Commands in the order of their application; required without the input `edit`.",
     )
     in_place: bool = Field(
-        False, description="Make each result the next revision of its clip; otherwise it is a clip of its own."
+        False, description="Make each result a new revision of its clip; otherwise each result is a new clip."
     )
 
     @model_validator(mode="after")
@@ -239,17 +254,21 @@ class EditParams(SuffixedResults):
 class ImportParams(ImportOptions):
     """Parameters of `import`."""
 
-    files: tuple[ImportFile, ...] = Field(min_length=1, max_length=10_000, description="Names and digests.")
+    files: tuple[ImportFile, ...] = Field(
+        min_length=1, max_length=10_000, description="Names and digests of the files."
+    )
 
 
 class RetargetParams(SuffixedResults):
     """Parameters of `retarget`."""
 
-    scale: float | None = Field(None, gt=0, lt=1000, description="Root scale; absent: ratio of the hip heights.")
+    scale: float | None = Field(
+        None, gt=0, lt=1000, description="Scale of the root's path; absent: the ratio of the hip heights."
+    )
 
 
 class ExportParams(Request):
     """Parameters of `export`: one archive of files."""
 
     format: ExportFormat = Field("bvh", description="Format of the files.")
-    unit: WrittenUnit = Field("cm", description="Unit of length where the format leaves it open.")
+    unit: WrittenUnit = Field("cm", description="Unit of length of the files, for formats without a fixed unit.")

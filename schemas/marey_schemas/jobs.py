@@ -46,7 +46,7 @@ class InputSpec(Answer):
     many: bool = False
     required: bool = True
     parts: tuple[str, ...] = Field(
-        (), description="Parts that are read, where the result depends on no others; none: all of them."
+        (), description="Parts of the items that the job reads, if its result depends on no others; empty: all parts."
     )
     description: str = ""
 
@@ -59,11 +59,13 @@ class JobKind(Answer):
     params_schema: dict[str, Any]
     inputs: dict[str, InputSpec]
     outputs: dict[str, Kind | Literal["file"]]
-    fan_out: str | None = Field(None, description="The input whose items are spread over many workers.")
-    batch_size: int = Field(1, description="Items a single task of a fan-out takes.")
-    gathers: bool = Field(False, description="The parameters say how many tasks there are; a worker gathers them.")
+    fan_out: str | None = Field(None, description="The input whose items are distributed over many tasks.")
+    batch_size: int = Field(1, description="Number of items that each task of a fan-out takes.")
+    gathers: bool = Field(
+        False, description="The parameters determine the number of tasks, and one worker gathers their results."
+    )
     deterministic: bool = Field(
-        True, description="Same inputs, parameters and seed give the same bytes: results may be cached."
+        True, description="The same inputs, parameters and seed give the same bytes, so that results may be cached."
     )
 
 
@@ -106,23 +108,23 @@ class JobCreate(Request):
     kind: str = Field(min_length=1, max_length=64)
     inputs: dict[str, JobInput | tuple[JobInput, ...]] = Field(default_factory=dict)
     params: dict[str, Any] = Field(default_factory=dict)
-    into: CollectionPath = Field("", description="The collection the results go to.")
+    into: CollectionPath = Field("", description="The collection that receives the results.")
     priority: int = Field(0, ge=-100, le=100, description="Jobs of higher priority run first.")
-    after: tuple[str, ...] = Field((), max_length=1000, description="Jobs that must succeed first.")
+    after: tuple[str, ...] = Field((), max_length=1000, description="Jobs that must succeed before this one starts.")
     on_failure: Literal["fail", "skip"] = Field(
-        "fail", description="What to do when a job in `after` does not succeed."
+        "fail", description="The reaction if a job in `after` does not succeed."
     )
     concurrency_key: str | None = Field(
-        None, max_length=255, description="At most one job of a project runs with this key."
+        None, max_length=255, description="Key of a lock: one job per project and key runs at a time."
     )
     cache: Literal["use", "refresh", "off"] = Field(
         "use",
-        description="use: take over the result of an identical job; refresh: compute it again and keep it for later "
-        "jobs; off: compute it again for this job alone.",
+        description="use: reuse the result of an identical job; refresh: compute it again and store it for "
+        "later jobs; off: compute it again for this job only.",
     )
-    seed: int = Field(0, ge=0, lt=2**63, description="Seed of all random numbers: the same seed, the same result.")
+    seed: int = Field(0, ge=0, lt=2**63, description="Seed of all random numbers; the same seed gives the same result.")
     max_attempts: int = Field(3, ge=1, le=20)
-    labels: dict[str, str] = Field(default_factory=dict, description="A worker must carry all of them.")
+    labels: dict[str, str] = Field(default_factory=dict, description="Labels that a worker must have to run the job.")
     resources: Resources = Resources()
     message: Message = ""
 
@@ -150,7 +152,7 @@ class JobOutput(Answer):
     item: str
     kind: Kind
     revision: int
-    created: bool = Field(description="False where the same content stood there before.")
+    created: bool = Field(description="False if the item had the same content before.")
 
 
 class Job(Answer):
@@ -162,9 +164,9 @@ class Job(Answer):
     state: JobState
     params: dict[str, Any]
     inputs: dict[str, Any] = Field(
-        description="What each input is: items at their revisions, or `{job}` for what that job has yet to make."
+        description="Inputs by name: items with their revisions, or `{job}` for results that this job has yet to make."
     )
-    after: tuple[str, ...] = Field((), description="Jobs that had, or have, to succeed first.")
+    after: tuple[str, ...] = Field((), description="Jobs that must succeed before this one starts.")
     into: str
     priority: int
     seed: int
@@ -173,11 +175,11 @@ class Job(Answer):
     max_attempts: int
     interruptions: int = 0
     parent: str | None = None
-    position: int | None = Field(None, description="Of a task: which of its fan-out it is, from 0.")
-    size: int | None = Field(None, description="Tasks of a fan-out.")
-    children: dict[str, int] = Field(default_factory=dict, description="Tasks by state.")
+    position: int | None = Field(None, description="Index of the task in its fan-out, from 0; null for other jobs.")
+    size: int | None = Field(None, description="Number of tasks of a fan-out.")
+    children: dict[str, int] = Field(default_factory=dict, description="Number of tasks in each state.")
     retry_of: str | None = None
-    cached_from: str | None = Field(None, description="The job whose result this one shares.")
+    cached_from: str | None = Field(None, description="The job whose cached result this one reuses.")
     progress: Progress | None = None
     failure: JobFailure | None = None
     result: dict[str, Any] | None = None

@@ -21,20 +21,33 @@ class ModelPlan(Request):
     made for searches.
     """
 
-    name: ItemName = Field(description="Of the model, and of the action.")
-    into: CollectionPath = Field(min_length=1, description="The collection of the model; all else goes below it.")
-    files: ImportParams | None = Field(None, description="Takes to import.")
-    clips: Inputs = Field((), max_length=1000, description="Takes that are there.")
-    skeleton: ItemInput | None = Field(None, description="What the takes are carried over to; absent: nothing.")
-    rigs: tuple[ItemInput, ...] = Field(
-        (), max_length=1000, description="Skeletons of the clips whose mapping was edited since."
+    name: ItemName = Field(description="Name of the model and of the action.")
+    into: CollectionPath = Field(
+        min_length=1, description="The collection of the model; everything else is stored below it."
     )
-    annotations: Inputs = Field((), max_length=1000, description="Annotations of the clips.")
-    annotate: AnnotateParams | None = Field(None, description="How annotations are proposed, where none are named.")
-    cut: CutParams | None = Field(None, description="Which examples are cut out; absent: every take is an example.")
+    files: ImportParams | None = Field(None, description="Files of takes to import.")
+    clips: Inputs = Field((), max_length=1000, description="Takes that are already in the project.")
+    skeleton: ItemInput | None = Field(
+        None, description="The skeleton that the takes are retargeted to; absent: no retargeting."
+    )
+    rigs: tuple[ItemInput, ...] = Field(
+        (),
+        max_length=1000,
+        description="The clips' skeletons at the revisions whose joint mappings are used; for mappings "
+        "edited after the import.",
+    )
+    annotations: Inputs = Field((), max_length=1000, description="Annotations of the takes.")
+    annotate: AnnotateParams | None = Field(
+        None, description="Parameters of the job that proposes annotations, if none are given."
+    )
+    cut: CutParams | None = Field(
+        None, description="Parameters of the job that cuts out examples; absent: every take is an example."
+    )
     align: AlignParams = AlignParams()
     model: ModelParams = ModelParams()
-    tree: TreeParams | None = Field(TreeParams(), description="null: no tree.")
+    tree: TreeParams | None = Field(
+        TreeParams(), description="Parameters of the job that makes the tree; null: no tree."
+    )
 
     @model_validator(mode="after")
     def _check_takes(self) -> Self:

@@ -31,7 +31,9 @@ class PipelineStep(Request):
     inputs: dict[str, StepInput | tuple[StepInput, ...]] = Field(default_factory=dict)
     params: dict[str, Any] = Field(default_factory=dict)
     after: tuple[StepName, ...] = Field(
-        (), max_length=MOST_STEPS, description="Steps that must succeed first, besides those that make its inputs."
+        (),
+        max_length=MOST_STEPS,
+        description="Steps that must succeed first, in addition to those that make its inputs.",
     )
 
     into: CollectionPath | None = None
@@ -48,12 +50,12 @@ class PipelineCreate(Request):
     """Submit jobs that depend on each other, all or none."""
 
     steps: dict[StepName, PipelineStep] = Field(min_length=1, max_length=MOST_STEPS)
-    into: CollectionPath = Field("", description="The collection the results go to.")
+    into: CollectionPath = Field("", description="The collection that receives the results.")
     priority: int = Field(0, ge=-100, le=100)
     cache: Literal["use", "refresh", "off"] = "use"
     seed: int = Field(0, ge=0, lt=2**63)
     max_attempts: int = Field(3, ge=1, le=20)
-    labels: dict[str, str] = Field(default_factory=dict, description="A worker must carry all of them.")
+    labels: dict[str, str] = Field(default_factory=dict, description="Labels that a worker must have to run the steps.")
     resources: Resources = Resources()
     message: Message = ""
 

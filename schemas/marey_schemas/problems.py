@@ -25,8 +25,10 @@ class Problem(Answer):
     status: int
     detail: str
     instance: str = Field(description="The request id; quote it when asking for help.")
-    code: str = Field(description="Stable; documented in docs/reference/errors.md.")
+    code: str = Field(
+        description="Code that stays the same between releases; docs/reference/errors.md lists all codes."
+    )
     errors: tuple[FieldError, ...] = ()
     context: dict[str, Any] = Field(
-        default_factory=dict, description="Facts of this code, such as the current revision."
+        default_factory=dict, description="Details of the problem, such as the current revision."
     )

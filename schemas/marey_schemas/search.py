@@ -59,12 +59,14 @@ def _read_old_unit(model: Request, name: str, old: str) -> None:
 
 
 class _SearchConstraint(Request):
-    at: Moment = Field(description="Label of a keyframe of the model, start, end, or a canonical frame.")
-    weight: Positive = Field(1.0, description="How much it counts.")
+    at: Moment = Field(
+        description="Time of the constraint: the label of a keyframe of the model, start, end, or a canonical frame."
+    )
+    weight: Positive = Field(1.0, description="Weight of the constraint.")
 
 
 class _PlaceConstraint(_SearchConstraint):
-    tolerance_m: Distance = Field(0.01, description="The error that counts as 1, in metres.")
+    tolerance_m: Distance = Field(0.01, description="Distance in metres at which the weighted error is 1.")
     tolerance_cm: Tolerance | None = _in_centimetres("tolerance_m")
 
     @model_validator(mode="after")
@@ -77,9 +79,9 @@ class JointPositionConstraint(_PlaceConstraint):
     """A joint is at a place."""
 
     type: Literal["joint_position"]
-    joint: JointLabel = Field(description="Its own name, or its standard name.")
+    joint: JointLabel = Field(description="Name of the joint, its own or its standard name.")
     target_m: tuple[Coordinate | None, Coordinate | None, Coordinate | None] = Field(
-        description="(x, y, z) in the world; null where it is free."
+        description="Target position (x, y, z) in the world, in metres; null for free coordinates."
     )
 
 
@@ -87,35 +89,45 @@ class JointOrientationConstraint(_SearchConstraint):
     """A joint is turned so."""
 
     type: Literal["joint_orientation"]
-    joint: JointLabel = Field(description="Its own name, or its standard name.")
-    rotation: tuple[Component, Component, Component, Component] = Field(description="(w, x, y, z) in the world.")
-    tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1, in degrees.")
+    joint: JointLabel = Field(description="Name of the joint, its own or its standard name.")
+    rotation: tuple[Component, Component, Component, Component] = Field(
+        description="Target rotation in the world, as a quaternion (w, x, y, z)."
+    )
+    tolerance_deg: Tolerance = Field(5.0, description="Angle in degrees at which the weighted error is 1.")
 
 
 class LookDirectionConstraint(_SearchConstraint):
     """An axis of a joint points in a direction, or at a point."""
 
     type: Literal["look_direction"]
-    joint: JointLabel = Field(description="Its own name, or its standard name.")
-    direction: tuple[Component, Component, Component] | None = Field(None, description="(x, y, z) in the world.")
-    point_m: tuple[Coordinate, Coordinate, Coordinate] | None = Field(None, description="In place of a direction.")
-    axis: tuple[Component, Component, Component] = Field((0.0, 0.0, 1.0), description="In the joint's own frame.")
-    tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1, in degrees.")
+    joint: JointLabel = Field(description="Name of the joint, its own or its standard name.")
+    direction: tuple[Component, Component, Component] | None = Field(
+        None, description="Target direction (x, y, z) in the world."
+    )
+    point_m: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
+        None, description="Target point (x, y, z) in the world, in metres, instead of a direction."
+    )
+    axis: tuple[Component, Component, Component] = Field(
+        (0.0, 0.0, 1.0), description="Axis that shall point there, in the joint's own frame."
+    )
+    tolerance_deg: Tolerance = Field(5.0, description="Angle in degrees at which the weighted error is 1.")
 
 
 class RootPositionConstraint(_PlaceConstraint):
     """The body stands over a place on the ground."""
 
     type: Literal["root_position"]
-    target_m: tuple[Coordinate | None, Coordinate | None] = Field(description="(x, z); null where it is free.")
+    target_m: tuple[Coordinate | None, Coordinate | None] = Field(
+        description="Target position (x, z) on the ground, in metres; null for free coordinates."
+    )
 
 
 class RootHeadingConstraint(_SearchConstraint):
     """The body faces a heading on the ground."""
 
     type: Literal["root_heading"]
-    heading_deg: Degrees = Field(description="0 along +z, positive to the left.")
-    tolerance_deg: Tolerance = Field(5.0, description="The error that counts as 1, in degrees.")
+    heading_deg: Degrees = Field(description="Target heading in degrees: 0 along +z, positive to the left.")
+    tolerance_deg: Tolerance = Field(5.0, description="Angle in degrees at which the weighted error is 1.")
 
 
 class KeyframeTimeConstraint(_SearchConstraint):
@@ -123,7 +135,7 @@ class KeyframeTimeConstraint(_SearchConstraint):
 
     type: Literal["keyframe_time"]
     seconds: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
-    tolerance_s: Tolerance = Field(0.05, description="The error that counts as 1, in seconds.")
+    tolerance_s: Tolerance = Field(0.05, description="Deviation in seconds at which the weighted error is 1.")
 
 
 SearchConstraint = Annotated[
@@ -144,38 +156,50 @@ SearchConstraints = Annotated[tuple[SearchConstraint, ...], Field(max_length=MOS
 class StartPlacement(Request):
     """Start of a motion: the model's canonical frame in the world."""
 
-    x: Coordinate = Field(0.0, description="Metres.")
-    z: Coordinate = Field(0.0, description="Metres.")
-    heading_deg: Degrees = Field(0.0, description="0 along +z, positive to the left.")
+    x: Coordinate = Field(0.0, description="Position along x, in metres.")
+    z: Coordinate = Field(0.0, description="Position along z, in metres.")
+    heading_deg: Degrees = Field(0.0, description="Heading in degrees: 0 along +z, positive to the left.")
 
 
 class SearchStep(Request):
     """One motion of several."""
 
-    model: ItemId | None = Field(None, description="A model of the project; absent: that of the address.")
+    model: ItemId | None = Field(
+        None, description="Id of a model of the project; absent: the model in the request's path."
+    )
     constraints: SearchConstraints = ()
 
 
 class SearchRequest(RefineOptions):
     """Ask for a motion, or for several that follow one another, that meet constraints."""
 
-    constraints: SearchConstraints = Field((), description="On one motion.")
+    constraints: SearchConstraints = Field(
+        (), description="Constraints on a single motion; for several motions, use `steps`."
+    )
     steps: tuple[SearchStep, ...] = Field(
-        (), max_length=MOST_STEPS, description="Several motions, each placed where the one before it ends."
+        (), max_length=MOST_STEPS, description="Several motions; each begins where the one before it ends."
     )
     start: StartPlacement = StartPlacement()
-    candidates: int = Field(8, ge=1, le=MOST_CANDIDATES, description="Nodes that are followed down the tree.")
-    passes: int = Field(
-        2, ge=1, le=4, description="1: the tree's samples alone; each further one looks closer around the best so far."
+    candidates: int = Field(
+        8, ge=1, le=MOST_CANDIDATES, description="Number of nodes of the tree that the search follows at each level."
     )
-    refine: bool = Field(True, description="Improve what the tree has by numerical optimisation.")
+    passes: int = Field(
+        2,
+        ge=1,
+        le=4,
+        description="Number of passes; 1: only the tree's samples; each further pass searches near the best "
+        "samples so far.",
+    )
+    refine: bool = Field(True, description="Improve the result of the tree by numerical optimisation.")
     transition_tolerance_m: Distance = Field(
-        0.02, description="Error of hands, feet and height from step to step that counts as 1, in metres."
+        0.02,
+        description="Discontinuity of hands, feet and height between two steps at which the weighted error "
+        "is 1, in metres.",
     )
     transition_tolerance_cm: Tolerance | None = _in_centimetres("transition_tolerance_m")
-    finish: bool = Field(False, description="Remove what is left of joint positions by inverse kinematics.")
-    seed: int = Field(0, ge=0, lt=2**63, description="Of the samples, where the model has no tree of its own.")
-    motion: bool = Field(True, description="Send the motion, too.")
+    finish: bool = Field(False, description="Remove the remaining errors of joint positions by inverse kinematics.")
+    seed: int = Field(0, ge=0, lt=2**63, description="Seed of the samples that are drawn if the model has no tree.")
+    motion: bool = Field(True, description="Include the motion in the answer.")
 
     @model_validator(mode="after")
     def _read_centimetres(self) -> Self:
@@ -203,34 +227,38 @@ class SearchRequest(RefineOptions):
 class ConstraintError(Answer):
     """Error of a constraint, in the unit at the end of its name."""
 
-    step: int = Field(description="From 0.")
-    constraint: int = Field(description="Within the step, from 0.")
+    step: int = Field(description="Index of the step, from 0.")
+    constraint: int = Field(description="Index of the constraint within its step, from 0.")
     type: str
     joint: str | None = None
     error_cm: float | None = None
     error_deg: float | None = None
     error_s: float | None = None
-    searched_error: float = Field(description="After the search of the tree, in the same unit.")
-    finished_error: float | None = Field(None, description="After inverse kinematics, in the same unit.")
-    reached: bool = Field(description="Within its tolerance, at the end.")
+    searched_error: float = Field(description="Error after the search of the tree, in the same unit.")
+    finished_error: float | None = Field(None, description="Error after inverse kinematics, in the same unit.")
+    reached: bool = Field(description="Whether the final error is within the tolerance.")
 
 
 class FoundStep(Answer):
     """One motion that was found."""
 
     model: RevisionRef
-    tree: Literal["stored", "drawn"] = Field(description="drawn: the model has no tree of its own, or an outdated one.")
+    tree: Literal["stored", "drawn"] = Field(
+        description="Origin of the samples; drawn: the model has no tree, or an outdated one."
+    )
     latent: tuple[float, ...]
     log_likelihood: float
     likelihood_percentile: float | None = Field(
-        None, description="Percent of the training examples that are less likely; null where those are not known."
+        None,
+        description="Percentage of the training examples that are less likely; null if their likelihoods are unknown.",
     )
     duration_s: float
     placement: StartPlacement
     jumps_cm: dict[str, float] = Field(
-        default_factory=dict, description="By which joints jump from the step before this one, and the root."
+        default_factory=dict,
+        description="Discontinuity of the joints and of the root between the step before and this one.",
     )
-    evaluations: int = Field(description="Motions that the search of the tree looked at.")
+    evaluations: int = Field(description="Number of motions that the search of the tree evaluated.")
 
 
 class SearchAnswer(Answer):
@@ -238,9 +266,9 @@ class SearchAnswer(Answer):
 
     steps: tuple[FoundStep, ...]
     errors: tuple[ConstraintError, ...]
-    reached: bool = Field(description="Whether all constraints are.")
+    reached: bool = Field(description="Whether all constraints are met.")
     out_of_reach: tuple[int, ...] = Field(
-        (), description="Places in `errors` that are off by more than 5 cm before inverse kinematics."
+        (), description="Indices of the entries of `errors` that are above 5 cm before inverse kinematics."
     )
-    iterations: int = Field(description="Of the optimisation.")
+    iterations: int = Field(description="Number of iterations of the optimisation.")
     motion: MotionDocument | None = None

@@ -19,13 +19,13 @@ PROTOCOL_VERSION = 1
 class ClaimRequest(Request):
     """A worker asks for work."""
 
-    worker: str = Field(min_length=1, max_length=255, description="Name of the worker, for people.")
+    worker: str = Field(min_length=1, max_length=255, description="Name of the worker, shown to people.")
     kinds: tuple[str, ...] = Field(min_length=1, max_length=256)
     labels: dict[str, str] = Field(default_factory=dict)
     max: int = Field(1, ge=1, le=256)
     wait_s: float = Field(0, ge=0, le=30)
     protocol: int = PROTOCOL_VERSION
-    job: str | None = Field(None, description="Only this job.")
+    job: str | None = Field(None, description="Claim only this job.")
 
 
 class PinnedInput(Answer):
@@ -36,7 +36,9 @@ class PinnedInput(Answer):
     kind: Kind
     name: str
     collection: str
-    below: str | None = Field(None, description="Of what another job made: its collection below that job's `into`.")
+    below: str | None = Field(
+        None, description="For results of another job: their collection, relative to that job's `into`."
+    )
 
     @property
     def folder(self) -> str:
@@ -68,8 +70,11 @@ class Lease(Answer):
     inputs: dict[str, tuple[PinnedInput, ...]]
     into: str
     seed: int
-    position: int | None = Field(None, description="Of a task: which of its fan-out it is, from 0.")
-    size: int | None = Field(None, description="Tasks of the fan-out, for its tasks and for the job that gathers them.")
+    position: int | None = Field(None, description="Index of the task in its fan-out, from 0; null for other jobs.")
+    size: int | None = Field(
+        None,
+        description="Number of tasks of the fan-out; set for its tasks and for the job that gathers their results.",
+    )
     resources: Resources
     fence: int
     attempt: int
@@ -95,25 +100,25 @@ class HeartbeatAnswer(Answer):
 
     lease_ttl_s: float
     cancel_requested: bool
-    deadline_s: float | None = Field(None, description="Seconds left of the job's time limit.")
+    deadline_s: float | None = Field(None, description="Seconds that remain of the job's time limit.")
 
 
 class StagedOutput(Request):
     """One result, staged: invisible until the attempt completes."""
 
     name: str = Field(
-        min_length=1, max_length=1500, description="Unique within the attempt; other outputs refer to it."
+        min_length=1, max_length=1500, description="Name that is unique within the attempt; other outputs refer to it."
     )
     kind: Kind
     item_name: ItemName
-    collection: CollectionPath = Field("", description="Below the job's `into`.")
+    collection: CollectionPath = Field("", description="Collection of the result, relative to the job's `into`.")
     tags: tuple[Tag, ...] = Field((), max_length=64)
     parts: dict[str, Any] = Field(min_length=1)
     sources: dict[str, tuple[ItemInput, ...]] = Field(
-        default_factory=dict, description="Inputs this result was made from, by input name."
+        default_factory=dict, description="Inputs that this result was made from, by input name."
     )
     reuse: Literal["by_name", "by_content"] = Field(
-        "by_name", description="by_content: an item of the project with equal parts serves instead of a new one."
+        "by_name", description="by_content: reuse an item of the project with equal parts, if there is one."
     )
 
 
@@ -138,9 +143,13 @@ class FailRequest(Request):
     write_id: str = Field(min_length=8, max_length=64)
     code: str = Field(min_length=1, max_length=128)
     detail: str = Field("", max_length=20_000)
-    signature: str | None = Field(None, max_length=255, description="Two attempts with the same signature are poison.")
+    signature: str | None = Field(
+        None,
+        max_length=255,
+        description="Signature of the failure; a job is not retried after two attempts with the same one.",
+    )
     retryable: bool = True
-    interrupted: bool = Field(False, description="The worker was stopped; counts as no attempt.")
+    interrupted: bool = Field(False, description="The worker was stopped; the attempt is not counted.")
 
 
 class BatchCompletion(CompleteRequest):
@@ -169,7 +178,7 @@ class FailAnswer(Answer):
 
     job: str
     state: JobState
-    retry_in_s: float | None = Field(None, description="Set when the job is queued again.")
+    retry_in_s: float | None = Field(None, description="Time of the next attempt, if the job is queued again.")
 
 
 class BatchCompletionResult(Answer):
@@ -197,5 +206,5 @@ class StageAnswer(Answer):
 class LogAnswer(Answer):
     """Length of the attempt's log."""
 
-    offset: int = Field(description="Where the next piece goes.")
-    capped: bool = Field(default=False, description="The log is full; nothing more is kept.")
+    offset: int = Field(description="Number of bytes received, which is where the next piece starts.")
+    capped: bool = Field(default=False, description="The log is full, and further output is dropped.")

@@ -29,9 +29,9 @@ class AlignedPlacement(Request):
 
     heading_rad: Metres = 0.0
     x: Metres = 0.0
-    y: Metres = Field(0.0, allow_inf_nan=False, description="What was taken off all heights.")
+    y: Metres = Field(0.0, allow_inf_nan=False, description="Height that was subtracted from the clip, in metres.")
     z: Metres = 0.0
-    joint: JointName | None = Field(None, description="The joint that stood there; default: the root.")
+    joint: JointName | None = Field(None, description="The joint whose position is given; default: the root.")
 
 
 class AlignmentInfo(Request):
@@ -41,23 +41,25 @@ class AlignmentInfo(Request):
     """
 
     schema_: Literal["marey/alignment@1"] = Field("marey/alignment@1", alias="schema")
-    name: str = Field("", max_length=300, description="Of the example, for people.")
-    clip: ExampleRef | None = Field(None, description="The source; absent where it is not in the store.")
+    name: str = Field("", max_length=300, description="Name of the example, shown to people.")
+    clip: ExampleRef | None = Field(None, description="The source clip; absent if it is not stored.")
     reference: ExampleRef | None = Field(None, description="The example whose time is the canonical time.")
-    set: Digest | None = Field(None, description="Of everything that was aligned together, and how.")
-    frame_rate_hz: float = Field(gt=0, allow_inf_nan=False, description="Of canonical frames, and of those counted in.")
-    source_frames: int = Field(ge=2, description="Frames of the source at this rate.")
+    set: Digest | None = Field(None, description="Digest of all clips that were aligned together and of the options.")
+    frame_rate_hz: float = Field(
+        gt=0, allow_inf_nan=False, description="Rate of the canonical frames and of `source_frames`, in hertz."
+    )
+    source_frames: int = Field(ge=2, description="Number of frames of the source at `frame_rate_hz`.")
     time_function: Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=1)] = Field(
-        description="Fractional frame of the source at each canonical frame, increasing from 0 to the last one."
+        description="Fractional source frame at each canonical frame, increasing from 0 to the last source frame."
     )
     placement: AlignedPlacement = AlignedPlacement()
     keyframes: dict[Label, Annotated[int, Field(ge=0)]] = Field(
-        default_factory=dict, max_length=10_000, description="Canonical frame by label."
+        default_factory=dict, max_length=10_000, description="Canonical frame of each keyframe, by label."
     )
     cost: float = Field(
-        0.0, ge=0, allow_inf_nan=False, description="Mean cost per frame of the alignment, metres squared."
+        0.0, ge=0, allow_inf_nan=False, description="Mean cost per frame of the alignment, in square metres."
     )
-    options: AlignParams | None = Field(None, description="How it was aligned, where that is known.")
+    options: AlignParams | None = Field(None, description="Options of the alignment; absent if unknown.")
 
     @model_validator(mode="after")
     def _check_times(self) -> Self:

@@ -40,8 +40,8 @@ class Annotation(Request):
     clip: RevisionRef | OutputRef
     layer: str = "default"
     made_by: Literal["person", "algorithm"] = "person"
-    segments: tuple[SegmentDocument, ...] = Field((), description="In the order of time.")
-    keyframes: tuple[KeyframeDocument, ...] = Field((), description="In the order of time.")
+    segments: tuple[SegmentDocument, ...] = Field((), description="Segments in the order of their frames.")
+    keyframes: tuple[KeyframeDocument, ...] = Field((), description="Keyframes in the order of their frames.")
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:

@@ -28,7 +28,9 @@ class MotionDocument(Request):
     schema_: Literal["marey/motion@1"] = Field("marey/motion@1", alias="schema")
     skeleton: RevisionRef | OutputRef
     frame_rate_hz: float = Field(gt=0, le=MAX_FRAME_RATE_HZ, allow_inf_nan=False)
-    joints: tuple[JointName, ...] = Field(min_length=1, max_length=MAX_JOINTS, description="Order of the rotations.")
+    joints: tuple[JointName, ...] = Field(
+        min_length=1, max_length=MAX_JOINTS, description="Order of the joints' rotations in `poses`."
+    )
     poses: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=2)] = Field(
         description="[frames, 3 + 4*joints]: root translation (m), then local quaternions."
     )
@@ -61,16 +63,20 @@ class Check(Request):
     code: Annotated[str, StringConstraints(pattern=r"^[a-z0-9-]{1,64}$")]
     message: str
     joints: tuple[str, ...] = ()
-    frames: tuple[int, int] | None = Field(None, description="Half-open frame range.")
+    frames: tuple[int, int] | None = Field(
+        None, description="Half-open range of the file's frames that the clip holds."
+    )
     values: dict[str, Any] = Field(default_factory=dict)
 
 
 class ClipSource(Request):
     """Origin of a clip, and the changes made by the importer."""
 
-    file: Digest | None = Field(None, description="The file exactly as it came.")
+    file: Digest | None = Field(None, description="The imported file, byte for byte.")
     file_name: str | None = None
-    companion: Digest | None = Field(None, description="A second file the format needs, as an ASF beside an AMC.")
+    companion: Digest | None = Field(
+        None, description="A second file that the format needs, such as the ASF of an AMC."
+    )
     companion_name: str | None = None
     format: str | None = None
     details: dict[str, Any] = Field(

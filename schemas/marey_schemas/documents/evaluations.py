@@ -19,8 +19,10 @@ class EvaluationDocument(Request):
     model_config = ConfigDict(extra="allow")
 
     schema_: Literal["marey/evaluation@1"] = Field("marey/evaluation@1", alias="schema")
-    verdict: str = Field(max_length=2000, description="How good the clips are, in a sentence or two.")
-    headline: dict[str, float | int | None] = Field(max_length=64, description="The numbers that lists show, by name.")
+    verdict: str = Field(max_length=2000, description="Assessment of the clips in one or two sentences.")
+    headline: dict[str, float | int | None] = Field(
+        max_length=64, description="Numbers that lists of items show, by name."
+    )
 
 
 class EvaluationRecords(Request):

@@ -33,7 +33,7 @@ class GraphPrimitive(Request):
     model: RevisionRef | OutputRef
     type: Literal["start", "standard", "end", "idle", "single", "cycle_end"] = "standard"
     transitions: tuple[GraphPlace, ...] = Field((), max_length=MOST_PRIMITIVES)
-    source_id: str | None = Field(None, max_length=255, description="What a file it comes from calls the model.")
+    source_id: str | None = Field(None, max_length=255, description="Id of the model in the imported file.")
 
 
 class GraphAction(Request):
@@ -51,9 +51,9 @@ class ModelGraph(Request):
 
     schema_: Literal["marey/model-graph@1"] = Field("marey/model-graph@1", alias="schema")
     actions: dict[NodeName, GraphAction] = Field(min_length=1, max_length=MOST_PRIMITIVES)
-    start: GraphPlace = Field(description="Where every sequence of actions begins.")
+    start: GraphPlace = Field(description="The primitive that every sequence of actions begins with.")
     description: str = Field("", max_length=10_000)
-    original: StoredOriginal | None = Field(None, description="The file it was imported from.")
+    original: StoredOriginal | None = Field(None, description="The file that the graph was imported from.")
 
     @model_validator(mode="after")
     def _check_graph(self) -> Self:

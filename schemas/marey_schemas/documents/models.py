@@ -31,12 +31,14 @@ class FunctionalComponentsDocument(Request):
     """Functions of canonical time with D channels: a mean and k principal functions in n B-spline coefficients."""
 
     degree: int = Field(3, ge=0, le=9)
-    knots: Vector = Field(description="[n + degree + 1] in canonical frames.")
-    mean: Matrix = Field(description="[n, D] coefficients.")
-    directions: Stack = Field(description="[k, n, D] what one unit of each score adds to the coefficients.")
-    projections: Stack = Field(description="[k, n, D] products with which give the scores of coefficients.")
-    variances: Vector = Field(description="[k] of the examples' scores.")
-    energy: Vector = Field(description="[k] share of all variance that the first 1, 2, ... components hold.")
+    knots: Vector = Field(description="[n + degree + 1] knots of the splines, in canonical frames.")
+    mean: Matrix = Field(description="[n, D] coefficients of the mean.")
+    directions: Stack = Field(description="[k, n, D] change of the coefficients per unit of each score.")
+    projections: Stack = Field(
+        description="[k, n, D] matrices whose inner products with centred coefficients are the scores."
+    )
+    variances: Vector = Field(description="[k] variances of the examples' scores.")
+    energy: Vector = Field(description="[k] share of the variance that the first 1, 2, ... components explain.")
 
     @model_validator(mode="after")
     def _check_shapes(self) -> Self:
@@ -62,9 +64,9 @@ class FunctionalComponentsDocument(Request):
 class MixtureDocument(Request):
     """K normal distributions over latent vectors of L numbers."""
 
-    weights: Vector = Field(description="[K] positive, of sum 1.")
+    weights: Vector = Field(description="[K] positive weights with a sum of 1.")
     means: Matrix = Field(description="[K, L]")
-    covariances: Stack = Field(description="[K, L, L] symmetric, positive definite.")
+    covariances: Stack = Field(description="[K, L, L] symmetric, positive definite covariance matrices.")
 
     @model_validator(mode="after")
     def _check_shapes(self) -> Self:
@@ -88,9 +90,11 @@ class Noted(Request):
 class PredecessorOrigin(Noted):
     """Origin of a model that was imported from the predecessor."""
 
-    animated_joints: tuple[JointName, ...] = Field((), max_length=MOST_JOINTS, description="Those that it moves.")
-    original: StoredOriginal | None = Field(None, description="The file of the model.")
-    tree: StoredOriginal | None = Field(None, description="The file of its tree.")
+    animated_joints: tuple[JointName, ...] = Field(
+        (), max_length=MOST_JOINTS, description="Joints that the model animates."
+    )
+    original: StoredOriginal | None = Field(None, description="The imported file of the model.")
+    tree: StoredOriginal | None = Field(None, description="The imported file of the model's tree.")
 
 
 class ModelProvenance(Noted):
@@ -103,14 +107,14 @@ class ExampleNotes(Noted):
     """Likelihood and error of one example under a model."""
 
     log_likelihood: float | None = Field(
-        None, allow_inf_nan=False, description="Natural logarithm of the density of the example."
+        None, allow_inf_nan=False, description="Natural logarithm of the model's density at the example."
     )
 
 
 class TrainingNotes(Noted):
     """Quality of a model, in numbers."""
 
-    examples: tuple[ExampleNotes, ...] = Field((), description="One by one.")
+    examples: tuple[ExampleNotes, ...] = Field((), description="One entry for each training example.")
 
 
 class MotionPrimitiveDocument(Request):
@@ -122,31 +126,43 @@ class MotionPrimitiveDocument(Request):
     """
 
     schema_: Literal["marey/motion-primitive@1"] = Field("marey/motion-primitive@1", alias="schema")
-    name: ItemName = Field(description="Of the action.")
-    verdict: str = Field("", max_length=2000, description="How good the model is, in a sentence or two.")
+    name: ItemName = Field(description="Name of the action that the model generates.")
+    verdict: str = Field("", max_length=2000, description="Assessment of the model in one or two sentences.")
     headline: dict[str, float | int | str | None] = Field(
-        default_factory=dict, max_length=64, description="The numbers that lists show, by name."
+        default_factory=dict, max_length=64, description="Numbers that lists of items show, by name."
     )
     skeleton: RevisionRef | OutputRef
-    joints: tuple[JointName, ...] = Field(min_length=1, max_length=MOST_JOINTS, description="Order of the rotations.")
-    frame_rate_hz: float = Field(gt=0, le=100_000, allow_inf_nan=False, description="Of canonical frames.")
+    joints: tuple[JointName, ...] = Field(
+        min_length=1, max_length=MOST_JOINTS, description="Order of the joints' rotations."
+    )
+    frame_rate_hz: float = Field(
+        gt=0, le=100_000, allow_inf_nan=False, description="Rate of the canonical frames, in hertz."
+    )
     spatial: FunctionalComponentsDocument
     temporal: FunctionalComponentsDocument
     temporal_weight: float = Field(gt=0, allow_inf_nan=False)
     mixture: MixtureDocument
     keyframes: dict[str, Annotated[int, Field(ge=0)]] = Field(
-        default_factory=dict, max_length=MOST_KEYFRAMES, description="Canonical frame by label."
+        default_factory=dict, max_length=MOST_KEYFRAMES, description="Canonical frame of each keyframe, by label."
     )
-    duration_range_s: tuple[float, float] | None = Field(None, description="Within which samples last.")
+    duration_range_s: tuple[float, float] | None = Field(
+        None, description="Shortest and longest duration of a sample, in seconds."
+    )
     log_slope_range: tuple[float, float] | None = Field(
-        None, description="What the temporal function is cut off at: that of the examples, a little widened."
+        None,
+        description="Lower and upper limit of the temporal function of samples: the range of the examples, "
+        "slightly widened.",
     )
-    scaling: dict[str, Any] | None = Field(None, description="Method and weights of the channels; undone above.")
-    options: dict[str, Any] | None = Field(None, description="What it was trained with.")
+    scaling: dict[str, Any] | None = Field(
+        None,
+        description="Method and weights of the channels during training; the functions in this document are "
+        "unweighted.",
+    )
+    options: dict[str, Any] | None = Field(None, description="Options of the training.")
     provenance: ModelProvenance = Field(
-        default_factory=ModelProvenance, description="The examples, and where they come from."
+        default_factory=ModelProvenance, description="The training examples and their origin."
     )
-    training: TrainingNotes | None = Field(None, description="How good it is, in numbers.")
+    training: TrainingNotes | None = Field(None, description="Measured quality of the model.")
 
     @model_validator(mode="after")
     def _check_shapes(self) -> Self:

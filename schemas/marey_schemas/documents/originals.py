@@ -24,7 +24,7 @@ CONTENT = {
 class StoredOriginal(Request):
     """The file that something was imported from, and the digest of what it became then."""
 
-    name: str = Field("", max_length=1024, description="Of the file, without its folders.")
+    name: str = Field("", max_length=1024, description="Name of the file without its folders.")
     blob: Digest
     content: Digest
 

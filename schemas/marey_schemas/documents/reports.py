@@ -26,14 +26,18 @@ class StoredFigure(Request):
     """A figure in each of its forms: picture, drawing, and what is plotted, as one JSON and as tables of CSV."""
 
     name: FigureName
-    number: str = Field("", description="The published figure it corresponds to.")
+    number: str = Field("", description="The corresponding figure of the publication.")
     title: str
     caption: str
-    trial: TrialName | None = Field(None, description="The trial it was asked for; others show the worst, or all.")
+    trial: TrialName | None = Field(
+        None, description="The trial that the figure was requested for; null for figures of the worst trial or of all."
+    )
     png: StoredFile
     svg: StoredFile
     json_: StoredFile = Field(alias="json")
-    csv: dict[str, StoredFile] = Field(default_factory=dict, max_length=64, description="By name of the table.")
+    csv: dict[str, StoredFile] = Field(
+        default_factory=dict, max_length=64, description="Tables of the plotted data, by name."
+    )
 
 
 class Report(Request):
@@ -42,7 +46,9 @@ class Report(Request):
     schema_: str = Field(alias="schema")
     title: str
     html: StoredFile
-    scripts: tuple[ScriptDigest, ...] = Field((), max_length=16, description="The scripts that the page may run.")
+    scripts: tuple[ScriptDigest, ...] = Field(
+        (), max_length=16, description="Hashes of the scripts that the page may run."
+    )
     figures: tuple[StoredFigure, ...] = Field((), max_length=10_000)
 
 

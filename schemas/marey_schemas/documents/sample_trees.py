@@ -24,13 +24,19 @@ class SampleTreeDocument(Request):
 
     schema_: Literal["marey/sample-tree@1"] = Field("marey/sample-tree@1", alias="schema")
     model_digest: Digest | PartDigestRef = Field(
-        description="The part `model` that the samples are of; the tree is of use to no other."
+        description="Digest of the part `model` that the samples were drawn from; the tree is valid for no other model."
     )
-    seed: int = Field(ge=0, lt=2**63, description="That they were drawn with.")
+    seed: int = Field(ge=0, lt=2**63, description="Seed that the samples were drawn with.")
     options: TreeOptions
-    samples: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=2)] = Field(description="[n, L] latent vectors.")
-    sizes: Annotated[NDArray[np.int32], ArrayOf("<i4", ndim=1)] = Field(description="[M] samples of each node.")
-    children: Annotated[NDArray[np.int32], ArrayOf("<i4", ndim=1)] = Field(description="[M] children of each node.")
+    samples: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=2)] = Field(
+        description="[n, L] latent vectors of the samples."
+    )
+    sizes: Annotated[NDArray[np.int32], ArrayOf("<i4", ndim=1)] = Field(
+        description="[M] number of samples below each node."
+    )
+    children: Annotated[NDArray[np.int32], ArrayOf("<i4", ndim=1)] = Field(
+        description="[M] number of children of each node."
+    )
 
     @model_validator(mode="after")
     def _check_shapes(self) -> Self:

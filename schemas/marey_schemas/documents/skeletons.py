@@ -25,8 +25,10 @@ class Joint(Request):
     name: JointName
     parent: int = Field(ge=-1, description="Index of the parent, smaller than the joint's own; -1 for the root.")
     offset: Vector3 = Field(description="Position in the parent's rest frame, metres.")
-    rest_rotation: Quaternion = Field((1.0, 0.0, 0.0, 0.0), description="Local rest rotation, w,x,y,z.")
-    display_name: str | None = Field(None, description="Name in the source, where it differs from `name`.")
+    rest_rotation: Quaternion = Field(
+        (1.0, 0.0, 0.0, 0.0), description="Local rest rotation as a unit quaternion w,x,y,z."
+    )
+    display_name: str | None = Field(None, description="Name in the imported file if it differs from `name`.")
 
 
 class EndSiteDocument(Request):
@@ -70,9 +72,11 @@ class SkeletonMapping(Request):
     """Part `mapping` of a skeleton: which joint plays which standard joint, and its axes. Editable."""
 
     schema_: Literal["marey/skeleton-mapping@1"] = Field("marey/skeleton-mapping@1", alias="schema")
-    rig: str | None = Field(None, description="The known rig whose names were recognised.")
+    rig: str | None = Field(None, description="The known rig whose joint names were recognised.")
     method: Literal["names", "geometry", "manual"] = "manual"
     confidence: float = Field(1.0, ge=0.0, le=1.0)
-    joints: dict[str, JointName] = Field(default_factory=dict, description="Standard joint name to joint name.")
+    joints: dict[str, JointName] = Field(
+        default_factory=dict, description="Name of the skeleton's joint, by the name of the standard joint."
+    )
     axes: dict[JointName, JointAxesDocument] = Field(default_factory=dict)
     notes: tuple[str, ...] = ()

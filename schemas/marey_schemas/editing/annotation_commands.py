@@ -21,7 +21,9 @@ class CreateSegment(Request):
     label: Label
     start: Frame
     end: Frame
-    overwrite: bool = Field(False, description="Segments that are there give way; else they forbid it.")
+    overwrite: bool = Field(
+        False, description="Shorten or remove overlapping segments; otherwise an overlap is an error."
+    )
 
 
 class RemoveSegment(Request):
@@ -36,14 +38,14 @@ class SplitSegment(Request):
 
     command: Literal["split_segment"]
     at: Frame = Field(description="First frame of the second part.")
-    label: Label | None = Field(None, description="Of the second part; absent: that of the first.")
+    label: Label | None = Field(None, description="Label of the second part; absent: the label of the first part.")
 
 
 class MergeSegment(Request):
     """Make one of a segment and its neighbour, with the gap between them."""
 
     command: Literal["merge_segment"]
-    at: Frame = Field(description="Any frame of the segment, whose label stays.")
+    at: Frame = Field(description="Any frame of the segment whose label is kept.")
     neighbour: Literal["next", "previous", "nearest"] = "next"
 
 
@@ -114,22 +116,26 @@ class AnnotationChange(Request):
     """Commands that are applied to an annotation one after another: all of them, or none."""
 
     commands: tuple[AnnotationCommand, ...] = Field(min_length=1, max_length=MAX_COMMANDS)
-    message: Message = Field("", description="Shown in the history.")
+    message: Message = Field("", description="Message shown in the history.")
 
 
 class AnnotationImport(Request):
     """An annotation of a clip in one of the predecessor's forms: `sections`, or `semantic_annotation`."""
 
-    document: dict[str, Any] = Field(description="The document, as the predecessor keeps or exports it.")
+    document: dict[str, Any] = Field(description="The predecessor's document, as it stores or exports it.")
     layer: LayerName = "imported"
-    name: ItemName | None = Field(None, description="Of the annotation; default: that of the clip and the layer's.")
+    name: ItemName | None = Field(
+        None, description="Name of the annotation; default: the names of the clip and the layer."
+    )
     end_index: Literal["inclusive", "exclusive"] = Field(
         "inclusive",
-        description="Whether a section holds its frame `end_idx`, as the predecessor's editor means it, or ends before "
-        "it, as its time warping means it.",
+        description="Whether a section includes its frame `end_idx`, as in the predecessor's editor, or ends "
+        "before it, as in its time warping.",
     )
     labels: tuple[Label, ...] | None = Field(
-        None, max_length=1000, description="Only these: labels that overlap make layers of their own."
+        None,
+        max_length=1000,
+        description="Labels to import; absent: all of them. Import labels whose segments overlap into separate layers.",
     )
     message: Message = ""
 

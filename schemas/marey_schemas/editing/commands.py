@@ -84,28 +84,34 @@ class Concatenate(Request):
     source: ItemId = Field(description="The clip to append.")
     place: Literal["seam", "keep"] = Field(
         "seam",
-        description="seam: turned and shifted on the ground so that it goes on where the motion ends; keep: as it is.",
+        description="seam: turned and shifted on the ground so that it continues the motion where it ends; "
+        "keep: unchanged.",
     )
     blend: Literal["inertialise", "slerp"] = Field(
         "inertialise",
-        description="inertialise: the difference at the seam dies away in the appended clip, no frame is lost; slerp: "
-        "the end of the one is faded over into the start of the other, which overlap.",
+        description="inertialise: the difference at the seam decays in the appended clip, and no frame is "
+        "lost; slerp: the end of one clip is cross-faded with the start of the other, and these "
+        "frames overlap.",
     )
-    blend_s: Seconds = Field(0.3, description="How long that takes; 0: a hard cut.")
+    blend_s: Seconds = Field(0.3, description="Duration of the blend in seconds; 0: a hard cut.")
 
 
 class Resample(Request):
     """The same motion at another frame rate."""
 
     command: Literal["resample"]
-    frame_rate_hz: float = Field(ge=0.1, le=100_000, allow_inf_nan=False, description="Frames per second.")
+    frame_rate_hz: float = Field(
+        ge=0.1, le=100_000, allow_inf_nan=False, description="New frame rate, in frames per second."
+    )
 
 
 class Retime(Request):
     """Faster or slower at the same frame rate."""
 
     command: Literal["retime"]
-    speed: float = Field(ge=0.01, le=100, allow_inf_nan=False, description="2: twice as fast, in half the time.")
+    speed: float = Field(
+        ge=0.01, le=100, allow_inf_nan=False, description="Speed factor; 2: twice as fast, in half the time."
+    )
 
 
 class CloseLoop(Request):
@@ -113,10 +119,12 @@ class CloseLoop(Request):
 
     command: Literal["close_loop"]
     in_place: bool = Field(
-        False, description="Take the travel and turn of a round out, so that each starts where the last one did."
+        False, description="Remove the travel and turn of one cycle, so that each cycle starts at the same place."
     )
     blend_s: Seconds | None = Field(
-        None, description="How far from either end poses may change; absent: up to the middle of the clip."
+        None,
+        description="Distance from either end, in seconds, within which poses may change; absent: up to the "
+        "middle of the clip.",
     )
 
 
@@ -127,17 +135,20 @@ class Translate(Request):
     """Shift the whole motion."""
 
     command: Literal["translate"]
-    shift_m: Shift = Field(description="Metres along x, y and z.")
+    shift_m: Shift = Field(description="Shift in metres along x, y and z.")
 
 
 class Rotate(Request):
     """Turn the whole motion about an axis of the world."""
 
     command: Literal["rotate"]
-    angle_deg: Degrees = Field(description="About the vertical, positive is to the left.")
-    axis: Axis = Field((0.0, 1.0, 0.0), description="Direction of the axis.")
+    angle_deg: Degrees = Field(
+        description="Angle about `axis`, in degrees; about the vertical, positive is to the left."
+    )
+    axis: Axis = Field((0.0, 1.0, 0.0), description="Direction of the rotation axis; default: the vertical.")
     pivot: Literal["origin", "body"] = Field(
-        "origin", description="Which point stays: the origin, or the ground under the body in the first frame."
+        "origin",
+        description="The point that stays in place: the origin, or the ground under the body in the first frame.",
     )
 
 
@@ -145,23 +156,25 @@ class Face(Request):
     """Turn the whole motion about the vertical so that a frame faces a given way."""
 
     command: Literal["face"]
-    heading_deg: Degrees = Field(0.0, description="0 faces +z; positive is to the left.")
-    frame: Frame = Field(0, description="The frame that shall face there; its body stays in place.")
+    heading_deg: Degrees = Field(0.0, description="Heading in degrees; 0 faces +z, and positive is to the left.")
+    frame: Frame = Field(
+        0, description="The frame in which the body shall face there; its position in that frame does not change."
+    )
 
 
 class MoveToOrigin(Request):
     """Shift the whole motion on the ground so that the body is above the origin in a frame; heights stay."""
 
     command: Literal["move_to_origin"]
-    frame: Frame = Field(0, description="The frame in which it is there.")
+    frame: Frame = Field(0, description="The frame in which the body shall be at the place.")
 
 
 class Scale(Request):
     """Scale where the body goes, heights too. The skeleton is an item of its own and keeps its size."""
 
     command: Literal["scale"]
-    factor: float = Field(ge=1e-4, le=1e4, allow_inf_nan=False, description="About the origin.")
-    translations: bool = Field(False, description="Scale the translations of other joints, where there are any, too.")
+    factor: float = Field(ge=1e-4, le=1e4, allow_inf_nan=False, description="Scale factor, about the origin.")
+    translations: bool = Field(False, description="Also scale the translations of joints other than the root.")
 
 
 SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
@@ -171,8 +184,8 @@ class FlipAxes(Request):
     """Turn a world whose axes stand otherwise, such as Blender's with Z up, to Y up."""
 
     command: Literal["flip_axes"]
-    up: SignedAxis = Field("+z", description="The axis that points up now.")
-    forward: SignedAxis = Field("-y", description="The axis that shall become +z, across the one that points up.")
+    up: SignedAxis = Field("+z", description="The axis of the clip that points up now.")
+    forward: SignedAxis = Field("-y", description="The axis that shall become +z; it is orthogonal to `up`.")
 
     @model_validator(mode="after")
     def _check_axes(self) -> Self:
@@ -185,11 +198,13 @@ class FixDrift(Request):
     """Spread a wanted shift and turn of the body over a range of frames; those after it get all of it."""
 
     command: Literal["fix_drift"]
-    shift_m: Shift = Field((0.0, 0.0, 0.0), description="What the end of the range is shifted by.")
-    turn_deg: Degrees = Field(0.0, description="What it is turned by about the vertical, positive to the left.")
-    frames: Frames | None = Field(None, description=f"{WHOLE_OR_RANGE} At least two.")
+    shift_m: Shift = Field((0.0, 0.0, 0.0), description="Shift of the end of the range.")
+    turn_deg: Degrees = Field(
+        0.0, description="Turn of the end of the range about the vertical, in degrees, positive to the left."
+    )
+    frames: Frames | None = Field(None, description=f"{WHOLE_OR_RANGE} The range has at least two frames.")
     profile: Literal["linear", "smooth"] = Field(
-        "linear", description="linear: the same share per frame; smooth: starting and ending gently."
+        "linear", description="linear: the same share in every frame; smooth: slow at the start and the end."
     )
 
 
@@ -201,7 +216,8 @@ class MoveToGround(Request):
 
     command: Literal["move_to_ground"]
     height_m: Metres | None = Field(
-        None, description="Where the ground is now; absent: estimated from the feet while they stand."
+        None,
+        description="Present height of the ground, in metres; absent: estimated from the feet during their contacts.",
     )
 
 
@@ -216,12 +232,20 @@ class FindContacts(Request):
 
     command: Literal["find_contacts"]
     speed_m_s: float = Field(
-        0.5, gt=0, le=100, allow_inf_nan=False, description="A foot that stands is slower than this."
+        0.5, gt=0, le=100, allow_inf_nan=False, description="Greatest speed of a foot in contact, in metres per second."
     )
-    shortest_swing_s: float = Field(0.1, gt=0, le=10, allow_inf_nan=False, description="Shorter swings are noise.")
-    shortest_stance_s: float = Field(0.06, gt=0, le=10, allow_inf_nan=False, description="Shorter stances are noise.")
+    shortest_swing_s: float = Field(
+        0.1, gt=0, le=10, allow_inf_nan=False, description="Swing phases shorter than this are treated as noise."
+    )
+    shortest_stance_s: float = Field(
+        0.06, gt=0, le=10, allow_inf_nan=False, description="Stance phases shorter than this are treated as noise."
+    )
     height_limit_m: float | None = Field(
-        0.1, gt=0, le=100, allow_inf_nan=False, description="And so near to the ground; null: at any height."
+        0.1,
+        gt=0,
+        le=100,
+        allow_inf_nan=False,
+        description="Greatest height above the ground of a foot in contact; null: any height.",
     )
 
 
@@ -239,30 +263,38 @@ class Smooth(Request):
 
     command: Literal["smooth"]
     method: Literal["savitzky_golay", "gaussian"] = Field(
-        "savitzky_golay", description="savitzky_golay keeps peaks, gaussian flattens them."
+        "savitzky_golay", description="Filter: savitzky_golay keeps peaks, gaussian flattens them."
     )
     window_s: float = Field(
-        0.25, gt=0, le=60, allow_inf_nan=False, description="Time that each frame is a weighted mean of."
+        0.25,
+        gt=0,
+        le=60,
+        allow_inf_nan=False,
+        description="Width of the filter, in seconds: each frame becomes a weighted mean over it.",
     )
-    order: int = Field(3, ge=0, le=9, description="Degree of the polynomials of savitzky_golay.")
-    joints: Joints | None = Field(None, description="Which joints; absent: all.")
-    root_translation: bool = Field(True, description="Smooth the path of the root, too.")
+    order: int = Field(3, ge=0, le=9, description="Degree of the polynomials of the filter savitzky_golay.")
+    joints: Joints | None = Field(None, description="Joints to smooth; absent: all.")
+    root_translation: bool = Field(True, description="Also smooth the path of the root.")
     frames: Frames | None = Field(None, description=WHOLE_OR_RANGE)
-    border_s: Seconds = Field(0.2, description="Time over which a range goes over into what is around it.")
+    border_s: Seconds = Field(
+        0.2, description="Seconds at either end of the range in which the change is blended in and out."
+    )
 
 
 class RotateJoint(Request):
     """Add a rotation to a joint."""
 
     command: Literal["rotate_joint"]
-    joint: JointName = Field(description="Which joint, by its name.")
-    angle_deg: Degrees = Field(description="How far it turns, in frames that are no borders.")
-    axis: Axis = Field(description="Direction of the axis that it turns about.")
+    joint: JointName = Field(description="Name of the joint.")
+    angle_deg: Degrees = Field(description="Angle of the turn, in degrees; less in the frames that are blended.")
+    axis: Axis = Field(description="Direction of the rotation axis.")
     space: Literal["joint", "parent", "world"] = Field(
-        "joint", description="Whose axes `axis` is given in: the joint's own, its parent's, or the world's."
+        "joint", description="Frame of reference of `axis`: the joint's own, its parent's, or the world's."
     )
     frames: Frames | None = Field(None, description=WHOLE_OR_RANGE)
-    border_s: Seconds = Field(0.2, description="Time over which a range goes over into what is around it.")
+    border_s: Seconds = Field(
+        0.2, description="Seconds at either end of the range in which the change is blended in and out."
+    )
 
 
 class Paste(Request):
@@ -270,7 +302,9 @@ class Paste(Request):
 
     command: Literal["paste"]
     source: ItemId = Field(description="The clip to copy from.")
-    joints: Joints = Field(description="Joints that both skeletons have, with the same axes.")
-    source_frames: Frames | None = Field(None, description="What to copy: half-open; absent: the whole clip.")
-    frames: Frames | None = Field(None, description="Where to put it: half-open; absent: the whole motion.")
-    border_s: Seconds = Field(0.2, description="Time within the range over which it goes over from what was there.")
+    joints: Joints = Field(description="Joints to copy; both skeletons have them, with the same axes.")
+    source_frames: Frames | None = Field(None, description="Half-open range of frames to copy; absent: the whole clip.")
+    frames: Frames | None = Field(None, description="Half-open range of frames to replace; absent: the whole motion.")
+    border_s: Seconds = Field(
+        0.2, description="Seconds at either end of the replaced range in which the copied motion is blended in and out."
+    )

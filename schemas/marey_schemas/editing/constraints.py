@@ -52,20 +52,32 @@ class _Constraint(Request):
     frames: Frames | None = Field(None, description=WHOLE_OR_RANGE)
     top: JointName | None = Field(
         None,
-        description="The highest joint that may turn; absent: of a wrist or an ankle the limb's, of others the one "
-        "below the root.",
+        description="The highest joint of the chain that may turn; absent: the upper joint of the limb for a "
+        "wrist or an ankle, the joint below the root for others.",
     )
-    weight: float = Field(1.0, gt=0, le=1e6, allow_inf_nan=False, description="Where constraints contradict.")
+    weight: float = Field(
+        1.0,
+        gt=0,
+        le=1e6,
+        allow_inf_nan=False,
+        description="Weight of the constraint where constraints contradict each other.",
+    )
 
 
 class PositionConstraint(_Constraint):
     """A joint, or a point that it carries, is somewhere. Without a place or a shift it stays where it first is."""
 
     kind: Literal["position"]
-    point_m: Shift | None = Field(None, description="The place.")
-    shift_m: Shift | None = Field(None, description="Or how far from where it is in each frame.")
-    axes: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"] = Field("xyz", description="Coordinates that count.")
-    offset_m: Shift = Field((0.0, 0.0, 0.0), description="From the joint to the point, in the joint's frame.")
+    point_m: Shift | None = Field(None, description="Target position in the world, in metres.")
+    shift_m: Shift | None = Field(
+        None, description="Shift of the joint from its position in each frame, in metres; an alternative to `point_m`."
+    )
+    axes: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"] = Field(
+        "xyz", description="Coordinates that are constrained."
+    )
+    offset_m: Shift = Field(
+        (0.0, 0.0, 0.0), description="Offset of the constrained point from the joint, in the joint's frame."
+    )
 
     @model_validator(mode="after")
     def _check_place(self) -> Self:
@@ -78,7 +90,9 @@ class OrientationConstraint(_Constraint):
     """A joint is turned in a certain way. Without a rotation it stays as it first is."""
 
     kind: Literal["orientation"]
-    rotation: Rotation | None = Field(None, description="Unit quaternion (w, x, y, z) in the world.")
+    rotation: Rotation | None = Field(
+        None, description="Target rotation in the world, as a unit quaternion (w, x, y, z)."
+    )
 
 
 class LookAtConstraint(_Constraint):
@@ -87,9 +101,11 @@ class LookAtConstraint(_Constraint):
     kind: Literal["look_at"]
     point_m: Shift
     axis: Axis | None = Field(
-        None, description="What looks, in the joint's frame; absent: of head and trunk the front, of limbs the bone."
+        None,
+        description="The direction that shall point at the target, in the joint's frame; absent: the front "
+        "of head and trunk, the bone of limbs.",
     )
-    offset_m: Shift = Field((0.0, 0.0, 0.0), description="From the joint to its eye, in the joint's frame.")
+    offset_m: Shift = Field((0.0, 0.0, 0.0), description="Offset of the eye from the joint, in the joint's frame.")
 
 
 AnyConstraint = Annotated[PositionConstraint | OrientationConstraint | LookAtConstraint, Field(discriminator="kind")]
@@ -100,7 +116,7 @@ class HingeLimit(Request):
 
     kind: Literal["hinge"]
     joint: JointName
-    angle_deg: AngleRange = Field(description="Least and greatest angle from the rest pose.")
+    angle_deg: AngleRange = Field(description="Least and greatest angle from the rest pose, in degrees.")
 
 
 class ConeLimit(Request):
@@ -108,8 +124,10 @@ class ConeLimit(Request):
 
     kind: Literal["cone"]
     joint: JointName
-    swing_deg: tuple[Opening, Opening] = Field(description="How far about the swing axis, and across it.")
-    twist_deg: AngleRange = Field((-180.0, 180.0), description="Least and greatest turn about the bone.")
+    swing_deg: tuple[Opening, Opening] = Field(
+        description="Greatest swing about the swing axis and across it, in degrees."
+    )
+    twist_deg: AngleRange = Field((-180.0, 180.0), description="Least and greatest twist about the bone, in degrees.")
 
 
 AnyLimit = Annotated[HingeLimit | ConeLimit, Field(discriminator="kind")]
@@ -121,13 +139,17 @@ class Constrain(Request):
     command: Literal["constrain"]
     constraints: tuple[AnyConstraint, ...] = Field(min_length=1, max_length=MOST_CONSTRAINTS)
     solver: Literal["auto", "ccd", "two_bone", "least_squares"] = Field(
-        "auto", description="auto: closed form for limbs, damped least squares for everything else."
+        "auto", description="Solver; auto: closed form for limbs, damped least squares for everything else."
     )
-    blend_s: Seconds = Field(0.3, description="Time before and after a range in which the motion may change; 0: none.")
-    root_moves: bool = Field(False, description="Shift the root, too (least squares).")
-    limits: tuple[AnyLimit, ...] = Field((), max_length=MOST_CONSTRAINTS, description="How far joints may turn.")
+    blend_s: Seconds = Field(
+        0.3, description="Seconds before and after the range in which the motion is blended; 0: none."
+    )
+    root_moves: bool = Field(False, description="Also shift the root (least squares only).")
+    limits: tuple[AnyLimit, ...] = Field((), max_length=MOST_CONSTRAINTS, description="Limits of the joints' angles.")
     stiffness: dict[JointName, Annotated[float, Field(ge=0, lt=1)]] = Field(
-        default_factory=dict, max_length=MOST_CONSTRAINTS, description="0: turns freely, near 1: hardly."
+        default_factory=dict,
+        max_length=MOST_CONSTRAINTS,
+        description="Stiffness of joints, by name; 0: turns freely, near 1: hardly turns.",
     )
 
 
@@ -143,16 +165,24 @@ class PlantFeet(Request):
 
     command: Literal["plant_feet"]
     contacts: tuple[FootContact, ...] | None = Field(
-        None, max_length=100_000, description="When feet stand; absent: found by their speed."
+        None, max_length=100_000, description="Contacts of the feet; absent: detected by the speed of the feet."
     )
     speed_m_s: float = Field(
-        0.15, gt=0, le=100, allow_inf_nan=False, description="A toe or heel that stands is slower than this."
+        0.15,
+        gt=0,
+        le=100,
+        allow_inf_nan=False,
+        description="Greatest speed of a toe or heel in contact, in metres per second.",
     )
     blend_s: Seconds = Field(
         0.15,
-        description="Time before and after a contact in which the foot is blended. Where a leg is too short, the body "
-        "comes down a little, within three times as long.",
+        description="Seconds before and after a contact in which the foot is blended. If a leg is too short, "
+        "the body is lowered a little within three times as long.",
     )
     knee_damping_deg: float = Field(
-        10.0, ge=0, le=90, allow_inf_nan=False, description="How long before straight a stretching knee is damped."
+        10.0,
+        ge=0,
+        le=90,
+        allow_inf_nan=False,
+        description="Angle before full extension at which a stretching knee is damped.",
     )

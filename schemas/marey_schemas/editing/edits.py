@@ -67,7 +67,7 @@ class EditDocument(Request):
     """Part `edit`: commands in the order in which they are applied."""
 
     schema_: Literal["marey/edit@1"] = Field("marey/edit@1", alias="schema")
-    title: str = Field("", max_length=200, description="What the edit is for.")
+    title: str = Field("", max_length=200, description="Purpose of the edit, for people.")
     commands: tuple[EditCommand, ...] = Field(min_length=1, max_length=MOST_COMMANDS)
 
     @property

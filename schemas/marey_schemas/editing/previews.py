@@ -19,13 +19,19 @@ from marey_schemas.jobs import ItemInput
 class EditPreviewRequest(Request):
     """Preview of the result of an edit; nothing is stored."""
 
-    commands: tuple[EditCommand, ...] = Field((), max_length=MOST_COMMANDS, description="Absent: those of `edit`.")
-    edit: ItemInput | None = Field(None, description="An edit, where `commands` are not given; default: its newest.")
-    revision: int | None = Field(None, ge=1, lt=2**31, description="Of the clip; absent: its newest.")
-    frames: Frames = Field((0, None), description="Which frames of the result; what lies beyond its end is left out.")
-    piece: int = Field(0, ge=0, lt=10_000, description="Which of the results, where the clip is split.")
+    commands: tuple[EditCommand, ...] = Field(
+        (), max_length=MOST_COMMANDS, description="Commands to apply; absent: those of `edit`."
+    )
+    edit: ItemInput | None = Field(
+        None, description="Edit to apply if `commands` are absent; by default its newest revision."
+    )
+    revision: int | None = Field(None, ge=1, lt=2**31, description="Revision of the clip; absent: the newest.")
+    frames: Frames = Field(
+        (0, None), description="Half-open range of the result's frames to return; the part beyond the end is left out."
+    )
+    piece: int = Field(0, ge=0, lt=10_000, description="Index of the result to return, if the commands split the clip.")
     fields: tuple[Literal["motion", "positions", "findings"], ...] = Field(
-        ("motion", "findings"), max_length=3, description="What to answer beside the counts."
+        ("motion", "findings"), max_length=3, description="Content of the answer in addition to the counts."
     )
 
     @model_validator(mode="after")
@@ -38,12 +44,14 @@ class EditPreviewRequest(Request):
 class EditPreview(Answer):
     """Frames of what an edit makes of a clip."""
 
-    pieces: int = Field(description="How many clips the edit makes of the clip.")
-    frame_count: int = Field(description="Frames of the whole result.")
+    pieces: int = Field(description="Number of clips that the edit makes from the clip.")
+    frame_count: int = Field(description="Number of frames of the whole result.")
     frame_rate_hz: float
-    frames: tuple[int, int] = Field(description="Which of them these are: half-open.")
-    motion: MotionDocument | None = Field(None, description="The motion of these frames.")
+    frames: tuple[int, int] = Field(description="Half-open range of the frames in this answer.")
+    motion: MotionDocument | None = Field(None, description="Motion of the frames in this answer.")
     positions: Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=3, columns=3)] | None = Field(
-        None, description="[frames, joints, 3]: where the joints are, metres."
+        None, description="[frames, joints, 3]: positions of the joints in metres."
     )
-    findings: tuple[dict[str, Any], ...] = Field((), description="What commands found out, each with its `command`.")
+    findings: tuple[dict[str, Any], ...] = Field(
+        (), description="Measurements that commands made, each with its `command`."
+    )

@@ -23,10 +23,10 @@ class CostOptions(Options):
 
     cost: CostMethod = Field(
         "turned",
-        description="Cost of a pair of poses. turned: after the best turn about the vertical and shift on the ground; "
-        "plain: as they are.",
+        description="Cost of a pair of poses. turned: after the best rotation about the vertical and shift "
+        "on the ground; plain: without either.",
     )
-    window: int = Field(1, ge=1, le=61, description="Odd number of frames that are compared at once.")
+    window: int = Field(1, ge=1, le=61, description="Number of frames in the window that is compared; odd.")
 
     @field_validator("window")
     @classmethod
@@ -49,19 +49,20 @@ class AlignOptions(CostOptions):
         gt=0,
         le=1000,
         allow_inf_nan=False,
-        description="Rate of canonical frames, in hertz; absent: that of the reference where it is named, else the "
-        "most common one.",
+        description="Rate of the canonical frames, in hertz; absent: the rate of the reference if it is "
+        "given, else the most common rate.",
     )
     slope_limit: int | None = Field(
         3,
         ge=0,
         le=60,
-        description="Greatest number of frames in a row of one clip that belong to one frame of the other; null: any.",
+        description="Greatest number of consecutive frames of one clip that are matched with one frame of "
+        "the other; null: no limit.",
     )
     weights: dict[JointName, _Weight] = Field(
         default_factory=dict,
         max_length=4096,
-        description="Weight in the cost by joint, under its own or its standard name; others count 1, and 0 where the "
-        "joint carries nothing of the body.",
+        description="Weight of each joint in the cost, by its own or its standard name; default 1, and 0 for "
+        "joints that move no part of the body.",
     )
-    keep_height: bool = Field(True, description="Leave heights above the floor as they are.")
+    keep_height: bool = Field(True, description="Keep the heights above the floor.")

@@ -18,14 +18,22 @@ class StepsProposal(Request):
 
     method: Literal["steps"] = "steps"
     contact_speed_m_s: float = Field(
-        0.5, gt=0, le=10, allow_inf_nan=False, description="A foot slower than this begins to stand."
+        0.5,
+        gt=0,
+        le=10,
+        allow_inf_nan=False,
+        description="Speed in metres per second below which a foot is in contact.",
     )
-    shortest_s: Seconds = Field(0.2, description="Shorter steps get no label.")
-    longest_s: Seconds = Field(1.5, description="Longer steps get no label.")
-    shortest_m: float = Field(0.2, ge=0, le=10, allow_inf_nan=False, description="Way of the hips in a step.")
-    most_turn_deg: Degrees = Field(45.0, description="Steps that turn the body more get no label.")
-    most_aside_deg: Degrees = Field(45.0, description="Steps that lead further off where the body faces get no label.")
-    standing_s: Seconds = Field(0.6, description="Both feet on the ground for so long: labelled `standing`.")
+    shortest_s: Seconds = Field(0.2, description="Duration of the shortest step that is labelled.")
+    longest_s: Seconds = Field(1.5, description="Duration of the longest step that is labelled.")
+    shortest_m: float = Field(
+        0.2, ge=0, le=10, allow_inf_nan=False, description="Least distance that the hips travel in a step."
+    )
+    most_turn_deg: Degrees = Field(45.0, description="Greatest turn of the body in a step that is labelled.")
+    most_aside_deg: Degrees = Field(
+        45.0, description="Greatest angle between the direction of a labelled step and the heading of the body."
+    )
+    standing_s: Seconds = Field(0.6, description="Least time with both feet on the ground that is labelled `standing`.")
 
     @model_validator(mode="after")
     def _check_durations(self) -> Self:
@@ -39,25 +47,33 @@ class VelocityMinimaProposal(Request):
 
     method: Literal["velocity_minima"] = "velocity_minima"
     joints: tuple[JointName, ...] = Field(
-        (), max_length=256, description="Joints, by their own or their standard names, whose mean speed counts."
+        (), max_length=256, description="Joints whose mean speed is used, by their own or their standard names."
     )
-    smoothing_s: float = Field(0.05, gt=0, le=10, allow_inf_nan=False, description="Deviation of the smoothing.")
+    smoothing_s: float = Field(
+        0.05, gt=0, le=10, allow_inf_nan=False, description="Standard deviation of the smoothing, in seconds."
+    )
     least_depth: float = Field(
-        0.1, gt=0, le=1, allow_inf_nan=False, description="Depth of a minimum, as a share of the highest speed."
+        0.1, gt=0, le=1, allow_inf_nan=False, description="Least depth of a minimum, as a share of the highest speed."
     )
-    least_apart_s: float = Field(0.2, gt=0, le=3600, allow_inf_nan=False, description="Time between minima.")
+    least_apart_s: float = Field(
+        0.2, gt=0, le=3600, allow_inf_nan=False, description="Least time between two minima, in seconds."
+    )
 
 
 class WristContactProposal(Request):
     """Reaches of a hand out of its rest and back, with a keyframe `contact` where it arrives at its far place."""
 
     method: Literal["wrist_contact"] = "wrist_contact"
-    hand: Literal["left", "right", "either"] = Field("either", description="Either: the one that reaches farther.")
-    least_reach_m: float = Field(0.2, gt=0, le=10, allow_inf_nan=False, description="Less is no reach.")
-    arrived: float = Field(
-        0.95, gt=0.25, le=1, allow_inf_nan=False, description="Share of the way at which a hand has arrived."
+    hand: Literal["left", "right", "either"] = Field(
+        "either", description="Hand that reaches; either: the one that reaches farther."
     )
-    release: bool = Field(False, description="A keyframe `release` at the last frame at the far place, too.")
+    least_reach_m: float = Field(
+        0.2, gt=0, le=10, allow_inf_nan=False, description="Least distance of a reach, in metres."
+    )
+    arrived: float = Field(
+        0.95, gt=0.25, le=1, allow_inf_nan=False, description="Share of the distance at which a hand has arrived."
+    )
+    release: bool = Field(False, description="Also add a keyframe `release` at the last frame at the far place.")
 
 
 Proposal = Annotated[StepsProposal | VelocityMinimaProposal | WristContactProposal, Field(discriminator="method")]

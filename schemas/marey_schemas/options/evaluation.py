@@ -21,7 +21,7 @@ class Grid(Options):
         tuple(1.0 + 0.25 * step for step in range(9)),
         min_length=1,
         max_length=200,
-        description="Speeds of the trials in metres per second, each with each turn rate.",
+        description="Speeds of the trials in metres per second; each is combined with each turn rate.",
     )
     turn_rates_deg_s: tuple[TurnRate, ...] = Field(
         tuple(-100.0 + 25.0 * step for step in range(9)),
@@ -55,14 +55,16 @@ class EvaluationOptions(Grid):
         5.0, ge=0.5, le=600, allow_inf_nan=False, description="Seconds that each speed of a switching trial lasts."
     )
     window: Literal["circle", "all"] = Field(
-        "circle", description="What is measured. circle: the circle alone; all: the approach, too."
+        "circle", description="Part of a trial that is measured. circle: the circle only; all: also the approach."
     )
     coverage_least_s: float = Field(
         1.0, gt=0, le=3600, allow_inf_nan=False, description="Seconds of data that a cell needs to count as covered."
     )
     literal_formulas: bool = Field(False, description="Add the values of the published formulas taken literally.")
-    database: DatabaseOptions = Field(DatabaseOptions(), description="How the clips become a database.")
-    controller: ControllerOptions = Field(ControllerOptions(), description="How motion matching plays the database.")
+    database: DatabaseOptions = Field(
+        DatabaseOptions(), description="Options of the database that is built from the clips."
+    )
+    controller: ControllerOptions = Field(ControllerOptions(), description="Options of the motion matching controller.")
 
     @model_validator(mode="after")
     def _check_families(self) -> Self:

@@ -15,12 +15,13 @@ _Factor = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 class ObjectiveOptions(Options):
     """Weights of the objective, the cost of a set of clips in metres: the smaller, the better."""
 
-    offset: _Price = Field(1.0, description="Weight of the mean distance from where the character should be.")
-    abs_se_v: _Price = Field(0.5, description="Metres that a speed error of 1 m/s counts as.")
-    abs_se_omega_deg: _Price = Field(0.005, description="Metres that a turn rate error of 1 degree/s counts as.")
-    pose_cost: _Price = Field(0.5, description="Metres that a metre of pose cost counts as.")
+    offset: _Price = Field(1.0, description="Weight of the mean distance between the character and its reference.")
+    abs_se_v: _Price = Field(0.5, description="Metres in the objective for a speed error of 1 m/s.")
+    abs_se_omega_deg: _Price = Field(0.005, description="Metres in the objective for a turn rate error of 1 degree/s.")
+    pose_cost: _Price = Field(0.5, description="Metres in the objective for a pose cost of 1 m.")
     seconds: _Price = Field(
-        0.0001, description="Metres that a second of data counts as; a clip that helps by less than this goes."
+        0.0001,
+        description="Metres in the objective for each second of data; a clip whose benefit is smaller is removed.",
     )
 
 
@@ -37,13 +38,13 @@ class SuggestionOptions(ObjectiveChoice):
         10,
         ge=0,
         le=1000,
-        description="Number of removals to plan one after another, once unused clips are gone; 0: none.",
+        description="Number of removals to plan after the unused clips; 0: none.",
     )
     consider: int | None = Field(
         50,
         ge=0,
         le=100_000,
-        description="Number of clips to leave out in turn, those that the fewest trials need; null: all.",
+        description="Number of clips to remove in turn, starting with those that the fewest trials use; null: all.",
     )
     duplicate_cm: float = Field(
         3.0,
@@ -57,8 +58,8 @@ class SuggestionOptions(ObjectiveChoice):
         gt=0,
         le=100,
         allow_inf_nan=False,
-        description="Greatest distance between poses that blend, summed over joints, in metres; absent: the median "
-        "over the transitions of the trials.",
+        description="Greatest distance between poses that can be blended, summed over joints, in metres; "
+        "absent: the median over the transitions of the trials.",
     )
 
 
@@ -70,18 +71,18 @@ class OptimisationOptions(ObjectiveChoice):
         ge=0,
         le=1000,
         allow_inf_nan=False,
-        description="End when no step lowers the objective by so many metres.",
+        description="End when no step lowers the objective by at least this many metres.",
     )
-    max_steps: int = Field(50, ge=1, le=10_000, description="End after so many steps.")
+    max_steps: int = Field(50, ge=1, le=10_000, description="Greatest number of steps.")
     max_evaluations: int | None = Field(
-        None, ge=1, le=1_000_000, description="End after so many sets of clips were tried; null: any number."
+        None, ge=1, le=1_000_000, description="Greatest number of sets of clips to try; null: no limit."
     )
     max_data_s: float | None = Field(
         None,
         gt=0,
         le=1e7,
         allow_inf_nan=False,
-        description="Longest set in seconds: nothing is added that makes it longer; null: any length.",
+        description="Greatest duration of the set in seconds; no clip is added beyond it; null: no limit.",
     )
     consider: int | None = Field(
         20,
@@ -98,5 +99,6 @@ class SweepOptions(ObjectiveChoice):
         (0.5, 2.0),
         min_length=1,
         max_length=20,
-        description="Each group of features is matched with its weight times each of these, all others as they are.",
+        description="Factors; the weight of each group of features is multiplied by each of them, with all "
+        "other weights unchanged.",
     )

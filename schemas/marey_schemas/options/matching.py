@@ -45,29 +45,37 @@ class DatabaseOptions(Options):
     )
     end_policy: EndPolicy = Field(
         "clamp",
-        description="What rows near a clip's end look ahead to. clamp: its last frame, and the last 1/3 s is not "
-        "selected; trim: nothing, and the last second is not selected; loop: its beginning, for clips marked as loops.",
+        description="Trajectory features near a clip's end. clamp: the last frame is repeated, and the last "
+        "1/3 s is not selected; trim: the last second is not selected; loop: the clip's "
+        "beginning follows, for clips marked as loops.",
     )
     root_mode: RootMode = Field(
-        "simulated", description="bone: the root joint moves as the character does, in data made so."
+        "simulated",
+        description="Source of the character's motion. bone: the root joint, for data whose root joint moves "
+        "on the ground as the character does.",
     )
     weights: FeatureWeights = Field(FeatureWeights(), description="Weight of each group of features.")
     horizons_s: tuple[Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)], ...] = Field(
         (1 / 3, 2 / 3, 1.0),
         min_length=1,
         max_length=8,
-        description="Times ahead at which the trajectory is compared, in seconds, increasing.",
+        description="Times ahead at which trajectories are compared, in seconds, increasing.",
     )
     extra_joints: tuple[Annotated[str, StringConstraints(min_length=1, max_length=64)], ...] = Field(
         (),
         max_length=16,
-        description="Standard joints matched beside feet and hips; with many of them the trajectory counts too little.",
+        description="Standard joints to match in addition to feet and hips; with many of them the trajectory "
+        "has too little weight.",
     )
     rate_hz: float = Field(
-        TICK_RATE_HZ, ge=10, le=240, allow_inf_nan=False, description="Rate of features and simulation, in hertz."
+        TICK_RATE_HZ,
+        ge=10,
+        le=240,
+        allow_inf_nan=False,
+        description="Rate of the features and of the simulation, in hertz.",
     )
     keep_rest_poses: bool = Field(
-        False, description="Keep frames at a clip's beginning and end that look like calibration or a T-pose."
+        False, description="Keep frames at the beginning and end of a clip that look like a calibration or a T-pose."
     )
 
     @field_validator("horizons_s")
@@ -99,52 +107,52 @@ class ControllerOptions(Options):
 
     follow: Follow = Field(
         "time",
-        description="What the character is asked for. time: the trajectory at the same time; path: the trajectory from "
-        "its nearest point; open_loop: only its speed and turn rate.",
+        description="Desired trajectory of the character. time: the reference at the same time; path: the "
+        "reference from its nearest point on; open_loop: only its speed and turn rate.",
     )
-    search_every_s: float = Field(0.1, gt=0, le=2, allow_inf_nan=False, description="Search period, in seconds.")
+    search_every_s: float = Field(0.1, gt=0, le=2, allow_inf_nan=False, description="Seconds between two searches.")
     continuing_bias: float = Field(
         0.0,
         ge=-1000,
         le=1000,
         allow_inf_nan=False,
-        description="Added to the cost of going on with the current clip; negative values favour it.",
+        description="Value added to the cost of continuing the current clip; negative values favour it.",
     )
     switch_margin: float = Field(
-        1e-4, ge=0, le=1000, allow_inf_nan=False, description="A switch must be cheaper by more than this."
+        1e-4, ge=0, le=1000, allow_inf_nan=False, description="Least gain in cost for which the controller switches."
     )
     reselect_window_s: float = Field(
         0.0,
         ge=0,
         le=10,
         allow_inf_nan=False,
-        description="A search does not choose frames within so many seconds of the current one.",
+        description="Seconds around the current frame that a search does not select.",
     )
     half_life_s: float = Field(
         0.1,
         gt=0,
         le=5,
         allow_inf_nan=False,
-        description="Seconds after a switch in which half of the offset from the old motion is blended out.",
+        description="Half-life in seconds of the offset from the old motion after a switch.",
     )
-    root_inertialisation: bool = Field(True, description="Blend the root's velocity, too.")
+    root_inertialisation: bool = Field(True, description="Also blend the root's velocity.")
     selection: Selection = Field(
         "features",
-        description="features: the weighted features choose; pose_distance: the published cost, the summed distance of "
-        "joints in metres, chooses.",
+        description="Cost of the search. features: the weighted features; pose_distance: the published cost, "
+        "the summed distance of joints in metres.",
     )
     root_adjustment: float = Field(
         0.0,
         ge=0,
         le=1,
         allow_inf_nan=False,
-        description="Share of its distance per second by which the character is pulled to the reference; hides what is "
-        "measured.",
+        description="Share of the distance to the reference per second by which the character is pulled to "
+        "it; this hides tracking errors.",
     )
     root_clamp_m: float | None = Field(
         None,
         gt=0,
         le=100,
         allow_inf_nan=False,
-        description="Greatest distance of the character from the reference, in metres; hides what is measured.",
+        description="Greatest distance of the character from the reference, in metres; this hides tracking errors.",
     )

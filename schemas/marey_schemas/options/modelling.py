@@ -21,24 +21,28 @@ _Share = Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)]
 class MixtureOptions(Options):
     """Fit of a mixture of normal distributions to latent vectors."""
 
-    criterion: Criterion = Field("bic", description="Criterion that chooses the number of mixture components.")
+    criterion: Criterion = Field("bic", description="Criterion that selects the number of mixture components.")
     most_mixture_components: int = Field(
         10,
         ge=1,
         le=100,
-        description="Greatest number of mixture components tried; n examples in d dimensions allow at most n / 2d.",
+        description="Greatest number of mixture components to try; n examples in d dimensions allow at most n / 2d.",
     )
     mixture_components: int | None = Field(
-        None, ge=1, le=100, description="Exact number of mixture components; absent: the criterion chooses."
+        None, ge=1, le=100, description="Exact number of mixture components; absent: the criterion selects it."
     )
     regularisation: float = Field(
-        1e-4, ge=1e-12, le=1, allow_inf_nan=False, description="Added to variances, as a share of the mean variance."
+        1e-4,
+        ge=1e-12,
+        le=1,
+        allow_inf_nan=False,
+        description="Regularisation added to variances, as a share of the mean variance.",
     )
     starts: int = Field(
-        5, ge=1, le=100, description="Number of starts of expectation maximisation; the best one counts."
+        5, ge=1, le=100, description="Number of starts of expectation maximisation; the best result is used."
     )
     folds: int = Field(
-        5, ge=0, le=100, description="Number of parts held out in turn to measure likelihoods; 0: none is."
+        5, ge=0, le=100, description="Number of folds of the cross-validation of likelihoods; 0: no cross-validation."
     )
 
 
@@ -47,17 +51,18 @@ class ModelOptions(MixtureOptions):
 
     scaling: Scaling = Field(
         "jacobian",
-        description="Weights of the channels. jacobian: by how far they move the body; sfpca: optimised for the "
-        "positions of joints; root_max: root axes to a maximum of 1; none: all the same.",
+        description="Weights of the channels. jacobian: by their effect on the body; sfpca: optimised for "
+        "the positions of joints; root_max: root axes scaled to a maximum of 1; none: equal "
+        "weights.",
     )
     inner_product: InnerProduct = Field(
         "coefficients",
-        description="Inner product of spatial functions. coefficients: of their spline coefficients; l2: integrals of "
-        "products of functions, which do not depend on the knots.",
+        description="Inner product of spatial functions. coefficients: of their spline coefficients; l2: of "
+        "the functions themselves, which does not depend on the knots.",
     )
-    spatial_share: _Share = Field(0.95, description="Share of the variance that the spatial components hold.")
+    spatial_share: _Share = Field(0.95, description="Share of the variance that the spatial components explain.")
     spatial_components: int | None = Field(
-        None, ge=0, le=1000, description="Exact number of spatial components, in place of the share."
+        None, ge=0, le=1000, description="Exact number of spatial components, instead of the share."
     )
     spatial_coefficients: int | None = Field(
         None,
@@ -65,8 +70,8 @@ class ModelOptions(MixtureOptions):
         le=10_000,
         description="Number of coefficients of each channel's spline; absent: a fifth of the frames, at least 7.",
     )
-    temporal_share: _Share = Field(0.99, description="Share of the variance that the time components hold.")
-    most_temporal_components: int = Field(3, ge=0, le=1000, description="Greatest number of time components.")
+    temporal_share: _Share = Field(0.99, description="Share of the variance that the temporal components explain.")
+    most_temporal_components: int = Field(3, ge=0, le=1000, description="Greatest number of temporal components.")
     temporal_coefficients: int = Field(
         8, ge=4, le=1000, description="Number of coefficients of the time function's spline."
     )
@@ -75,11 +80,14 @@ class ModelOptions(MixtureOptions):
         ge=1e-3,
         le=1e3,
         allow_inf_nan=False,
-        description="Weight of time scores in latent vectors; absent: time gets the variance of space.",
+        description="Weight of temporal scores in latent vectors; absent: temporal and spatial scores get "
+        "equal variance.",
     )
-    leave_one_out: bool = Field(True, description="Measure how well each example is reconstructed by the others.")
+    leave_one_out: bool = Field(
+        True, description="Measure how well a model of the other examples reconstructs each example."
+    )
     report_samples: int = Field(
-        200, ge=0, le=10_000, description="Number of samples drawn to measure feet and durations."
+        200, ge=0, le=10_000, description="Number of samples drawn to measure foot sliding and durations."
     )
 
 
@@ -88,10 +96,12 @@ class TreeOptions(Options):
 
     samples: int = Field(10_000, ge=1, le=MOST_TREE_SAMPLES, description="Number of samples drawn from the model.")
     branching: int = Field(4, ge=2, le=64, description="Greatest number of children of a node.")
-    leaf_size: int = Field(1, ge=1, le=MOST_TREE_SAMPLES, description="Nodes of at most so many samples are not split.")
+    leaf_size: int = Field(
+        1, ge=1, le=MOST_TREE_SAMPLES, description="Greatest number of samples in a node that is not split."
+    )
     depth: int = Field(64, ge=1, le=64, description="Greatest number of levels below the root.")
     features: FeatureKind = Field(
         "end_effectors",
-        description="What is grouped. end_effectors: where hands, feet and head are at the keyframes, the middle and "
-        "the end; latent: the spatial scores.",
+        description="Values by which samples are grouped. end_effectors: positions of hands, feet and head "
+        "at the keyframes, the middle and the end; latent: the spatial scores.",
     )

@@ -16,6 +16,6 @@ class RefineOptions(Options):
         le=1e6,
         allow_inf_nan=False,
         alias="lambda",
-        description="Weight of a likely motion; the smaller, the nearer the motion comes to the targets.",
+        description="Weight of the motion's likelihood; smaller values bring the motion closer to the targets.",
     )
     iterations: int = Field(50, ge=1, le=200, description="Greatest number of iterations of the optimisation.")
