@@ -308,8 +308,8 @@ def _hip_height_ratio(
 ) -> float:
     """Target by source height of the pelvis above the toes of bodies that stand straight.
 
-    Added up along the bones, because the rest pose of many files is not one that stands. What only one of the skeletons
-    can tell is left out of both.
+    Bone lengths are added up, because many files have a rest pose that is not upright. A part that is known of one
+    skeleton only is left out of both.
     """
     parts = []
     for skeleton, axes, which in ((source, source_axes, "source"), (target, target_axes, "target")):
@@ -326,7 +326,7 @@ def _hip_height_ratio(
 def _heights(
     skeleton: Skeleton, joints: Mapping[str, int], up: NDArray[np.float64], side: str
 ) -> tuple[float, float, float]:
-    """Heights in metres of the pelvis above the hip, the leg and the foot; NaN where they cannot be told.
+    """Measure the pelvis above the hip, the leg and the foot, in metres; NaN where the skeleton does not show it.
 
     `up` is the direction of the trunk in the pelvis' frame.
     """

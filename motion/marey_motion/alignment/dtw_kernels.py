@@ -13,10 +13,10 @@ LANES = 4
 
 @compiled
 def align(costs, path):  # type: ignore[no-untyped-def]
-    """Fill `path` backwards from the end; the least total and the number of cells."""
+    """Fill `path` backwards from the end; return the least total and the number of cells."""
     n, m = costs.shape
     steps = np.empty((n, m), np.uint8)
-    # The row before a block and those of the block, with a border that no way comes from, but into the first cell.
+    # The row before a block and those of the block, with a border from which no path comes, except into the first cell.
     totals = np.full((LANES + 1, m + 1), np.inf)
     totals[0, 0] = 0.0
     whole = n - n % LANES if m >= LANES else 0
@@ -31,7 +31,7 @@ def align(costs, path):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
-    """The least of three totals and the step that has it, without branches, which could not be foreseen."""
+    """Find the least of three totals and its step, without branches, which the processor could not predict."""
     least = min(both, first, second)
     alone = least < both
     return least, np.uint8(alone) + np.uint8(alone & (least < first))
@@ -39,7 +39,7 @@ def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cells(costs, before, totals, steps, start, stop):  # type: ignore[no-untyped-def]
-    """Columns [start, stop) of one row; totals stand one column further than costs and steps."""
+    """Fill columns [start, stop) of one row; totals are one column further right than costs and steps."""
     for j in range(start, stop):
         least, steps[j] = _cheapest(before[j], before[j + 1], totals[j])
         totals[j + 1] = least + costs[j]
@@ -47,7 +47,7 @@ def _cells(costs, before, totals, steps, start, stop):  # type: ignore[no-untype
 
 @compiled
 def _four_rows(costs, totals, steps):  # type: ignore[no-untyped-def]
-    """Each cell waits for the one on its left. Rows that go a column behind the one above them do not wait for it."""
+    """Fill four rows at once, each a column behind the one above it, so that their cells are computed in parallel."""
     m = costs.shape[1]
     for row in range(LANES - 1):
         _cells(costs[row], totals[row], totals[row + 1], steps[row], 0, LANES - 1 - row)
@@ -99,9 +99,9 @@ def total(costs):  # type: ignore[no-untyped-def]
 
 @compiled
 def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
-    """As `align`, with at most `max_run` steps 1-0, or 0-1, in a row."""
+    """Do as `align`, with at most `max_run` steps 1-0, or 0-1, in a row."""
     n, m = costs.shape
-    # Least totals of the ways to each cell that do not come by a step in the first alone, and in the second alone.
+    # Least totals of the paths to each cell whose last step is not in the first alone, and not in the second alone.
     not_first, not_second = np.empty((n, m)), np.empty((n, m))
     runs, scratch = np.full((max_run, m), np.inf), np.empty((2, m))
     for i in range(n):
@@ -113,7 +113,7 @@ def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
 
 @compiled
 def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
-    """The least total alone, infinite where no way keeps the limit, in memory for a few rows."""
+    """Compute the least total alone, with memory for a few rows; infinite where no path keeps the limit."""
     n, m = costs.shape
     not_first, not_second = np.empty((2, m)), np.empty((2, m))
     runs, scratch = np.full((max_run, m), np.inf), np.empty((2, m))
@@ -160,7 +160,7 @@ def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first
 
 @compiled
 def _walk_back_limited(costs, max_run, not_first, not_second, path):  # type: ignore[no-untyped-def]
-    """Fill `path` backwards: at each cell, the first of the least ways to it, runs as a whole."""
+    """Fill `path` backwards: at each cell the first of the cheapest paths to it, a run of steps at a time."""
     i, j, length = costs.shape[0] - 1, costs.shape[1] - 1, 0
     barred = BOTH  # what the step that was taken last, in time, forbids: to go on as another run of its own kind
     while i > 0 or j > 0:
@@ -214,10 +214,10 @@ def distances(a, b, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def total_within(a, b, rest, limit):  # type: ignore[no-untyped-def]
-    """Least total of a way through the distances of a (n, P, 3) and b (P, 3, m); infinite when it is above `limit`.
+    """Compute the least total of a path through the distances of a (n, P, 3) and b (P, 3, m); infinite above `limit`.
 
-    rest (n,): what the rows after each row cost at the least. Every way passes every row, and totals never fall along
-    it: once the least of a row and the rest are above the limit, so is the end.
+    rest (n,): lower bound of the cost of the rows after each row. Every path passes every row, and totals never fall
+    along it: once the least total of a row plus the rest is above the limit, so is the total at the end.
     """
     n, m = a.shape[0], b.shape[2]
     costs = np.empty(m)

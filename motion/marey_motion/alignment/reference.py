@@ -13,7 +13,7 @@ from marey_motion.alignment.dtw import least_total
 from marey_motion.arrays import Floats
 
 Advance = Callable[[int, int], None]
-"""Told how many alignments are done, and of how many."""
+"""Function called with the number of alignments done and their total."""
 
 SAME = 1e-9
 """Sums of costs that differ by less than this share of them are ties."""

@@ -144,7 +144,7 @@ class _Rig:
 
     @property
     def axes(self) -> dict[str, JointAxes]:
-        """Axes of the mapped joints by name; of limbs that the rest pose does not tell, from the motion."""
+        """Axes of the mapped joints by name; where the rest pose does not define those of a limb, from the motion."""
         if self._axes is None:
             take = self.take
             clip = take.motion.as_clip(take.skeleton, take.frame_rate_hz)

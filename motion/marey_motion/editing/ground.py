@@ -15,7 +15,7 @@ from marey_motion.kinematics import forward_kinematics
 
 FEET = ("left_foot", "right_foot")
 LOWEST_SHARE = 0.05
-"""Of the frames: where no foot ever stands, the lowest ones tell where the ground is."""
+"""Share of the frames, the lowest ones, from which the ground is estimated where no foot is ever in stance."""
 
 
 class Ground(NamedTuple):
@@ -24,7 +24,8 @@ class Ground(NamedTuple):
     Parameters
     ----------
     height_m : metres
-    standing_frames : how many frames tell it; with 0, it is where the lowest point of the feet comes down to
+    standing_frames : number of frames with a foot in stance, from which the height is estimated; with 0, the height is
+        that of the feet in the lowest frames
     """
 
     height_m: float

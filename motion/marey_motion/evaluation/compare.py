@@ -32,7 +32,7 @@ LESS_IS_BETTER = (
     "pose_cost_p95",
     "response_s",
 )
-"""Metrics with a direction; of the others only the change is told."""
+"""Metrics of which a lower value is better; of all others only the change is reported."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from marey_schemas.options.evaluation import Grid
 
 MOST_CELLS = 2000
 FARTHEST_M = 1e6
-"""From the origin; beyond it, positions are no longer exact enough to tell speeds, or are broken."""
+"""Distance from the origin beyond which positions are broken, or too inexact to give speeds."""
 
 PATH_RATE_HZ = 5.0
 AWAY_DECIMALS = 1
@@ -269,10 +269,10 @@ def _require_near(positions: Floats) -> None:
 
 
 def _directions(facing: Floats, before: Floats | None) -> Floats:
-    """Unit directions of facing (n, 2), those too short to tell taking that of the frame before them.
+    """Normalise facing directions (n, 2); one that is too short takes the direction of the frame before it.
 
-    `before` (2,) is that of the frame before the first. Without it, frames before the first that tells one are left
-    out: the last m directions (m, 2) come back.
+    `before` (2,) is the direction of the frame before the first. Without it, frames before the first long enough
+    direction are left out, and the last m directions (m, 2) are returned.
     """
     length = np.hypot(facing[:, 0], facing[:, 1])
     known = length >= SHORTEST_LATERAL_M

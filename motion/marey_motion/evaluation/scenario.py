@@ -132,7 +132,8 @@ def require_names(trials: Iterable[Trial]) -> None:
     for trial in trials:
         if trial.name in seen:
             raise MotionError(
-                f"two trials are called {trial.name}; their records could not be told apart", where="grid"
+                f"two trials are called {trial.name}; each needs a name of its own, since records are found by it",
+                where="grid",
             )
         seen.add(trial.name)
 

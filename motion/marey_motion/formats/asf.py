@@ -57,7 +57,7 @@ class AsfSkeleton:
     """An ASF file: bones in depth-first order, the root first.
 
     `parents` are indices; `length_unit` is the file's `units length` (CMU: 0.45), None when it gives none;
-    `degrees` is false where its angles are radians; `root_position` is where the root stands before any motion.
+    `degrees` is false where its angles are radians; `root_position` is the root's position in the rest pose.
     """
 
     bones: list[Bone]

@@ -151,6 +151,6 @@ def _notices(source: SourceMotion, up_axis: UpAxis) -> list[CheckWarning]:
         notices.append(CheckWarning("mixed-rotation-orders", message, values={"orders": listed}))
     repeated = [name for name, shown in zip(source.joint_names, source.display_names, strict=True) if name != shown]
     if repeated:
-        message = f"{len(repeated)} joint names repeat in the file; they are told apart by their parent"
+        message = f"{len(repeated)} joint names repeat in the file; each gets the name of its parent before its own"
         notices.append(CheckWarning("duplicate-joint-names", message, joints=tuple(repeated)))
     return notices

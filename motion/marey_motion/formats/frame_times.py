@@ -42,7 +42,7 @@ def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWar
     FormatError    where no valid rate follows, naming the option that sets it
     """
     if frame_time_s is None:
-        raise _no_rate("no Frame Time tells the frame rate", file)
+        raise _no_rate("the file has no Frame Time", file)
     if LONGEST_FRAME_TIME_S < frame_time_s < float("inf"):
         reason = f"a Frame Time of {frame_time_s:g} s gives no rate of a motion; it looks like a rate or milliseconds"
         raise _no_rate(reason, file)

@@ -24,7 +24,7 @@ CODES = {
     "frames-wrapped": "Frames run over several lines; they were joined by counting values.",
     "no-frames": "The file holds no motion; its skeleton was imported.",
     "frame-time-snapped": "The frame time is rounded; the known frame rate it stands for was taken.",
-    "frame-rate-unusual": "The frame rate is near a usual one, but not equal; it was taken as it stands.",
+    "frame-rate-unusual": "The frame rate is near a usual one, but not equal; it was taken unchanged.",
     "frame-rate-assumed": "The format carries no frame rate; the usual one of its source was assumed.",
     "frame-number-gap": "Frames are numbered with gaps; they were taken as they follow each other.",
     "mixed-rotation-orders": "Joints differ in the order of their Euler angles; each was read in its own.",
@@ -37,12 +37,12 @@ CODES = {
     "sign-flips-unrolled": "Rotations jumped between a quaternion and its negative; the signs were made continuous.",
     # What was inferred.
     "unit-inferred": "The unit of length is not a usual one; it was inferred from the body.",
-    "up-axis-assumed": "Nothing tells which axis points up; y was assumed.",
+    "up-axis-assumed": "The file does not show which axis points up; y was assumed.",
     "up-axis-converted": "Another axis than y points up in the file; the motion was turned.",
     "left-handed": "Left is on the right: the file may be left-handed.",
     # What the motion shows.
     "rest-pose-frame": "The motion begins or ends with a rest pose, which spoils means; it can be trimmed.",
-    "floor-offset": "The feet stand above or below height zero.",
+    "floor-offset": "The floor under the feet is above or below height zero.",
     "floor-penetration": "Feet go below the ground they otherwise stand on.",
     "foot-skate": "Feet slide while they stand.",
     "in-place-gait": "The body walks without travelling, as on a treadmill; leave it out of speed coverage.",
@@ -291,7 +291,7 @@ def _floor_offset(tracks: _Tracks) -> CheckWarning | None:
         return None
     return CheckWarning(
         "floor-offset",
-        f"the feet stand at a height of {height:.2f} m; --align-floor (align_floor) brings them to the ground",
+        f"the floor under the feet is at a height of {height:.2f} m; --align-floor (align_floor) moves it to zero",
         values={"floor_height_m": height},
     )
 

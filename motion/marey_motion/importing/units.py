@@ -142,11 +142,13 @@ def _choose_up_axis(source: SourceMotion, body: _Measurements, options: ImportOp
         return source.up_axis
     if body.leg is None:
         body.evidence.append("up axis y: the usual one, assumed because no feet were found")
-        body.warnings.append(CheckWarning("up-axis-assumed", "no feet tell which way is up; y is assumed"))
+        body.warnings.append(
+            CheckWarning("up-axis-assumed", "no feet were found that show which axis points up; y is assumed")
+        )
         return "y"
     standing, flat = _body_axis(body.positions, body.landmarks), _flat_axis(body)
     if flat is not None and flat[0] != standing[0] and _stands_on_all_fours(body, flat[0]):
-        body.evidence.append(f"up axis {flat[0]}: hands and feet stand below the hips; {flat[1]}")
+        body.evidence.append(f"up axis {flat[0]}: hands and feet are below the hips; {flat[1]}")
         return flat[0]
     if standing[0] == "y" and standing[1] >= _CLEAR_COSINE:
         body.evidence.append(

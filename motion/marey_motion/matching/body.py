@@ -29,7 +29,7 @@ class MatchingBody:
         reference, only move the whole body about.
     torso : the joint whose ground projection carries the simulation root: the upper spine, else the hips
     feet, toes : (left, right); the ankles, and what touches the ground (the ankles where there are no toes)
-    lefts, rights : matching joints of both sides, hips and shoulders, whose difference tells where the body faces
+    lefts, rights : matching joints of both sides, hips and shoulders; their difference shows where the body faces
     pose_joints : the joints of the pose cost, in the order of `POSE_JOINTS`, those that the skeleton has
     partners : (J,) each joint's partner on the other side, its own index for joints of the centre
     standard_joints : joint index by standard name, of all that the mapping knows

@@ -74,7 +74,7 @@ class ControllerConstants(NamedTuple):
 
 
 class DatabaseArrays(NamedTuple):
-    """What a controller needs of a database beside the index: its course, pose joints, normaliser and look-ahead."""
+    """Arrays of a database that a controller needs beside the index: steps of the root, pose joints and normaliser."""
 
     successors: NDArray[np.int64]
     steps: Floats
@@ -119,11 +119,8 @@ def run_trial(
     """
     from marey_motion.matching import controller_kernels as kernels
 
-    wish, rules, playback = (
-        trajectory_arrays(guide),
-        controller_constants(options, guide.rate_hz),
-        database_arrays(database),
-    )
+    trajectory, constants = trajectory_arrays(guide), controller_constants(options, guide.rate_hz)
+    rows = database_arrays(database)
     if guide.rate_hz != database.options.rate_hz:
         raise MotionError(
             f"the trajectory has {guide.rate_hz:g} ticks per second, the database {database.options.rate_hz:g}"
@@ -131,11 +128,11 @@ def run_trial(
     if len(index.rows) != database.row_count:
         raise MotionError(f"the index has {len(index.rows)} rows, the database {database.row_count}")
     last = database.starts[1:] - 1
-    ends = last[database.selectable[last] & (playback.successors[last] < 0)]
+    ends = last[database.selectable[last] & (rows.successors[last] < 0)]
     if len(ends):
         raise MotionError(f"row {ends[0]} may be chosen but is the last of its clip", where="selectable")
     ticks = guide.tick_count
-    arrays = _Arrays(
+    played = _Arrays(
         rows=np.empty(ticks, np.int32),
         positions=np.empty((ticks, 2)),
         headings=np.empty(ticks),
@@ -143,9 +140,9 @@ def run_trial(
         match_cost=np.empty(ticks),
         continuing_cost=np.empty(ticks),
     )
-    kernels.run(index, playback, wish, rules, arrays)
-    costs = pose_costs(database, arrays.rows, options)
-    return TrialRecord(rate_hz=guide.rate_hz, pose_cost=costs, **arrays._asdict())
+    kernels.run(index, rows, trajectory, constants, played)
+    costs = pose_costs(database, played.rows, options)
+    return TrialRecord(rate_hz=guide.rate_hz, pose_cost=costs, **played._asdict())
 
 
 def controller_constants(options: ControllerOptions, rate_hz: float) -> ControllerConstants:

@@ -142,7 +142,7 @@ class MatchingDatabase:
     R(theta) the turn about +Y, joint 0 is at R(theta)·poses[:3] + (p.x, 0, p.z) with the rotation R(theta)·poses[3:7].
     All other joints follow by their local rotations, offsets and translations. With the clip's own root that gives the
     clip's pose, for the body's carrier and every joint below it. Joints above the carrier, which in clips may be left
-    behind at an origin, stand at rest under the body and head as the root does.
+    behind at an origin, are at rest under the body and have the heading of the root.
 
     Parameters
     ----------

@@ -57,7 +57,7 @@ class FittedExamples:
 
 
 def _silent(_done: int, _total: int | None, _doing: str) -> None:
-    """Tell nobody."""
+    """Ignore progress."""
 
 
 def train_primitive(

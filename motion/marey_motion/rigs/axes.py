@@ -201,8 +201,8 @@ class _PosedBody:
         """Make the error for a direction between joints at the same position."""
         names = [self.skeleton.joint_names[self.joints[standard]] for standard in (start, end)]
         return MappingError(
-            f"{names[0]} ({start}) and {names[1]} ({end}) stand in one place, so no axis can be told from the bone "
-            f"between them; map {end} to a joint further on, or give the bone a length",
+            f"{names[0]} ({start}) and {names[1]} ({end}) are at the same position, so the bone between them "
+            f"gives no axis; map {end} to a joint further on, or give the bone a length",
             where=end,
         )
 

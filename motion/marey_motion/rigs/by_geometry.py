@@ -29,10 +29,10 @@ TWIN = 0.02
 MOST_PLANS = 30
 # Cosine of the sharpest turn within a neck.
 HAIR_TURN = 0.75
-# How much telling the sides apart by the rest pose takes from the confidence.
+# Factors of the confidence where the sides are distinguished by the rest pose, or guessed.
 SIDES_UNNAMED, SIDES_GUESSED = 0.8, 0.7
-TOLD = "were told apart by the rest pose alone"
-GUESSED = "are a guess: no foot tells where the body faces, so left was taken for +x; check before use"
+TOLD = "were distinguished by the rest pose alone"
+GUESSED = "are a guess: no foot shows the direction the body faces, so left was taken for +x; check before use"
 # Plans that are worth so little less are as likely, and what that takes from the confidence.
 CLOSE, DOUBTED = 0.3, 0.6
 
@@ -159,7 +159,7 @@ def _branches(tree: BoneTree, joint: int) -> list[int]:
 
 
 def _left_direction(skeleton: Skeleton, legs: LimbReading, joints: dict[str, int]) -> Floats | None:
-    """Up crossed with where the feet point, in the rest pose; None where that pose is too degenerate to tell."""
+    """Cross up with the direction of the feet, in the rest pose; None where that pose is too degenerate."""
     positions = skeleton.rest_global_positions
     up = positions[joints.get("head", joints["pelvis"])] - positions[joints["pelvis"]]
     forward = sum((_foot(skeleton, legs.joint(side, 2), legs.joint(side, 3)) for side in range(2)), start=np.zeros(3))

@@ -18,7 +18,7 @@ Names = str | tuple[str, ...]
 class KnownRig:
     """Names of one rig's joints; several names of a joint are alternatives, the first that is found counts.
 
-    `signature` tells rigs apart that name the body alike: names of further joints, or what most names begin with,
+    `signature` distinguishes rigs that name the body alike: names of further joints, or a prefix of most names,
     written "prefix*". More than half of it must be there. `everyday` marks words that are no tool's own: they count
     where they name more of a body than the names of every tool.
     """

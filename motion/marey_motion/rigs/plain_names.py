@@ -74,7 +74,7 @@ def _without_common_start(names: Names) -> Names:
 
 
 def _without_numbers(names: Names) -> Names:
-    """Without running numbers before or after all names, unless they are what tells joints apart."""
+    """Drop running numbers before or after all names, unless names would repeat without them."""
     for number in (_NUMBER_AFTER, _NUMBER_BEFORE):
         plainer = tuple(number.sub("", name) for name in names)
         if all(map(number.search, _marked(names))) and len(set(plainer)) == len(set(names)):

@@ -151,7 +151,7 @@ def told_apart(names: Sequence[str]) -> list[str]:
 
 
 def labels_of(names: Sequence[str], longest: int = LONGEST_NAME) -> list[str]:
-    """Names of clips as short as `longest` signs, by which those that differ can be told apart.
+    """Shorten names of clips to `longest` characters so that different names stay different.
 
     Folders are left out where the takes in them have names of their own, and what all names begin with where one is
     too long. Where cutting the middle would make several alike, the beginning that they share is cut instead.
@@ -197,7 +197,7 @@ def nice_ceiling(value: float) -> float:
 
 
 def warm_colours() -> Colormap:
-    """From a yellow that is told from an empty page to brown."""
+    """Make a colour map from yellow to brown that differs from an empty page at its light end."""
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 

@@ -46,7 +46,7 @@ class StickFigure:
     pelvis : the joint that figures are centred on
     head : bone along which the middle of the head is, and how far from its inner (0) to its outer (1) end; None
         where no head is known
-    facing : joints of the left and, matching, of the right side that tell where the body faces
+    facing : joints of the left side and their partners of the right, which give the direction the body faces
     """
 
     bones: Indices
@@ -63,7 +63,7 @@ class Stances:
     Parameters
     ----------
     points : (K, P, 3) positions over the floor, centred on the pelvis, metres
-    facing : (K, 2) unit (x, z) directions, None where the body does not tell
+    facing : (K, 2) unit (x, z) directions, None where the body does not show them
     """
 
     points: AnyFloats

@@ -8,7 +8,7 @@ from marey_reports.drawing.tables import table
 
 _WORDS = (
     ("example", "a clip that the model was made of, after it was aligned with the others"),
-    ("sample", "a motion that the model made up"),
+    ("sample", "a synthetic motion, drawn from the model"),
     (
         "canonical frame and time",
         "the common place and time of all examples: the root begins where the axes cross, the body faces forward, and "
@@ -45,7 +45,7 @@ _NUMBERS = (
         "alignment",
         "cm",
         "root mean square distance of the joints of an example and of the reference, after the best turn and shift, "
-        "along the way of the alignment",
+        "along the path of the alignment",
     ),
     (
         "sliding feet",

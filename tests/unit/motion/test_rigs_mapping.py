@@ -369,7 +369,7 @@ def test_sides_that_no_foot_tells_are_said_to_be_a_guess(body):
     )
     mapping = map_joints(footless)
 
-    assert sum("are a guess: no foot tells" in note for note in mapping.notes) == 2
+    assert sum("are a guess: no foot shows" in note for note in mapping.notes) == 2
     assert mapping.confidence < map_joints(anonymous(body)).confidence
 
 

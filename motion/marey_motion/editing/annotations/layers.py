@@ -70,7 +70,7 @@ class Layer:
         return index
 
     def _among(self, start: int, end: int) -> tuple[int, int]:
-        """The range of the segments that have some of the frames [start, end), or would stand there."""
+        """Find the range of the segments that share frames with [start, end), or the place to insert one."""
         first = bisect_right(self.segments, start, key=_end)
         return first, max(first, bisect_left(self.segments, end, key=_start))
 
@@ -433,7 +433,7 @@ def _require_keyframes(keyframes: Sequence[Keyframe], frame_count: int) -> None:
             raise _wrong(keyframe, "outside-clip", f"the clip has the frames 0:{frame_count}")
     for earlier, later in pairwise(keyframes):
         if earlier == later:
-            raise _wrong(later, "keyframe-exists", "it stands there already")
+            raise _wrong(later, "keyframe-exists", "the layer has it already")
 
 
 def _require_label(label: str, place: str) -> None:

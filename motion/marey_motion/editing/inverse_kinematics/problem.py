@@ -1,6 +1,7 @@
 """Targets and freedom packed into the arrays that the kernels of inverse kinematics work on.
 
-Of a skeleton only the joints between the root and the targets matter; these K joints are numbered anew, parents first.
+Of a skeleton only the joints between the root and the targets matter; these K joints are numbered
+parents first.
 """
 
 from __future__ import annotations

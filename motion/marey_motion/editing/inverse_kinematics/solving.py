@@ -62,8 +62,8 @@ class TwoBoneLimb:
     Parameters
     ----------
     start, middle, end : indices of shoulder, elbow, wrist, or hip, knee, ankle
-    hinge : unit direction in the middle joint's frame about which the limb bends. It is read where the limb is nearly
-        straight, or a little beyond, and does not tell itself; None leaves that to chance.
+    hinge : unit axis in the middle joint's frame about which the limb bends. It is used where the limb is nearly
+        straight, or a little overstretched, so that its pose does not define the axis; with None the axis is arbitrary
     """
 
     start: int

@@ -80,8 +80,8 @@ def _bent(upper, fore, wished, hinge):  # type: ignore[no-untyped-def]
 def _turn_from_hinge(along, across, cosine, wished):  # type: ignore[no-untyped-def]
     """Angle about the upper bone from a limb's hinge to the axis that it bends about by `wished` radians.
 
-    A limb that is nearly straight is taken to bend as its hinge says, even where it is a little beyond straight; what
-    it is bent aside stays, what is added is about the hinge. One that is bent tells its axis itself.
+    A nearly straight limb bends about its hinge, even where it is a little overstretched; a bend to the side is kept,
+    and the added bend is about the hinge. The pose of a bent limb defines the axis.
 
     Parameters
     ----------

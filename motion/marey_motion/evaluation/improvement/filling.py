@@ -45,7 +45,7 @@ class Filling:
     filled_s : sum over the cells
     blendable_share : of its frames in these cells, how many come near a frame of the set; None for another skeleton
     measured : frames compared
-    needs_retarget : it is of another skeleton; its share can be told once it is retargeted
+    needs_retarget : it is of another skeleton; its share is known once it is retargeted
     score : filled_s times blendable_share; candidates are ranked by it, those without a share last by filled_s
     coverage_index : of the set with this candidate
     """

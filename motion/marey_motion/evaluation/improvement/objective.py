@@ -10,7 +10,7 @@ from marey_motion.evaluation.result import TrialResult
 from marey_schemas.options.improvement import ObjectiveOptions
 
 HEADLINES = ("offset_mean", "abs_se_v", "abs_se_omega_deg", "pose_cost_mean", "transitions_per_s")
-"""Metrics by which changes of a data set are told."""
+"""Metrics that are reported for a changed data set."""
 
 
 def objective_value(weights: ObjectiveOptions, results: Sequence[TrialResult], seconds: float) -> float:

@@ -133,7 +133,7 @@ def _require_same(simulation: Resimulation, options: OptimisationOptions, last: 
     if value != last.objective:
         raise MotionError(
             f"the objective is {value:.17g} where the log has {last.objective:.17g}; go on with the same clips, "
-            "normaliser, trials and objective, or begin anew",
+            "normaliser, trials and objective, or start a new log",
             code="log-mismatch",
             where=f"step {last.number}",
         )

@@ -31,7 +31,7 @@ from marey_schemas.options.improvement import SuggestionOptions
 ProgressCallback = Callable[[int, int, str], None]
 
 USUAL_BLENDABLE_M = 0.5
-"""Summed over seven joints; taken where a suite made no transition whose cost could tell."""
+"""Pose cost summed over seven joints; the default where a suite made no transition to measure it by."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ clips. Of a used clip those frames are unneeded that lie farther than `MARGIN_BE
 `MARGIN_AFTER_S` after every frame that a trial displayed or chose, and beyond the window of frames that a search there
 may not choose. Taking their rows out of the database leaves the rows that are needed, the ones that follow them and all
 their features as they are. The margins are as wide as filters and differences reach, so that they hold what the
-features of needed frames were made from, too; but a recording that is cut there is sampled and filtered anew, which
+features of needed frames were made from, too; but a recording that is cut there is sampled and filtered again, which
 rounds differently, and its frames near the cut look ahead into nothing: that is near the same, not the same, and is not
 called safe.
 """
@@ -47,8 +47,8 @@ class UnusedClip:
 class UnusedRange:
     """Frames [start, stop), at the database's rate from the clip's first row, that no trial needs of a source.
 
-    They are unneeded in the clip and in its mirrored twin. The times are those of the recording, whose beginning need
-    not be the first row.
+    They are unneeded in the clip and in its mirrored copy. Times are times of the recording, which may begin before the
+    first row.
     """
 
     source: str

@@ -30,7 +30,7 @@ class PredecessorAlignment:
 
     Parameters
     ----------
-    frames : (N,) int64    frame of the source at each canonical frame, as it stands in the document
+    frames : (N,) int64    frame of the source at each canonical frame, unchanged from the document
     sections : canonical frames [start, end) of each section
     """
 

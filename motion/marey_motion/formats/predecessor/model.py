@@ -2,8 +2,8 @@
 
 Layout 3 has the parts `sspm` (space), `tspm` (time) and `gmm`; layouts 1 and 2 are flat and name space
 `eigen_vectors_spatial` and time `*_temporal_semantic*` or `*_time*`; a static primitive has `spatial_coeffs` alone.
-Right-handed, centimetres, quaternions w, x, y, z; the root's translation is added to the root's offset. Coefficients
-stand in rows (coefficient, channel).
+Right-handed, centimetres, quaternions w, x, y, z; the root's translation is added to the root's offset. Arrays
+of coefficients have the shape (coefficient, channel).
 """
 
 from __future__ import annotations
@@ -309,7 +309,7 @@ def _functions(part: Document, what: str, file: str) -> tuple[SplineBasis, Float
 
 
 def _basis(part: Document, what: str, file: str) -> SplineBasis:
-    """The basis over the knots; the oldest models tell how many coefficients and frames there are instead."""
+    """Make the basis over the knots; the oldest models have the numbers of coefficients and frames instead of knots."""
     if "knots" not in part and "n_frames" in part:
         frames, count = (field_of(part, name, int, file) for name in ("n_frames", "n_coeffs"))
         if not 2 <= count <= frames <= MOST_FRAMES:

@@ -1,6 +1,6 @@
-"""The time functions of the predecessor's models, and ours made of them and the other way round.
+"""Conversion between the time functions of the predecessor's models and ours, in both directions.
 
-Both models tell which frame of an example stands at each canonical frame x = 0 to N - 1, as functions of a score vector
+Both models map each canonical frame x = 0 to N - 1 to a frame of an example, as functions of a score vector
 g. Ours keeps ln(t(x + 1) - t(x)), linear in g. The predecessor has two forms:
 
 * `coefficients` (layouts 1 and 3, and layout 2 by its later trainer): t(x) is a spline whose coefficients are
@@ -190,7 +190,7 @@ def _linear_fit(scores: Floats, values: Floats) -> tuple[Floats, Floats]:
 def _basis_over(steps: int) -> SplineBasis:
     """As many coefficients as steps: a function is taken over as it is, whatever its own knots.
 
-    Knots stand at steps, all but the second and the last but one: evenly spaced ones would drift from the steps to
+    Knots are at steps, all but the second and the last but one: evenly spaced ones would drift from the steps to
     between them, where interpolation amplifies rounding. Long functions have fewer.
     """
     if steps <= DEGREE:

@@ -32,8 +32,8 @@ from marey_motion.modelling.search.tracking import (
     Chains,
     Clocks,
     Tracked,
+    body_place,
     facing,
-    standing,
     track_points,
     track_times,
 )
@@ -247,7 +247,7 @@ def _row(
             return _ResidualRow(kernels.HEADING, place(facing(frame, standard_joints)), (constraint.heading_rad,))
         case RootPosition():
             x, z = constraint.target_m
-            return _position_row(place(standing(frame, standard_joints)), (x, None, z))
+            return _position_row(place(body_place(frame, standard_joints)), (x, None, z))
         case _:
             joint = place(Tracked(frame, (joint_index(primitive, constraint.joint, standard_joints),)))
     match constraint:

@@ -22,7 +22,7 @@ from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search import slope_kernels
 from marey_motion.modelling.search.constraints import Constraint, InvalidConstraint
 from marey_motion.modelling.search.objective import AT_ORIGIN, Linearised, Objective, as_row, build_objective
-from marey_motion.modelling.search.tracking import Chains, Tracked, facing, standing, track_points
+from marey_motion.modelling.search.tracking import Chains, Tracked, body_place, facing, track_points
 
 MOST_STEPS = 32
 TRANSITION_JOINTS = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
@@ -37,8 +37,8 @@ class Step:
 
     Parameters
     ----------
-    standard_joints : joint index by standard name; where there are several steps, with hips and shoulders, which tell
-        where the body faces
+    standard_joints : joint index by standard name; several steps need hips and shoulders, which give the direction
+        the body faces
     """
 
     primitive: MotionPrimitive
@@ -262,7 +262,7 @@ def _ends(step: Step, joints: Sequence[str]) -> tuple[Tracked, ...]:
         one
         for frame in (0.0, float(step.primitive.frame_count - 1))
         for one in (
-            standing(frame, step.standard_joints),
+            body_place(frame, step.standard_joints),
             facing(frame, step.standard_joints),
             *(Tracked(frame, (step.standard_joints[name],)) for name in joints),
         )

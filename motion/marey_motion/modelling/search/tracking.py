@@ -16,7 +16,7 @@ from marey_motion.errors import MappingError
 from marey_motion.modelling.primitive import MotionPrimitive
 
 LEFTS, RIGHTS = ("left_hip", "left_shoulder"), ("right_hip", "right_shoulder")
-"""Standard joints whose difference tells where a body faces."""
+"""Standard joints whose difference gives the direction the body faces."""
 
 
 class Tracked(NamedTuple):
@@ -40,7 +40,7 @@ class Chains(NamedTuple):
     Parameters
     ----------
     mean, directions : (X,), (k, X) channels, and what one unit of each spatial score adds to them
-    columns : (V,) first channel of each joint's quaternion; a root's translation stands before it
+    columns : (V,) first channel of each joint's quaternion; a root's translation precedes it
     parents : (V,) place of the parent among the V, -1 for roots
     offsets : (V, 3) metres
     term_starts, term_nodes, term_signs : (n + 1,), (t,), (t,) the joints whose positions make up each point
@@ -81,7 +81,7 @@ class Clocks(NamedTuple):
     log_slope_bounds: Floats
 
 
-def standing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
+def body_place(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
     """Choose the point that gives the place of the body: the pelvis, else the root.
 
     Parameters

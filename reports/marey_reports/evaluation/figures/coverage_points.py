@@ -1,4 +1,4 @@
-"""Figure 1: the speeds and turn rates of every clip, told apart by colour and marker."""
+"""Figure 1: the speeds and turn rates of every clip, distinguished by colour and marker."""
 
 from __future__ import annotations
 

@@ -159,7 +159,7 @@ def _seconds(subject: Subject, plane: _Plane, edges: tuple[Floats, Floats], cell
 
 
 def _norm(ceiling: float) -> Any:
-    """Square roots, so that little data is told from none."""
+    """Make a scale of square roots, on which little data is distinguishable from none."""
     from matplotlib.colors import PowerNorm
 
     return PowerNorm(0.5, vmin=0.0, vmax=ceiling)

@@ -44,8 +44,8 @@ class CostView(NamedTuple):
     frames: tuple[NDArray[np.int64], NDArray[np.int64]]
 
     @property
-    def along_way_cm(self) -> Floats:
-        """(N,) at each canonical frame, where the way goes."""
+    def along_path_cm(self) -> Floats:
+        """Costs (N,) along the path, one at each canonical frame."""
         wanted = (np.arange(len(self.clip.time_function)), np.rint(self.clip.time_function))
         cells = [
             np.abs(frames - each[:, None]).argmin(axis=1) for frames, each in zip(self.frames, wanted, strict=True)
@@ -54,7 +54,7 @@ class CostView(NamedTuple):
 
 
 def draw_alignment_costs(aligned: AlignedSet, options: PoseCostSettings | None = None) -> Sketch | None:
-    """The clip of middling cost and the one of the highest; None where there is only the reference."""
+    """Draw the clip of median cost and the one of the highest; None where there is only the reference."""
     views = [_view(aligned, role, clip, options) for role, clip in _chosen(aligned)]
     if not views:
         return None
@@ -75,24 +75,24 @@ def draw_alignment_costs(aligned: AlignedSet, options: PoseCostSettings | None =
         ends = (float(view.frames[0][-1]) / rate, float(view.frames[1][-1]) / rate)
         image = panel.imshow(view.costs_cm.T, origin="lower", extent=(0.0, ends[0], 0.0, ends[1]), aspect="auto",
                              cmap=MORE_IS_WORSE, vmin=0.0, vmax=ceiling, interpolation="nearest")  # fmt: skip
-        way = np.arange(aligned.frame_count) / rate
+        path_s = np.arange(aligned.frame_count) / rate
         for colour, width in ((LIGHT, 3.0), (DARK, 1.3)):
-            panel.plot(way, view.clip.time_function / rate, color=colour, lw=width)
+            panel.plot(path_s, view.clip.time_function / rate, color=colour, lw=width)
     place_of_bar = Place(0.75 + len(views) * (SIDE + 0.85) - 0.55, 0.65, 0.12, SIDE)
     add_colour_bar(figure, image, place_of_bar, "distance of poses (cm)")
     parts = [
-        f"{view.clip.name}, {view.role} ({100.0 * np.sqrt(view.clip.cost):.1f} cm along its way)" for view in views
+        f"{view.clip.name}, {view.role} ({100.0 * np.sqrt(view.clip.cost):.1f} cm along its path)" for view in views
     ]
     caption = (
         "How far poses of a clip are from poses of the reference, after the best turn and shift on the floor, for "
-        f"every pair of moments; the line is the way that was taken: {'; '.join(parts)}. A way along a light valley, "
+        f"every pair of moments; the line is the path that was taken: {'; '.join(parts)}. A path along a light valley, "
         "without long straight runs, is a good alignment. Clips are rebuilt from their aligned form."
     )
     table = {
         "clip": [view.clip.uid for view in views for _ in range(aligned.frame_count)],
         "reference_frame": np.tile(np.arange(aligned.frame_count), len(views)),
         "clip_frame": np.concatenate([view.clip.time_function for view in views]),
-        "distance_cm": np.concatenate([view.along_way_cm for view in views]),
+        "distance_cm": np.concatenate([view.along_path_cm for view in views]),
     }
     return Sketch(figure, {"ways": table}, caption)
 

@@ -174,7 +174,7 @@ def _deviations(judged: Floats) -> Floats:
 
 
 def _judged(example: ExampleReport) -> float:
-    """The likelihood that tells odd examples."""
+    """The likelihood by which unusual examples are found: the held-out one where it is known."""
     held_out = example.held_out_log_likelihood
     return example.log_likelihood if held_out is None else held_out
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 NAMED = 4
 POINTS = 12_000
-"""That all lines of a panel have together: more cannot be told apart."""
+"""Most points of all lines of a panel together; more could not be seen."""
 TABLED = 100
 SPEED_SPAN = (0.1, 10.0)
 
