@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from benchmarks.timing import Row, Timing, time_in_turn
 from marey_motion import quaternions
-from marey_motion.alignment.aligning import AlignmentSettings, SourceExample, align_clips
-from marey_motion.alignment.cost import PoseCostSettings, frame_costs
+from marey_motion.alignment.aligning import SourceExample, align_clips
+from marey_motion.alignment.cost import frame_costs
 from marey_motion.alignment.dtw import align
 from marey_motion.alignment.warp import warped
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
 from marey_motion.rigs import map_joints
+from marey_schemas.options.alignment import AlignOptions, CostOptions
 
 Floats = NDArray[np.float64]
 
@@ -79,7 +80,7 @@ def _clouds(frames: int, points: int, seed: int) -> Floats:
 def _pair(frames: int, others: int, points: int, repeats: int, calls: int) -> list[Row]:
     a, b = _clouds(frames, points, 1), _clouds(others, points, 2)
     size = f"{frames} x {others}, {points} points"
-    plain = PoseCostSettings("plain")
+    plain = CostOptions(cost="plain")
     costs = frame_costs(a, b, plain)
     given = _peers_given_costs(costs)
     of_points = _peers_of_points(a.reshape(frames, -1), b.reshape(others, -1))
@@ -142,7 +143,7 @@ def _published_pair() -> Row:
 
 def _published_set() -> Row:
     examples, body = _examples(30, (42, 53))
-    options = AlignmentSettings(reference=examples[0].uid)
+    options = AlignOptions(reference=examples[0].uid)
     (ours,) = time_in_turn(lambda: align_clips(examples, body, options), repeats=5)
     return Row(
         "aligning clips with a given reference",

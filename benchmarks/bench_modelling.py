@@ -10,7 +10,7 @@ from skfda.representation.basis import BSplineBasis
 from sklearn.mixture import GaussianMixture
 
 from benchmarks.timing import Row, Timing, time_in_turn
-from marey_motion.alignment.aligning import AlignmentSettings, SourceExample, align_clips
+from marey_motion.alignment.aligning import SourceExample, align_clips
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.modelling.fpca import Keep, find_components
@@ -18,6 +18,7 @@ from marey_motion.modelling.mixture_fitting import fit_mixture, one_thread
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.modelling.training import train_primitive
 from marey_motion.rigs import map_joints
+from marey_schemas.options.alignment import AlignOptions
 from marey_schemas.options.modelling import ModelOptions
 
 Floats = NDArray[np.float64]
@@ -107,7 +108,7 @@ def _mixtures() -> Row:
 
 def _whole_model() -> Row:
     examples, body = _examples(30)
-    options = AlignmentSettings(reference=examples[0].uid)
+    options = AlignOptions(reference=examples[0].uid)
     (ours,) = time_in_turn(lambda: train_primitive(align_clips(examples, body, options), WITHOUT_REPORT), repeats=5)
     return Row(
         "alignment, principal functions, mixture",
@@ -122,7 +123,7 @@ def _whole_model() -> Row:
 
 def _report() -> Row:
     examples, body = _examples(200)
-    aligned = align_clips(examples, body, AlignmentSettings(reference=examples[0].uid))
+    aligned = align_clips(examples, body, AlignOptions(reference=examples[0].uid))
     (ours,) = time_in_turn(lambda: train_primitive(aligned), repeats=3)
     return Row(
         "training with its report, every example left out once",

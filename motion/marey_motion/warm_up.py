@@ -198,21 +198,21 @@ def _compare(points: NDArray[np.float32]) -> None:
 
 def _align(clip: Clip) -> None:
     """Align a clip with itself by every cost, as quickly and as slowly as it likes."""
-    from marey_motion.alignment.aligning import AlignmentSettings, SourceExample, align_clips
-    from marey_motion.alignment.cost import PoseCostSettings
+    from marey_motion.alignment.aligning import SourceExample, align_clips
     from marey_motion.matching.body import MatchingBody
     from marey_motion.rigs import map_joints
+    from marey_schemas.options.alignment import AlignOptions
 
     body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
     examples = [SourceExample(uid, uid, clip) for uid in ("one", "other")]
-    for cost in (
-        PoseCostSettings(),
-        PoseCostSettings("plain"),
-        PoseCostSettings(window=3),
-        PoseCostSettings("plain", window=3),
+    for options in (
+        AlignOptions(cost="turned"),
+        AlignOptions(cost="plain"),
+        AlignOptions(cost="turned", window=3),
+        AlignOptions(cost="plain", window=3),
     ):
-        for max_run in (None, 3):
-            align_clips(examples, body, AlignmentSettings(cost=cost, max_run=max_run))
+        for slope_limit in (None, 3):
+            align_clips(examples, body, options.replace(slope_limit=slope_limit))
 
 
 def _measure(clip: Clip) -> None:

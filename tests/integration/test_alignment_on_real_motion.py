@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from marey_motion.alignment.aligned import AlignedSet
-from marey_motion.alignment.aligning import AlignmentSettings, SourceExample, align_clips, restore
+from marey_motion.alignment.aligning import SourceExample, align_clips, restore
 from marey_motion.formats import read_motion
 from marey_motion.kinematics import forward_directions
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
 from marey_motion.resampling import resample_motion
 from marey_motion.rigs import map_joints
+from marey_schemas.options.alignment import AlignOptions
 
 RATE_HZ = 30.0
 
@@ -50,7 +51,7 @@ def test_six_ways_to_raise_a_hand_become_one_action(mocap: Path) -> None:
     files = sorted((mocap / "bandai-namco-2").glob("*raise-up*right-hand*normal*.bvh"))
     examples, body = examples_in(files)
     assert len(examples) == 6
-    aligned = align_clips(examples, body, AlignmentSettings(rate_hz=RATE_HZ))
+    aligned = align_clips(examples, body, AlignOptions(rate_hz=RATE_HZ))
     require_aligned(aligned, examples, body)
     assert max(clip.cost for clip in aligned.clips) < 0.02**2
     right_hand = body.standard_joints["right_wrist"]
@@ -62,7 +63,7 @@ def test_six_ways_to_raise_a_hand_become_one_action(mocap: Path) -> None:
 def test_walks_of_one_person_are_in_step(mocap: Path) -> None:
     folder = mocap / "cmu-amc" / "07"
     examples, body = examples_in(sorted(folder.glob("*walk.amc"))[:5], folder / "07.asf")
-    aligned = align_clips(examples, body, AlignmentSettings(rate_hz=RATE_HZ))
+    aligned = align_clips(examples, body, AlignOptions(rate_hz=RATE_HZ))
     require_aligned(aligned, examples, body)
     lefts, rights = body.feet
     ahead = []

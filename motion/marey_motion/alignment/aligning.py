@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Placement
 from marey_motion.alignment.canonical import placed, to_canonical
-from marey_motion.alignment.cost import CostPoints, PoseCostSettings, cost_points, costs_between
+from marey_motion.alignment.cost import CostPoints, cost_points, costs_between
 from marey_motion.alignment.dtw import align
 from marey_motion.alignment.reference import medoid, nearest_mean_length, pairwise_totals
 from marey_motion.alignment.segments import (
@@ -35,8 +35,8 @@ from marey_motion.mirroring import mirror_clip
 from marey_motion.motion import Motion
 from marey_motion.resampling import resample_motion
 from marey_motion.skeleton import Skeleton, same_hierarchy
+from marey_schemas.options.alignment import MEDOID, NEAREST_MEAN_LENGTH, AlignOptions
 
-MEDOID, NEAREST_MEAN_LENGTH = "medoid", "nearest_mean_length"
 LEAST_CLIPS = 2
 LEAST_FRAMES = 4
 MOST_FRAMES = 4000
@@ -67,28 +67,6 @@ class SourceExample:
     name: str
     clip: Clip
     cuts: tuple[Cut, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class AlignmentSettings:
-    """Options of an alignment.
-
-    Parameters
-    ----------
-    reference : "medoid", "nearest_mean_length", or the uid of the example whose time is the canonical time
-    rate_hz : of canonical frames; None for that of the reference where its uid is given, else for the commonest one
-    max_run : at most so many frames of one motion in a row are matched with a single one of the other (the slope
-        limit); None for any
-    cost : of a pair of frames; its weights are one for each joint of the skeleton. Without weights, all joints of the
-        body count the same, and those that it does not carry (a static root, what lies on the floor) not at all.
-    keep_height : leave heights above the floor as they are
-    """
-
-    reference: str = MEDOID
-    rate_hz: float | None = None
-    max_run: int | None = 3
-    cost: PoseCostSettings = field(default_factory=PoseCostSettings)
-    keep_height: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +109,7 @@ def with_mirrored(examples: Sequence[SourceExample], body: MatchingBody) -> list
 def align_clips(
     clips: Sequence[SourceExample],
     body: MatchingBody,
-    options: AlignmentSettings | None = None,
+    options: AlignOptions | None = None,
     *,
     threads: int = 1,
     progress: Progress | None = None,
@@ -145,7 +123,7 @@ def align_clips(
     ----------
     clips : sequence of SourceExample    clips of one skeleton
     body : MatchingBody    body of that skeleton
-    options : AlignmentSettings, optional    options
+    options : AlignOptions, optional    options; their reference may be the uid of an example
     threads : int    threads to use
     progress : callable, optional    called as progress(done, total, note)
     on_refusal : callable, optional    called with each example that does not fit and its error, and the example is
@@ -159,7 +137,7 @@ def align_clips(
     ------
     MotionError    for options that do not fit the clips, and where fewer than two examples are left
     """
-    run = _Aligning(body, options or AlignmentSettings(), threads, progress or (lambda _done, _total, _note: None))
+    run = _Aligning(body, options or AlignOptions(), threads, progress or (lambda _done, _total, _note: None))
     run.on_refusal = on_refusal
     return run.align(sorted(clips, key=lambda one: (one.name, one.uid)))
 
@@ -169,12 +147,10 @@ class _Aligning:
 
     on_refusal: OnRefusal | None = None
 
-    def __init__(self, body: MatchingBody, options: AlignmentSettings, threads: int, progress: Progress) -> None:
+    def __init__(self, body: MatchingBody, options: AlignOptions, threads: int, progress: Progress) -> None:
         self._body = body
         self._options = options
-        self._cost = options.cost
-        if self._cost.weights is None:
-            self._cost = replace(self._cost, weights=body_weights(body))
+        self._weights = joint_weights(body, options.weights)
         self._threads = max(1, threads)
         self._tell = progress
 
@@ -210,9 +186,6 @@ class _Aligning:
         wanted = self._options.reference
         if wanted not in (MEDOID, NEAREST_MEAN_LENGTH) and wanted not in {one.uid for one in clips}:
             raise MotionError("the reference is none of the clips", code="unknown-reference", where=wanted)
-        rate = self._options.rate_hz
-        if rate is not None and not (np.isfinite(rate) and rate > 0):
-            raise MotionError(f"the rate is {rate}, a positive number is needed", where="rate_hz")
 
     def _require_size(self, clips: Sequence[SourceExample], rate_hz: float) -> None:
         frames = sum(one.clip.frame_count / one.clip.frame_rate_hz * rate_hz for one in clips)
@@ -277,7 +250,7 @@ class _Aligning:
             )
         sections = sections_of(example.cuts, frames, rate_ratio=rate_hz / clip.frame_rate_hz)
         moved, placement = to_canonical(motion, self._body, keep_height=self._options.keep_height)
-        points = cost_points(moved.positions(skeleton), self._cost)
+        points = cost_points(moved.positions(skeleton), self._options, self._weights)
         return _Prepared(example, moved, placement, sections, points)
 
     def _common_labels(self, prepared: Sequence[_Prepared]) -> tuple[tuple[str, ...], ...]:
@@ -299,8 +272,8 @@ class _Aligning:
         totals = pairwise_totals(
             [one.points for one in prepared],
             [one.sections.bounds for one in prepared],
-            self._cost,
-            max_run=self._options.max_run,
+            self._options,
+            max_run=self._options.slope_limit,
             threads=self._threads,
             progress=lambda done, total: self._tell(done, total, f"comparing {len(prepared)} clips"),
         )
@@ -323,26 +296,37 @@ class _Aligning:
 
     def _found(self, reference: _Prepared, one: _Prepared) -> SectionedAlignment:
         return align_sections(
-            costs_between(reference.points, one.points, self._cost),
+            costs_between(reference.points, one.points, self._options),
             reference.sections.bounds,
             one.sections.bounds,
-            partial(align, max_run=self._options.max_run),
+            partial(align, max_run=self._options.slope_limit),
         )
 
 
-def body_weights(body: MatchingBody) -> Floats:
+def joint_weights(body: MatchingBody, given: Mapping[str, float]) -> Floats:
     """Compute the weights of the joints in the cost.
 
     Parameters
     ----------
     body : MatchingBody    J joints
+    given : mapping of str to float    weights of joints, under their own or their standard names
 
     Returns
     -------
-    (J,) float64    1 for the carrier and the joints below it, 0 for others
+    (J,) float64    the given weights; of other joints 1 for the carrier and the joints below it, else 0
+
+    Raises
+    ------
+    MotionError    for a name that is none of a joint
     """
     paths = (body.skeleton.path_to_root(joint) for joint in range(body.skeleton.joint_count))
-    return np.array([float(body.carrier in path) for path in paths])
+    weights = np.array([float(body.carrier in path) for path in paths])
+    for name, weight in given.items():
+        if name not in body.skeleton and name in body.standard_joints:
+            weights[body.standard_joints[name]] = weight
+        else:
+            weights[body.skeleton.index_of(name)] = weight
+    return weights
 
 
 def _with_signs_of(motion: Motion, reference: Motion) -> Motion:

@@ -2,42 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
-
-CostMethod = Literal["turned", "plain"]
-
-LONGEST_WINDOW = 61
-
-
-@dataclass(frozen=True, eq=False)
-class PoseCostSettings:
-    """Options of the cost.
-
-    Parameters
-    ----------
-    method : "turned" compares after the best turn about the vertical and the best shift on the ground, so that only the
-        pose and its height count; "plain" compares positions as they are
-    window : odd number of frames that are compared at once, around each frame; 1 for poses alone. At the ends of a
-        motion its first and last frame are repeated. All frames of a window are turned and shifted together.
-    weights : (P,) not negative, of the points; equal ones when None. Their sum does not matter.
-    """
-
-    method: CostMethod = "turned"
-    window: int = 1
-    weights: ArrayLike | None = None
-
-    def __post_init__(self) -> None:
-        if self.method not in ("turned", "plain"):
-            raise MotionError(f"{self.method!r} is no cost; there are turned and plain", where="cost")
-        if not (1 <= self.window <= LONGEST_WINDOW and self.window % 2 == 1):
-            raise MotionError(f"a window is an odd number of frames up to {LONGEST_WINDOW}", where="window")
+from marey_schemas.options.alignment import CostOptions
 
 
 class CostPoints(NamedTuple):
@@ -60,7 +32,7 @@ class CostPoints(NamedTuple):
     centres: Floats
 
 
-def frame_costs(a: Floats, b: Floats, options: PoseCostSettings | None = None) -> Floats:
+def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weights: ArrayLike | None = None) -> Floats:
     """Compute the cost of each pair of frames of two motions.
 
     The weighted mean over points of their squared distances (and over the frames of the window, if there is one).
@@ -69,7 +41,8 @@ def frame_costs(a: Floats, b: Floats, options: PoseCostSettings | None = None) -
     ----------
     a : (n, P, 3) float64    points in metres, Y up
     b : (m, P, 3) float64    the same points
-    options : PoseCostSettings, optional    options
+    options : CostOptions, optional    options
+    weights : (P,), optional    not negative, of the points; equal ones when None. Their sum does not matter.
 
     Returns
     -------
@@ -84,20 +57,24 @@ def frame_costs(a: Floats, b: Floats, options: PoseCostSettings | None = None) -
     Kovar and Gleicher 2002, equation 1, divided by the sum of weights. With horizontal positions as complex numbers z
     about their weighted centre, the least sum over all turns and shifts is Σ w|z_a|² + Σ w|z_b|² - 2 |Σ w z_a z̄_b|;
     the differences of heights are added as they are.
+
+    At the ends of a motion, its first and last frame are repeated for the window. All frames of a window are turned and
+    shifted together.
     """
-    options = options or PoseCostSettings()
+    options = options or CostOptions()
     if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
         raise MotionError(f"points must be (frames, points, 3), the same points in both, not {a.shape} and {b.shape}")
-    return costs_between(cost_points(a, options), cost_points(b, options), options)
+    return costs_between(cost_points(a, options, weights), cost_points(b, options, weights), options)
 
 
-def cost_points(points: Floats, options: PoseCostSettings) -> CostPoints:
+def cost_points(points: Floats, options: CostOptions, weights: ArrayLike | None = None) -> CostPoints:
     """Prepare the points of a motion for comparison.
 
     Parameters
     ----------
     points : (n, P, 3) float64    metres, Y up
-    options : PoseCostSettings    options
+    options : CostOptions    options
+    weights : (P,), optional    as in `frame_costs`
 
     Returns
     -------
@@ -105,17 +82,17 @@ def cost_points(points: Floats, options: PoseCostSettings) -> CostPoints:
 
     Raises
     ------
-    MotionError    for positions that are not finite
+    MotionError    for positions that are not finite, and for invalid weights
     """
     columns = np.array(points.transpose(1, 2, 0), dtype=np.float64, order="C")
     if not np.isfinite(columns).all():
         raise MotionError("positions must be finite", where=f"frame {int(np.argwhere(~np.isfinite(points))[0, 0])}")
-    shares = _shares(options.weights, points.shape[1])
+    shares = _shares(weights, points.shape[1])
     window = options.window
     if window > 1:
         columns = np.pad(columns, ((0, 0), (0, 0), (window // 2, window // 2)), mode="edge")
     ground, centres = columns[:, ::2], np.zeros((2, len(points)))
-    if options.method == "turned":
+    if options.cost == "turned":
         middle = np.einsum("p,pcf->cf", shares, ground)
         ground -= middle if window == 1 else middle.mean(axis=1, keepdims=True)
         if window > 1:
@@ -126,13 +103,13 @@ def cost_points(points: Floats, options: PoseCostSettings) -> CostPoints:
     return CostPoints(np.ascontiguousarray(columns.transpose(2, 0, 1)), columns, energies, centres.T.copy())
 
 
-def costs_between(a: CostPoints, b: CostPoints, options: PoseCostSettings) -> Floats:
+def costs_between(a: CostPoints, b: CostPoints, options: CostOptions) -> Floats:
     """Compute `frame_costs` for prepared points.
 
     Parameters
     ----------
     a, b : CostPoints    n and m frames, prepared with the same options
-    options : PoseCostSettings    options
+    options : CostOptions    options
 
     Returns
     -------
@@ -141,7 +118,7 @@ def costs_between(a: CostPoints, b: CostPoints, options: PoseCostSettings) -> Fl
     from marey_motion.alignment import cost_kernels as kernels
 
     costs = np.empty((len(a.energies), len(b.energies)))
-    if options.method == "turned":
+    if options.cost == "turned":
         if options.window == 1:
             kernels.turned(a.rows, b.columns, a.energies, b.energies, costs)
         else:

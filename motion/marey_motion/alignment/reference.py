@@ -8,9 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from marey_motion.alignment.cost import CostPoints, PoseCostSettings, costs_between
+from marey_motion.alignment.cost import CostPoints, costs_between
 from marey_motion.alignment.dtw import least_total
 from marey_motion.arrays import Floats
+from marey_schemas.options.alignment import CostOptions
 
 Advance = Callable[[int, int], None]
 """Function called with the number of alignments done and their total."""
@@ -55,7 +56,7 @@ def medoid(totals: Floats) -> int:
 def pairwise_totals(
     points: Sequence[CostPoints],
     bounds: Sequence[Sequence[int]],
-    options: PoseCostSettings,
+    options: CostOptions,
     *,
     max_run: int | None,
     threads: int = 1,
@@ -69,7 +70,7 @@ def pairwise_totals(
     ----------
     points : sequence of CostPoints    points of each motion
     bounds : sequence of sequences of int    bounds of each motion's sections, equally many
-    options : PoseCostSettings    options of the cost
+    options : CostOptions    options of the cost
     max_run : int or None    slope limit of `dtw.align`
     threads : int    threads to use
     progress : callable, optional    called as progress(done, total)

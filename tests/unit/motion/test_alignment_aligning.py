@@ -10,22 +10,21 @@ from tests.support.alignment_examples import body_of, moved, played, sine_warp, 
 from marey_motion.alignment import aligning
 from marey_motion.alignment.aligning import (
     MIRRORED,
-    AlignmentSettings,
     SourceExample,
     align_clips,
-    body_weights,
+    joint_weights,
     restore,
     with_mirrored,
 )
-from marey_motion.alignment.cost import PoseCostSettings
 from marey_motion.alignment.segments import Cut
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.gait import generate_gait
 from marey_motion.motion import Motion
+from marey_schemas.options.alignment import AlignOptions
 
 BODY = body_of(walk())
-TO_FIRST = AlignmentSettings(reference="clip_a@1")
+TO_FIRST = AlignOptions(reference="clip_a@1")
 
 
 def raised(examples, options=None):
@@ -101,7 +100,7 @@ def test_more_than_half_a_turn_does_not_break_the_signs():
 @pytest.mark.parametrize("reference", ["medoid", "nearest_mean_length", "clip_c@1"])
 def test_the_same_bytes_come_out_for_any_threads_and_any_order(reference):
     examples, _ = warped_walks(5)
-    options = AlignmentSettings(reference=reference)
+    options = AlignOptions(reference=reference)
     expected = as_bytes(align_clips(examples, BODY, options, threads=1))
     assert as_bytes(align_clips(examples, BODY, options, threads=2)) == expected
     for order in list(permutations(examples))[:40:13]:
@@ -125,7 +124,7 @@ def test_a_reference_that_is_named_is_found_without_comparing_pairs(monkeypatch)
     with pytest.raises(AssertionError, match="pairs were compared"):
         align_clips(examples, BODY)
     for one in examples:
-        assert align_clips(examples, BODY, AlignmentSettings(reference=one.uid)).reference == one.uid
+        assert align_clips(examples, BODY, AlignOptions(reference=one.uid)).reference == one.uid
 
 
 def test_cuts_are_matched_exactly_and_become_keyframes():
@@ -172,11 +171,11 @@ def test_clips_of_several_rates_are_aligned_at_the_commonest_that_of_the_referen
         replace(one, cuts=one.cuts or (Cut(("down",), int(np.argmin(np.abs(warps[one.uid] - 30)))),)) for one in mixed
     ]
     assert align_clips(mixed, BODY).frame_rate_hz == 60.0
-    by_slow = align_clips(mixed, BODY, AlignmentSettings(reference="clip_z@1"))
+    by_slow = align_clips(mixed, BODY, AlignOptions(reference="clip_z@1"))
     assert by_slow.frame_rate_hz == 30.0
     assert by_slow.frame_count == 30
     assert by_slow.keyframes == {"down": 15}
-    asked = align_clips(mixed, BODY, AlignmentSettings(reference="clip_z@1", rate_hz=120.0))
+    asked = align_clips(mixed, BODY, AlignOptions(reference="clip_z@1", rate_hz=120.0))
     assert asked.frame_rate_hz == 120.0
     assert asked.keyframes == {"down": 60}
 
@@ -211,11 +210,11 @@ def test_mirrored_examples_stand_beside_the_others():
 
 
 def test_weights_fall_on_what_the_body_carries():
-    assert body_weights(BODY).tolist() == [1.0] * BODY.skeleton.joint_count
+    names = BODY.skeleton.joint_names
+    assert joint_weights(BODY, {}).tolist() == [1.0] * len(names)
     examples, _ = warped_walks(3)
-    weights = np.zeros(BODY.skeleton.joint_count)
-    weights[list(BODY.feet)] = 1.0
-    feet = align_clips(examples, BODY, replace(TO_FIRST, cost=PoseCostSettings(weights=weights)))
+    weights = {name: float(joint in BODY.feet) for joint, name in enumerate(names)}
+    feet = align_clips(examples, BODY, TO_FIRST.replace(weights=weights))
     whole = align_clips(examples, BODY, TO_FIRST)
     assert feet.clips[1].cost != whole.clips[1].cost
 
@@ -254,8 +253,8 @@ def short(frames):
             "cut: contact, frame 60: it has the frames 0:60",
         ),
         (short(8), TO_FIRST, "alignment-impossible", "short: .*60 frames cannot be aligned with 8"),
-        (short(20), AlignmentSettings(reference="nobody"), "unknown-reference", "nobody: the reference is none"),
-        (short(20), AlignmentSettings(rate_hz=float("nan")), "motion-invalid", "rate_hz: the rate is nan"),
+        (short(20), AlignOptions(reference="nobody"), "unknown-reference", "nobody: the reference is none"),
+        (short(20), AlignOptions(weights={"tail": 2.0}), "unknown-joint", "tail"),
         (SourceExample("clip_a@1", "twin", walk()), None, "motion-invalid", "clip_a@1: two examples have this uid"),
     ],
 )  # fmt: skip
@@ -279,11 +278,12 @@ def test_fewer_than_two_examples_cannot_be_aligned():
 def test_a_reference_that_does_not_fit_is_not_left_out_silently():
     examples, _ = warped_walks(3)
     with pytest.raises(MotionError, match="short: it has 3 frames"):
-        align_clips([*examples, short(3)], BODY, AlignmentSettings(reference="short@1"), on_refusal=lambda *_: None)
+        align_clips([*examples, short(3)], BODY, AlignOptions(reference="short@1"), on_refusal=lambda *_: None)
 
 
 def test_more_than_fits_into_memory_is_refused_before_anything_is_computed():
-    examples, _ = warped_walks(3)
-    error = raised(examples, AlignmentSettings(rate_hz=1e6))
+    long = generate_gait(1.3, 0.2, 66.0)
+    examples = [SourceExample(f"long@{index}", "long", long) for index in range(30)]
+    error = raised(examples, AlignOptions(rate_hz=1000.0))
     assert error.code == "too-much"
     assert "a lower rate" in str(error)

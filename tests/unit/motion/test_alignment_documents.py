@@ -7,11 +7,12 @@ import pytest
 from tests.support.alignment_examples import body_of, walk, warped_walks
 
 from marey_motion.alignment.aligned_documents import StoredExample, example_to_tree, set_from_examples, uid_of
-from marey_motion.alignment.aligning import AlignmentSettings, align_clips, restore, with_mirrored
+from marey_motion.alignment.aligning import align_clips, restore, with_mirrored
 from marey_motion.alignment.segments import Cut
 from marey_motion.errors import MotionError
 from marey_schemas.documents.alignments import AlignmentInfo
 from marey_schemas.encoding.codecs import JSON, MEDIA_TYPES, decode_tree, encode_tree
+from marey_schemas.options.alignment import AlignOptions
 
 BODY = body_of(walk())
 DIGEST = f"sha256:{64 * 'a'}"
@@ -21,7 +22,7 @@ DIGEST = f"sha256:{64 * 'a'}"
 def aligned():
     examples, warps = warped_walks(3)
     cut = [replace(one, cuts=(Cut(("down",), int(np.argmin(np.abs(warps[one.uid] - 30)))),)) for one in examples]
-    return align_clips(with_mirrored(cut, BODY), BODY, AlignmentSettings(reference="clip_a@1"))
+    return align_clips(with_mirrored(cut, BODY), BODY, AlignOptions(reference="clip_a@1"))
 
 
 def stored(aligned, media_type=JSON):

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from marey_motion.alignment.cost import PoseCostSettings, cost_points, frame_costs
+from marey_motion.alignment.cost import cost_points, frame_costs
 from marey_motion.alignment.dtw import align
 from marey_motion.alignment.reference import medoid, nearest_mean_length, pairwise_totals
 from marey_motion.alignment.segments import align_sections
+from marey_schemas.options.alignment import CostOptions
 
 
 def test_the_medoid_has_the_least_sum_of_costs():
@@ -47,7 +48,7 @@ def clouds(seed=0):
 @pytest.mark.parametrize("max_run", [None, 3, 1])
 @pytest.mark.parametrize("threads", [1, 2])
 def test_costs_of_pairs_are_those_of_aligning_each_section_of_each_two(max_run, threads):
-    points, options = clouds(), PoseCostSettings()
+    points, options = clouds(), CostOptions()
     bounds = [(0, len(cloud) // 3, len(cloud) - 1) for cloud in points]
     ready = [cost_points(cloud, options) for cloud in points]
     told = []

@@ -11,17 +11,7 @@ import numpy as np
 from marey_motion import documents
 from marey_motion.alignment import aligned_documents
 from marey_motion.alignment.aligned import AlignedClip, AlignedSet
-from marey_motion.alignment.aligning import (
-    MEDOID,
-    MIRRORED,
-    NEAREST_MEAN_LENGTH,
-    AlignmentSettings,
-    SourceExample,
-    align_clips,
-    body_weights,
-    with_mirrored,
-)
-from marey_motion.alignment.cost import PoseCostSettings
+from marey_motion.alignment.aligning import MIRRORED, SourceExample, align_clips, with_mirrored
 from marey_motion.alignment.segments import Cut, cuts_of
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
@@ -32,6 +22,7 @@ from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.job_params import MOST_EXAMPLES, AlignParams
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
+from marey_schemas.options.alignment import MEDOID, NEAREST_MEAN_LENGTH, AlignOptions
 from marey_schemas.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
@@ -90,7 +81,7 @@ class _Job:
             aligned = align_clips(
                 with_mirrored(examples, body) if self._params.mirroring == "add" else examples,
                 body,
-                self._options(body),
+                self._options(),
                 threads=self._context.threads,
                 progress=self._context.progress,
                 on_refusal=lambda example, error: self._refusals.add(
@@ -227,24 +218,15 @@ class _Job:
 
     # -- options --
 
-    def _options(self, body: MatchingBody) -> AlignmentSettings:
-        params = self._params
-        reference = params.reference
-        if reference not in (MEDOID, NEAREST_MEAN_LENGTH):
-            named = [pin for pin in self._pins.values() if pin.item == reference]
-            if not named:
-                raise JobRefused("unknown-reference", f"the reference {reference} is none of the clips")
-            reference = _uid(max(named, key=lambda pin: pin.revision))
-        weights = body_weights(body)
-        for name, weight in params.weights.items():
-            weights[_joint(name, body)] = weight
-        return AlignmentSettings(
-            reference=reference,
-            rate_hz=params.rate_hz,
-            max_run=params.slope_limit,
-            cost=PoseCostSettings(params.cost, params.window, weights),
-            keep_height=params.keep_height,
-        )
+    def _options(self) -> AlignOptions:
+        """Take the options of the alignment, with the newest revision of a reference that is the id of an item."""
+        options = AlignOptions.of(self._params)
+        if options.reference in (MEDOID, NEAREST_MEAN_LENGTH):
+            return options
+        named = [pin for pin in self._pins.values() if pin.item == options.reference]
+        if not named:
+            raise JobRefused("unknown-reference", f"the reference {options.reference} is none of the clips")
+        return options.replace(reference=_uid(max(named, key=lambda pin: pin.revision)))
 
     def _digest(self, clips: Sequence[_Clip], examples: Sequence[SourceExample], rig: Rig) -> str:
         """Of all that the alignment is made from."""
@@ -328,13 +310,6 @@ def _row(one: AlignedClip) -> dict[str, Any]:
         "least_slope": float(slopes.min()),
         "greatest_slope": float(slopes.max()),
     }
-
-
-def _joint(name: str, body: MatchingBody) -> int:
-    """The joint of a name of its own, or of a standard one. Raises `MotionError`."""
-    if name not in body.skeleton and name in body.standard_joints:
-        return body.standard_joints[name]
-    return body.skeleton.index_of(name)
 
 
 def _uid(pin: PinnedInput) -> str:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import AlignedClip, AlignedSet
 from marey_motion.alignment.aligning import restore
-from marey_motion.alignment.cost import PoseCostSettings, frame_costs
+from marey_motion.alignment.cost import frame_costs
 from marey_motion.arrays import Floats
 from marey_reports.drawing.drawn import Sketch
 from marey_reports.drawing.paper import (
@@ -24,6 +24,7 @@ from marey_reports.drawing.paper import (
     told_apart,
 )
 from marey_reports.models.figures.subjects import evenly
+from marey_schemas.options.alignment import CostOptions
 
 SIDE = 2.7
 MOST_CELLS = 200
@@ -53,7 +54,7 @@ class CostView(NamedTuple):
         return np.asarray(self.costs_cm[cells[0], cells[1]], dtype=np.float64)
 
 
-def draw_alignment_costs(aligned: AlignedSet, options: PoseCostSettings | None = None) -> Sketch | None:
+def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None) -> Sketch | None:
     """Draw the clip of median cost and the one of the highest; None where there is only the reference."""
     views = [_view(aligned, role, clip, options) for role, clip in _chosen(aligned)]
     if not views:
@@ -107,7 +108,7 @@ def _chosen(aligned: AlignedSet) -> list[tuple[str, AlignedClip]]:
     return [("worst", worst)] if typical is worst else [("typical", typical), ("worst", worst)]
 
 
-def _view(aligned: AlignedSet, role: str, clip: AlignedClip, options: PoseCostSettings | None) -> CostView:
+def _view(aligned: AlignedSet, role: str, clip: AlignedClip, options: CostOptions | None) -> CostView:
     reference = next(one for one in aligned.clips if one.uid == aligned.reference)
     points, frames = [], []
     for motion in (reference.motion, restore(clip, aligned.skeleton)):
