@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from marey_client.marey import Marey
     from marey_schemas.access import NewToken, TokenCreate
 
-token = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Your tokens.")
-user = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Users, for administrators.")
+token = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage your tokens.")
+user = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage users (for administrators).")
 
 SECONDS_PER_DAY = 86_400
 
@@ -33,11 +33,11 @@ def add_to(app: typer.Typer) -> None:
 
 def login(
     context: typer.Context,
-    name: Annotated[str | None, typer.Option(help="User name; asked for when left out.")] = None,
+    name: Annotated[str | None, typer.Option(help="User name; the command asks for it if it is left out.")] = None,
     with_token: Annotated[
         bool, typer.Option("--with-token", help="Read a token from standard input instead of asking for a password.")
     ] = False,
-    days: Annotated[int, typer.Option(min=1, max=90, help="How long the login lasts.")] = 7,
+    days: Annotated[int, typer.Option(min=1, max=90, help="Days until the login expires.")] = 7,
 ) -> None:
     """Remember a server and a token for it, readable by you alone."""
     from marey_client.credentials import logins_path, store_login
@@ -75,14 +75,17 @@ def logout(context: typer.Context) -> None:
 @token.command("create")
 def create_token(
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="What the token is for.")],
+    name: Annotated[str, typer.Argument(help="Purpose of the token, for your own reference.")],
     scope: Annotated[
-        list[str] | None, typer.Option(help="read, write, jobs, work or admin, perhaps with !project=NAME.")
+        list[str] | None,
+        typer.Option(help="Scope: read, write, jobs, work or admin; !project=NAME limits it to one project."),
     ] = None,
-    days: Annotated[int, typer.Option(min=0, help="How long it lasts; 0 for ever.")] = 90,
+    days: Annotated[int, typer.Option(min=0, help="Days until the token expires; 0: never.")] = 90,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "--out", "-o", help="Write the secret to this file (0600), not to the screen."),
+        typer.Option(
+            "--output", "--out", "-o", help="Write the secret to this file (mode 0600) instead of the screen."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -141,11 +144,16 @@ def revoke_token(
 @user.command("create")
 def create_user(
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="What the user signs in with.")],
+    name: Annotated[str, typer.Argument(help="Name that the user signs in with.")],
     display_name: Annotated[str | None, typer.Option(help="Name shown to people.")] = None,
-    administrator: Annotated[bool, typer.Option("--administrator", help="May do everything everywhere.")] = False,
+    administrator: Annotated[
+        bool, typer.Option("--administrator", help="Make the user an administrator, with all rights.")
+    ] = False,
     without_password: Annotated[
-        bool, typer.Option("--without-password", help="The user can sign in with tokens only.")
+        bool,
+        typer.Option(
+            "--without-password", help="Create the user without a password; the user can sign in with tokens only."
+        ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -180,7 +188,7 @@ def list_users(context: typer.Context, as_json: AsJson = False) -> None:
 @user.command("show")
 def show_user(
     context: typer.Context,
-    name: Annotated[str | None, typer.Argument(help="Left out: yourself.")] = None,
+    name: Annotated[str | None, typer.Argument(help="User name; default: yourself.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show a user, or who you are."""
@@ -195,7 +203,7 @@ def show_user(
 
 @user.command("password")
 def change_password(
-    context: typer.Context, name: Annotated[str | None, typer.Argument(help="Left out: yourself.")] = None
+    context: typer.Context, name: Annotated[str | None, typer.Argument(help="User name; default: yourself.")] = None
 ) -> None:
     """Set a new password; your own needs the current one."""
     from marey_schemas.access import UserChange
@@ -233,7 +241,7 @@ def change_user(
     context: typer.Context,
     name: UserName,
     display_name: Annotated[str | None, typer.Option(help="Name shown to people.")] = None,
-    administrator: Annotated[bool | None, typer.Option(help="May do everything everywhere, or not any more.")] = None,
+    administrator: Annotated[bool | None, typer.Option(help="Grant or revoke the rights of an administrator.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Change what a user is called, and whether they are an administrator."""

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 ANNOTATE = OptionsOf("marey_schemas.job_params:AnnotateParams")
 DEFAULT_PROPOSAL = {"method": "steps"}
 
-annotation = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Segments and keyframes of clips.")
+annotation = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Edit segments and keyframes of clips.")
 
 Place = Annotated[str, typer.Argument(help="An annotation: project/folder/name, or project/id.")]
 At = Annotated[int, typer.Argument(min=0, help="Any frame of the segment.")]
-Label = Annotated[str, typer.Argument(help="The label.")]
+Label = Annotated[str, typer.Argument(help="Label of the segment or keyframe.")]
 
 
 class Neighbour(StrEnum):
@@ -90,10 +90,12 @@ def show(context: typer.Context, place: Place, as_json: AsJson = False) -> None:
 def create(
     context: typer.Context,
     clip: Annotated[str, typer.Argument(help="The clip: project/folder/name, or project/id.")],
-    layer: Annotated[str, typer.Option(help="What the layer is called.")] = "default",
-    name: Annotated[str | None, typer.Option(help="Name; default: that of the clip and the layer's.")] = None,
-    segment: Annotated[list[str] | None, typer.Option(help="label=first:end; may be repeated.")] = None,
-    keyframe: Annotated[list[str] | None, typer.Option(help="label=frame; may be repeated.")] = None,
+    layer: Annotated[str, typer.Option(help="Name of the layer.")] = "default",
+    name: Annotated[
+        str | None, typer.Option(help="Name of the annotation; default: the names of the clip and the layer.")
+    ] = None,
+    segment: Annotated[list[str] | None, typer.Option(help="Segment as label=first:end; may be repeated.")] = None,
+    keyframe: Annotated[list[str] | None, typer.Option(help="Keyframe as label=frame; may be repeated.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Make an annotation of a clip, with segments and keyframes or without any."""
@@ -117,8 +119,8 @@ def add(
     context: typer.Context,
     place: Place,
     label: Label,
-    frames: Annotated[str, typer.Argument(help="first:end; the last frame is the one before the end.")],
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Segments that are there give way.")] = False,
+    frames: Annotated[str, typer.Argument(help="Frames as first:end; the frame `end` is not included.")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Shorten or remove overlapping segments.")] = False,
 ) -> None:
     """Add a segment: frames under a label."""
     _, start, end = _segment(f"{label}={frames}")
@@ -130,7 +132,9 @@ def split(
     context: typer.Context,
     place: Place,
     at: Annotated[int, typer.Argument(min=0, help="First frame of the second part.")],
-    label: Annotated[str | None, typer.Option(help="Of the second part; default: that of the first.")] = None,
+    label: Annotated[
+        str | None, typer.Option(help="Label of the second part; default: the label of the first part.")
+    ] = None,
 ) -> None:
     """Cut a segment in two."""
     _apply(context, place, command="split_segment", at=at, label=label)
@@ -141,7 +145,7 @@ def merge(
     context: typer.Context,
     place: Place,
     at: At,
-    neighbour: Annotated[Neighbour, typer.Option("--with", help="Which neighbour.")] = Neighbour.NEXT,
+    neighbour: Annotated[Neighbour, typer.Option("--with", help="Neighbour to merge with.")] = Neighbour.NEXT,
 ) -> None:
     """Merge a segment with its neighbour and the gap between them."""
     _apply(context, place, command="merge_segment", at=at, neighbour=neighbour.value)
@@ -152,8 +156,10 @@ def move(
     context: typer.Context,
     place: Place,
     at: At,
-    start: Annotated[int | None, typer.Option(min=0, help="Where the segment shall start.")] = None,
-    end: Annotated[int | None, typer.Option(min=0, help="Where the segment shall end.")] = None,
+    start: Annotated[int | None, typer.Option(min=0, help="New first frame of the segment.")] = None,
+    end: Annotated[
+        int | None, typer.Option(min=0, help="New end of the segment; the frame itself is not included.")
+    ] = None,
 ) -> None:
     """Move the start or the end of a segment; a neighbouring segment at that edge is adapted."""
     edges = [(edge, to) for edge, to in (("start", start), ("end", end)) if to is not None]
@@ -179,9 +185,9 @@ def mark(
     context: typer.Context,
     place: Place,
     label: Label,
-    frame: Annotated[int, typer.Argument(min=0, help="The frame.")],
-    move_to: Annotated[int | None, typer.Option("--move", min=0, help="Move it to this frame.")] = None,
-    remove_it: Annotated[bool, typer.Option("--remove", help="Take it away.")] = False,
+    frame: Annotated[int, typer.Argument(min=0, help="Frame of the keyframe.")],
+    move_to: Annotated[int | None, typer.Option("--move", min=0, help="Move the keyframe to this frame.")] = None,
+    remove_it: Annotated[bool, typer.Option("--remove", help="Remove the keyframe.")] = False,
 ) -> None:
     """Add, move or remove a keyframe."""
     if move_to is not None and remove_it:
@@ -205,9 +211,14 @@ def propose(
     job: Chosen,
     option: Annotated[
         list[str] | None,
-        typer.Option("--set", help="name=value of the method, as in most_turn_deg=30; may be repeated."),
+        typer.Option("--set", help="Option of the method as name=value, such as most_turn_deg=30; may be repeated."),
     ] = None,
-    into: Annotated[str, typer.Option(help="Folder above the clips' own folders; default: beside the clips.")] = "",
+    into: Annotated[
+        str,
+        typer.Option(
+            help="Folder of the annotations, which repeats the clips' folders; default: the folders of the clips."
+        ),
+    ] = "",
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
@@ -228,12 +239,14 @@ def import_annotation(
     context: typer.Context,
     clip: Annotated[str, typer.Argument(help="The clip: project/folder/name, or project/id.")],
     file: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="A JSON file of the predecessor.")],
-    layer: Annotated[str, typer.Option(help="What the layer is called.")] = "imported",
-    name: Annotated[str | None, typer.Option(help="Name; default: that of the clip and the layer's.")] = None,
+    layer: Annotated[str, typer.Option(help="Name of the layer.")] = "imported",
+    name: Annotated[
+        str | None, typer.Option(help="Name of the annotation; default: the names of the clip and the layer.")
+    ] = None,
     end_index: Annotated[
-        EndIndex, typer.Option(help="Whether a section holds its frame end_idx; the predecessor's editor means so.")
+        EndIndex, typer.Option(help="Whether a section includes its frame end_idx, as in the predecessor's editor.")
     ] = EndIndex.INCLUSIVE,
-    label: Annotated[list[str] | None, typer.Option(help="Only this label; may be repeated.")] = None,
+    label: Annotated[list[str] | None, typer.Option(help="Import only this label; may be repeated.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Annotate a clip from a file of the predecessor: sections, or the frames of labels."""
@@ -255,10 +268,10 @@ def export_annotation(
     place: Place,
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
     form: Annotated[
-        Form, typer.Option(help="Sections by label, a list of sections, or frames by label.")
+        Form, typer.Option(help="Form of the file: sections by label, a list of sections, or frames by label.")
     ] = Form.LABELS,
     end_index: Annotated[
-        EndIndex, typer.Option(help="Whether a section holds its frame end_idx.")
+        EndIndex, typer.Option(help="Whether a section includes its frame end_idx.")
     ] = EndIndex.INCLUSIVE,
 ) -> None:
     """Write an annotation to a file of the predecessor."""

@@ -48,10 +48,13 @@ def _tell_version(wanted: bool) -> None:
 def marey(
     context: typer.Context,
     server: Annotated[
-        str | None, typer.Option(envvar="MAREY_URL", help="Address of the server; default: where you logged in last.")
+        str | None,
+        typer.Option(envvar="MAREY_URL", help="Address of the server; default: the server of your last login."),
     ] = None,
     token_file: Annotated[Path | None, typer.Option(help="File that holds a token and nothing else.")] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show details, also of errors.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Show details, including tracebacks of errors.")
+    ] = False,
     version: Annotated[  # noqa: ARG001 - its callback does it
         bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Show the version and exit.")
     ] = False,

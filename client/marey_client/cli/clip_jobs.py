@@ -77,7 +77,9 @@ def align(
     job: Chosen,
     annotations: Annotated[
         list[str] | None,
-        typer.Option(help="Annotations or folders of them to use; default: all of these clips; may be repeated."),
+        typer.Option(
+            help="Annotations to use, or folders of them; default: all annotations of these clips; may be repeated."
+        ),
     ] = None,
     wait: Wait = True,
     as_json: AsJson = False,
@@ -103,7 +105,7 @@ def align(
 
 def cut(
     context: typer.Context,
-    sources: Annotated[list[str], typer.Argument(help="Annotations or folders of them: project/folder[/name].")],
+    sources: Annotated[list[str], typer.Argument(help="Annotations, or folders of them: project/folder[/name].")],
     into: Into,
     params: Chosen,
     job: Chosen,

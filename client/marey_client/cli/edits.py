@@ -26,18 +26,21 @@ if TYPE_CHECKING:
     from marey_schemas.editing.edits import EditDocument
     from marey_schemas.editing.previews import EditPreview
 
-edit = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Edits: commands on clips.")
+edit = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Edit clips with commands.")
 
 EDIT = OptionsOf("marey_schemas.job_params:EditParams", without=("commands",))
 
 Do = Annotated[
     list[str] | None,
-    typer.Option("--do", help="A command, as in 'trim start=10 stop=200'; may be repeated. See marey edit commands."),
+    typer.Option(
+        "--do",
+        help="A command, such as 'trim start=10 stop=200'; may be repeated. marey edit commands lists all commands.",
+    ),
 ]
 From = Annotated[
-    str | None, typer.Option("--file", help="Commands from a file of JSON: a list, or an edit; - for standard input.")
+    str | None, typer.Option("--file", help="JSON file with a list of commands or an edit; - reads standard input.")
 ]
-With = Annotated[str | None, typer.Option("--with", help="The commands of a saved edit: project/folder/name.")]
+With = Annotated[str | None, typer.Option("--with", help="Saved edit whose commands are applied: project/folder/name.")]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -78,11 +81,11 @@ def apply_edit(
 @edit.command("save")
 def save_edit(
     context: typer.Context,
-    address: Annotated[str, typer.Argument(help="What the edit is called: project/folder/name.")],
+    address: Annotated[str, typer.Argument(help="Name of the edit: project/folder/name.")],
     do: Do = None,
     file: From = None,
-    title: Annotated[str, typer.Option(help="What the edit is for.")] = "",
-    message: Annotated[str, typer.Option("--message", "-m", help="Shown in the history.")] = "",
+    title: Annotated[str, typer.Option(help="Purpose of the edit.")] = "",
+    message: Annotated[str, typer.Option("--message", "-m", help="Message shown in the history.")] = "",
     as_json: AsJson = False,
 ) -> None:
     """Keep commands as an edit, or change one."""
@@ -127,8 +130,8 @@ def preview_edit(
     do: Do = None,
     file: From = None,
     saved: With = None,
-    frames: Annotated[str, typer.Option(help="Which frames of the result, as in 100:200.")] = ":",
-    piece: Annotated[int, typer.Option(min=1, help="Which of the results, where the clip is split.")] = 1,
+    frames: Annotated[str, typer.Option(help="Frames of the result to show, such as 100:200.")] = ":",
+    piece: Annotated[int, typer.Option(min=1, help="Number of the result to show if the clip is split, from 1.")] = 1,
     as_json: AsJson = False,
 ) -> None:
     """Show the result of commands on a clip without storing it. With --json, its motion too."""
@@ -145,7 +148,7 @@ def preview_edit(
 
 @edit.command("commands")
 def list_commands(
-    name: Annotated[str | None, typer.Argument(help="Left out: every command.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Name of a command; default: all commands.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show what an edit can do, or the parameters of one command."""

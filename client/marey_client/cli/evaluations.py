@@ -47,13 +47,17 @@ def evaluate(
     job: Chosen,
     into: Annotated[str | None, typer.Option(help="Folder of the result; default: the folder of the clips.")] = None,
     loop: Annotated[
-        list[str] | None, typer.Option(help="A clip that is a loop, or a folder of loops; may be repeated.")
+        list[str] | None, typer.Option(help="A clip that is a loop, or a folder of such clips; may be repeated.")
     ] = None,
     trim: Annotated[
-        list[str] | None, typer.Option(help="project/folder/clip=first:stop, the frames to use; may be repeated.")
+        list[str] | None,
+        typer.Option(help="Frames of a clip to use, as project/folder/clip=first:stop; may be repeated."),
     ] = None,
     normaliser: Annotated[
-        str | None, typer.Option(help="Use the scales of this evaluation, to be comparable: project/folder/name.")
+        str | None,
+        typer.Option(
+            help="Use the normaliser of this evaluation, which makes the results comparable: project/folder/name."
+        ),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
     wait: Wait = True,
@@ -104,8 +108,10 @@ def report(
     walk_graph: Annotated[
         Path | None, typer.Option(help="Write the walk graph of an evaluation to this file: .graphml or .json.")
     ] = None,
-    trial: Annotated[str | None, typer.Option(help="The trial of the walk graph; default: all together.")] = None,
-    open_it: Annotated[bool, typer.Option("--open", help="Show it in a browser.")] = False,
+    trial: Annotated[
+        str | None, typer.Option(help="The trial of the walk graph; default: all trials together.")
+    ] = None,
+    open_it: Annotated[bool, typer.Option("--open", help="Open the report in a browser.")] = False,
 ) -> None:
     """Write the report of an evaluation or a model to a file."""
     from marey_schemas.kinds import Kind

@@ -41,9 +41,9 @@ def add_to(app: typer.Typer) -> None:
 def upload(
     context: typer.Context,
     places: Annotated[list[Path], typer.Argument(help="Motion files, or folders of them.")],
-    project: Annotated[str, typer.Option(help="The project they go to.")],
+    project: Annotated[str, typer.Option(help="The project that receives the files.")],
     options: Chosen,
-    left_handed: Annotated[bool, typer.Option("--left-handed", help="The same as --handedness left.")] = False,
+    left_handed: Annotated[bool, typer.Option("--left-handed", help="Short form of --handedness left.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Import motion files. Each goes in or is refused with a reason; the same file again makes nothing new."""
@@ -96,11 +96,15 @@ def _print_entries(entries: Sequence[ImportEntry]) -> None:
 
 def ls(
     context: typer.Context,
-    place: Annotated[str | None, typer.Argument(help="project, or project/folder; left out: the projects.")] = None,
-    recursive: Annotated[bool, typer.Option("--recursive", "-r", help="Folders below, too.")] = False,
-    kind: Annotated[list[str] | None, typer.Option(help="Only items of this kind; may be repeated.")] = None,
-    tag: Annotated[str | None, typer.Option(help="Only items with one of these tags, separated by commas.")] = None,
-    deleted: Annotated[bool, typer.Option("--deleted", help="What was removed, here and below.")] = False,
+    place: Annotated[
+        str | None, typer.Argument(help="What to list: project or project/folder; default: all projects.")
+    ] = None,
+    recursive: Annotated[bool, typer.Option("--recursive", "-r", help="Include all folders below.")] = False,
+    kind: Annotated[list[str] | None, typer.Option(help="List only items of this kind; may be repeated.")] = None,
+    tag: Annotated[
+        str | None, typer.Option(help="List only items with one of these tags, separated by commas.")
+    ] = None,
+    deleted: Annotated[bool, typer.Option("--deleted", help="List removed items, here and below.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Show what a folder holds."""
@@ -193,9 +197,9 @@ def _items_in(
 
 def show(
     context: typer.Context,
-    place: Annotated[str, typer.Argument(help="project/folder/name, or project/id.")],
-    part: Annotated[str | None, typer.Option(help="Print the document of this part instead, as JSON.")] = None,
-    history: Annotated[bool, typer.Option("--history", help="Every revision, and what it was made from.")] = False,
+    place: Annotated[str, typer.Argument(help="The item: project/folder/name, or project/id.")],
+    part: Annotated[str | None, typer.Option(help="Print only the document of this part, as JSON.")] = None,
+    history: Annotated[bool, typer.Option("--history", help="Show every revision and its inputs.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Show an item: its parts, its place, what was found when it was imported."""
@@ -257,11 +261,13 @@ def _show_history(item: ItemHandle, as_json: bool) -> None:
 
 def download(
     context: typer.Context,
-    place: Annotated[str, typer.Argument(help="A clip, or a folder of them: project/folder[/name].")],
+    place: Annotated[str, typer.Argument(help="A clip, or a folder of clips: project/folder[/name].")],
     format: Annotated[str, typer.Option(help=f"{one_of(EXPORT_FORMATS)}.")] = "original",  # noqa: A002
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
-    unit: Annotated[str | None, typer.Option(help="Unit of a BVH file: cm or m.")] = None,
-    restored: Annotated[bool, typer.Option(help="Aligned clips in their own time, where they stood.")] = False,
+    unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
+    restored: Annotated[
+        bool, typer.Option(help="Export aligned clips with the time and place of their source clips.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Write clips to files. A folder comes with the folders below it; one without clips with its aligned clips.

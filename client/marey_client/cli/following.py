@@ -21,7 +21,7 @@ JOB = OptionsOf("marey_schemas.jobs:JobCreate", only=("priority", "cache"))
 SEEDED_JOB = OptionsOf("marey_schemas.jobs:JobCreate", only=("seed", "priority", "cache"))
 
 Sources = Annotated[list[str], typer.Argument(help="Clips or folders of clips of one project: project/folder[/name].")]
-Into = Annotated[str, typer.Option(help="Folder of the project that the results go to.")]
+Into = Annotated[str, typer.Option(help="Folder of the project that receives the results.")]
 Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the job has ended.")]
 
 

@@ -43,7 +43,9 @@ TOLD_FIRST = (
 Evaluation = Annotated[str, typer.Argument(help="An evaluation: project/folder/name, or project/id.")]
 From = Annotated[
     list[str] | None,
-    typer.Option("--from", help="A folder or clip of the same project that may be added; may be repeated."),
+    typer.Option(
+        "--from", help="A clip that may be added, or a folder of clips, in the same project; may be repeated."
+    ),
 ]
 
 
@@ -58,7 +60,10 @@ def add_to(app: typer.Typer) -> None:
 def compare(
     context: typer.Context,
     before: Evaluation,
-    after: Annotated[str, typer.Argument(help="One of the same trials, evaluated with --normaliser BEFORE.")],
+    after: Annotated[
+        str,
+        typer.Argument(help="The evaluation after the change: the same trials, evaluated with --normaliser BEFORE."),
+    ],
     params: Chosen,
     job: Chosen,
     out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
@@ -90,7 +95,10 @@ def suggest(
     job: Chosen,
     candidates: From = None,
     remove_out: Annotated[
-        Path | None, typer.Option(help="Write the clips that can go without any change to this file, a path a line.")
+        Path | None,
+        typer.Option(
+            help="Write the paths of the clips that can be removed without any effect to this file, one per line."
+        ),
     ] = None,
     wait: Wait = True,
     as_json: AsJson = False,

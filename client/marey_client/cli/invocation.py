@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
     from marey_client.marey import Marey
 
-ProjectName = Annotated[str, typer.Argument(help="The project; marey project ls shows them.")]
-UserName = Annotated[str, typer.Argument(help="The user; marey user ls shows them.")]
-JobId = Annotated[str, typer.Argument(help="The id of a job; marey job ls shows them.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
+ProjectName = Annotated[str, typer.Argument(help="Name of the project; marey project ls lists them.")]
+UserName = Annotated[str, typer.Argument(help="Name of the user; marey user ls lists them.")]
+JobId = Annotated[str, typer.Argument(help="Id of the job; marey job ls lists them.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 
 @dataclass(frozen=True)

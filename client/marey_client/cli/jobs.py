@@ -32,7 +32,7 @@ def add_to(app: typer.Typer) -> None:
 @job.command("kinds")
 def list_kinds(
     context: typer.Context,
-    name: Annotated[str | None, typer.Argument(help="Left out: every kind.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Kind of job; default: all kinds.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show what can be asked for, or what one kind takes."""
@@ -57,14 +57,18 @@ def list_kinds(
 def submit_job(
     context: typer.Context,
     project: ProjectName,
-    kind: Annotated[str, typer.Argument(help="What to do; marey job kinds shows what there is.")],
+    kind: Annotated[str, typer.Argument(help="Kind of the job; marey job kinds lists them.")],
     job: Chosen,
     inputs: Annotated[
         list[str] | None,
-        typer.Option("--input", help="name=folder, folder/item, or id of the job that makes it; may be repeated."),
+        typer.Option(
+            "--input",
+            help="Input as name=folder, name=folder/item, or name=id of the job that makes it; may be repeated.",
+        ),
     ] = None,
     params: Annotated[
-        list[str] | None, typer.Option("--param", help="name=value, the value as JSON or plain text; may be repeated.")
+        list[str] | None,
+        typer.Option("--param", help="Parameter as name=value; the value is JSON or plain text; may be repeated."),
     ] = None,
     into: Into = "",
     wait: Wait = True,
@@ -119,8 +123,11 @@ def _input_at(marey: Marey, address: Address, spec: InputSpec) -> JobInput:
 def list_jobs(
     context: typer.Context,
     project: ProjectName,
-    state: Annotated[str | None, typer.Option(help="waiting, queued, running, succeeded, failed or cancelled.")] = None,
-    limit: Annotated[int, typer.Option(min=1, help="How many, newest first.")] = 50,
+    state: Annotated[
+        str | None,
+        typer.Option(help="List only jobs in this state: waiting, queued, running, succeeded, failed or cancelled."),
+    ] = None,
+    limit: Annotated[int, typer.Option(min=1, help="Greatest number of jobs, the newest first.")] = 50,
     as_json: AsJson = False,
 ) -> None:
     """Show the jobs of a project, newest first."""
@@ -152,7 +159,7 @@ def show_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -> 
 def show_log(
     context: typer.Context,
     job_id: JobId,
-    go_on: Annotated[bool, typer.Option("--follow", "-f", help="Go on until the job has ended.")] = False,
+    go_on: Annotated[bool, typer.Option("--follow", "-f", help="Follow the log until the job has ended.")] = False,
 ) -> None:
     """Print the log of a job."""
     with connect(context) as marey:
@@ -174,7 +181,7 @@ def cancel_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -
 def retry_job(
     context: typer.Context,
     job_id: JobId,
-    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it has ended.")] = False,
+    wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the job has ended.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Submit a job that failed or was cancelled again, with those it needs and those that failed because of it."""
@@ -186,7 +193,7 @@ def retry_job(
 
 def why(
     context: typer.Context,
-    job_id: Annotated[str, typer.Argument(help="A job that waits, runs for long, or failed.")],
+    job_id: Annotated[str, typer.Argument(help="Id of a job that is waiting, slow or failed.")],
     as_json: AsJson = False,
 ) -> None:
     """Explain the state of a job."""

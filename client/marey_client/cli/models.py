@@ -40,7 +40,7 @@ def add_to(app: typer.Typer) -> None:
 
 def model(
     context: typer.Context,
-    sources: Annotated[list[str], typer.Argument(help="Aligned clips or folders of them: project/folder.")],
+    sources: Annotated[list[str], typer.Argument(help="Aligned clips, or folders of them: project/folder[/name].")],
     params: Chosen,
     job: Chosen,
     into: Annotated[str | None, typer.Option(help="Folder of the model; default: the folder of the clips.")] = None,
@@ -65,14 +65,18 @@ def model(
 def sample(
     context: typer.Context,
     place: Annotated[str, typer.Argument(help="A model: project/folder/name, or project/id.")],
-    n: Annotated[int, typer.Option("-n", min=1, max=1000, help="How many motions.")] = 1,
-    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same motions.")] = 0,
+    n: Annotated[int, typer.Option("-n", min=1, max=1000, help="Number of motions.")] = 1,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the random numbers; the same seed gives the same motions.")
+    ] = 0,
     format: Annotated[str, typer.Option(help=f"{one_of(SAMPLE_FORMATS)}.")] = "bvh",  # noqa: A002
     out: Annotated[
-        Path | None, typer.Option("--out", "--output", "-o", help="Folder to write files to; default: this one.")
+        Path | None, typer.Option("--out", "--output", "-o", help="Folder of the files; default: the current folder.")
     ] = None,
-    into: Annotated[str | None, typer.Option(help="Make clips in this folder of the project, not files.")] = None,
-    unit: Annotated[str | None, typer.Option(help="Unit of a BVH file: cm or m.")] = None,
+    into: Annotated[
+        str | None, typer.Option(help="Create clips in this folder of the project instead of files.")
+    ] = None,
+    unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Draw motions from a model, and write them to files or make clips of them."""

@@ -18,8 +18,13 @@ if TYPE_CHECKING:
     from marey_client.items import ItemHandle
     from marey_client.marey import Marey
 
-Places = Annotated[list[str], typer.Argument(help="project/folder/name, project/folder/ or project/id; one or more.")]
-KindOf = Annotated[str | None, typer.Option("--kind", help="Where several things have one name; collection: a folder.")]
+Places = Annotated[
+    list[str], typer.Argument(help="One or more items or folders: project/folder/name, project/folder/ or project/id.")
+]
+KindOf = Annotated[
+    str | None,
+    typer.Option("--kind", help="Kind of the thing, if several things have the same name; collection: a folder."),
+]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -31,7 +36,10 @@ def add_to(app: typer.Typer) -> None:
 def mv(
     context: typer.Context,
     places: Annotated[
-        list[str], typer.Argument(help="What moves, and last where to: a new name, or a folder, which ends with /.")
+        list[str],
+        typer.Argument(
+            help="Items or folders to move, then the destination: a new name, or a folder, which ends with /."
+        ),
     ],
     kind: KindOf = None,
     as_json: AsJson = False,
@@ -63,7 +71,7 @@ def rm(
     context: typer.Context,
     places: Places,
     kind: KindOf = None,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask, however many items are removed.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Remove without asking for confirmation.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Remove items, and folders with all they hold; `marey restore` brings them back."""
@@ -104,9 +112,9 @@ def restore(context: typer.Context, places: Places, kind: KindOf = None, as_json
 
 def tag(
     context: typer.Context,
-    places: Annotated[list[str], typer.Argument(help="Items: project/folder/name, or project/id; one or more.")],
+    places: Annotated[list[str], typer.Argument(help="One or more items: project/folder/name, or project/id.")],
     add: Annotated[list[str] | None, typer.Option(help="A tag to add; may be repeated.")] = None,
-    remove: Annotated[list[str] | None, typer.Option(help="A tag to take away; may be repeated.")] = None,
+    remove: Annotated[list[str] | None, typer.Option(help="A tag to remove; may be repeated.")] = None,
     kind: KindOf = None,
     as_json: AsJson = False,
 ) -> None:

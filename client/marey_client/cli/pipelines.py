@@ -44,8 +44,8 @@ def add_to(app: typer.Typer) -> None:
 
 def pipeline(
     context: typer.Context,
-    file: Annotated[Path, typer.Argument(help="The pipeline, in JSON; - reads standard input.")],
-    project: Annotated[str, typer.Option(help="The project it runs in.")],
+    file: Annotated[Path, typer.Argument(help="JSON file of the pipeline; - reads standard input.")],
+    project: Annotated[str, typer.Option(help="The project that the pipeline runs in.")],
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
@@ -62,22 +62,29 @@ def build_model(
     context: typer.Context,
     takes: Annotated[
         list[str],
-        typer.Argument(help="Clips or folders of clips, project/folder[/name]; with --project, files of this machine."),
+        typer.Argument(help="Clips or folders of clips, as project/folder[/name]; with --project, local files."),
     ],
-    name: Annotated[str, typer.Option(help="Name of the model, and of the action.")],
+    name: Annotated[str, typer.Option(help="Name of the model and of the action.")],
     propose: Chosen,
     job: Chosen,
-    project: Annotated[str | None, typer.Option(help="The project that files of this machine go to.")] = None,
-    to: Annotated[str | None, typer.Option(help="Skeleton to carry the takes over to: project/folder/name.")] = None,
-    into: Annotated[str | None, typer.Option(help="Folder of the results; default: the model's name.")] = None,
-    layer: Annotated[str | None, typer.Option(help="Annotations of this layer; with --propose, its name.")] = None,
-    label: Annotated[list[str] | None, typer.Option(help="Only segments of this label; may be repeated.")] = None,
-    whole: Annotated[bool, typer.Option("--whole", help="Cut nothing: annotations align whole takes.")] = False,
+    project: Annotated[str | None, typer.Option(help="The project that receives local files.")] = None,
+    to: Annotated[str | None, typer.Option(help="Skeleton to retarget the takes to: project/folder/name.")] = None,
+    into: Annotated[str | None, typer.Option(help="Folder of the results; default: the name of the model.")] = None,
+    layer: Annotated[
+        str | None, typer.Option(help="Layer of the annotations to use; with --propose, name of the proposed layer.")
+    ] = None,
+    label: Annotated[list[str] | None, typer.Option(help="Use only segments with this label; may be repeated.")] = None,
+    whole: Annotated[
+        bool, typer.Option("--whole", help="Do not cut the takes; annotations only guide their alignment.")
+    ] = False,
     rate: Annotated[float | None, typer.Option(help="Frames per second of the aligned clips.")] = None,
-    mirror: Annotated[bool, typer.Option("--mirror", help="Learn from mirrored examples, too.")] = False,
-    tree: Annotated[bool, typer.Option("--tree/--no-tree", help="Make a tree for searches.")] = True,
+    mirror: Annotated[bool, typer.Option("--mirror", help="Also train on mirrored examples.")] = False,
+    tree: Annotated[bool, typer.Option("--tree/--no-tree", help="Make a tree, which speeds up searches.")] = True,
     choices: Annotated[
-        list[str] | None, typer.Option("--set", help="step.parameter=value, such as align.window=5; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            "--set", help="Parameter of a step as step.parameter=value, such as align.window=5; may be repeated."
+        ),
     ] = None,
     wait: Wait = True,
     as_json: AsJson = False,

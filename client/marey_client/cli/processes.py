@@ -10,10 +10,17 @@ import typer
 
 from marey_client.cli.invocation import AsJson
 
-db = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="The database of a server on this machine.")
+db = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage the database of a server on this machine.")
 
-DataFolder = Annotated[Path | None, typer.Option(help="Data folder; default: MAREY_DATA, marey.toml, ./marey-data.")]
-DatabaseUrl = Annotated[str | None, typer.Option(help="postgresql://...; default: marey.db in the data folder.")]
+DataFolder = Annotated[
+    Path | None, typer.Option(help="Data folder; default: MAREY_DATA, else the one in marey.toml, else ./marey-data.")
+]
+DatabaseUrl = Annotated[
+    str | None,
+    typer.Option(
+        help="URL of a Postgres database, postgresql://...; default: the SQLite file marey.db in the data folder."
+    ),
+]
 
 
 class LogForm(StrEnum):
@@ -33,11 +40,17 @@ def add_to(app: typer.Typer) -> None:
 
 def serve(
     data: DataFolder = None,
-    host: Annotated[str | None, typer.Option(help="Address to listen on; default 127.0.0.1.")] = None,
-    port: Annotated[int | None, typer.Option(min=0, max=65535, help="0 for any free one; default 8460.")] = None,
-    workers: Annotated[int | None, typer.Option(min=0, help="Worker processes beside it; default 1.")] = None,
+    host: Annotated[str | None, typer.Option(help="Address to listen on; default: 127.0.0.1.")] = None,
+    port: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="Port to listen on; 0: any free one; default: 8460.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=0, help="Number of worker processes that the server starts; default: 1.")
+    ] = None,
     database_url: DatabaseUrl = None,
-    log_form: Annotated[LogForm | None, typer.Option(help="text, the default at a terminal, or json.")] = None,
+    log_form: Annotated[
+        LogForm | None, typer.Option(help="Format of the log: text (the default at a terminal) or json.")
+    ] = None,
 ) -> None:
     """Run a server, its database file and a local worker until stopped."""
     from marey_client import embedded
@@ -48,13 +61,22 @@ def serve(
 
 def worker(
     context: typer.Context,
-    slots: Annotated[int, typer.Option(min=1, help="Jobs at the same time, each in a process of its own.")] = 1,
-    kind: Annotated[list[str] | None, typer.Option(help="Only jobs of this kind; may be repeated.")] = None,
-    label: Annotated[list[str] | None, typer.Option(help="name=value that jobs may ask for; may be repeated.")] = None,
-    name: Annotated[str | None, typer.Option(help="Name shown to people; default: host and process id.")] = None,
-    cache: Annotated[Path | None, typer.Option(help="Folder that keeps downloaded inputs.")] = None,
-    cache_mb: Annotated[int, typer.Option(min=16, help="How much it may keep.")] = 2048,
-    log_form: Annotated[LogForm | None, typer.Option(help="text, the default at a terminal, or json.")] = None,
+    slots: Annotated[
+        int, typer.Option(min=1, help="Number of jobs that run at the same time, each in its own process.")
+    ] = 1,
+    kind: Annotated[list[str] | None, typer.Option(help="Run only jobs of this kind; may be repeated.")] = None,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(help="Label of the worker, as name=value, that jobs may require; may be repeated."),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the worker, shown to people; default: host and process id.")
+    ] = None,
+    cache: Annotated[Path | None, typer.Option(help="Folder for a cache of downloaded inputs.")] = None,
+    cache_mb: Annotated[int, typer.Option(min=16, help="Greatest size of the cache.")] = 2048,
+    log_form: Annotated[
+        LogForm | None, typer.Option(help="Format of the log: text (the default at a terminal) or json.")
+    ] = None,
 ) -> None:
     """Run jobs of a server until stopped. The token must have the scope `work`."""
     from marey_client import embedded
@@ -76,9 +98,11 @@ def worker(
 
 
 def demo(
-    motion: Annotated[Path | None, typer.Argument(help="A folder of motion files; left out: generated walks.")] = None,
+    motion: Annotated[Path | None, typer.Argument(help="A folder of motion files; default: generated walks.")] = None,
     data: Annotated[Path, typer.Option(help="Data folder of the demonstration's server.")] = Path("marey-demo"),
-    serve_on: Annotated[bool, typer.Option("--serve", help="Keep serving when everything is done.")] = False,
+    serve_on: Annotated[
+        bool, typer.Option("--serve", help="Keep the server running when the demonstration has ended.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """From takes to an evaluated dataset on this machine: import, retarget, evaluate; a table, a picture, a report."""
@@ -98,7 +122,7 @@ def upgrade_database(data: DataFolder = None, database_url: DatabaseUrl = None) 
 
 @db.command("backup")
 def backup_database(
-    target: Annotated[Path, typer.Argument(help="The file to write; it must not be there yet.")],
+    target: Annotated[Path, typer.Argument(help="The file to write; it must not exist.")],
     data: DataFolder = None,
     database_url: DatabaseUrl = None,
 ) -> None:
@@ -124,7 +148,9 @@ def check_database(data: DataFolder = None, database_url: DatabaseUrl = None, as
 
 @db.command("admin-token")
 def make_admin_token(
-    user: Annotated[str | None, typer.Option(help="The administrator; default: the one who was made first.")] = None,
+    user: Annotated[
+        str | None, typer.Option(help="Name of the administrator; default: the one who was created first.")
+    ] = None,
     data: DataFolder = None,
     database_url: DatabaseUrl = None,
 ) -> None:

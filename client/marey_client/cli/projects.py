@@ -10,7 +10,7 @@ from marey_client.cli.invocation import AsJson, ProjectName, UserName, connect
 from marey_client.cli.output import print_json, print_pairs, print_table, tell
 
 project = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Projects.")
-member = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Who may do what in a project.")
+member = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage projects and their members.")
 
 
 def add_to(app: typer.Typer) -> None:
@@ -22,10 +22,12 @@ def add_to(app: typer.Typer) -> None:
 @project.command("create")
 def create_project(
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Lower-case letters, digits, - and _.")],
+    name: Annotated[str, typer.Argument(help="Name of the project: lower-case letters, digits, - and _.")],
     title: Annotated[str | None, typer.Option(help="Name shown to people.")] = None,
-    description: Annotated[str, typer.Option(help="What it is for.")] = "",
-    public: Annotated[bool, typer.Option("--public", help="Everybody with the address may read.")] = False,
+    description: Annotated[str, typer.Option(help="Purpose of the project.")] = "",
+    public: Annotated[
+        bool, typer.Option("--public", help="Make the project public: everybody who can reach the server may read it.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Make a project; you become its owner."""
@@ -66,8 +68,8 @@ def change_project(
     context: typer.Context,
     name: ProjectName,
     title: Annotated[str | None, typer.Option(help="Name shown to people.")] = None,
-    description: Annotated[str | None, typer.Option(help="What it is for.")] = None,
-    visibility: Annotated[str | None, typer.Option(help="private or public.")] = None,
+    description: Annotated[str | None, typer.Option(help="Purpose of the project.")] = None,
+    visibility: Annotated[str | None, typer.Option(help="Visibility: private or public.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Change what a project is called and who may read it."""
@@ -113,7 +115,7 @@ def put_member(
     context: typer.Context,
     project_name: ProjectName,
     user: UserName,
-    role: Annotated[str, typer.Argument(help="reader, contributor, maintainer or owner.")],
+    role: Annotated[str, typer.Argument(help="Role: reader, contributor, maintainer or owner.")],
 ) -> None:
     """Give a user a role in a project."""
     from marey_schemas.access import MemberChange

@@ -61,19 +61,25 @@ def search(
     place: Annotated[str, typer.Argument(help="A model: project/folder/name, or project/id.")],
     params: Chosen,
     at: Annotated[
-        Many, typer.Option(help="A joint is at a place: WHEN:JOINT=x,y,z in metres; _ leaves a coordinate free.")
+        Many, typer.Option(help="Put a joint at a position: WHEN:JOINT=x,y,z in metres; _ leaves a coordinate free.")
     ] = None,
-    turned: Annotated[Many, typer.Option(help="A joint is turned: WHEN:JOINT=w,x,y,z.")] = None,
-    look: Annotated[Many, typer.Option(help="A joint's z axis points: WHEN:JOINT=x,y,z.")] = None,
-    look_at: Annotated[Many, typer.Option(help="A joint's z axis points at a place: WHEN:JOINT=x,y,z.")] = None,
-    stand: Annotated[Many, typer.Option(help="The body stands: WHEN=x,z in metres.")] = None,
-    face: Annotated[Many, typer.Option(help="The body faces: WHEN=degrees from +z, positive to the left.")] = None,
-    time: Annotated[Many, typer.Option(help="A moment comes: WHEN=seconds.")] = None,
-    start: Annotated[str | None, typer.Option(help="Where the motion begins: x,z,degrees.")] = None,
-    tolerance_cm: Annotated[float | None, typer.Option(help="Of places, in centimetres; default 1.")] = None,
-    tolerance_deg: Annotated[float | None, typer.Option(help="Of turns and directions, in degrees; default 5.")] = None,
+    turned: Annotated[Many, typer.Option(help="Give a joint a rotation in the world: WHEN:JOINT=w,x,y,z.")] = None,
+    look: Annotated[Many, typer.Option(help="Point a joint's z axis in a direction: WHEN:JOINT=x,y,z.")] = None,
+    look_at: Annotated[Many, typer.Option(help="Point a joint's z axis at a position: WHEN:JOINT=x,y,z.")] = None,
+    stand: Annotated[Many, typer.Option(help="Put the body at a position on the ground: WHEN=x,z in metres.")] = None,
+    face: Annotated[
+        Many, typer.Option(help="Turn the body to a heading: WHEN=degrees from +z, positive to the left.")
+    ] = None,
+    time: Annotated[Many, typer.Option(help="Set the time of a keyframe: WHEN=seconds.")] = None,
+    start: Annotated[str | None, typer.Option(help="Position and heading of the motion's start: x,z,degrees.")] = None,
+    tolerance_cm: Annotated[
+        float | None, typer.Option(help="Tolerance of positions, in centimetres; default: 1.")
+    ] = None,
+    tolerance_deg: Annotated[
+        float | None, typer.Option(help="Tolerance of rotations and directions, in degrees; default: 5.")
+    ] = None,
     request: Annotated[
-        Path | None, typer.Option(help="File with the whole request as JSON, for several steps.")
+        Path | None, typer.Option(help="JSON file with the whole request; needed for several steps.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "--output", "-o", help="File or folder to write the motion to.")

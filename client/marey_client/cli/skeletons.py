@@ -11,7 +11,9 @@ from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, print_table, tell
 
-skeleton = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Which joint is which, and its axes.")
+skeleton = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Edit the joint mapping and the joint axes of skeletons."
+)
 
 
 def add_to(app: typer.Typer) -> None:
@@ -22,12 +24,13 @@ def add_to(app: typer.Typer) -> None:
 @skeleton.command("map")
 def map_joints(
     context: typer.Context,
-    place: Annotated[str, typer.Argument(help="project/folder/name, or project/id.")],
+    place: Annotated[str, typer.Argument(help="The skeleton: project/folder/name, or project/id.")],
     assignments: Annotated[
-        list[str] | None, typer.Argument(help="standard_joint=JointName to set one, standard_joint= to clear it.")
+        list[str] | None,
+        typer.Argument(help="Mapping of a joint: standard_joint=JointName to set it, standard_joint= to clear it."),
     ] = None,
     confirm: Annotated[
-        bool, typer.Option("--confirm", help="Take what was recognised as right, however doubtful it was.")
+        bool, typer.Option("--confirm", help="Confirm the recognised mapping, even if it was uncertain.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -54,10 +57,12 @@ def map_joints(
 @skeleton.command("axes")
 def joint_axes(
     context: typer.Context,
-    place: Annotated[str, typer.Argument(help="project/folder/name, or project/id.")],
-    joint: Annotated[str | None, typer.Argument(help="The joint to change; left out: show all.")] = None,
+    place: Annotated[str, typer.Argument(help="The skeleton: project/folder/name, or project/id.")],
+    joint: Annotated[str | None, typer.Argument(help="The joint to change; default: show all joints.")] = None,
     twist: Annotated[str | None, typer.Option(help="Axis along the bone, in the joint's frame: x,y,z.")] = None,
-    swing: Annotated[str | None, typer.Option(help="Axis orthogonal to it: x,y,z.")] = None,
+    swing: Annotated[
+        str | None, typer.Option(help="Axis orthogonal to the bone's axis, in the joint's frame: x,y,z.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show the twist and swing axes of joints, or change those of one."""

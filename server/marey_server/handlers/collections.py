@@ -15,8 +15,8 @@ from marey_server.store import collections
 class CollectionsQuery(PageQuery):
     """Filters of a list of folders."""
 
-    path: str = Field("", max_length=1024, description="This folder and those below it.")
-    deleted: bool = Field(False, description="Among the deleted ones.")
+    path: str = Field("", max_length=1024, description="Folder whose subtree is listed, itself included.")
+    deleted: bool = Field(False, description="List deleted folders instead of existing ones.")
 
 
 class ProjectCollections(Resource):

@@ -17,10 +17,10 @@ class Service(Answer):
 
     name: str = "Marey"
     version: str
-    api: str = Field(API, description="What every path of the API begins with.")
-    documentation: str = Field(f"{API}/docs", description="The API for people.")
-    openapi: str = Field(f"{API}/openapi.json", description="The API for programs.")
-    ready: str = Field("/readyz", description="Whether the server can serve.")
+    api: str = Field(API, description="Prefix of all paths of the API.")
+    documentation: str = Field(f"{API}/docs", description="Path of the API documentation for people.")
+    openapi: str = Field(f"{API}/openapi.json", description="Path of the OpenAPI document.")
+    ready: str = Field("/readyz", description="Path of the readiness check.")
 
 
 class ApiRoot(Resource):

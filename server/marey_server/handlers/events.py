@@ -23,8 +23,8 @@ WRITE_TIMEOUT_S = 30.0
 class EventsQuery(Request):
     """The position and number of events to read."""
 
-    after: int = Field(0, ge=0, le=2**62, description="Number of the last event received; 0 from the beginning.")
-    limit: int = Field(100, ge=1, le=events.MAX_EVENTS, description="Longest page.")
+    after: int = Field(0, ge=0, le=2**62, description="Number of the last event received; 0: from the beginning.")
+    limit: int = Field(100, ge=1, le=events.MAX_EVENTS, description="Greatest number of events in a page.")
 
 
 class Events(Resource):

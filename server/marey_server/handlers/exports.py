@@ -22,28 +22,31 @@ from marey_server.motions.predecessor_exports import PredecessorOptions
 class ExportQuery(Request):
     """Format and options of the exported file."""
 
-    format: ExportFormat = Field("original", description="original: the file exactly as it was imported.")
-    unit: WrittenUnit = Field("cm", description="Unit of length of a BVH.")
+    format: ExportFormat = Field("original", description="File format; original: the file exactly as it was imported.")
+    unit: WrittenUnit = Field("cm", description="Unit of length of a BVH file.")
     end_index: Literal["inclusive", "exclusive"] = Field(
-        "inclusive", description="Of an annotation of the predecessor: whether a section holds its frame `end_idx`."
+        "inclusive",
+        description="For annotations in the predecessor's format: whether a section includes its frame `end_idx`.",
     )
     form: Literal["labels", "list", "frames"] = Field(
-        "labels", description="Of an annotation of the predecessor: sections by label, a list, or frames by label."
+        "labels",
+        description="For annotations in the predecessor's format: sections by label, a list of sections, or "
+        "frames by label.",
     )
     part: Literal["model", "tree", "alignment"] | None = Field(
         None,
-        description="For the predecessor: the tree of a model, or what is kept beside an aligned clip: its time "
-        "function and sections. The original of a tree is its file, too. Absent: the model, or the clip. Other items "
-        "have none.",
+        description="Part to export. For models: `tree`. For aligned clips in the predecessor's format: the "
+        "time function and the sections. Absent: the model or the clip itself.",
     )
     layout: Literal["2", "3"] | None = Field(
-        None, description="Of a model of the predecessor; absent: as it was imported, else 3."
+        None,
+        description="For models in the predecessor's format: version of the layout; absent: the imported one, else 3.",
     )
     time: ExportTime = Field(
         "canonical",
-        description="Of an aligned clip: its canonical frames, or those of the clip it was made of, where that stood.",
+        description="For aligned clips: canonical time, or the time and place of the source clip.",
     )
-    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Absent: the newest.")
+    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision to export; absent: the newest.")
 
 
 class Export(BlobSender):

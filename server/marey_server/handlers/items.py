@@ -21,21 +21,31 @@ MAX_DOCUMENT_BYTES = 128 * MIB
 class ItemsQuery(CountedPageQuery):
     """Filters, order and detail of a list of items."""
 
-    collection: str | None = Field(None, max_length=1024, description="In this folder or below it.")
+    collection: str | None = Field(None, max_length=1024, description="Return items in this folder or below it.")
     directly_in: str | None = Field(
-        None, max_length=1024, description="In this folder, not below it; the empty path is the root."
+        None, max_length=1024, description="Return items in this folder but not below it; the empty path is the root."
     )
-    path: str | None = Field(None, max_length=1300, description="Folder and name of one item.")
-    name: str | None = Field(None, max_length=255, description="Exactly this name, or with a final * its beginning.")
-    tag_in: CommaSeparated = Field((), alias="tag.in", description="With any of these tags.")
-    skeleton: str | None = Field(None, max_length=64, description="Clips on this skeleton.")
-    clip: str | None = Field(None, max_length=64, description="Annotations of this clip.")
-    frames_gte: int | None = Field(None, alias="frames.gte", ge=0, le=MAX_INTEGER, description="At least so long.")
-    frames_lte: int | None = Field(None, alias="frames.lte", ge=0, le=MAX_INTEGER, description="At most so long.")
-    q: str | None = Field(None, max_length=255, description="Part of the name, in any case.")
-    deleted: bool = Field(False, description="Among the deleted ones.")
-    sort: str = Field("-created_at", max_length=100, description="Of id, name, created_at, updated_at, frames.")
-    fields: CommaSeparated | None = Field(None, description="Only these members of each item.")
+    path: str | None = Field(
+        None, max_length=1300, description="Return the item with this path, made of folder and name."
+    )
+    name: str | None = Field(
+        None, max_length=255, description="Return items with this name; a final * matches any ending."
+    )
+    tag_in: CommaSeparated = Field((), alias="tag.in", description="Return items that have any of these tags.")
+    skeleton: str | None = Field(None, max_length=64, description="Return clips that use this skeleton.")
+    clip: str | None = Field(None, max_length=64, description="Return annotations of this clip.")
+    frames_gte: int | None = Field(
+        None, alias="frames.gte", ge=0, le=MAX_INTEGER, description="Least duration in seconds."
+    )
+    frames_lte: int | None = Field(
+        None, alias="frames.lte", ge=0, le=MAX_INTEGER, description="Greatest duration in seconds."
+    )
+    q: str | None = Field(
+        None, max_length=255, description="Return items whose name contains this text, in upper or lower case."
+    )
+    deleted: bool = Field(False, description="Return deleted items instead of existing ones.")
+    sort: str = Field("-created_at", max_length=100, description="Sort keys: id, name, created_at, updated_at, frames.")
+    fields: CommaSeparated | None = Field(None, description="Members of each item to return; absent: all.")
 
     def filters(self) -> ItemFilters:
         """Return the filters of the store."""
@@ -168,7 +178,7 @@ class RevisionResource(Resource):
 class LineageQuery(Request):
     """Of which revision."""
 
-    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Absent: the newest.")
+    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision to return; absent: the newest.")
 
 
 class LineageResource(Resource):

@@ -60,11 +60,13 @@ class JobKindResource(Resource):
 class JobsQuery(CountedPageQuery):
     """Filters and order of a list of jobs."""
 
-    state: CommaSeparatedOf[JobState] = Field((), description="In any of these states.")
-    kind: CommaSeparated = Field((), description="Of any of these kinds.")
-    parent: str | None = Field(None, max_length=64, description="Tasks of this job; without it, no tasks are listed.")
-    author: str | None = Field(None, max_length=64, description="Name of who submitted them.")
-    sort: str = Field("-created_at", max_length=100, description="Of id, created_at, priority.")
+    state: CommaSeparatedOf[JobState] = Field((), description="Return jobs in any of these states.")
+    kind: CommaSeparated = Field((), description="Return jobs of any of these kinds.")
+    parent: str | None = Field(
+        None, max_length=64, description="Return the tasks of this job; absent: jobs that are not tasks."
+    )
+    author: str | None = Field(None, max_length=64, description="Return jobs that the user with this name submitted.")
+    sort: str = Field("-created_at", max_length=100, description="Sort keys: id, created_at, priority.")
 
     def filters(self) -> JobFilters:
         """Return the filters of the store."""
@@ -212,8 +214,8 @@ class JobResults(Resource):
 class JobEventsQuery(Request):
     """The position and number of events to read."""
 
-    after: int = Field(0, ge=0, le=2**62, description="Number of the last event received; 0 from the beginning.")
-    limit: int = Field(100, ge=1, le=events.MAX_EVENTS, description="Longest page.")
+    after: int = Field(0, ge=0, le=2**62, description="Number of the last event received; 0: from the beginning.")
+    limit: int = Field(100, ge=1, le=events.MAX_EVENTS, description="Greatest number of events in a page.")
 
 
 class JobEvents(Resource):
@@ -231,8 +233,8 @@ class JobEvents(Resource):
 class JobLogQuery(Request):
     """The piece of the log to read."""
 
-    offset: int = Field(0, ge=0, le=2**53, description="First byte.")
-    limit: int = Field(MOST_READ_BYTES, ge=1, le=MOST_READ_BYTES, description="Most bytes.")
+    offset: int = Field(0, ge=0, le=2**53, description="Offset of the first byte to return.")
+    limit: int = Field(MOST_READ_BYTES, ge=1, le=MOST_READ_BYTES, description="Greatest number of bytes to return.")
 
 
 class JobLog(Resource):

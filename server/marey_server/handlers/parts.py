@@ -28,9 +28,9 @@ FrameRange = Annotated[str, StringConstraints(pattern=r"^\d{0,9}:\d{0,9}$")]
 class PartQuery(Request):
     """Revision, frames and joints of a part to read."""
 
-    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Absent: the newest.")
-    frames: FrameRange | None = Field(None, description="Half-open range, as in 100:200, :200 or 100:.")
-    joints: CommaSeparated | None = Field(None, description="Names of joints, in the order wanted.")
+    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision to return; absent: the newest.")
+    frames: FrameRange | None = Field(None, description="Half-open range of frames, such as 100:200, :200 or 100:.")
+    joints: CommaSeparated | None = Field(None, description="Names of the joints to return, in the desired order.")
 
     def frame_slice(self) -> slice | None:
         """`frames` as a slice."""
@@ -43,7 +43,7 @@ class PartQuery(Request):
 class PartChange(Request):
     """Message of the revision that a change makes."""
 
-    message: Message = Field("", description="Shown in the history.")
+    message: Message = Field("", description="Message shown in the history.")
 
 
 def read_part(

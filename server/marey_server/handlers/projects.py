@@ -15,7 +15,11 @@ from marey_server.store import members, projects
 class ProjectsQuery(PageQuery):
     """Page and order of a list of projects."""
 
-    sort: str = Field("name", max_length=100, description="Of id, name, created_at, updated_at; - for falling.")
+    sort: str = Field(
+        "name",
+        max_length=100,
+        description="Sort keys: id, name, created_at, updated_at; a leading - sorts in descending order.",
+    )
 
 
 class Projects(Resource):

@@ -35,15 +35,21 @@ SHOWN_ONLY = "default-src 'none'; base-uri 'none'; form-action 'none'; style-src
 class ReportQuery(Request):
     """The revision to read."""
 
-    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Absent: the newest.")
+    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision of the report; absent: the newest.")
 
 
 class FigureQuery(ReportQuery):
     """The form of a figure to read."""
 
-    format: Literal["png", "svg", "csv", "json"] = Field("png", description="Picture, drawing, or what is plotted.")
-    trial: str | None = Field(None, max_length=100, description="Name of a trial, for figures of one trial.")
-    table: str | None = Field(None, max_length=100, description="Which table, as CSV; absent: the first.")
+    format: Literal["png", "svg", "csv", "json"] = Field(
+        "png", description="Form of the figure: an image (png, svg) or the plotted data (json, csv)."
+    )
+    trial: str | None = Field(
+        None, max_length=100, description="Name of the trial; only for figures of a single trial."
+    )
+    table: str | None = Field(
+        None, max_length=100, description="Table of the figure to return as CSV; absent: the first."
+    )
 
 
 class StoredFileSender(BlobSender):
@@ -147,7 +153,9 @@ def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:
 class WalkGraphQuery(ReportQuery):
     """The walks to read and their form."""
 
-    format: WalkGraphFormat = Field("json", description="GraphML is read by networkx, Gephi, yEd and igraph.")
+    format: WalkGraphFormat = Field(
+        "json", description="Format of the graph; GraphML can be read by networkx, Gephi, yEd and igraph."
+    )
     trial: str | None = Field(None, max_length=100, description="Name of a trial; absent: all trials together.")
 
 

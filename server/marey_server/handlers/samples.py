@@ -20,16 +20,23 @@ from marey_server.motions.models import FoundModel, UsableModel
 class SampleQuery(Request):
     """Number, seed and revision of samples."""
 
-    n: int = Field(1, ge=1, le=MOST_SAMPLES, description="How many; the first are those of a smaller number.")
-    seed: int = Field(0, ge=0, le=MOST_SEED, description="The same seed gives the same samples.")
-    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Absent: the newest.")
+    n: int = Field(
+        1,
+        ge=1,
+        le=MOST_SAMPLES,
+        description="Number of samples; a larger number keeps the first samples of a smaller one.",
+    )
+    seed: int = Field(
+        0, ge=0, le=MOST_SEED, description="Seed of the random numbers; the same seed gives the same samples."
+    )
+    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision of the model; absent: the newest.")
 
 
 class SampleFileQuery(SampleQuery):
     """Samples to draw, and the format of their files."""
 
-    format: MotionFormat = Field("bvh", description="Of the files; several come as one ZIP archive.")
-    unit: WrittenUnit = Field("cm", description="Unit of length of a BVH.")
+    format: MotionFormat = Field("bvh", description="File format; several files are returned in one ZIP archive.")
+    unit: WrittenUnit = Field("cm", description="Unit of length of BVH files.")
 
 
 class ModelUser(Resource):

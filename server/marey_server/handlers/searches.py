@@ -19,8 +19,8 @@ from marey_server.motions.searching import FoundSearchable, Searchable, Searchab
 class FoundFileQuery(Request):
     """As which file."""
 
-    format: MotionFormat = Field("bvh", description="Of the file.")
-    unit: WrittenUnit = Field("cm", description="Unit of length of a BVH.")
+    format: MotionFormat = Field("bvh", description="File format of the motion.")
+    unit: WrittenUnit = Field("cm", description="Unit of length of a BVH file.")
 
 
 class Searcher(Resource):

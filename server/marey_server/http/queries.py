@@ -29,13 +29,15 @@ CommaSeparated = CommaSeparatedOf[Annotated[str, StringConstraints(max_length=10
 class PageQuery(Request):
     """Page of a list."""
 
-    limit: int = Field(DEFAULT_LIMIT, ge=1, le=MAX_LIMIT, description="Longest page.")
+    limit: int = Field(DEFAULT_LIMIT, ge=1, le=MAX_LIMIT, description="Greatest number of entries in a page.")
     cursor: str | None = Field(
-        None, max_length=4096, pattern="^[A-Za-z0-9_-]+$", description="`next_cursor` of the page before."
+        None, max_length=4096, pattern="^[A-Za-z0-9_-]+$", description="Value of `next_cursor` in the previous page."
     )
 
 
 class CountedPageQuery(PageQuery):
     """Page of a list, optionally with the count of all entries."""
 
-    count: Literal["exact"] | None = Field(None, description="Count the whole list; it costs time on long ones.")
+    count: Literal["exact"] | None = Field(
+        None, description="Return the length of the whole list, which is slow for long lists."
+    )

@@ -39,34 +39,58 @@ class Settings(BaseSettings):
     blobs: Literal["database", "directory"] = Field(
         "database", description="Where bytes are kept: in the database, or in the folder blobs of the data folder."
     )
-    answer_cache_bytes: int = Field(
-        64 * MIB, ge=0, description="Memory for documents as they were sent, so that the next reader gets them sooner."
-    )
+    answer_cache_bytes: int = Field(64 * MIB, ge=0, description="Memory for a cache of encoded documents.")
     trust_proxy: bool = Field(
-        False, description="Believe X-Forwarded-For and X-Forwarded-Proto. Only behind a proxy that sets them."
+        False,
+        description="Trust X-Forwarded-For and X-Forwarded-Proto; only for servers behind a proxy that sets them.",
     )
-    log_form: Literal["json", "text"] = Field("json", description="One JSON object per line, or lines for people.")
+    log_form: Literal["json", "text"] = Field(
+        "json", description="Format of the log: one JSON object per line, or text for people."
+    )
     log_level: Literal["debug", "info", "warning", "error"] = "info"
-    drain_s: float = Field(25.0, ge=0, le=600, description="Seconds that running requests get to finish on SIGTERM.")
+    drain_s: float = Field(
+        25.0, ge=0, le=600, description="Seconds that running requests have to finish after SIGTERM."
+    )
     header_timeout_s: float = Field(
-        75.0, gt=0, description="An idle connection, or one that sends its headers slowly, is closed."
+        75.0,
+        gt=0,
+        description="Seconds after which an idle connection, or one that sends its headers too slowly, is closed.",
     )
-    body_timeout_s: float = Field(60.0, gt=0, description="Seconds a whole ordinary request body may take.")
-    upload_timeout_s: float = Field(6 * 3600.0, gt=0, description="Seconds a streamed body may take.")
-    max_header_bytes: int = Field(64 * 1024, ge=4096, description="Longest head of a request.")
+    body_timeout_s: float = Field(
+        60.0, gt=0, description="Greatest number of seconds to receive an ordinary request body."
+    )
+    upload_timeout_s: float = Field(
+        6 * 3600.0, gt=0, description="Greatest number of seconds to receive a streamed request body."
+    )
+    max_header_bytes: int = Field(
+        64 * 1024, ge=4096, description="Greatest size of the request line and the headers, in bytes."
+    )
     login_tries_per_minute: int = Field(
-        10, ge=1, description="Sign-in attempts per user name, and ten times that per address."
+        10,
+        ge=1,
+        description="Greatest number of sign-in attempts per minute for a user name; an address has ten times as many.",
     )
-    import_files_now: int = Field(64, ge=0, description="Imports of more files become a job.")
-    import_bytes_now: int = Field(64 * MIB, ge=0, description="Imports of more bytes become a job.")
-    lease_ttl_s: float = Field(60.0, ge=1, le=3600, description="How long a worker keeps a job without a sign of life.")
+    import_files_now: int = Field(
+        64, ge=0, description="Greatest number of files in an import that runs at once; larger imports become a job."
+    )
+    import_bytes_now: int = Field(
+        64 * MIB,
+        ge=0,
+        description="Greatest number of bytes in an import that runs at once; larger imports become a job.",
+    )
+    lease_ttl_s: float = Field(
+        60.0, ge=1, le=3600, description="Seconds without a heartbeat after which a worker loses its job."
+    )
     heartbeat_s: float = Field(
-        15.0, ge=0.1, le=600, description="How often workers give a sign of life; at least twice in a lease."
+        15.0, ge=0.1, le=600, description="Seconds between the heartbeats of a worker; at most half of lease_ttl_s."
     )
     cancel_grace_s: float = Field(
-        30.0, ge=0, le=3600, description="How long a worker may take to stop, once a job is cancelled or its time over."
+        30.0,
+        ge=0,
+        le=3600,
+        description="Seconds that a worker has to stop a job that was cancelled or whose time limit has passed.",
     )
-    local_workers: int = Field(0, ge=0, le=256, description="Worker processes to start beside the server.")
+    local_workers: int = Field(0, ge=0, le=256, description="Number of worker processes that the server starts.")
 
     @field_validator("heartbeat_s")
     @classmethod
