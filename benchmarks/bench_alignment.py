@@ -54,7 +54,7 @@ def _require_same_totals() -> None:
 
 
 def _peers_given_costs(costs: Floats) -> dict[str, Callable[[], float]]:
-    """Each finds a way through the costs as well as its total."""
+    """Time the peers on given costs; each computes the path as well as its total."""
     return {
         "librosa": lambda: float(librosa.sequence.dtw(C=costs)[0][-1, -1]),
         "dtw-python": lambda: float(dtw_python.dtw(costs, step_pattern="symmetric1").distance),
@@ -62,7 +62,7 @@ def _peers_given_costs(costs: Floats) -> dict[str, Callable[[], float]]:
 
 
 def _peers_of_points(a: Floats, b: Floats) -> dict[str, Callable[[], float]]:
-    """Each makes squared distances of flat vectors, too, and finds a way through them."""
+    """Time the peers on points; each computes squared distances of flat vectors and a path through them."""
     return {
         "librosa": lambda: float(librosa.sequence.dtw(a.T, b.T, metric="sqeuclidean")[0][-1, -1]),
         "dtw-python": lambda: float(
@@ -103,7 +103,7 @@ def _against(
     calls: int,
     goal: float | None = None,
 ) -> Row:
-    """Beside each of the peers; the ratio is that with librosa, the quickest of them."""
+    """Make a row per peer; the ratio is to librosa, the fastest of them."""
     own, *theirs = _each(calls, repeats, ours, *peers.values())
     by_name = dict(zip(peers, theirs, strict=True))
     ratio = by_name["librosa"].median_s / own.median_s

@@ -1,4 +1,4 @@
-"""From the text of a BVH file to a clip of quaternions, against pymotion and a loader of the usual kind in plain numpy.
+"""Reading of BVH text to a clip of quaternions, against pymotion and a plain loader in numpy.
 
 Marey is timed twice: reading alone (`read_bvh`: numbers, quaternions, every check of the text), which is what the peers
 do and what the goals are about; and importing (`read_motion`), which besides finds the body's landmarks, settles unit

@@ -17,7 +17,7 @@ from marey_motion.gait import generate_gait
 
 FRAMES, RATE_HZ = 10_000, 60.0
 MOST_MS = 500
-"""What a person who drags a slider still takes for an answer, for nearly three minutes of motion."""
+"""Longest response to a moved slider that feels immediate, for nearly three minutes of motion."""
 
 ARM = ("LeftArm", "LeftForeArm", "LeftHand")
 COMMANDS: tuple[NamedCommand, ...] = (
@@ -82,9 +82,9 @@ def _beside(walk: Clip, name: str, peer: str, command: NamedCommand, theirs: Cal
 
 
 def _peers(walk: Clip) -> list[tuple[str, str, NamedCommand, Callable[[], Any]]]:
-    """The same by scipy's means, from and to single precision; what scipy has no word for is left out.
+    """Time the same with scipy, from and to single precision; edits that scipy does not have are left out.
 
-    Its filter smooths components: it neither minds where a quaternion changes its sign nor keeps the ends.
+    Its filter smooths components: it ignores sign changes of quaternions and does not keep the ends.
     """
 
     def slerped() -> list[NDArray[np.float32]]:

@@ -15,7 +15,7 @@ MOST_MB = 2000
 
 
 def run() -> list[Row]:
-    """On one thread and on two, each in a process of its own, so that the memory is its own, too."""
+    """Measure on one thread and on two, each in a separate process, so that memory is measured separately, too."""
     return [_row(threads) for threads in (1, 2)]
 
 

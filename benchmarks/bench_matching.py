@@ -128,7 +128,7 @@ def _database(row_count: int) -> tuple[Floats, Rows, Floats]:
 
 
 def _play(index: SearchIndex, starts: Rows, wishes: Floats, hard: bool) -> _Play:
-    """Each trial shows a row, asks for one that goes on with its pose towards a wish, and shows what follows that."""
+    """Play trials: each shows a row, searches for one that continues its pose towards a goal, and shows the next."""
     rng = np.random.default_rng(1)
     stops = np.repeat(starts[1:], np.diff(starts))
     shown = rng.choice(np.flatnonzero(index.selectable), TRIALS)

@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 CLIPS, FRAMES, CHANNELS, COEFFICIENTS, COMPONENTS = 100, 150, 255, 30, 20
 PUBLISHED_S = 12.7 + 0.26 + 0.50
-"""Of the published system, on two cores of the same kind: alignment, principal components, mixtures of 30 clips."""
+"""Seconds of the published system for 30 clips, on two similar cores: alignment, components and mixtures."""
 
 GOAL_S = 0.5
 WITHOUT_REPORT = ModelOptions(leave_one_out=False, folds=0, report_samples=0)
@@ -133,7 +133,7 @@ def _report() -> Row:
 
 
 def _smooth(channels: int) -> Floats:
-    """(clips, frames, channels) random smooth functions and a little noise."""
+    """Make random smooth functions (clips, frames, channels) with a little noise."""
     random = np.random.default_rng(1)
     basis = SplineBasis.clamped(FRAMES, COEFFICIENTS)
     modes = random.standard_normal((40, COEFFICIENTS, channels)) * np.geomspace(1.0, 0.02, 40)[:, None, None]

@@ -21,7 +21,7 @@ FRAMES, JOINTS = 1040, 63
 CONNECTIONS = 8
 SECONDS = 6.0
 ROUNDS = 4
-"""In which reading takes turns with the bare server."""
+"""Number of rounds in which Marey and the bare server are read in turn."""
 BATCH = 250
 PREDECESSOR_MS = 160
 GOAL_READS_PER_S, GOAL_P99_MS = 999, 20
@@ -101,7 +101,7 @@ def _size(seeded: Seeded) -> str:
 
 
 def _with_processor_ms(server: LocalServer, measure: Callable[[], Load]) -> tuple[Load, float]:
-    """What was measured, and the server's processor time for each of it; the warm-up counts like the rest."""
+    """Add the server's processor time per request to a measurement; the warm-up is included."""
     before_s = server.processor_s()
     measured = measure()
     share = measured.seconds / (measured.seconds + load.WARM_UP_S)

@@ -35,7 +35,7 @@ Floats = NDArray[np.float64]
 EXAMPLES, TARGETS, NOISE_M = 30, 15, 0.005
 FRAME = 24.0
 COMPONENTS = 25
-"""As many as the published model has."""
+"""Number of components of the published model."""
 
 LEAF = 50
 

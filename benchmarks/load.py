@@ -1,4 +1,4 @@
-"""What clients and workers do to a server under load. Each function runs in a process of its own (`in_process`)."""
+"""Load that clients and workers put on a server. Each function runs in a process of its own (`in_process`)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Load:
         return len(self.latencies_s) / self.seconds
 
     def percentile_ms(self, percent: int) -> float:
-        """The time that `percent` of the requests did not exceed, milliseconds."""
+        """Compute the time that `percent` of the requests did not exceed, in milliseconds."""
         return statistics.quantiles(self.latencies_s, n=100, method="inclusive")[percent - 1] * 1e3
 
 

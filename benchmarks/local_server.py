@@ -121,7 +121,7 @@ def free_port() -> int:
 
 @dataclass(frozen=True)
 class Seeded:
-    """What `seed` put into the project: a clip, and the skeleton it is on."""
+    """Content of a project after `seed`: a clip and its skeleton."""
 
     clip: str
     stored_bytes: int

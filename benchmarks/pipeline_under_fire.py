@@ -45,7 +45,7 @@ PARTS = {Kind.PROCESSED: ("motion", "info"), Kind.MODEL: ("model", "tree")}
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a pipeline: how long it took, when workers were killed, and digests of its arrays."""
+    """Outcome of a pipeline: its duration, the times at which workers were killed, and digests of its arrays."""
 
     seconds: float
     attempts: int
@@ -113,7 +113,7 @@ def _attempts(marey: Marey, lab: ProjectHandle) -> Iterator[str | None]:
 
 
 def digests(lab: ProjectHandle) -> dict[str, str]:
-    """Digest of every array of every aligned clip and model, by the place of the item and in its documents."""
+    """Compute digests of all arrays of aligned clips and models, by path of the item and place in its documents."""
     found: dict[str, str] = {}
     for kind, parts in PARTS.items():
         for one in lab.items(kind).list():
@@ -172,7 +172,7 @@ class Shift:
 
 @contextmanager
 def at_work(server: LocalServer, count: int) -> Iterator[Shift]:
-    """So many workers, while the block runs."""
+    """Keep `count` workers running while the block runs."""
     shift = Shift(server, count)
     with ExitStack() as stack:
         stack.callback(shift.kill)

@@ -11,7 +11,7 @@ Floats = NDArray[np.float64]
 
 
 def load_plainly(path: Path) -> Floats:
-    """(F, J, 4) local quaternions w, x, y, z, of a file whose joints all turn in the same order."""
+    """Read local quaternions (F, J, 4) w, x, y, z of a file whose joints all have the same rotation order."""
     channels: list[int] = []
     order = ""
     frames: list[list[float]] = []

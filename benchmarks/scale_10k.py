@@ -128,7 +128,7 @@ def _page_times_ms(server: LocalServer) -> Iterator[float]:
 
 
 def _check(server: LocalServer) -> tuple[bool, str]:
-    """Whether `marey db fsck` passes, and what it says."""
+    """Run `marey db fsck`; return whether it passes, and its output."""
     run = subprocess.run(
         [sys.executable, "-m", "marey_client.cli", "db", "fsck"],
         env=clean_environment() | {"MAREY_DATA": str(server.data)},

@@ -196,7 +196,7 @@ class FormatError(MotionError):
 
 
 class UnknownFormat(FormatError):
-    """No reader recognises the file.
+    """Refusal of a file that no reader recognises.
 
     Examples
     --------

@@ -284,7 +284,7 @@ def _check_enough(pairs: tuple[JointPair, ...], source_mapping: JointMapping, ta
 
 
 def _axes_of(axes: Mapping[str, JointAxes], joint: str, which: str) -> NDArray[np.float64]:
-    """(3, 3) orthonormal: twist, swing and their cross product as columns, in the joint's frame."""
+    """Make the orthonormal matrix (3, 3) of twist, swing and their cross product as columns, in the joint's frame."""
     if joint not in axes:
         raise MappingError(f"the {which} skeleton has no twist and swing axes for this joint", where=joint)
     twist, swing = np.array(axes[joint].twist), np.array(axes[joint].swing)
@@ -306,7 +306,7 @@ def _hip_height_ratio(
     target: Skeleton,
     target_axes: Mapping[str, JointAxes],
 ) -> float:
-    """Target by source height of the pelvis above the toes of bodies that stand straight.
+    """Compute the ratio of target to source of the height of the pelvis above the toes, of upright bodies.
 
     Bone lengths are added up, because many files have a rest pose that is not upright. A part that is known of one
     skeleton only is left out of both.
@@ -350,7 +350,7 @@ def _heights(
 
 
 def _are_same_rig(source: Skeleton, target: Skeleton) -> bool:
-    """Whether both have the same joints, connected and at rest alike, of whatever lengths."""
+    """Check that both have the same joints, hierarchy and rest rotations; lengths may differ."""
     if source.joint_names != target.joint_names or not np.array_equal(source.parents, target.parents):
         return False
     turned = quaternions.angle_between(source.rest_rotations, target.rest_rotations)

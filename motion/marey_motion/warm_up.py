@@ -94,7 +94,7 @@ def _recorded_origin() -> str:
 
 
 def _is_done() -> bool:
-    """Whether everything is compiled, from the installed sources and by the installed compiler."""
+    """Check that everything is compiled, from the installed sources and by the installed compiler."""
     return STAMP.is_file() and STAMP.read_text("utf-8") == f"{_origin()} {_DONE}"
 
 
@@ -280,7 +280,7 @@ STAGES: Mapping[str, Callable[[Clip], None]] = {
     "alignment": _align,
     "coverage": _measure,
 }
-"""What uses kernels, by name; the longest first after that which the others need."""
+"""Functions that use kernels, by name; first the one that the others need, then the longest first."""
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ ALIGNMENT_SCHEMA = "marey/alignment@1"
 Tree = dict[str, Any]
 
 SHARED = ("set", "reference", "keyframes")
-"""What all examples of a set have in common."""
+"""Fields that all examples of a set have in common."""
 
 
 class StoredExample(NamedTuple):

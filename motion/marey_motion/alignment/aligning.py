@@ -40,11 +40,11 @@ from marey_schemas.options.alignment import MEDOID, NEAREST_MEAN_LENGTH, AlignOp
 LEAST_CLIPS = 2
 LEAST_FRAMES = 4
 MOST_FRAMES = 4000
-"""Of one example: the costs of two such take 128 MB."""
+"""Most frames of one example: the costs of two such examples take 128 MB."""
 MOST_JOINT_FRAMES = 30_000_000
-"""Of all examples together, joints times frames: these take about 3 GB."""
+"""Most joints times frames of all examples together: these take about 3 GB."""
 SAME_OFFSET_M = 1e-3
-"""By which bones of one skeleton may differ between files."""
+"""Largest difference of bone offsets that counts as rounding of one skeleton in several files."""
 MIRRORED = "~mirrored"
 
 Progress = Callable[[float, float | None, str], None]

@@ -71,7 +71,7 @@ def _origin(placement: Placement) -> Floats:
 
 
 def _turn(angle_rad: float) -> Floats:
-    """To the left about the vertical."""
+    """Make the rotation by an angle to the left about the vertical."""
     return np.asarray(quaternions.from_axis_angle((0.0, 1.0, 0.0), angle_rad), dtype=np.float64)
 
 

@@ -11,14 +11,14 @@ from math import inf
 from marey_motion.errors import EditError
 
 PER_COMMAND, PER_NUMBER = 1_000_000, 100
-"""Of most commands, and for each number of the motion."""
+"""Work of most commands, and work for each number of the motion, in nanoseconds."""
 PER_RIG = 10_000_000
-"""Of finding out which joints are limbs, and how they bend."""
+"""Work of finding the limbs of a skeleton and the axes they bend about, in nanoseconds."""
 PER_PLANTED_NUMBER = 600
 PER_TAP, MOST_OF_TAPS = 0.35, 200.0
-"""Of means over time, for each number: by each frame of the window, and where that is long, at most."""
+"""Work of a moving mean for each number: for each frame of its window, and the most for a long window."""
 PER_MEETING, PER_MET_NUMBER = 1_000_000, 10
-"""Of one range of constraints that is met and blended in."""
+"""Work of one range of constraints that is solved and blended in, and work for each number of its frames."""
 
 
 @dataclass

@@ -216,7 +216,7 @@ class _Cluster:
         return displace(motion, frames, changed, windows_around(frames, blend_frames, motion.frame_count))
 
     def _solve(self, given: Motion, frames: Ints, constraints: Sequence[Constraint]) -> Motion:
-        """Those frames of a motion with constraints met that count in all of them."""
+        """Solve the given frames of a motion, in all of which the same constraints apply."""
         limb = constraints[0].limb if all(one.limb == constraints[0].limb for one in constraints) else None
         joints = tuple(sorted({joint for one in constraints for joint in one.joints}))
         self.budget.spend(self._work(len(frames), constraints, limb, joints))
@@ -233,7 +233,7 @@ class _Cluster:
     def _work(
         self, frames: int, constraints: Sequence[Constraint], limb: TwoBoneLimb | None, joints: tuple[int, ...]
     ) -> float:
-        """Of solving these frames, where nothing can be reached."""
+        """Estimate the work of solving these frames when no target can be reached."""
         limited, asked = bool(self.freedom.limits), limb_targets([one.target for one in constraints], limb)
         alone = limb is not None and set(joints) <= set(limb.joints) and not self.freedom.root_moves
         method: Literal["ccd", "two_bone", "least_squares"] = "ccd" if self.solver == "ccd" else "least_squares"

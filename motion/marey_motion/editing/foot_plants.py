@@ -65,7 +65,7 @@ class PlantOptions:
 
 
 class FootContacts(NamedTuple):
-    """When a foot touches the ground with its toe and with its heel: flags (F,)."""
+    """Flags (F,) of the frames in which a foot touches the ground with its toe and with its heel."""
 
     toe: Flags
     heel: Flags

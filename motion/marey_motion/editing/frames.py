@@ -151,7 +151,7 @@ def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
 
 
 def _joined(first: Motion, second: Motion, overlap: int, count: int, frame_rate_hz: float) -> Motion:
-    """Both, blended over `count` frames, which overlap or not; 0 for a hard cut."""
+    """Join two motions, blended over `count` frames that overlap or not; 0 for a hard cut."""
     if overlap:
         return _faded_over(first, second, overlap)
     return _in_a_row(first, _inertialised(first, second, count, frame_rate_hz) if count else second)
@@ -175,7 +175,7 @@ def _in_a_row(first: Motion, second: Motion) -> Motion:
 
 
 def _faded_over(first: Motion, second: Motion, overlap: int) -> Motion:
-    """Both, the last frames of the one faded over into the first ones of the other."""
+    """Join two motions; the last frames of the one fade into the first frames of the other."""
     share = smooth_step(np.arange(1, overlap + 1) / (overlap + 1))
     end, start = slice(first.frame_count - overlap, None), slice(None, overlap)
     middle = first._replace(

@@ -1,4 +1,4 @@
-"""Clips made into loops."""
+"""Conversion of clips to loops."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def close_loop(take: Take, *, in_place: bool = False, blend_s: float | None = No
 
 
 def _in_place(motion: Motion, places: Floats, seam: LoopSeam) -> Motion:
-    """Without the travel and turn of a round, given pelvis positions (F, 3): each frame turns back about its own."""
+    """Remove travel and turn of a round, given pelvis positions (F, 3); each frame turns about its own position."""
     shares = np.arange(motion.frame_count) / motion.frame_count
     start = places[0, [0, 2]]
     travel = rotated(start, seam.turn_rad) + seam.shift_m - start
@@ -64,7 +64,7 @@ def _in_place(motion: Motion, places: Floats, seam: LoopSeam) -> Motion:
 
 
 def _closed(motion: Motion, seam: LoopSeam, life: float, velocity_life: float) -> Motion:
-    """The difference at the seam, half of it at either end."""
+    """Remove the difference at the seam, half of it at each end."""
     frames = motion.frame_count
     following = moved_over(motion.sliced(0, 2), seam)
     arrival = step_of(motion, frames - 2)

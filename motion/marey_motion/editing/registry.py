@@ -58,7 +58,7 @@ COMMANDS: Mapping[str, Command] = {
         plant_feet,
     )
 }
-"""By name. A new one gets its line here and its schema in `marey_schemas.editing.edits`."""
+"""Commands by name. A new one gets its line here and its schema in `marey_schemas.editing.edits`."""
 
 
 @dataclass(frozen=True, eq=False)

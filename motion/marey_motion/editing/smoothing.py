@@ -17,10 +17,10 @@ from marey_motion.errors import EditError
 LONG_WINDOW = 512
 """Means over more frames are computed by Fourier transforms, in which the length of the window costs little."""
 CHANNELS_AT_ONCE = 32
-"""In Fourier transforms, which take several times the room of what they transform."""
+"""Channels that are transformed together: a Fourier transform takes several times the memory of its input."""
 
 LEAST_LENGTH = 0.1
-"""Of a mean of unit quaternions: with less, what is averaged goes all the way round and has no mean."""
+"""Least length of a mean of unit quaternions; a shorter one is of rotations in all directions, which have no mean."""
 
 
 def smooth(

@@ -21,11 +21,11 @@ from marey_motion.rigs import JointMapping, map_joints, symmetric_joints
 from marey_motion.skeleton import Skeleton
 
 MOST_NUMBERS = 200_000_000
-"""Numbers of the motion that a command may make: 1.6 GB, or two and a half hours of 60 joints at 90 Hz."""
+"""Most numbers of a motion that a command may make: 1.6 GB, or two and a half hours of 60 joints at 90 Hz."""
 
 
 UNIT_IN_SINGLE = 3e-7
-"""What rounding to single precision leaves between the square of a length and one."""
+"""Largest difference between the squared length of a unit quaternion and one after rounding to single precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class EditedBody:
 
     @cached_property
     def partners(self) -> NDArray[np.int32]:
-        """(J,) each joint's partner on the other side, its own index for joints of the centre."""
+        """Index (J,) of each joint's partner on the other side; its own index for joints of the centre."""
         return symmetric_joints(self.skeleton, self.mapping)
 
     @cached_property

@@ -226,7 +226,7 @@ def _clip_frames(result: EvaluationResult, record: TrialRecord, numbers: dict[st
 
 
 def _numbers_differ(first: TrialRecord, second: TrialRecord) -> NDArray[np.bool_]:
-    """(T,) ticks at which two records differ in anything but the rows, whose numbers depend on the database."""
+    """Find the ticks (T,) at which two records differ in anything but row numbers, which depend on the database."""
     differs: NDArray[np.bool_] = np.any(first.positions != second.positions, axis=1)
     for name in ("headings", "status", "match_cost", "continuing_cost", "pose_cost"):
         one, other = getattr(first, name), getattr(second, name)

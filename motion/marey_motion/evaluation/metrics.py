@@ -27,7 +27,7 @@ RESPONSE_SHARE = 0.1
 RESPONSE_HOLD_S = 0.5
 """...for so long."""
 LEAST_TRAVEL_M_S = 0.05
-"""Slower steps have no direction of travel worth the name."""
+"""Speed below which the direction of travel of a step is not defined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ def measure_trial(trial: Trial, reference: Reference, record: TrialRecord, optio
 
 
 def _pieces(trial: Trial, times_s: Floats) -> NDArray[np.int64]:
-    """Number of the stretch of constant speed that each time falls into, -1 before the circle."""
+    """Number the period of constant speed that each time belongs to; -1 before the circle."""
     on_circle = times_s + TIME_TOLERANCE_S - trial.approach_s
     if trial.family == "switching":
         return np.maximum(np.floor(on_circle / trial.switch_every_s), -1.0).astype(np.int64)

@@ -23,7 +23,7 @@ from marey_motion.matching.record import Status, TrialRecord
 ProgressCallback = Callable[[int, int, str], None]
 
 MOST_FRAMES = 2_000
-"""Of a cell with more frames every k-th is measured, k the least that leaves no more than this. All are candidates."""
+"""Most frames of a cell that are measured; of more, every k-th is taken. All of them are candidates for matches."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,7 +73,7 @@ def read_amc(
 
 
 def _read_amc_header(lines: TextLines, degrees: bool) -> tuple[bool, float | None]:
-    """Whether angles are degrees, and the frame rate if one is given; leaves `lines` before the first frame.
+    """Read whether angles are in degrees, and the frame rate if one is given; leave `lines` before the first frame.
 
     Where the AMC does not say, its angles are in the unit of its skeleton's, `degrees` or not.
     """

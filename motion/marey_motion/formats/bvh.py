@@ -116,7 +116,7 @@ def channel_columns(channels: tuple[tuple[str, ...], ...]) -> ChannelColumns:
 def _read_frames(
     header: BvhHeader, columns: ChannelColumns, lines: TextLines, warnings: list[CheckWarning]
 ) -> NDArray[np.float64]:
-    """(F, C) channel values."""
+    """Read the channel values (F, C)."""
     width = len(columns.labels)
     text = np.frombuffer(lines.data, np.uint8, offset=min(header.data_start, len(lines.data)))
     try:
@@ -178,7 +178,7 @@ def _fill_motion(source: SourceMotion, values: NDArray[np.float64], columns: Cha
 def _positions_of(
     joint: int, values: NDArray[np.float64], columns: ChannelColumns, offsets: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(F, 3) local positions of one joint: its position channels, and its OFFSET on the axes that have none."""
+    """Read local positions (F, 3) of one joint: its position channels, and its OFFSET on the axes without one."""
     positions = np.tile(offsets[joint], (len(values), 1))
     for axis, column in enumerate(columns.positions[joint].tolist()):
         if column != NO_COLUMN:

@@ -109,7 +109,7 @@ def _written_offset(offset: NDArray[np.float64], scale: float) -> str:
 
 
 def _channel_values(clip: Clip, order: list[int], axes: NDArray[np.int64], scale: float) -> NDArray[np.float64]:
-    """(F, C) the numbers of the file, frame by frame."""
+    """Compute the numbers (F, C) of the file, frame by frame."""
     angles_deg = np.empty((clip.frame_count, len(order), 3))
     euler_from_rotations(np.ascontiguousarray(clip.rotations[:, order]), axes, angles_deg)
     columns: list[NDArray[np.floating]] = []

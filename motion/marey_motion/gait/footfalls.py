@@ -64,7 +64,7 @@ class Cadence:
 
     @cached_property
     def _pieces(self) -> AnyFloats:
-        """(4, pieces): start time, phase there, stride rate there and its slope."""
+        """Table (4, pieces): start time, and at that time phase, stride rate and slope of the stride rate."""
         pieces = self.path.pieces
         turn_rates = np.array([piece.turn_rate_rad_s for piece in pieces])
         travels = np.array([piece.travel_angle_rad for piece in pieces])

@@ -1,1 +1,1 @@
-"""From uploaded files to documents of skeletons, clips, and models. Bytes in, documents out."""
+"""Conversion of uploaded files to documents of skeletons, clips and models."""

@@ -108,7 +108,7 @@ class _Tracks:
         return self.positions[:, [self.column[joint] for joint in joints]]
 
     def sole_heights(self) -> NDArray[np.float32]:
-        """(F, 2) height of the lowest point of each foot."""
+        """Compute the height (F, 2) of the lowest point of each foot."""
         return np.stack([self.positions[:, sole, 1].min(axis=1) for sole in self.soles], axis=1)
 
     def floor_height(self) -> float:
@@ -255,7 +255,7 @@ def _rest_pose_frames(clip: Clip, tracks: _Tracks) -> tuple[int, int]:
 
 
 def _at_rest(clip: Clip) -> NDArray[np.bool_]:
-    """(F,) whether the joints below the root, all but one in twenty, are turned as in the skeleton's rest pose."""
+    """Find the frames (F,) in which 19 of 20 joints below the root are turned as in the skeleton's rest pose."""
     rotations = clip.rotations[:, 1:]
     if rotations.shape[1] == 0:
         return np.zeros(clip.frame_count, np.bool_)
@@ -266,7 +266,7 @@ def _at_rest(clip: Clip) -> NDArray[np.bool_]:
 
 
 def _in_t_pose(clip: Clip, tracks: _Tracks) -> NDArray[np.bool_]:
-    """(F,) whether both arms are stretched out level and the legs are straight."""
+    """Find the frames (F,) with both arms stretched out level and the legs straight."""
     landmarks = tracks.landmarks
     if landmarks.hands is None or landmarks.feet is None or landmarks.hips is None:
         return np.zeros(clip.frame_count, np.bool_)
@@ -380,7 +380,7 @@ def _rotation_jumps(clip: Clip) -> CheckWarning | None:
 
 
 def _dead_joints(clip: Clip, tracks: _Tracks) -> CheckWarning | None:
-    """Limbs none of whose joints ever turns, while other joints do."""
+    """Warn of limbs of which no joint ever turns, while other joints do."""
     landmarks, skeleton = tracks.landmarks, clip.skeleton
     if clip.frame_count < 2 or not (landmarks.hands and landmarks.feet):
         return None
@@ -396,6 +396,6 @@ def _dead_joints(clip: Clip, tracks: _Tracks) -> CheckWarning | None:
 
 
 def _step_cosines(rotations: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(F - 1, J) cosine of half the angle between consecutive frames."""
+    """Compute cosines (F - 1, J) of half the angle between consecutive frames."""
     cosines: NDArray[np.float32] = np.abs(np.einsum("fjc,fjc->fj", rotations[1:], rotations[:-1]))
     return cosines

@@ -235,7 +235,7 @@ def _flat_axis(body: _Measurements) -> tuple[UpAxis, str] | None:
 
 
 def _stands_on_origin(body: _Measurements, axis: UpAxis) -> bool:
-    """Whether a ground through the origin, orthogonal to the axis, passes just under the body."""
+    """Check that a ground through the origin, orthogonal to the axis, is just under the body."""
     assert body.leg is not None
     lowest = _heights(body.positions, axis).min(axis=1)
     return bool(abs(np.quantile(lowest, 0.05)) <= _FLAT_GROUND * body.leg)
@@ -359,7 +359,7 @@ def _walks_on_hands(body: _Measurements, up_axis: UpAxis) -> bool:
 
 
 def _stands_on_all_fours(body: _Measurements, up_axis: UpAxis) -> bool:
-    """Whether hands and feet stand on one ground well below the hips, as a body's sides never do."""
+    """Check that hands and feet are on one ground well below the hips, which no body lying on its side has."""
     assert body.leg is not None
     return _walks_on_hands(body, up_axis) and _hip_height(body, up_axis) > 0.5 * body.leg
 

@@ -31,23 +31,23 @@ class Trajectory(Protocol):
 
     @property
     def positions(self) -> Floats:
-        """(T + L, 2) metres on the ground."""
+        """Positions (T + L, 2) on the ground, in metres."""
 
     @property
     def headings(self) -> Floats:
-        """(T + L,) radians, continuous."""
+        """Headings (T + L,) in radians, continuous."""
 
     @property
     def speeds_m_s(self) -> Floats:
-        """(T + L,)."""
+        """Values (T + L,)."""
 
     @property
     def turn_rates_rad_s(self) -> Floats:
-        """(T + L,)."""
+        """Values (T + L,)."""
 
 
 class TrajectoryArrays(NamedTuple):
-    """A guide as compiled code takes it."""
+    """A trajectory as arrays for compiled code."""
 
     positions: Floats
     headings: Floats

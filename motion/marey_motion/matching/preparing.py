@@ -24,7 +24,7 @@ from marey_schemas.options.matching import DatabaseOptions
 from marey_schemas.wording import counted
 
 SAME_OFFSET_M = 1e-3
-"""By which bones of one skeleton may differ between files."""
+"""Largest difference of bone offsets that counts as rounding of one skeleton in several files."""
 
 # The seam of a loop is measured in steps between its frames.
 REPEATED_STEPS = 0.2
@@ -136,7 +136,7 @@ def _wanted_frames(
 
 
 def _moves(clip: Clip, skeleton: Skeleton) -> bool:
-    """Whether a clip can move this skeleton as it is: tips, and offsets that translations replace, may differ."""
+    """Check that a clip can move this skeleton: tips, and offsets that translations replace, may differ."""
     own = clip.skeleton
     if own is skeleton:
         return True

@@ -24,7 +24,7 @@ from marey_motion.motion import Motion
 from marey_schemas.options.matching import DatabaseOptions
 
 CLAMPED_S = 1 / 3
-"""Of a clip's end, whose futures clamp to the last frame, are not selectable."""
+"""Seconds at the end of a clip that searches may not choose, because their look-ahead is cut at the last frame."""
 
 
 class ClipRows(NamedTuple):

@@ -167,7 +167,7 @@ def _boxes(low: NDArray[np.float32], high: NDArray[np.float32], starts: NDArray[
 
 
 def _boxes_pay(index: SearchIndex) -> bool:
-    """Whether queries that take their first half from one row and the rest from another leave enough boxes out."""
+    """Test on mixed queries, half from one row and half from another, whether boxes save enough comparisons."""
     from marey_motion.matching import search_kernels as kernels
 
     draws = np.random.default_rng(0).choice(np.flatnonzero(index.selectable), size=(2, _PROBES))

@@ -22,9 +22,9 @@ LEAST_EXAMPLES_PER_COMPONENT = 5
 LEAST_FOLDS = 2
 SEEDS = 2**32
 MOST_ITERATIONS = 500
-"""Of each start of expectation maximisation."""
+"""Most iterations of each start of expectation maximisation."""
 TOLERANCE = 1e-3
-"""Of the mean log-likelihood of an example, from one iteration to the next; it has no unit."""
+"""Change of the mean log-likelihood between iterations below which the fit has converged; without unit."""
 
 
 @dataclass(frozen=True)
@@ -242,7 +242,7 @@ def _ordered(weights: Floats, means: Floats, covariances: Floats) -> LatentMixtu
 
 
 def _rescaled(candidate: MixtureCandidate, shift: float) -> MixtureCandidate:
-    """In the units of the data; `shift` is the logarithm of the volume that all examples gain."""
+    """Convert a mixture to the units of the data; `shift` is the change of all log-likelihoods by the scaling."""
     return replace(
         candidate,
         bic=candidate.bic + 2.0 * shift,

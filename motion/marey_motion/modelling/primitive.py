@@ -17,13 +17,13 @@ from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 
 MOST_FRAMES = 100_000
-"""Of one motion."""
+"""Most frames of one motion."""
 
 MOST_LOG_SLOPE = 12.0
-"""Of models whose examples are not known: steps between e^-12 and e^12 frames add up to times that still rise."""
+"""Bound of ln(slope) where the examples are unknown; sums of steps between e^-12 and e^12 frames still increase."""
 
 MOST_ATTEMPTS = 100
-"""To draw a motion that lasts neither too short nor too long."""
+"""Most draws of a sample before its duration, too short or too long, is accepted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +239,7 @@ class MotionPrimitive:
     def motions(self, latents: Floats) -> list[Motion]:
         """Compute motions in real time.
 
-        Each has a whole number of frames, at most half a frame off.
+        The duration of each is rounded to a whole number of frames.
 
         Parameters
         ----------

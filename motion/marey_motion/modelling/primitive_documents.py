@@ -128,7 +128,7 @@ def _components_to_tree(components: FunctionalComponents) -> Tree:
 
 
 def _components_from_tree(tree: Mapping[str, Any], columns: NDArray[np.int64] | None) -> FunctionalComponents:
-    """With channels in the order `columns` of those of the tree."""
+    """Read components with their channels in the order `columns`."""
     arrays = {name: np.asarray(tree[name]) for name in _COMPONENTS}
     if columns is not None:
         for name in ("mean", "directions", "projections"):

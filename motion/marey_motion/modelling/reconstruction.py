@@ -17,7 +17,7 @@ from marey_motion.skeleton import Skeleton
 Progress = Callable[[int, int, str], None]
 
 MOST_DIMENSIONS = 200
-"""Of the space in which examples are left out; with more examples than that, the smallest components are dropped."""
+"""Most dimensions for leaving examples out; with more examples than that, the smallest components are dropped."""
 
 CM_PER_M = 100.0
 

@@ -20,7 +20,7 @@ SMALLEST_WEIGHT = 1e-2
 LARGEST_WEIGHT = 1e3
 MOST_ITERATIONS = 60
 TOLERANCE = 1e-5
-"""Of the error, as a share of that at the start."""
+"""Change of the error, as a share of the first one, below which the optimisation stops."""
 
 MOST_POSES = 6000
 """Poses at which joints are compared; more examples are compared at fewer frames."""
@@ -84,7 +84,7 @@ def optimised_weights(
 
 
 def _logarithms(weights: Floats) -> Floats:
-    """(3 + J,) of weights (3 + 4·J,) that are one for each joint."""
+    """Compute logarithms (3 + J,) of weights (3 + 4·J,) that are equal in the channels of a joint."""
     return np.log(np.clip(np.concatenate((weights[:3], weights[3::4])), SMALLEST_WEIGHT, LARGEST_WEIGHT))
 
 
@@ -104,12 +104,12 @@ class _Problem:
 
     @cached_property
     def deviations(self) -> Floats:
-        """(m, n, D) of the examples from their mean."""
+        """Deviations (m, n, D) of the examples from their mean."""
         return np.asarray(self.coefficients - self.coefficients.mean(axis=0))
 
     @cached_property
     def grams(self) -> Floats:
-        """(3 + J, m, m) inner products of the examples in each group of channels."""
+        """Inner products (3 + J, m, m) of the examples in each group of channels."""
         duals = dual_coefficients(self.basis, self.deviations, self.inner_product)
         each = self.deviations.transpose(2, 0, 1) @ duals.transpose(2, 1, 0)
         joints = each[3:].reshape(-1, 4, *each.shape[1:]).sum(axis=1)
@@ -117,7 +117,7 @@ class _Problem:
 
     @cached_property
     def values(self) -> Floats:
-        """(T, n) of the basis functions at the frames where joints are compared."""
+        """Values (T, n) of the basis functions at the frames where joints are compared."""
         frames = comparison_frames(self.basis)
         allowed = max(4, MOST_POSES // len(self.coefficients))
         chosen = frames[np.unique(np.linspace(0, len(frames) - 1, min(allowed, len(frames))).round().astype(np.int64))]
@@ -125,17 +125,17 @@ class _Problem:
 
     @cached_property
     def deviating_poses(self) -> Floats:
-        """(m, T·D) deviations of the examples at those frames."""
+        """Deviations (m, T·D) of the examples at the frames where joints are compared."""
         return np.asarray((self.values @ self.deviations).reshape(len(self.coefficients), -1))
 
     @cached_property
     def mean_poses(self) -> Floats:
-        """(T·D,)"""
+        """Mean poses (T·D,) at the frames where joints are compared."""
         return np.asarray((self.values @ self.coefficients.mean(axis=0)).ravel())
 
     @cached_property
     def targets(self) -> Floats:
-        """(m·T, J, 3) where the joints of the examples are."""
+        """Positions (m·T, J, 3) of the joints of the examples."""
         poses = (self.mean_poses + self.deviating_poses).reshape(-1, self.coefficients.shape[2])
         rotations = poses[:, 3:].reshape(len(poses), -1, 4)
         rotations /= np.sqrt(np.einsum("fjc,fjc->fj", rotations, rotations))[..., None]

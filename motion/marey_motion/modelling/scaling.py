@@ -12,10 +12,10 @@ LEAST_ROOT_EXTENT_M = 1e-3
 """A root axis that stays within a millimetre is not blown up to the size of the others."""
 
 LEAST_WEIGHT_M = 0.01
-"""Of joints that carry nothing: how a hand is turned still counts a little."""
+"""Least weight of a joint, so that the rotation of a joint without children, such as a hand, counts a little."""
 
 MOST_DIFFERENCES = 1_000_000
-"""Of positions, held at once."""
+"""Most differences of positions in memory at once."""
 
 
 def root_max_weights(poses: Floats) -> Floats:
@@ -68,7 +68,7 @@ def jacobian_weights(skeleton: Skeleton, poses: Floats) -> Floats:
 
 
 def _descent(skeleton: Skeleton) -> Floats:
-    """(J, J) 1 where a joint hangs below a joint, else 0."""
+    """Make the matrix (J, J) that is 1 where one joint is a descendant of the other, else 0."""
     below = np.zeros((skeleton.joint_count, skeleton.joint_count))
     for joint, parent in enumerate(skeleton.parents.tolist()):
         if parent >= 0:

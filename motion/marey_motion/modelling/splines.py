@@ -149,5 +149,5 @@ class SplineBasis:
 
     @cached_property
     def _fitting(self) -> Floats:
-        """(n, N) from samples to coefficients."""
+        """Compute the matrix (n, N) that fits coefficients to samples."""
         return np.asarray(np.linalg.pinv(self.at_frames), dtype=np.float64)

@@ -29,7 +29,7 @@ DURATION_SLACK = 0.05
 
 @dataclass(frozen=True)
 class ExampleReport:
-    """One example as the model sees it.
+    """Errors and likelihood of one example in the model.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class ExampleReport:
 
 @dataclass(frozen=True)
 class Durations:
-    """Of motions, in seconds; `outside_share` are over 5 % outside the range of the examples."""
+    """Durations of motions in seconds; `outside_share` are over 5 % outside the range of the examples."""
 
     least_s: float
     mean_s: float
@@ -192,7 +192,7 @@ def _durations(durations: Floats, span: tuple[float, float]) -> Durations:
 def _feet(
     primitive: MotionPrimitive, aligned: AlignedSet, poses: Floats, sampled: Floats | None
 ) -> tuple[FootQuality | None, FootQuality | None]:
-    """Of the examples and of samples; None where the skeleton has no feet that are known."""
+    """Measure feet of the examples and of samples; None where the skeleton has no known feet."""
     joints = find_landmarks(primitive.skeleton).ground_joints
     if not joints:
         return None, None

@@ -134,7 +134,7 @@ def _readings(tree: BoneTree, pair: LimbPair, build: Build) -> list[LimbReading]
 
 
 def _likeliest_first(reading: LimbReading) -> tuple[float, int, int, int]:
-    """By worth; of joints in one place, the lower ones carry the bones and the upper one is the wrist or ankle."""
+    """Sort plans by worth; of joints at one position, the lower carry the bones, the upper is wrist or ankle."""
     a, b, c = reading.places
     return -round(reading.worth, 6), -a, -b, c
 

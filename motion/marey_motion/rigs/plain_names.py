@@ -60,14 +60,14 @@ def _shared_start(names: Sequence[str]) -> str:
 
 
 def _without_common_end(names: Names) -> Names:
-    """Without what follows the last separator and that with it, where it is the same for all."""
+    """Drop the last separator and the text after it, where all names share it."""
     shared = _shared_start([name[::-1] for name in _marked(names)])[::-1]
     at = max((found.start() for found in _SEPARATORS.finditer(shared)), default=None)
     return names if at is None else tuple(name.removesuffix(shared[at:]) for name in names)
 
 
 def _without_common_start(names: Names) -> Names:
-    """Without what precedes the first separator and that with it, where it is the same for all."""
+    """Drop the first separator and the text before it, where all names share it."""
     shared = _shared_start(_marked(names))
     found = _SEPARATORS.search(shared)
     return names if found is None else tuple(name.removeprefix(shared[: found.end()]) for name in names)
@@ -83,7 +83,7 @@ def _without_numbers(names: Names) -> Names:
 
 
 def _without_ending(names: Names) -> Names:
-    """Without a modeller's word for a joint, where most names end in the same one."""
+    """Drop a word for "joint" that most names end in."""
     endings = Counter(found[1].lower() for name in names if (found := _ENDING.search(name)))
     ending, count = endings.most_common(1)[0] if endings else ("", 0)
     if 2 * count <= len(names):

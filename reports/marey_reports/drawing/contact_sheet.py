@@ -189,7 +189,7 @@ def _draw_titles(axes: Axes, row: _SheetRow, top: float) -> None:
 
 
 def _draw_floor(axes: Axes, stage: _SheetCell, camera: Camera, facing: AnyFloats | None, radius_m: float) -> None:
-    """The stage's ground, the floor line, the spot of floor under the figure and an arrow where it faces."""
+    """Draw the ground, the floor line, the patch of floor under the figure and an arrow in its facing direction."""
     from matplotlib.patches import Ellipse, Rectangle
 
     size = (stage.width, STAGE)

@@ -1,7 +1,7 @@
-"""The look that all figures share, and how a figure becomes a PNG and an SVG.
+"""Style that all figures share, and writing of figures as PNG and SVG.
 
-Only matplotlib's object interface is used, and its settings are touched for nothing but the few of the SVG writer that
-have no other way, one figure at a time; threads may draw at once.
+Only matplotlib's object interface is used, so threads may draw at once. Its global settings are changed for the SVG
+writer alone, which takes some of them in no other form; one figure is written at a time.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ def square_root_ticks(ceiling: float) -> NDArray[np.float64]:
 
 
 def nice_levels(largest: float) -> NDArray[np.float64]:
-    """At most 11 levels from 0 to the first at or above `largest`, at steps of 1, 2 or 5 times a power of ten."""
+    """Choose at most 11 levels from 0 to the first at or above `largest`, in steps of 1, 2 or 5 times 10^n."""
     reach = largest if largest > 0.0 and np.isfinite(largest) else 1.0
     scale = 10.0 ** np.floor(np.log10(reach / 10.0))
     step = next(factor * scale for factor in (1, 2, 5, 10, 20) if reach <= 10 * factor * scale * (1 + 1e-9))

@@ -55,7 +55,7 @@ class StripRow:
 
 
 class StripMoments(NamedTuple):
-    """The columns of a strip: where each looks at, (T, 2) x and z of its middle in metres, and what it is called."""
+    """The columns of a strip: x and z of the centre of each, (T, 2) in metres, and its title."""
 
     middles: Floats
     names: Sequence[str]
@@ -104,7 +104,7 @@ def draw_strips(
 
 @dataclass(frozen=True)
 class _StripCell:
-    """A cell: its lower left corner and its size in inches, and what it looks at, `scale` inches per metre."""
+    """A cell: its lower left corner and size in inches, and the point at its centre, at `scale` inches per metre."""
 
     corner: tuple[float, float]
     size: tuple[float, float]
@@ -165,7 +165,7 @@ GHOST = _Look(LINE_POINTS, 0.55, REFERENCE)
 
 
 def _draw_cell(axes: Axes, stage: _StripCell, shapes: _Shapes, row: StripRow, column: int) -> None:
-    """The floor, the ways on it, the ghost, then the bodies; nothing leaves the cell to its sides."""
+    """Draw the floor, the root's paths on it, the ghost and the bodies, clipped at the sides of the cell."""
     from matplotlib.patches import Rectangle
 
     (left, bottom), (width, height) = stage.corner, stage.size

@@ -24,7 +24,7 @@ LEAST_SHIFT_M = 0.005  # what is written as 0.00 is neither good nor bad
 
 
 def compared(before: EvaluationResult, after: EvaluationResult) -> str:
-    """Whether the change helped, in one sentence."""
+    """Say in one sentence whether the change helped."""
     first, second = judge(before), judge(after)
     pairs = paired(before, after)
     gained = sum(is_followed(new) and not is_followed(old) for old, new in pairs)

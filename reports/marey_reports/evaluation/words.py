@@ -1,4 +1,4 @@
-"""Speeds, turn rates and what is missing as an animator says them."""
+"""Words of an animator for speeds, turn rates and missing data."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class CoverageGap(NamedTuple):
 
     @property
     def words(self) -> str:
-        """For example "left turns of 75 to 100 degrees a second at 2 to 3 m/s"."""
+        """Words for the range, such as "left turns of 75 to 100 degrees a second at 2 to 3 m/s"."""
         return f"{turning(*self.turn_rates_deg_s)} at {span(*self.speeds_m_s)} m/s"
 
 

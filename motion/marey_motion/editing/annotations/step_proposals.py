@@ -106,15 +106,15 @@ class _Step(NamedTuple):
 
 
 def _standing(stances: tuple[list[Stance], ...], clip: Clip, standing_s: float) -> list[Stance]:
-    """When both feet stand for long."""
+    """Find the periods in which both feet are on the ground for long."""
     both = [Stance(max(a.start, b.start), min(a.end, b.end)) for a in stances[0] for b in stances[1]]
     return sorted(one for one in both if one.end - one.start >= max(1.0, standing_s * clip.frame_rate_hz))
 
 
 def _steps(stances: tuple[list[Stance], ...], standing: list[Stance]) -> list[_Step]:
-    """From each contact to the next one where that is of the other foot; where one stood between, from lift to contact.
+    """Find steps: from each contact to the next if that is of the other foot; after standing, from lift to contact.
 
-    A stance that begins with the clip has no contact in it.
+    A stance that begins with the clip has no contact.
     """
     begins, ends = {one.start for one in standing}, {one.end for one in standing}
     lifts = [{after.start: before.end for before, after in pairwise(of_side)} for of_side in stances]
@@ -130,7 +130,7 @@ def _steps(stances: tuple[list[Stance], ...], standing: list[Stance]) -> list[_S
 
 
 def _flying(stances: tuple[list[Stance], ...], frame_count: int) -> NDArray[np.bool_]:
-    """Whether no foot touches the ground (F,)."""
+    """Find the frames (F,) in which no foot touches the ground."""
     flying = np.ones(frame_count, dtype=np.bool_)
     for stance in (one for of_side in stances for one in of_side):
         flying[stance.start : stance.end] = False
@@ -142,7 +142,7 @@ def _has_flight(step: _Step, flying: NDArray[np.bool_], frame_rate_hz: float) ->
 
 
 def _label(step: _Step, has_flight: bool) -> str | None:
-    """None for a jump: a flight out of standing."""
+    """Choose the label of a step; None for a jump, which is a flight out of standing."""
     if has_flight:
         manner = None if step.from_standing else "run"
     elif step.from_standing:
@@ -169,7 +169,7 @@ class _Travel(NamedTuple):
         return cls(ground[:, body.hips], ground[:, list(body.feet)], heading, clip.frame_rate_hz)
 
     def is_step(self, step: _Step, options: StepOptions) -> bool:
-        """Whether this is one step ahead, and no turn."""
+        """Whether the movement is one step ahead and not a turn."""
         if not options.shortest_s <= (step.end - step.start) / self.frame_rate_hz <= options.longest_s:
             return False
         way = self.hips[step.end] - self.hips[step.start]

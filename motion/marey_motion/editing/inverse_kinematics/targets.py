@@ -46,7 +46,7 @@ class PositionTarget:
 
     @property
     def values(self) -> Floats:
-        """(F or 1, 3) metres."""
+        """Target positions (F or 1, 3), in metres."""
         return _rows(self.position, 3, "position")
 
 
@@ -67,7 +67,7 @@ class OrientationTarget:
 
     @property
     def values(self) -> Floats:
-        """(F or 1, 4) of unit length."""
+        """Target rotations (F or 1, 4), quaternions of unit length."""
         return np.asarray(quaternions.normalise(_rows(self.rotation, 4, "rotation")), dtype=np.float64)
 
 
@@ -92,7 +92,7 @@ class LookAtTarget:
 
     @property
     def values(self) -> Floats:
-        """(F or 1, 3) metres."""
+        """Target positions (F or 1, 3), in metres."""
         return _rows(self.point, 3, "point")
 
 
@@ -172,7 +172,7 @@ class JointLimit:
 
     @property
     def row(self) -> Floats:
-        """(14,) as the kernels read it."""
+        """Target as the row (14,) that the kernels read."""
         reference = quaternions.normalise(_rows(self.reference, 4, "reference")[0])
         return np.concatenate(
             (reference, _vector(self.axis, ""), _vector(self.side, ""), self.twist_rad, self.swing_rad)
@@ -181,7 +181,7 @@ class JointLimit:
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """When to stop.
+    """Limits at which a solver stops.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Near-duplicates: clips with the same poses in the same order, led by a root on the same course.
+"""Near-duplicates: clips with the same poses in the same order and the same course of the root.
 
 A frame is its pose joints and the future root at each horizon, as points in the frame of the root: two walks whose
 poses agree but that turn differently are different. The distance of two clips is that of their best alignment in time
@@ -117,10 +117,10 @@ class _Families:
         return source_of(self._clips[self._first[number]])
 
     def compared(self, number: int, limit_m: float) -> tuple[list[NearDuplicate], int, int]:
-        """Near-duplicates of a source's clip among later sources, how many clips were aligned with it, and how many
-        there are.
+        """Find near-duplicates of a source's clip among later sources; also count the clips aligned with it, and all
+        later clips.
 
-        That both are mirrored changes no distance, so one side is taken as it is.
+        Mirroring both clips changes no distance, so one of them is never mirrored.
         """
         one, others = self._first[number], np.arange(self._first[number + 1], len(self._clips))
         near: dict[int, list[NearDuplicate]] = {}

@@ -20,7 +20,7 @@ from marey_schemas.options.evaluation import EvaluationOptions
 ProgressCallback = Callable[[int, int, str], None]
 
 MOST_FRAMES = 200
-"""Of a candidate with more frames in holes every k-th is compared with the set, k the least that leaves no more."""
+"""Most frames of a candidate that are compared with the set; of more frames in holes, every k-th is taken."""
 
 
 @dataclass(frozen=True)

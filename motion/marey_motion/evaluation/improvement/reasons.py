@@ -8,7 +8,7 @@ from marey_motion.evaluation.improvement.redundancy import Removal
 from marey_motion.evaluation.improvement.unused import UnusedClip, UnusedRange
 
 NOTICEABLE_M = 0.0005
-"""Smaller changes of the mean distance from the path are called none."""
+"""Change of the mean distance from the path below which the text says that nothing changes."""
 
 
 def why_unused_clip(clip: UnusedClip) -> str:

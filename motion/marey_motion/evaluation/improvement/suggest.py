@@ -127,7 +127,7 @@ def suggest(
 def _redundancy(
     simulation: Resimulation, how: SuggestionOptions, gone: frozenset[str], stages: _Stages
 ) -> tuple[tuple[Removal, ...], tuple[PlannedRemoval, ...]]:
-    """Both lists start from the set without what is unused."""
+    """Rank clips and plan removals, both for the set without its unused clips."""
     found = leave_one_out(
         simulation, how.objective, removed=gone, consider=how.consider, progress=stages.within("leaving out")
     )

@@ -28,7 +28,7 @@ from marey_motion.matching.simulation_root import DIRECTION_WINDOW_S
 from marey_schemas.options.evaluation import EvaluationOptions
 
 LEAST_RANGE_S = 0.5
-"""Shorter stretches are not worth a cut."""
+"""Duration below which an unused range is not reported, because a cut is not worth it."""
 DIFFERENCES_S = 0.05
 MARGIN_BEFORE_S = 0.5 * DIRECTION_WINDOW_S + DIFFERENCES_S
 MARGIN_AFTER_S = MARGIN_BEFORE_S

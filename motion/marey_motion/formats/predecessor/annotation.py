@@ -188,6 +188,6 @@ def _frames(given: Any, label: str, file: str) -> list[int]:
 
 
 def _only_shares_ends(segments: Sequence[Segment]) -> bool:
-    """Whether no segments would overlap if each ended a frame earlier."""
+    """Check that segments overlap in nothing but the frame where they meet."""
     ordered = sorted(segments, key=lambda one: (one.start, one.end))
     return all(before.end - 1 <= after.start for before, after in pairwise(ordered))

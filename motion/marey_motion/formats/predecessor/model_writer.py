@@ -133,6 +133,6 @@ def _mixture(primitive: MotionPrimitive) -> dict[str, Any]:
 
 
 def _roots(covariances: Floats) -> Floats:
-    """(K, L, L) E with E · Eᵀ = covariance: eigenvectors times the roots of their eigenvalues."""
+    """Factor covariances into E (K, L, L) with E · Eᵀ = covariance: eigenvectors times roots of eigenvalues."""
     values, vectors = np.linalg.eigh(covariances)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :])

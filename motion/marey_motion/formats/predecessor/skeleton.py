@@ -79,7 +79,7 @@ def skeleton_document(skeleton: Skeleton, *, form: SkeletonForm = "database") ->
 
 
 def _listed_nodes(document: Document, file: str) -> list[tuple[str, str | None, Document]]:
-    """(name, parent, node) depth first, from the list of joints."""
+    """List (name, parent, node) depth first, from the list of joints."""
     listed: dict[str, Document] = {}
     parents: dict[str, str] = {}
     for node in document["jointDescs"]:
@@ -108,7 +108,7 @@ def _listed_nodes(document: Document, file: str) -> list[tuple[str, str | None, 
 
 
 def _nested_nodes(root: Document, file: str) -> list[tuple[str, str | None, Document]]:
-    """(name, parent, node) depth first, from nested nodes."""
+    """List (name, parent, node) depth first, from nested nodes."""
     nodes: list[tuple[str, str | None, Document]] = []
     waiting: list[tuple[Any, str | None]] = [(root, None)]
     while waiting:
@@ -162,7 +162,7 @@ def _source(nodes: list[tuple[str, str | None, Document]], mirrored: bool, file:
 
 
 def _tips(skeleton: Skeleton) -> list[tuple[str, int, NDArray[np.float64]]]:
-    """(name, joint, offset in metres) of every tip; leaf joints without an end site get one where they are."""
+    """List (name, joint, offset in metres) of every tip; leaf joints without an end site get one at the joint."""
     sites = [(site.joint, site.offset) for site in skeleton.end_sites]
     ended = {joint for joint, _ in sites}
     sites += [(j, np.zeros(3)) for j, children in enumerate(skeleton.children) if not children and j not in ended]

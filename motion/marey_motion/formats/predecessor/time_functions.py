@@ -28,7 +28,7 @@ DRAWN, SEED = 512, 0
 """Scores that a linear function is fitted over: so many, drawn with this seed."""
 ODD_LOG_SLOPE = 20.0
 KNOTS_AT_MOST = 500
-"""Within a time function that is taken over: no published model has as many canonical frames."""
+"""Most knots of a time function that is converted: no published model has as many canonical frames."""
 WRITTEN_COEFFICIENTS = 8
 
 
@@ -188,7 +188,7 @@ def _linear_fit(scores: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def _basis_over(steps: int) -> SplineBasis:
-    """As many coefficients as steps: a function is taken over as it is, whatever its own knots.
+    """Make a basis with as many coefficients as steps, so that any function is represented exactly.
 
     Knots are at steps, all but the second and the last but one: evenly spaced ones would drift from the steps to
     between them, where interpolation amplifies rounding. Long functions have fewer.

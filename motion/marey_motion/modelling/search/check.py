@@ -28,7 +28,7 @@ LEAST_EXAMPLES = 10
 MOST_TARGETS = 60
 SAMPLES = 2000
 REFINING = RefineOptions(likelihood_weight=0.01)
-"""What is asked is how near the model can come."""
+"""Options with little weight on likelihood, because the check measures how near the model can come."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +94,6 @@ def check_search(
 
 
 def _most_varied(aligned: AlignedSet, joints: tuple[int, ...]) -> NDArray[np.int64]:
-    """(k,) canonical frames at which each joint's places are farthest apart."""
+    """Find the canonical frames (k,) at which each joint's positions are farthest apart."""
     places = toe_positions(aligned.skeleton, aligned.poses, joints)
     return np.asarray(places.var(axis=0).sum(axis=-1).argmax(axis=0), dtype=np.int64)

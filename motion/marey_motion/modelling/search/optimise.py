@@ -146,7 +146,7 @@ class _Prior:
         self.scales = np.concatenate([_precisions(mixture) for mixture in mixtures])
 
     def cost(self, stacked: Floats) -> float:
-        """By the whole mixtures."""
+        """Compute -λ ln p with all components of the mixtures."""
         pairs = zip(self._mixtures, self._parts, strict=True)
         return -self._weight * sum(float(mixture.log_density(stacked[None, part])[0]) for mixture, part in pairs)
 
@@ -163,7 +163,7 @@ class _Prior:
 
 
 def _precisions(mixture: LatentMixture) -> Floats:
-    """(L,) one over the variance of each number: what steps are damped by, so that units do not matter."""
+    """Inverse variance (L,) of each number; steps are damped in proportion, so that units do not matter."""
     centre = mixture.weights @ mixture.means
     spread = np.diagonal(mixture.covariances, axis1=1, axis2=2) + (mixture.means - centre) ** 2
     return np.asarray(1.0 / (mixture.weights @ spread))

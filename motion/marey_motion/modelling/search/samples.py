@@ -18,7 +18,7 @@ CANDIDATES = 8
 
 PASSES = 2
 NARROWING = 0.25
-"""By how much the samples are drawn together for each further pass."""
+"""Factor of the distances between samples for each further pass."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +132,7 @@ def _smallest(costs: Floats, places: Indices, count: int) -> Indices:
 
 
 def _ranges(starts: NDArray[np.int32], counts: NDArray[np.int32]) -> Indices:
-    """The numbers from each start on, as many as its count, one range after the other."""
+    """Concatenate ranges of integers, given their starts and counts."""
     ends = np.cumsum(counts)
     firsts: Indices = np.repeat(starts - (ends - counts), counts)
     return firsts + np.arange(len(firsts), dtype=np.intp)

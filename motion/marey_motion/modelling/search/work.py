@@ -104,7 +104,7 @@ def finishing_work(steps: Sequence[Step], found: FoundMotion) -> float:
 
 
 def _evaluation_work(objective: Objective) -> float:
-    """Of one motion in a tree."""
+    """Estimate the work of evaluating one motion in a tree."""
     primitive, chains = objective.primitive, objective.chains
     times = len(objective.clocks.weights) + (primitive.temporal.count + _PER_STEP_OF_TIME)
     timed = primitive.frame_count * times if len(objective.clocks.weights) else 0
@@ -114,7 +114,7 @@ def _evaluation_work(objective: Objective) -> float:
 
 
 def _slope_work(objective: Objective, width: int) -> float:
-    """Of one motion and its derivatives by `width` numbers."""
+    """Estimate the work of one motion and its derivatives by `width` numbers."""
     timed = objective.primitive.frame_count * width if len(objective.clocks.weights) else 0
     followed = (len(objective.chains.parents) + len(objective.constraints)) * width
     return float(_PER_LINEARISED_STEP + objective.chains.directions.size + _PER_SLOPE * followed + timed)

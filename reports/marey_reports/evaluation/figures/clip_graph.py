@@ -48,7 +48,7 @@ class _Line(NamedTuple):
 
 
 def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: FigureOptions) -> Sketch:
-    """Of the suite, or of one trial; two subjects have the same clips in the same places."""
+    """Draw the graph of clips of the suite or of one trial; two subjects have the same clips in the same places."""
     popularity = [_popularity(subject, trial) for subject in subjects]
     switches = [subject.switches(trial) for subject in subjects]
     uids = _most_used(popularity, min(options.most_clips, MOST_CLIPS))
@@ -147,7 +147,7 @@ def _fit(panel: Axes, circles: dict[str, Circle], longest_name: int, size_in: tu
 
 
 def _draw_lines(panel: Axes, circles: dict[str, Circle], lines: Sequence[_Line]) -> None:
-    """Each in the colour of the clip it leaves; thicker and fuller where it was taken often."""
+    """Draw lines, each in the colour of the clip it leaves; a jump that is taken more often is thicker and darker."""
     from matplotlib.collections import PathCollection
     from matplotlib.path import Path
 

@@ -36,7 +36,7 @@ class Circle:
 
     @property
     def bounds(self) -> Ints:
-        """(dots + 1,) first frame of each dot, and the number of frames."""
+        """First frame of each dot, then the number of frames (dots + 1,)."""
         return np.asarray(-(-np.arange(self.dots + 1) * self.frames // self.dots), dtype=np.int64)
 
     def middle_of(self, dots: Any) -> Any:
@@ -45,7 +45,7 @@ class Circle:
         return (bounds[dots] + bounds[np.asarray(dots) + 1]) // 2
 
     def place_of(self, frames: Any) -> Floats:
-        """(..., 2) of each frame: clockwise from above."""
+        """Compute the position (..., 2) of each frame: clockwise from the top."""
         turn = OPEN / 2 + (1.0 - OPEN) * (np.asarray(frames) + 0.5) / max(self.frames, 1)
         return self.centre + self.radius * np.stack((np.sin(2 * np.pi * turn), np.cos(2 * np.pi * turn)), axis=-1)
 
@@ -69,7 +69,7 @@ def arrange(frames: Mapping[str, int], links: Mapping[tuple[str, str], int]) -> 
 
 
 def _neighbours(uids: Sequence[str], links: Mapping[tuple[str, str], int]) -> list[str]:
-    """Begin with the first; go on with the clip that has most transitions with the last one."""
+    """Order clips: first the first one, then each time the clip with most transitions to or from the one before."""
     left, order = list(uids), list[str]()
     while left:
         last = order[-1] if order else None
@@ -80,7 +80,7 @@ def _neighbours(uids: Sequence[str], links: Mapping[tuple[str, str], int]) -> li
 
 
 def _ring(radii: Floats) -> Floats:
-    """(n, 2) centres of circles that touch none of their neighbours; the first above, then clockwise."""
+    """Place centres (n, 2) of circles so that neighbours do not touch; the first at the top, then clockwise."""
     if len(radii) < 2:
         return np.zeros((len(radii), 2))
     rooms = radii + BETWEEN / 2

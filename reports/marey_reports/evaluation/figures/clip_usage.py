@@ -97,7 +97,7 @@ def _use(subject: Subject, trial: str | None) -> _Use:
 
 
 def _order(uses: Sequence[_Use]) -> list[str]:
-    """Clips by what all subjects display of them, most first; then by uid. Unused ones are none of the picture."""
+    """Sort clips by the time that all subjects display them, most first, then by uid; unused clips are left out."""
     totals: dict[str, int] = {}
     for use in uses:
         for uid, ticks in use.ticks.items():

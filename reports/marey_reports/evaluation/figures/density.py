@@ -81,7 +81,7 @@ def draw_density(subjects: Sequence[Subject], _trial: str | None, _options: Figu
 
 
 def draw_directions(subjects: Sequence[Subject], _trial: str | None, _options: FigureOptions) -> Sketch:
-    """Over sideways and forward speed."""
+    """Draw the density of data over sideways and forward speed."""
     return _draw(subjects, DIRECTIONS)
 
 
@@ -147,7 +147,7 @@ def _target(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float], tup
 
 
 def _seconds(subject: Subject, plane: _Plane, edges: tuple[Floats, Floats], cell: tuple[float, float]) -> Floats:
-    """(FINE, FINE) seconds of data that a trial's cell around each fine cell would hold, smoothed for display."""
+    """Compute the seconds (FINE, FINE) of data in a trial's cell around each fine cell, smoothed for display."""
     from scipy.ndimage import gaussian_filter
 
     coverage = subject.result.coverage

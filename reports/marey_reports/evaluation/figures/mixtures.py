@@ -24,7 +24,7 @@ class Normals(NamedTuple):
     deviations: AnyFloats
 
     def density(self, values: AnyFloats) -> AnyFloats:
-        """Of the mixture at each value."""
+        """Compute the density of the mixture at each value."""
         return np.asarray(_densities(values, self).sum(axis=1), dtype=np.float64)
 
 

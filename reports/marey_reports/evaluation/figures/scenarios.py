@@ -91,7 +91,7 @@ def _number_sections(
     sections: Sequence[tuple[int, int, float]],
     limits: tuple[tuple[float, float], tuple[float, float]],
 ) -> None:
-    """Each number on its section, as far from the numbers before as its section allows."""
+    """Write each number on its section, as far from the numbers before as its section allows."""
     span = limits[0][1] - limits[0][0]
     placed: list[Floats] = []
     for number, (start, stop, _) in enumerate(sections, start=1):

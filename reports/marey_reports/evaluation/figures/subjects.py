@@ -43,7 +43,7 @@ class Subject:
 
     @property
     def seconds_per_row(self) -> float:
-        """Of the database."""
+        """Duration of a row of the database, in seconds."""
         return 1.0 / self.result.options.database.rate_hz
 
     @property
@@ -60,7 +60,7 @@ class Subject:
         return self.result.usage if trial is None else measure_usage(self.result.clips, [find_record(self, trial)])
 
     def switches(self, trial: str | None) -> NDArray[np.int64]:
-        """(S, 3) row left, row entered and how often, in one trial or in the whole suite."""
+        """List jumps (S, 3): row left, row entered and how often, in one trial or in the whole suite."""
         return self.result.switches if trial is None else count_switches(self.result.clips, [find_record(self, trial)])
 
 
@@ -75,13 +75,13 @@ class TrialView:
 
     @property
     def evaluated(self) -> NDArray[np.bool_]:
-        """(S,) the steps that the metrics are taken over."""
+        """Mask (S,) of the steps that the metrics are computed from."""
         everything = self.subject.result.options.window == "all"
         return np.asarray(everything | (self.series.pieces >= 0))
 
     @property
     def switched(self) -> NDArray[np.bool_]:
-        """(S,) the steps that lead to another place in the clips, by choice."""
+        """Mask (S,) of the steps that jump to another place in the clips by choice."""
         return np.asarray(self.record.status[1:] == Status.REPLACING)
 
 

@@ -13,7 +13,7 @@ from marey_reports.drawing.paper import COLOURS, REFERENCE, Place, add_keys, add
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject, TrialView, choose_trial, view_trial
 
 LEAST_TOP_M = 0.01
-"""How far the axis of costs goes at least: what is far below is rounding, of a character that stands."""
+"""Least upper end of the axis of costs; costs far below are rounding errors of a character at rest."""
 
 
 def draw_transition_costs(subjects: Sequence[Subject], trial: str | None, _options: FigureOptions) -> Sketch:

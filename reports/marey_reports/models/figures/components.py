@@ -56,7 +56,7 @@ def draw_component(subject: ModelSubject, component: int) -> Sketch:
 
 
 def sweep(subject: ModelSubject, component: int) -> Floats:
-    """(5, N, 3 + 4·J) poses of the motions along a spatial component."""
+    """Compute poses (5, N, 3 + 4·J) of the motions along a spatial component."""
     primitive = subject.primitive
     latents = np.zeros((len(DEVIATIONS), primitive.dimensions))
     latents[:, component] = np.array(DEVIATIONS) * np.sqrt(primitive.spatial.variances[component])

@@ -88,7 +88,7 @@ def _odd_ones(count: int) -> str:
 
 
 def _pairs(spatial: int, temporal: int) -> list[tuple[int, int]]:
-    """At most three pairs: the first poses against each other, and the first of time."""
+    """Choose at most three pairs of components: the first of poses against each other, and the first of time."""
     pairs = [(0, 1)] if spatial > 1 else []
     if spatial > 2:
         pairs.append((0, 2))
@@ -121,7 +121,7 @@ def _draw_pair(panel: Axes, subject: ModelSubject, samples: Floats, pair: tuple[
 
 
 def ellipse(mean: Floats, covariance: Floats) -> Floats:
-    """(60, 2) the outline that holds two standard deviations of a normal distribution in a plane."""
+    """Compute the outline (60, 2) of two standard deviations of a normal distribution in a plane."""
     values, vectors = np.linalg.eigh(covariance)
     angles = np.linspace(0.0, 2.0 * np.pi, 60)
     circle = np.stack((np.cos(angles), np.sin(angles)), axis=1)

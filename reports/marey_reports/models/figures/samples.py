@@ -33,7 +33,7 @@ WIDTH, LEAST_WIDTH, LEAST_HEIGHT, MOST_HEIGHT = 4.2, 2.6, 1.0, 3.2
 
 
 class Reach(NamedTuple):
-    """The space of one joint: (3, 2) least and greatest x (left), y (up) and z (forward) of its moments, metres."""
+    """Space that one joint reaches: least and greatest x (left), y (up) and z (forward), (3, 2) in metres."""
 
     joint: str
     examples_m: Floats
@@ -121,7 +121,7 @@ def draw_paths(subject: ModelSubject) -> Sketch:
 
 
 def _path_table(names: list[str], joints: list[str], frames: NDArray[np.int64], points: Floats) -> dict[str, object]:
-    """Ways of points (motions, T, joints, 3) as columns of a table."""
+    """Make the columns of a table from trajectories of points (motions, T, joints, 3)."""
     ways = points.transpose(0, 2, 1, 3).reshape(-1, 3)
     return {
         "motion": np.repeat(names, len(joints) * len(frames)).tolist(),
@@ -149,7 +149,7 @@ def _extent(places: Floats) -> tuple[Floats, Floats]:
 
 
 def _draw_paths(panel: Axes, points: Floats, names: list[str], axis: int) -> None:
-    """Ways of points (m, T, joints, 3) over the forward axis."""
+    """Draw trajectories of points (m, T, joints, 3) over the forward axis."""
     alpha = float(np.clip(2.5 / np.sqrt(len(points)), 0.3, 1.0))
     for place, name in enumerate(names):
         _, colour, style = FOLLOWED.get(name, ("", REFERENCE, "-"))

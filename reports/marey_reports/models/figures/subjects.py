@@ -26,7 +26,7 @@ SAMPLES = 16
 LONGEST_LABEL = 18
 
 FROM_ASIDE_RAD, FROM_AHEAD_RAD = float(np.radians(-50.0)), float(np.radians(-25.0))
-"""Where canonical motions, which begin facing +z, are seen from: their front right, so that walks go to the right."""
+"""Directions that canonical motions, which begin facing +z, are seen from: front right, so that walks go right."""
 
 TRAVELS_M = 0.3
 
@@ -57,17 +57,17 @@ class ModelSubject:
 
     @cached_property
     def names(self) -> list[str]:
-        """Of the examples, without what all of them begin with."""
+        """Names of the examples without the beginning that all share."""
         return told_apart([clip.name for clip in self.examples.clips])
 
     @cached_property
     def poses(self) -> Floats:
-        """(m, N, 3 + 4·J) of the examples, with the signs of the model."""
+        """Poses (m, N, 3 + 4·J) of the examples, with the signs of the model."""
         return consistent_poses(self.examples.poses, self.mean_poses)
 
     @cached_property
     def latents(self) -> Floats:
-        """(m, L) of the examples."""
+        """Latent vectors (m, L) of the examples."""
         return self.primitive.latents_of(self.poses, self.examples.time_functions)
 
     @cached_property
@@ -78,16 +78,16 @@ class ModelSubject:
 
     @cached_property
     def samples(self) -> Floats:
-        """(n, L) drawn from the model."""
+        """Latent vectors (n, L) drawn from the model."""
         return self.primitive.sample(SAMPLES, self.seed)
 
     @cached_property
     def mean_poses(self) -> Floats:
-        """(N, 3 + 4·J) of the mean motion."""
+        """Poses (N, 3 + 4·J) of the mean motion."""
         return np.asarray(self.primitive.poses(np.zeros((1, self.primitive.dimensions)))[0], dtype=np.float64)
 
     def points(self, poses: Floats) -> Floats:
-        """(..., P, 3) where joints, then end sites, of poses (..., 3 + 4·J) are, metres."""
+        """Compute positions (..., P, 3) of joints, then end sites, of poses (..., 3 + 4·J), in metres."""
         return points_of(self.primitive.skeleton, poses)
 
     def moments(self, count: int = MOMENTS) -> tuple[NDArray[np.int64], StripMoments]:
@@ -101,7 +101,7 @@ def evenly(count: int, most: int) -> NDArray[np.int64]:
 
 
 def points_of(skeleton: Skeleton, poses: Floats) -> Floats:
-    """(..., P, 3) where joints, then end sites, of poses (..., 3 + 4·J) are, metres."""
+    """Compute positions (..., P, 3) of joints, then end sites, of poses (..., 3 + 4·J), in metres."""
     flat = np.ascontiguousarray(poses).reshape(-1, poses.shape[-1])
     points = kinematics.forward_kinematics(skeleton, flat, end_sites=True)
     return np.asarray(points.reshape(*poses.shape[:-1], -1, 3), dtype=np.float64)

@@ -69,7 +69,7 @@ def draw_time_components(subject: ModelSubject) -> Sketch | None:
 
 
 def sweep_time(subject: ModelSubject, component: int) -> Floats:
-    """(5, N) seconds passed along a time component."""
+    """Compute the seconds passed (5, N) of five motions along a time component."""
     primitive = subject.primitive
     latents = np.zeros((len(DEVIATIONS), primitive.dimensions))
     deviation = primitive.temporal_weight * np.sqrt(primitive.temporal.variances[component])
@@ -78,7 +78,7 @@ def sweep_time(subject: ModelSubject, component: int) -> Floats:
 
 
 def _rates(passed_s: Floats, frame_rate_hz: float) -> Floats:
-    """(5, N - 1) how many times as fast as the reference."""
+    """Compute speeds (5, N - 1) relative to the reference."""
     return np.asarray(1.0 / (np.diff(passed_s, axis=1) * frame_rate_hz), dtype=np.float64)
 
 
