@@ -9,6 +9,7 @@ from .errors import RotationError as RotationError
 from .errors import SkeletonError as SkeletonError
 from .errors import UnknownFormat as UnknownFormat
 from .errors import UnknownJoint as UnknownJoint
+from .formats import ImportOptions as ImportOptions
 from .formats import read_motion as read_motion
 from .formats import write_motion as write_motion
 from .gait import game_skeleton as game_skeleton
@@ -16,7 +17,6 @@ from .gait import generate_dataset as generate_dataset
 from .gait import generate_gait as generate_gait
 from .gait import studio_skeleton as studio_skeleton
 from .importing.source import ImportedMotion as ImportedMotion
-from .importing.source import ImportOptions as ImportOptions
 from .kinematics import foot_contacts as foot_contacts
 from .kinematics import forward_directions as forward_directions
 from .kinematics import forward_kinematics as forward_kinematics

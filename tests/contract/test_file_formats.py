@@ -11,9 +11,8 @@ from marey_motion.clip import Clip
 from marey_motion.exporting import write_clip_file
 from marey_motion.formats import detect_format, read_motion, write_predecessor_skeleton
 from marey_motion.gait import generate_gait
-from marey_motion.importing.source import ImportOptions
 from marey_schemas.formats import EXPORT_FORMATS, FORMATS, IMPORTED, MOTION_FORMATS, FileFormat, format_named
-from marey_schemas.options.imports import ImportOptions as ImportOptionsSchema
+from marey_schemas.options.imports import ImportOptions
 
 by_name = pytest.mark.parametrize("row", FORMATS, ids=lambda row: str(row.name))
 
@@ -62,4 +61,4 @@ def test_exports_and_imports_accept_what_the_table_has_and_nothing_else() -> Non
     with pytest.raises(ValueError, match="Input should be"):
         ExportParams(format="fbx")
     with pytest.raises(ValueError, match="Input should be"):
-        ImportOptionsSchema(unit="parsec")
+        ImportOptions(unit="parsec")

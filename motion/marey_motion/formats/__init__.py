@@ -17,8 +17,9 @@ from marey_motion.formats.conversion import convert
 from marey_motion.formats.detection import detect_format
 from marey_motion.formats.npz import write_npz
 from marey_motion.formats.predecessor import write_predecessor, write_predecessor_skeleton
-from marey_motion.importing.source import ImportedMotion, ImportOptions, SourceDocument, SourceInfo, SourceMotion
+from marey_motion.importing.source import ImportedMotion, SourceDocument, SourceInfo, SourceMotion
 from marey_schemas.formats import MOTION_FORMATS, FileFormat
+from marey_schemas.options.imports import ImportOptions
 
 __all__ = [
     "ImportOptions",

@@ -12,9 +12,10 @@ from marey_motion.errors import ClipError, FormatError, SkeletonError
 from marey_motion.importing import checks
 from marey_motion.importing.anatomy import anatomy_of
 from marey_motion.importing.checks import CheckWarning
-from marey_motion.importing.source import ImportedMotion, ImportOptions, SourceInfo, SourceMotion, UpAxis
+from marey_motion.importing.source import ImportedMotion, SourceInfo, SourceMotion
 from marey_motion.importing.units import infer_conversion
 from marey_motion.skeleton import EndSite, Skeleton
+from marey_schemas.options.imports import ImportOptions, UpAxis
 
 Real = TypeVar("Real", np.float32, np.float64)
 

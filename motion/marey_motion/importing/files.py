@@ -7,8 +7,6 @@ so that a caller may run it in a process of its own.
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
 
 from marey_motion.clip import Clip
@@ -28,16 +26,13 @@ from marey_motion.importing.items import (
     skeleton_item,
 )
 from marey_motion.importing.plan import PlannedFile
-from marey_motion.importing.source import ImportedMotion, ImportOptions, SourceDocument
-from marey_motion.importing.units import unit_in_metres
+from marey_motion.importing.source import ImportedMotion, SourceDocument
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, Refusal, refused_entry, skeleton_output
 from marey_schemas.kinds import Kind
-from marey_schemas.options.imports import ImportOptions as UserOptions
 
-_READER_OPTIONS = tuple(option.name for option in fields(ImportOptions))
 _LONGEST_COLLECTION = 1024
 
 
@@ -94,19 +89,18 @@ def refusal_of(error: MotionError) -> Refusal:
 
 
 def _imported(file: FileToImport) -> ImportedFile:
-    options = reader_options(file.options)
     source = read_source(
         file.data,
         file.planned.name,
         companion=file.companion,
         companion_name=file.planned.companion or "the companion",
-        options=options,
+        options=file.options,
     )
     if isinstance(source, SourceDocument):
         from marey_motion.importing.models import import_document
 
         return import_document(file, source)
-    imported = convert(source, file.planned.name, options)
+    imported = convert(source, file.planned.name, file.options)
     checks = tuple(_check_document(warning.as_dict()) for warning in imported.warnings)
     items: list[ImportedItem] = []
     clip, reference = imported.clip, {"output": skeleton_output(file.planned.name)}
@@ -120,23 +114,6 @@ def _imported(file: FileToImport) -> ImportedFile:
         parts = {"motion": motion, "info": _info(imported, file, checks)}
         items.append(main_item(file, Kind.CLIP, file.planned.item_name, parts))
     return ImportedFile(file.planned.name, tuple(items), checks, None if clip is None else clip.frame_count)
-
-
-def reader_options(given: UserOptions) -> ImportOptions:
-    """Convert the user's options for the readers; a unit by name becomes its size in metres.
-
-    Parameters
-    ----------
-    given : options    options of an import
-
-    Returns
-    -------
-    ImportOptions    options of the readers
-    """
-    chosen = {name: value for name in _READER_OPTIONS if (value := getattr(given, name)) is not None}
-    if given.unit is not None:
-        chosen.setdefault("unit_scale_m", unit_in_metres(given.unit))
-    return ImportOptions(**chosen)
 
 
 def mapping_part(found: ImportedFile) -> Tree:

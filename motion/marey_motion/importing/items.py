@@ -14,7 +14,7 @@ from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import Refusal, skeleton_output
 from marey_schemas.kinds import Kind
-from marey_schemas.options.imports import ImportOptions as UserOptions
+from marey_schemas.options.imports import ImportOptions
 
 SKELETON_COLLECTION = "skeletons"
 SAME_OFFSET_M = 1e-3
@@ -52,7 +52,7 @@ class FileToImport:
     planned: PlannedFile
     data: bytes | memoryview
     digest: str
-    options: UserOptions = field(default_factory=UserOptions)
+    options: ImportOptions = field(default_factory=ImportOptions)
     companion: bytes | memoryview | None = None
     companion_digest: str | None = None
     skeleton: GivenSkeleton | None = None

@@ -1,4 +1,4 @@
-"""Input and output of an import: options, the content of a file in its own units, and the record of what was done."""
+"""Input and output of the conversion of a file: its content in its own units, and the record of the changes."""
 
 from __future__ import annotations
 
@@ -13,50 +13,9 @@ from numpy.typing import NDArray
 from marey_motion.clip import Clip
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.skeleton import Skeleton
+from marey_schemas.options.imports import Handedness, UpAxis
 
-UpAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
-Handedness = Literal["right", "left"]
 Subject = Literal["model", "tree", "graph"]
-UP_AXES: tuple[UpAxis, ...] = ("x", "y", "z", "-x", "-y", "-z")
-
-
-@dataclass(frozen=True)
-class ImportOptions:
-    """Facts that the user knows better than the file; None means "infer, and record how".
-
-    Parameters
-    ----------
-    unit_scale_m : float, optional    metres per unit of length of the file
-    up_axis : str, optional    the axis of the file that points up: x, y, z, -x, -y or -z
-    handedness : str    "left" mirrors a left-handed file in x
-    frame_rate_hz : float, optional    replaces the file's rate
-    trim_rest_pose : bool    drop a rest pose before or after the motion, where `checks` finds one
-    align_floor : bool    lift or lower the motion so that its lowest contacts lie on y = 0
-
-    Examples
-    --------
-    >>> from marey_motion import ImportOptions, generate_gait, read_motion, write_motion
-    >>> walk = write_motion(generate_gait(1.2, 0.0, 2.0), "bvh")
-    >>> read_motion(walk, "walk.bvh", options=ImportOptions(frame_rate_hz=30.0)).clip.duration_s
-    4.0
-    """
-
-    unit_scale_m: float | None = None
-    up_axis: UpAxis | None = None
-    handedness: Handedness = "right"
-    frame_rate_hz: float | None = None
-    trim_rest_pose: bool = False
-    align_floor: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("unit_scale_m", "frame_rate_hz"):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise ValueError(f"{name} is {value}, a positive number is needed")
-        if self.up_axis is not None and self.up_axis not in UP_AXES:
-            raise ValueError(f"up_axis is {self.up_axis!r}, one of {', '.join(UP_AXES)} is needed")
-        if self.handedness not in ("right", "left"):
-            raise ValueError(f"handedness is {self.handedness!r}, 'right' or 'left' is needed")
 
 
 @dataclass(eq=False)

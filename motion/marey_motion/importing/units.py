@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from marey_motion.errors import AmbiguousUnits, MotionError
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.importing.landmarks import Landmarks, path_length
-from marey_motion.importing.source import Handedness, ImportOptions, SourceMotion, UpAxis
+from marey_motion.importing.source import SourceMotion
 from marey_motion.kinematics import forward_kinematics
 from marey_schemas.formats import UNITS_M
+from marey_schemas.options.imports import Handedness, ImportOptions, UpAxis
 
 CONVENTIONAL_UNITS = ("m", "cm", "mm")
 # Adults, from the joint that carries both legs down the bones to the ankle. No length fits two units in these bounds.
@@ -256,11 +257,9 @@ def _heights(positions: NDArray[np.float64], up_axis: UpAxis) -> NDArray[np.floa
 
 def _choose_unit(source: SourceMotion, body: _Measurements, options: ImportOptions, up_axis: UpAxis) -> float:
     hip_height = _hip_height(body, up_axis)
-    if options.unit_scale_m is not None:
-        body.evidence.append(
-            f"unit {options.unit_scale_m:g} m: given by the user{_as_hips(hip_height, options.unit_scale_m)}"
-        )
-        return options.unit_scale_m
+    if (given := options.metres_per_unit) is not None:
+        body.evidence.append(f"unit {given:g} m: given by the user{_as_hips(hip_height, given)}")
+        return given
     if source.unit_scale_m is not None and (
         not source.declared or body.leg is None or _is_leg(body.leg * source.unit_scale_m)
     ):

@@ -6,13 +6,26 @@ from typing import Literal
 
 from pydantic import Field
 
-from marey_schemas.base import Request
-from marey_schemas.formats import LengthUnit
+from marey_schemas.base import Options
+from marey_schemas.formats import UNITS_M, LengthUnit
 from marey_schemas.names import CollectionPath, Tag
 
+UpAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
+Handedness = Literal["right", "left"]
 
-class ImportOptions(Request):
-    """Facts that the user knows better than the files. Absent: inferred from evidence, or refused when ambiguous."""
+
+class ImportOptions(Options):
+    """Facts that the user knows better than the files. Absent: inferred from evidence, or refused when ambiguous.
+
+    `marey_motion.read_motion` uses those about the content of a file: unit, axes, frame rate, rest pose and floor.
+
+    Examples
+    --------
+    >>> from marey_motion import ImportOptions, generate_gait, read_motion, write_motion
+    >>> walk = write_motion(generate_gait(1.2, 0.0, 2.0), "bvh")
+    >>> read_motion(walk, "walk.bvh", options=ImportOptions(frame_rate_hz=30.0)).clip.duration_s
+    4.0
+    """
 
     collection: CollectionPath = Field("", description="Folder of the project that receives the clips.")
     skeleton: str | None = Field(
@@ -24,10 +37,8 @@ class ImportOptions(Request):
     unit_scale_m: float | None = Field(
         None, gt=1e-6, lt=1e3, description="Metres per unit of length, for units without a name."
     )
-    up_axis: Literal["x", "y", "z", "-x", "-y", "-z"] | None = Field(
-        None, description="Axis that points up in the files. Absent: inferred."
-    )
-    handedness: Literal["right", "left"] = Field("right", description="left: mirror the files, which are left-handed.")
+    up_axis: UpAxis | None = Field(None, description="Axis that points up in the files. Absent: inferred.")
+    handedness: Handedness = Field("right", description="left: mirror the files, which are left-handed.")
     align_floor: bool = Field(
         False, description="Shift each clip vertically, so that its feet are on the ground at height 0."
     )
@@ -39,3 +50,10 @@ class ImportOptions(Request):
     subject: str | None = Field(None, max_length=255, description="The performer.")
     licence: str | None = Field(None, max_length=255, description="Licence of the data.")
     capture_system: str | None = Field(None, max_length=255, description="The device or system that recorded the data.")
+
+    @property
+    def metres_per_unit(self) -> float | None:
+        """Size of the given unit in metres; the size counts before the name, and None means that neither is given."""
+        if self.unit_scale_m is not None or self.unit is None:
+            return self.unit_scale_m
+        return UNITS_M[self.unit]

@@ -14,8 +14,6 @@ from marey_client.cli.evaluations import EVALUATE
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.files import UPLOAD
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
-from marey_motion.importing.files import reader_options
-from marey_motion.importing.source import ImportOptions as ReaderOptions
 from marey_schemas.job_params import AlignParams, EvaluateParams
 from marey_schemas.options.imports import ImportOptions
 
@@ -76,8 +74,8 @@ def test_fields_of_nested_models_are_options_too() -> None:
 
 def test_what_the_reader_of_files_can_be_told_an_upload_can_say() -> None:
     arguments = "--handedness left --align-floor --up-axis -z --fps 30 --unit-scale-m 0.01 --trim-rest-pose"
-    given = reader_options(ImportOptions.model_validate(typed(arguments, UPLOAD)))
-    assert given == ReaderOptions(
+    given = ImportOptions.model_validate(typed(arguments, UPLOAD))
+    assert given == ImportOptions(
         unit_scale_m=0.01, up_axis="-z", handedness="left", frame_rate_hz=30.0, trim_rest_pose=True, align_floor=True
     )
 

@@ -11,8 +11,8 @@ from marey_motion.clip import Clip
 from marey_motion.formats import read_motion, write_bvh
 from marey_motion.gait import generate_gait, studio_skeleton
 from marey_motion.importing.checks import CODES, CheckWarning, check_clip, on_the_floor, without_rest_pose
-from marey_motion.importing.source import ImportOptions
 from marey_motion.kinematics import global_positions
+from marey_schemas.options.imports import ImportOptions
 
 
 @pytest.fixture(scope="module")

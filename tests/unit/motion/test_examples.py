@@ -12,11 +12,12 @@ PACKAGE = Path(marey_motion.__file__).parent
 
 
 def modules_with_examples() -> list[str]:
-    return sorted(
+    own = {
         ".".join(("marey_motion", *file.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__")
         for file in PACKAGE.rglob("*.py")
         if ">>> " in file.read_text(encoding="utf-8")
-    )
+    }
+    return sorted(own | {getattr(marey_motion, name).__module__ for name in marey_motion.__all__})
 
 
 @pytest.mark.parametrize("name", marey_motion.__all__)

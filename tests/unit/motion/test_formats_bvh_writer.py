@@ -14,9 +14,10 @@ from marey_motion.clip import Clip
 from marey_motion.errors import FormatError, MotionError
 from marey_motion.formats import read_motion, write_motion
 from marey_motion.formats.bvh_writer import format_table, write_bvh
-from marey_motion.importing.source import ImportOptions, SourceInfo
+from marey_motion.importing.source import SourceInfo
 from marey_motion.kinematics import global_positions
 from marey_motion.skeleton import Skeleton, same_hierarchy
+from marey_schemas.options.imports import ImportOptions
 
 CENTIMETRES = ImportOptions(unit_scale_m=0.01, up_axis="y")
 

@@ -219,6 +219,17 @@ def test_the_users_word_counts_more_than_the_body(walk: Clip) -> None:
     assert any("given by the user" in sentence for sentence in motion.source.evidence)
 
 
+@pytest.mark.parametrize(
+    ("options", "metres"),
+    [({"unit": "inch"}, 0.0254), ({"unit": "inch", "unit_scale_m": 0.02}, 0.02)],
+    ids=["by its name", "by its size, which counts before the name"],
+)
+def test_a_unit_is_given_by_name_or_by_size(walk: Clip, options: dict[str, Any], metres: float) -> None:
+    motion = read_motion(write_bvh(walk), "walk.bvh", options=ImportOptions(**options))
+    assert motion.source.unit_scale_m == metres
+    assert any(sentence.startswith(f"unit {metres:g} m: given by the user") for sentence in motion.source.evidence)
+
+
 def test_a_format_that_fixes_its_unit_is_believed(walk: Clip) -> None:
     assert read_motion(write_npz(walk), "walk.npz").source.unit_scale_m == 1.0
 

@@ -29,11 +29,11 @@ from marey_motion.formats.predecessor.time_functions import (
     as_log_slopes,
     components_of,
 )
-from marey_motion.importing.source import ImportOptions
 from marey_motion.modelling.mixture import LatentMixture
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.splines import DEGREE, SplineBasis
 from marey_motion.skeleton import Skeleton
+from marey_schemas.options.imports import ImportOptions
 
 Layout = Literal["1", "2", "3", "static"]
 Document = Mapping[str, Any]
