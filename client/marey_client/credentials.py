@@ -62,14 +62,14 @@ def require_address(url: str) -> None:
     except (httpx.InvalidURL, ValueError):
         fits = False
     if not fits:
-        raise BadAddress(f"{url!r} is no address of a server; write it as in {DEFAULT_URL}")
+        raise BadAddress(f"{url!r} is not the address of a server; write it like {DEFAULT_URL}")
 
 
 def as_token(text: str) -> str:
     """`text` without the ends of lines that files and variables bring along. Raises `BadToken`, without telling it."""
     token = text.strip()
     if not token or not token.isascii() or not token.isprintable() or " " in token:
-        raise BadToken("what was given as a token is none: a token is one word of letters, digits and _")
+        raise BadToken("the text given is not a token: a token is one word of letters, digits and _")
     return token
 
 

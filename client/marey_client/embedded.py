@@ -94,5 +94,5 @@ def room(module: str, extra: str) -> ModuleType:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         raise NotInstalled(
-            f"this needs a part that is not installed ({error.name}); pip install 'marey[{extra}]'"
+            f"this needs a package that is not installed ({error.name}); pip install 'marey[{extra}]'"
         ) from error

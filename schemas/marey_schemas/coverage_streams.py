@@ -66,11 +66,11 @@ class CoverageStreamCreate(Request):
     def _check_grid(self) -> Self:
         for name in ("speeds_m_s", "turn_rates_deg_s", "least_s"):
             if self.evaluation is not None and getattr(self, name) is not None:
-                raise ValueError(f"{name}: the evaluation says it; leave one of them out")
+                raise ValueError(f"{name}: the evaluation sets it already; give only one of the two")
         for name in ("speeds_m_s", "turn_rates_deg_s"):
             values = getattr(self, name) or ()
             if len(set(values)) != len(values):
-                raise ValueError(f"{name}: the same value stands twice")
+                raise ValueError(f"{name}: a value is repeated")
         if self.speeds_m_s and self.turn_rates_deg_s:
             cells = len(self.speeds_m_s) * len(self.turn_rates_deg_s)
             if cells > MOST_CELLS:
@@ -104,15 +104,15 @@ class CoverageFrames(Request):
         if self.poses is not None and self.roots is not None:
             raise ValueError("send poses or roots, not both")
         if self.poses is None and (self.translations is not None or self.translated_joints):
-            raise ValueError("translations come with poses")
+            raise ValueError("translations can only be sent with poses")
         for name in ("poses", "translations", "roots"):
             frames = getattr(self, name)
             if frames is not None and not np.issubdtype(frames.dtype, np.floating):
-                raise ValueError(f"{name}: dtype {frames.dtype.str}, where <f4 or <f8 is needed")
+                raise ValueError(f"{name}: dtype {frames.dtype.str}; it must be <f4 or <f8")
         if self.frame_count > MOST_FRAMES:
-            raise ValueError(f"{self.frame_count} frames; at most {MOST_FRAMES} are taken at once")
+            raise ValueError(f"{self.frame_count} frames; a request may have at most {MOST_FRAMES}")
         if self.frame_count == 0 and not self.ends_take:
-            raise ValueError("no frames, and no end of a take")
+            raise ValueError("send frames, or set ends_take")
         return self
 
     @property

@@ -102,7 +102,7 @@ class KindDeclaration:
         if self.batch_size < 1:
             raise ValueError(f"{self.name}: batch_size must be at least 1, not {self.batch_size}")
         if (self.task_count is None) != (self.gathering is None):
-            raise ValueError(f"{self.name}: task_count and gathering go together")
+            raise ValueError(f"{self.name}: declare task_count and gathering together")
         if self.task_count is not None and self.fan_out is not None:
             raise ValueError(f"{self.name}: tasks come from fan_out or from task_count, not from both")
 

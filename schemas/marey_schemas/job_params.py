@@ -99,7 +99,7 @@ class CutParams(TaggedResults):
     def _check_name(cls, name: str) -> str:
         fields = {found.group(1) for found in _NAME_FIELD.finditer(name)}
         if fields != {"clip", "label", "number"}:
-            raise ValueError("must have {clip}, {label} and {number} in it, so that no two pieces share a name")
+            raise ValueError("must contain {clip}, {label} and {number}, so that every piece has a name of its own")
         if set("{}/") & set(_NAME_FIELD.sub("", name)):
             raise ValueError("only {clip}, {label} and {number} (or {number:3} for three digits) may be in braces")
         return name
@@ -239,7 +239,7 @@ class EditParams(SuffixedResults):
     @model_validator(mode="after")
     def _check_place(self) -> Self:
         if self.in_place and self.suffix:
-            raise ValueError("suffix: results that take the place of their clips keep their names")
+            raise ValueError("suffix: must be empty with in_place, which keeps the names of the clips")
         return self
 
     def unclear_place(self, into: str) -> str | None:

@@ -52,13 +52,13 @@ class ModelPlan(Request):
     @model_validator(mode="after")
     def _check_takes(self) -> Self:
         if (self.files is None) == (not self.clips):
-            raise ValueError("takes are either files to import or clips that are there")
+            raise ValueError("give either files to import or clips, not both")
         if self.annotations and (self.files is not None or self.annotate is not None):
-            raise ValueError("annotations are named for clips that are there, or proposed")
+            raise ValueError("annotations: give them only for existing clips, and only if none are proposed")
         if self.cut is not None and not self.annotations and self.annotate is None:
-            raise ValueError("what is cut out needs annotations: name some, or have them proposed")
+            raise ValueError("cut: needs annotations; give some, or let them be proposed")
         if self.annotations and self.skeleton is not None and self.cut is None:
-            raise ValueError("annotations of clips do not go over to another skeleton; cut the clips along them")
+            raise ValueError("annotations: cannot be used after retargeting; cut the clips first")
         return self
 
 

@@ -48,7 +48,7 @@ def _read_old_unit(model: Request, name: str, old: str) -> None:
     if centimetres is None:
         return
     if name in model.model_fields_set:
-        raise ValueError(f"{old}: give {name} alone")
+        raise ValueError(f"{old}: give only {name}")
     object.__setattr__(model, name, centimetres * 0.01)
     object.__setattr__(model, old, None)
     model.model_fields_set.discard(old)
@@ -209,7 +209,7 @@ class SearchRequest(RefineOptions):
     @model_validator(mode="after")
     def _check_steps(self) -> Self:
         if self.steps and self.constraints:
-            raise ValueError("constraints: on several motions they stand in steps")
+            raise ValueError("constraints: for several motions, give them in steps")
         total = sum(len(step.constraints) for step in self.asked_steps)
         if total > MOST_CONSTRAINTS:
             raise ValueError(f"steps: {total} constraints in all, over {MOST_CONSTRAINTS}")

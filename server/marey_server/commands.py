@@ -50,7 +50,7 @@ def read_settings(**given: Any) -> Settings:
         return Settings(**given)
     except ValidationError as error:
         wrong = "; ".join(f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors())
-        raise CommandFailed(f"a setting is wrong: {wrong}") from None
+        raise CommandFailed(f"invalid setting: {wrong}") from None
 
 
 def upgrade(**settings: Any) -> None:
@@ -68,7 +68,7 @@ def backup(*, target: Path, **settings: Any) -> None:
     """Copy an SQLite database as it is at one moment, while a server may be writing to it."""
     source = _sqlite_file(read_settings(**settings), must_exist=True)
     if target.exists():
-        raise CommandFailed(f"{target} exists; a backup never writes over a file")
+        raise CommandFailed(f"{target} exists; choose a file that does not exist")
     partial = target.with_name(f"{target.name}.partial")
     partial.unlink(missing_ok=True)
     _copy_database(source, partial)
@@ -83,9 +83,9 @@ def restore(*, source: Path, **settings: Any) -> None:
     # A log that stays behind would be played into the backup.
     for left in (target, target.with_name(f"{target.name}-wal"), target.with_name(f"{target.name}-shm")):
         if left.exists():
-            raise CommandFailed(f"{left} exists; stop the server and move it away first, so that nothing is lost")
+            raise CommandFailed(f"{left} exists; stop the server and move the file away first, so that nothing is lost")
     if not source.is_file():
-        raise CommandFailed(f"{source} is no file")
+        raise CommandFailed(f"{source} is not a file")
     chosen.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     partial = target.with_name(f"{target.name}.partial")
     partial.unlink(missing_ok=True)
@@ -114,7 +114,7 @@ def fsck(*, as_json: bool = False, **settings: Any) -> None:
             _say(str(finding))
         _say(f"checked {', '.join(f'{count:,} {what}' for what, count in checked.items()) or 'nothing'}")
     if findings:
-        raise CommandFailed(f"{len(findings)} things are wrong")
+        raise CommandFailed(f"{len(findings)} faults were found")
 
 
 def admin_token(*, user: str | None = None, **settings: Any) -> None:
@@ -173,7 +173,7 @@ def _copy_database(source: Path, target: Path) -> None:
             (state,) = writing.execute("PRAGMA quick_check").fetchone()
     except sqlite3.DatabaseError as error:
         target.unlink()
-        raise CommandFailed(f"{source} is no sound database: {error}") from None
+        raise CommandFailed(f"{source} is not an intact database: {error}") from None
     if state != "ok":
         target.unlink()
         raise CommandFailed(f"{source} is damaged: {state}")

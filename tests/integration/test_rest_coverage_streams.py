@@ -173,7 +173,7 @@ def test_it_goes_on_from_what_an_evaluation_found(owner) -> None:
     assert progress["changed"][0]["seconds"] == pytest.approx(1.5 + 91 / 60)
     assert (progress["index"], progress["targets"]) == (1.0, [])
     both = owner.post(STREAMS, json={"frame_rate_hz": 60, "evaluation": made.json()["id"], "least_s": 1})
-    assert "leave one of them out" in problem(both, 422)["detail"]
+    assert "give only one of the two" in problem(both, 422)["detail"]
 
 
 @pytest.mark.parametrize(
@@ -213,7 +213,7 @@ def test_a_skeleton_that_tells_no_direction_is_refused(owner) -> None:
     [
         ({"frame_rate_hz": 5}, "greater than or equal to 10"),
         ({"frame_rate_hz": 1000}, "less than or equal to 240"),
-        ({"frame_rate_hz": 60, "speeds_m_s": [1, 1]}, "stands twice"),
+        ({"frame_rate_hz": 60, "speeds_m_s": [1, 1]}, "is repeated"),
         ({"frame_rate_hz": 60, "speeds_m_s": list(range(1, 21)), "turn_rates_deg_s": list(range(150))}, "3000 cells"),
         ({"frame_rate_hz": 60, "target_count": 17}, "less than or equal to 16"),
         ({}, "required"),
@@ -246,7 +246,7 @@ def test_frames_that_make_no_sense_are_refused_and_change_nothing(owner, skeleto
         (stream, {"poses": poses.astype(np.int32)}, "<f4 or <f8"),
         (stream, {"poses": np.zeros((5000, poses.shape[1]), np.float32)}, "at most 4096"),
         (stream, {"poses": poses, "roots": np.zeros((10, 3))}, "not both"),
-        (stream, {"poses": poses, "translated_joints": ["Hips"]}, "go together"),
+        (stream, {"poses": poses, "translated_joints": ["Hips"]}, "give translations and translated_joints together"),
         (stream, {"roots": far}, "from the origin"),
         (stream, {"poses": poses * np.float32(1e30)}, "rotation of length"),
         (stream, {"poses": np.hstack((poses[:, :3] + 1e30, poses[:, 3:]))}, "from the origin"),

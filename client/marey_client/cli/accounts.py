@@ -212,7 +212,7 @@ def change_password(
         me = marey.me().user
         who = name or (me.name if me else None)
         if who is None:
-            raise WrongUsage("the token belongs to no user; say whose password to change")
+            raise WrongUsage("the token belongs to no user; give the name of the user")
         change = {"password": _ask_secret("New password", twice=True)}
         if me is not None and who == me.name:
             change["current_password"] = _ask_secret("Current password")
@@ -250,7 +250,7 @@ def change_user(
     given = {"display_name": display_name, "administrator": administrator}
     change = UserChange.model_validate({key: value for key, value in given.items() if value is not None})
     if not change.model_fields_set:
-        raise WrongUsage("say what changes: --display-name or --administrator")
+        raise WrongUsage("give --display-name or --administrator")
     with connect(context) as marey:
         changed = marey.users.change(name, change)
     if as_json:
@@ -270,7 +270,7 @@ def _ask_secret(what: str, *, twice: bool = False) -> str:
         return str(typer.prompt(what, hide_input=True, confirmation_prompt=twice, err=True))
     if secret := sys.stdin.readline().rstrip("\r\n"):
         return secret
-    raise WrongUsage(f"{what}: there is no terminal to ask at, and no line on standard input")
+    raise WrongUsage(f"{what}: there is neither a terminal to ask at nor a line on standard input")
 
 
 def _yes(value: bool) -> str:

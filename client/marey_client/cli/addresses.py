@@ -93,7 +93,7 @@ def kind_named(name: str) -> Kind:
     try:
         return Kind(name)
     except ValueError:
-        raise WrongUsage(f"{name!r} is no kind; there are {', '.join(Kind)}") from None
+        raise WrongUsage(f"{name!r} is not a kind of item; the kinds are {', '.join(Kind)}") from None
 
 
 def _existing(items: Any, item_id: str) -> ItemHandle | None:
@@ -222,7 +222,7 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
     found = list(_things(marey.project(address.project), address, wanted, deleted=deleted))
     kinds = list(dict.fromkeys(one.kind for one in found))
     if len(kinds) > 1:
-        raise WrongUsage(f"{address} is the name of a {' and of a '.join(kinds)}; say which with --kind")
+        raise WrongUsage(f"{address} is the name of a {' and of a '.join(kinds)}; choose one with --kind")
     if not found:
         what, option = ("nothing deleted", " --deleted") if deleted else ("nothing", "")
         raise WrongUsage(f"there is {what} at {address}; marey ls{option} {address.project} shows what there is")

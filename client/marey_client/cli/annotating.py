@@ -164,7 +164,7 @@ def move(
     """Move the start or the end of a segment; a neighbouring segment at that edge is adapted."""
     edges = [(edge, to) for edge, to in (("start", start), ("end", end)) if to is not None]
     if len(edges) != 1:
-        raise WrongUsage("give --start or --end, one of them")
+        raise WrongUsage("give either --start or --end")
     _apply(context, place, command="move_boundary", at=at, edge=edges[0][0], to=edges[0][1])
 
 
@@ -254,7 +254,7 @@ def import_annotation(
 
     document = read_json(file)
     if not isinstance(document, dict):
-        raise WrongUsage(f"{file} holds no JSON object")
+        raise WrongUsage(f"{file} does not contain a JSON object")
     options = {"layer": layer, "name": name, "end_index": end_index.value, "labels": tuple(label) if label else None}
     with connect(context) as marey:
         found = require_item(marey, Address.parse(clip), [Kind.CLIP])

@@ -64,7 +64,9 @@ def apply_edit(
     """Apply commands to clips, as a job."""
     addresses = addresses_in_one_project(sources)
     if not (into or params.get("suffix") or params.get("in_place")):
-        raise WrongUsage("say where the results go: --into a folder, with a --suffix beside the clips, or --in-place")
+        raise WrongUsage(
+            "choose a place for the results: --into for a folder, --suffix for names beside the clips, or --in-place"
+        )
     with connect(context) as marey:
         commands = _commands(marey, addresses[0].project, do, file, saved)
         clips = [clips_at(marey, address) for address in addresses]
@@ -155,7 +157,7 @@ def list_commands(
     from marey_schemas.editing.edits import COMMAND_MODELS
 
     if name is not None and name not in COMMAND_MODELS:
-        raise WrongUsage(f"there is no command {name!r}; there are {', '.join(COMMAND_MODELS)}")
+        raise WrongUsage(f"there is no command {name!r}; the commands are {', '.join(COMMAND_MODELS)}")
     wanted = {one: model for one, model in COMMAND_MODELS.items() if name in (None, one)}
     if as_json:
         return print_json({one: model.model_json_schema() for one, model in wanted.items()})
@@ -181,7 +183,7 @@ def _commands(
     if saved is None:
         return _given(marey, project, do, file)
     if do or file:
-        raise WrongUsage("give --with an edit, or commands by --do or --file, and not both")
+        raise WrongUsage("give either an edit by --with or commands by --do or --file, not both")
     if Address.parse(saved).project != project:
         raise WrongUsage("the edit and the clips must be in one project")
     return _edit_at(marey, saved)
@@ -191,12 +193,12 @@ def _given(marey: Marey, project: str, do: list[str] | None, file: str | None) -
     from marey_client.handles.edits import as_edit
 
     if (file is None) == (not do):
-        raise WrongUsage("give commands by --do, or by --file, and not both")
+        raise WrongUsage("give commands either by --do or by --file, not both")
     tree: Any = [parse_command(text) for text in do or ()] if file is None else read_json(file)
     given = tree if isinstance(tree, dict) else {"commands": tree}
     commands, title = given.get("commands"), given.get("title", "")
     if not isinstance(commands, list):
-        raise WrongUsage(f"{file} holds no commands; a list is needed, or an object with `commands`")
+        raise WrongUsage(f"{file} contains no commands; it must be a list, or an object with `commands`")
     return as_edit([_with_ids(marey, project, one) for one in commands], title=title)
 
 
@@ -239,7 +241,7 @@ def parse_command(text: str) -> dict[str, Any]:
     except ValueError as error:
         raise WrongUsage(f"{text!r}: {error}; write a command and its parameters, as in 'trim start=10'") from None
     if name not in COMMAND_MODELS:
-        raise WrongUsage(f"there is no command {name!r}; there are {', '.join(COMMAND_MODELS)}")
+        raise WrongUsage(f"there is no command {name!r}; the commands are {', '.join(COMMAND_MODELS)}")
     parameters = _parameters(COMMAND_MODELS[name])
     command: dict[str, Any] = {"command": name}
     for assignment in assigned:

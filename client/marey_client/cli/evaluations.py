@@ -68,7 +68,7 @@ def evaluate(
 
     addresses = addresses_in_one_project(sources)
     if out is not None and not wait:
-        raise WrongUsage("--out needs the result; leave --no-wait out")
+        raise WrongUsage("--out needs the result; remove --no-wait")
     folder, _, last = addresses[0].path.rpartition("/")
     if loop:
         params.setdefault("database", {}).setdefault("end_policy", "loop")
@@ -119,7 +119,7 @@ def report(
     if walk_graph is not None and walk_graph.suffix.lower() not in (".graphml", ".json"):
         raise WrongUsage(f"--walk-graph: {walk_graph} must end in .graphml or .json")
     if trial is not None and walk_graph is None:
-        raise WrongUsage("--trial chooses the walks of --walk-graph; give that, too")
+        raise WrongUsage("--trial selects the walks for --walk-graph; give --walk-graph as well")
     kinds = [Kind.EVALUATION, Kind.MODEL] if walk_graph is None else [Kind.EVALUATION]
     with connect(context) as marey:
         found = require_item(marey, Address.parse(place), kinds)

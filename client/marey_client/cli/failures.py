@@ -47,7 +47,7 @@ def reported(*, verbose: bool) -> Iterator[None]:
         if isinstance(error, BadAddress | CodecError):
             _exit(WRONG_USAGE, str(error), verbose)
         if isinstance(error, UnicodeEncodeError):
-            _exit(WRONG_USAGE, f"{error.object[:MOST_SHOWN]!r} is no text in UTF-8", verbose)
+            _exit(WRONG_USAGE, f"{error.object[:MOST_SHOWN]!r} is not text in UTF-8", verbose)
         if isinstance(error, MareyError | OSError):
             _exit(FAILED, sentence(error), verbose)
         raise

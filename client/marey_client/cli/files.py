@@ -275,7 +275,7 @@ def download(
     A file that is there already is replaced; of clips that would have one file name, the later ones get a number.
     """
     if format not in EXPORT_FORMATS:
-        raise WrongUsage(f"{format!r} is no format; there are {', '.join(EXPORT_FORMATS)}")
+        raise WrongUsage(f"{format!r} is not a format; the formats are {', '.join(EXPORT_FORMATS)}")
     address = Address.parse(place)
     with connect(context) as marey:
         clips, base = _clips_at(marey, address)

@@ -72,7 +72,7 @@ def compare(
 ) -> None:
     """Show what changed between two evaluations, trial by trial."""
     if out is not None and not wait:
-        raise WrongUsage("--out needs the result; leave --no-wait out")
+        raise WrongUsage("--out needs the result; remove --no-wait")
     with connect(context) as marey:
         first, second = evaluation_at(marey, before), evaluation_at(marey, after)
         if first.project != second.project:
@@ -105,7 +105,7 @@ def suggest(
 ) -> None:
     """Find clips of an evaluated set that can go, and others that would fill its holes."""
     if remove_out is not None and not wait:
-        raise WrongUsage("--remove-out needs the result; leave --no-wait out")
+        raise WrongUsage("--remove-out needs the result; remove --no-wait")
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
         request = handle.suggest_request(_places(marey, handle, candidates), **params)

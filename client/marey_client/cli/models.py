@@ -81,9 +81,9 @@ def sample(
 ) -> None:
     """Draw motions from a model, and write them to files or make clips of them."""
     if format not in SAMPLE_FORMATS:
-        raise WrongUsage(f"{format!r} is no format; there are {', '.join(SAMPLE_FORMATS)}")
+        raise WrongUsage(f"{format!r} is not a format; the formats are {', '.join(SAMPLE_FORMATS)}")
     if into is not None and out is not None:
-        raise WrongUsage("--out writes files, --into makes clips; ask for one of them")
+        raise WrongUsage("--out writes files, --into creates clips; give only one of them")
     with connect(context) as marey:
         found = model_at(marey, place)
         if into is not None:

@@ -47,7 +47,7 @@ def mv(
     """Move or rename items and folders within a project. Ids and history stay."""
     *sources, target = places
     if not sources:
-        raise WrongUsage("say what moves, and where to: marey mv lab/raw/walk lab/raw/stroll")
+        raise WrongUsage("give what to move and the destination, such as: marey mv lab/raw/walk lab/raw/stroll")
     to = Address.parse(target)
     for source in sources:
         if Address.parse(source).project != to.project:
@@ -123,14 +123,14 @@ def tag(
 
     added, removed = tuple(add or ()), frozenset(remove or ())
     if not added and not removed:
-        raise WrongUsage("say which tags: --add NAME, --remove NAME")
+        raise WrongUsage("give tags with --add NAME or --remove NAME")
     ItemChange(tags=added)  # a tag that is none is told before anything changes
     with connect(context) as marey:
         things = [the_thing(marey, place, kind) for place in places]
         require_apart(things)
         for thing in things:
             if thing.kind == FOLDER:
-                raise WrongUsage(f"{thing.place} is a folder; folders have no tags, name the items in it")
+                raise WrongUsage(f"{thing.place} is a folder, and folders have no tags; give the items in it")
 
         def put_tags(thing: Any) -> Any:
             handle: ItemHandle = thing.handle
@@ -165,7 +165,7 @@ def _named(things: Sequence[Thing]) -> str:
 def _ask(question: str) -> None:
     """Go on after a yes. Raises `Refused` after anything else, `WrongUsage` where nobody can answer."""
     if not sys.stdin.isatty():
-        raise WrongUsage(f"{question} there is no terminal to ask at: say --yes")
+        raise WrongUsage(f"{question} there is no terminal to ask at: confirm with --yes")
     if not typer.confirm(question, err=True):
         tell("nothing is removed")
         raise Refused

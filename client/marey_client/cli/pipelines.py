@@ -136,7 +136,7 @@ def _choose(chosen: dict[str, Any], path: Sequence[str], value: Any, told: str) 
     for depth, name in enumerate(path[:-1], start=1):
         place = place.setdefault(name, {})
         if not isinstance(place, dict):
-            raise WrongUsage(f"{told} does not go with --set {'.'.join(path[:depth])}={place}; give one of them")
+            raise WrongUsage(f"{told} conflicts with --set {'.'.join(path[:depth])}={place}; give one of them")
     place[path[-1]] = value
 
 
@@ -147,7 +147,7 @@ def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[st
         if len({address.project for address in addresses}) > 1:
             raise WrongUsage("the takes must be in one project")
         if options:
-            raise WrongUsage("import.… is for files of this machine; name the project they go to with --project")
+            raise WrongUsage("import.… is for local files; give their project with --project")
         return addresses[0].project, {"takes": [clips_at(marey, address) for address in addresses]}
     from marey_client.imports import find_files, left_out_text
     from marey_schemas.options.imports import ImportOptions

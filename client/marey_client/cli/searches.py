@@ -91,7 +91,7 @@ def search(
     from marey_schemas.search import SearchRequest
 
     if format not in MOTION_FORMATS:
-        raise WrongUsage(f"{format!r} is no format; there are {', '.join(MOTION_FORMATS)}")
+        raise WrongUsage(f"{format!r} is not a format; the formats are {', '.join(MOTION_FORMATS)}")
     asked: dict[str, Any] = _read_request(request)
     tolerance_m = None if tolerance_cm is None else tolerance_cm * 0.01
     constraints = [
@@ -106,7 +106,7 @@ def search(
     if constraints:
         asked["constraints"] = constraints
     if not (asked.get("constraints") or asked.get("steps")):
-        raise WrongUsage("nothing is asked for; give --at WHEN:JOINT=x,y,z or another constraint")
+        raise WrongUsage("there are no constraints; give --at WHEN:JOINT=x,y,z or another one")
     asked |= params
     if start is not None:
         asked["start"] = _start(start)
@@ -130,7 +130,7 @@ def _read_request(path: Path | None) -> dict[str, Any]:
         return {}
     read = read_json(path)
     if not isinstance(read, dict):
-        raise WrongUsage(f"{path}: a request is a JSON object")
+        raise WrongUsage(f"{path}: a request must be a JSON object")
     return read
 
 
@@ -182,7 +182,7 @@ def _numbers(text: str, count: int, whole: str) -> list[float | None]:
     except ValueError:
         raise WrongUsage(f"{whole!r}: {text!r} is not {count} numbers") from None
     if len(numbers) != count:
-        raise WrongUsage(f"{whole!r}: {len(numbers)} numbers where there are {count}")
+        raise WrongUsage(f"{whole!r}: {len(numbers)} numbers instead of {count}")
     return numbers
 
 

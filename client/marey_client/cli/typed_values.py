@@ -197,11 +197,11 @@ def read_numbers(text: str, most: int | None = None) -> list[float]:
         raise WrongUsage(f"{text!r}: a range is first:last:step, as in 1:3:0.25")
     first, last, step = numbers
     if not (step > 0 and last >= first):
-        raise WrongUsage(f"{text!r}: a range goes up in steps above 0")
+        raise WrongUsage(f"{text!r}: in a range first:last:step, last must be at least first and step above 0")
     most = most or MOST_VALUES
     steps = (last - first) / step + EVEN
     if steps >= most:
-        raise WrongUsage(f"{text!r}: the range has over {most} values, the most that are possible")
+        raise WrongUsage(f"{text!r}: the range has more than {most} values")
     return [first + index * step for index in range(int(steps) + 1)]
 
 
@@ -214,9 +214,9 @@ def read_json(file: Path | str) -> Any:
     try:
         return json.loads(data.decode("utf-8-sig"))
     except UnicodeDecodeError:
-        raise WrongUsage(f"{_named(file)} is no text in UTF-8") from None
+        raise WrongUsage(f"{_named(file)} is not text in UTF-8") from None
     except (ValueError, RecursionError) as error:
-        raise WrongUsage(f"{_named(file)} is no JSON: {error}") from None
+        raise WrongUsage(f"{_named(file)} is not JSON: {error}") from None
 
 
 def _read(file: str) -> bytes:

@@ -109,8 +109,8 @@ def frames_text(frames: slice | None) -> str | None:
     if frames is None:
         return None
     if frames.step not in (None, 1):
-        raise ValueError(f"frames go one by one, not in steps of {frames.step}; slice the arrays instead")
+        raise ValueError(f"frames: a step of {frames.step} is not possible; slice the arrays instead")
     bounds: tuple[Any, Any] = (frames.start, frames.stop)
     if any(bound is not None and bound < 0 for bound in bounds):
-        raise ValueError("frames count from the start; a negative bound is not understood")
+        raise ValueError("frames are counted from the start; negative bounds are not possible")
     return ":".join("" if bound is None else str(bound) for bound in bounds)

@@ -62,7 +62,7 @@ class EvaluationHandle(ReportedHandle):
         """Write the walk graph to a file, as GraphML or JSON by the ending of its name."""
         form = Path(path).suffix.lower().removeprefix(".")
         if form not in ("json", "graphml"):
-            raise ValueError(f"{path}: a walk graph is written as .json or .graphml")
+            raise ValueError(f"{path}: the name of a walk graph must end in .json or .graphml")
         return saved(path, self._walk_graph(form, trial))
 
     def _walk_graph(self, form: str, trial: str | None) -> bytes:

@@ -60,7 +60,9 @@ class PipelineRun:
             left_s = LONGEST_WAIT_S if deadline is None else deadline - time.monotonic()
             if left_s <= 0:
                 unfinished = ", ".join(name for name, job in self._steps.items() if not job.state.terminal)
-                raise WaitedTooLong(f"after {timeout_s:g} s these steps have not ended: {unfinished}; they go on")
+                raise WaitedTooLong(
+                    f"after {timeout_s:g} s these steps have not ended: {unfinished}; they continue on the server"
+                )
             asked = time.monotonic()
             self._look(wait_s=min(left_s, LOOK_EVERY_S if on_progress else LONGEST_WAIT_S))
             if not self.ended:

@@ -70,5 +70,5 @@ class AlignmentInfo(Request):
             raise ValueError(f"time_function: must go from 0 to {self.source_frames - 1}, the last frame of the source")
         for label, frame in self.keyframes.items():
             if frame >= len(times):
-                raise ValueError(f"keyframes.{label}: there are {len(times)} canonical frames")
+                raise ValueError(f"keyframes.{label}: frame {frame} is outside the {len(times)} canonical frames")
         return self

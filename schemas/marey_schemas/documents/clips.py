@@ -47,13 +47,13 @@ class MotionDocument(Request):
         if width != 3 + 4 * len(self.joints):
             raise ValueError(f"poses: {width} columns, but {len(self.joints)} joints need {3 + 4 * len(self.joints)}")
         if (self.translations is None) != (not self.translated_joints):
-            raise ValueError("translations and translated_joints go together")
+            raise ValueError("give translations and translated_joints together")
         if self.translations is not None and self.translations.shape != (frames, len(self.translated_joints), 3):
             raise ValueError(
                 f"translations: shape {self.translations.shape}, expected {(frames, len(self.translated_joints), 3)}"
             )
         if unknown := set(self.translated_joints) - set(self.joints):
-            raise ValueError(f"translated_joints: {sorted(unknown)} are none of the joints")
+            raise ValueError(f"translated_joints: {sorted(unknown)} are not joints of the motion")
         return self
 
 

@@ -63,7 +63,7 @@ class ModelGraph(Request):
             for name, node in group.primitives.items()
         }
         if len(nodes) > MOST_PRIMITIVES:
-            raise ValueError(f"actions: {len(nodes)} primitives; {MOST_PRIMITIVES} are accepted")
+            raise ValueError(f"actions: {len(nodes)} primitives; at most {MOST_PRIMITIVES} are accepted")
         _require_known(nodes, "start", [self.start])
         for place, node in nodes.items():
             _require_known(nodes, f"{place}: transitions", node.transitions)
@@ -74,13 +74,15 @@ class ModelGraph(Request):
             raise ValueError(f"{_first(lost)}: it cannot be reached from the start, {self.start}")
         ends = [place for place, node in nodes.items() if node.type in TYPES_TO_END_IN]
         if not ends:
-            raise ValueError(f"actions: no primitive is of a type to end in: {', '.join(TYPES_TO_END_IN)}")
+            raise ValueError(
+                f"actions: at least one primitive must have a type that ends a sequence: {', '.join(TYPES_TO_END_IN)}"
+            )
         precedes: dict[GraphPlace, set[GraphPlace]] = {place: set() for place in nodes}
         for place, following in follows.items():
             for other in following:
                 precedes[other].add(place)
         if stuck := nodes.keys() - _reached(ends, precedes):
-            raise ValueError(f"{_first(stuck)}: no primitive to end in can be reached from it")
+            raise ValueError(f"{_first(stuck)}: no primitive that ends a sequence can be reached from it")
         return self
 
 

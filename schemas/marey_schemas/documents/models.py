@@ -170,14 +170,14 @@ class MotionPrimitiveDocument(Request):
         if self.spatial.mean.shape[1] != width:
             raise ValueError(f"spatial: {self.spatial.mean.shape[1]} channels, but the joints need {width}")
         if self.temporal.mean.shape[1] != 1:
-            raise ValueError(f"temporal: {self.temporal.mean.shape[1]} channels where there is 1")
+            raise ValueError(f"temporal: {self.temporal.mean.shape[1]} channels; it must have 1")
         if self.duration_range_s is not None and not self.duration_range_s[0] <= self.duration_range_s[1]:
-            raise ValueError("duration_range_s: the most must not be less than the least")
+            raise ValueError("duration_range_s: the second number must not be less than the first")
         dimensions = len(self.spatial.directions) + len(self.temporal.directions)
         if self.mixture.means.shape[1] != dimensions:
             raise ValueError(f"mixture: {self.mixture.means.shape[1]} dimensions for {dimensions} components")
         if self.log_slope_range is not None and not self.log_slope_range[0] <= self.log_slope_range[1]:
-            raise ValueError("log_slope_range: must be a lower and an upper limit")
+            raise ValueError("log_slope_range: the second number must not be less than the first")
         return self
 
 

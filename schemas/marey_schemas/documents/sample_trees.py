@@ -43,7 +43,7 @@ class SampleTreeDocument(Request):
         if len(self.sizes) != len(self.children):
             raise ValueError(f"children: {len(self.children)} values for {len(self.sizes)} nodes")
         if not len(self.sizes) or self.sizes[0] != len(self.samples):
-            raise ValueError(f"sizes: the first node holds all {len(self.samples)} samples")
+            raise ValueError(f"sizes: the first node must hold all {len(self.samples)} samples")
         if len(self.samples) > MOST_TREE_SAMPLES:
             raise ValueError(f"samples: {len(self.samples):,}, over {MOST_TREE_SAMPLES:,}")
         return self

@@ -50,7 +50,7 @@ class SkeletonHierarchy(Request):
         seen: set[str] = set()
         for index, joint in enumerate(self.joints):
             if joint.name in seen:
-                raise ValueError(f"joints[{index}]: the name {joint.name!r} stands twice")
+                raise ValueError(f"joints[{index}]: the name {joint.name!r} is used twice")
             seen.add(joint.name)
             if (joint.parent == -1) != (index == 0) or joint.parent >= index:
                 place = f"joints[{index}] ({joint.name})"

@@ -82,7 +82,9 @@ class PositionConstraint(_Constraint):
     @model_validator(mode="after")
     def _check_place(self) -> Self:
         if self.point_m is not None and self.shift_m is not None:
-            raise ValueError("point_m, shift_m: one of them, or neither to hold the joint where it first is")
+            raise ValueError(
+                "give point_m or shift_m, not both; without them the joint stays where it is in the first frame"
+            )
         return self
 
 

@@ -37,7 +37,7 @@ class EditPreviewRequest(Request):
     @model_validator(mode="after")
     def _check_commands(self) -> Self:
         if (self.edit is None) == (not self.commands):
-            raise ValueError("give either commands or an edit, and not both")
+            raise ValueError("give either commands or an edit, not both")
         return self
 
 

@@ -190,7 +190,7 @@ def _read_head(data: bytes) -> tuple[_Layout, list[int]]:
     sizes = np.frombuffer(data, "<u4", count, table)
     starts = [end + 4, *(end + 4 + np.cumsum(sizes, dtype=np.int64)).tolist()]
     if starts[-1] != len(data):
-        raise BlockError(f"{len(data)} bytes were given where the index says {starts[-1]}")
+        raise BlockError(f"{len(data)} bytes were given, but the index gives {starts[-1]}")
     return layout, starts
 
 

@@ -126,7 +126,7 @@ def _parse_msgpack(data: bytes) -> Any:
 def _parse_bson(data: bytes) -> Any:
     # Read lazily, object by object: an eager read would turn {"$ref", "$id"} into a database reference.
     if int.from_bytes(data[:4], "little", signed=True) != len(data):
-        raise ValueError(f"its size is not the {len(data)} bytes that were given")
+        raise ValueError(f"its stated size differs from the {len(data)} bytes that were given")
     return RawBSONDocument(data)
 
 
@@ -175,7 +175,7 @@ class _Walk:
     def visit(self, value: Any) -> Any:
         """The checked and converted value. Raises `CodecError`."""
         if isinstance(value, _FOREIGN):
-            raise self._error("bad-type", f"a value of type {type(value).__name__} cannot travel")
+            raise self._error("bad-type", f"a value of type {type(value).__name__} cannot be encoded")
         if isinstance(value, str):
             return self._text(value)
         if value is None or isinstance(value, bool):
@@ -192,7 +192,7 @@ class _Walk:
             return self._array(self._on_array, value)
         if isinstance(value, np.generic) and value.dtype.newbyteorder("<").str in DTYPES and self._on_array is not None:
             return self.visit(value.item())
-        raise self._error("bad-type", f"a value of type {type(value).__name__} cannot travel")
+        raise self._error("bad-type", f"a value of type {type(value).__name__} cannot be encoded")
 
     def _object(self, value: Mapping[Any, Any]) -> Any:
         self._enter()
@@ -211,7 +211,7 @@ class _Walk:
     def _list(self, value: list[Any] | tuple[Any, ...]) -> list[Any]:
         self._enter()
         if len(value) > MAX_LIST:
-            raise self._error("too-large", f"a list of {len(value)}; above {MAX_LIST} numbers must travel as an array")
+            raise self._error("too-large", f"a list of {len(value)}; above {MAX_LIST} numbers must be sent as an array")
         items = []
         for index, item in enumerate(value):
             self._path.append(index)
@@ -251,7 +251,7 @@ class _Walk:
 
     def _float(self, number: float) -> float:
         if not math.isfinite(number):
-            raise self._error("not-finite", f"{number} cannot travel; only finite numbers may")
+            raise self._error("not-finite", f"{number} cannot be encoded; only finite numbers can")
         return float(number)
 
     def _enter(self) -> None:

@@ -32,7 +32,7 @@ class CostOptions(Options):
     @classmethod
     def _check_window(cls, window: int) -> int:
         if window % 2 == 0:
-            raise ValueError("must be odd: as many frames before as after")
+            raise ValueError("must be odd, with as many frames before as after")
         return window
 
 

@@ -74,4 +74,4 @@ class EvaluationOptions(Grid):
 
 def _require_different(name: str, values: tuple[object, ...]) -> None:
     if len(set(values)) != len(values):
-        raise ValueError(f"{name}: the same value stands twice")
+        raise ValueError(f"{name}: a value is repeated")

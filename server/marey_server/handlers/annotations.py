@@ -38,7 +38,7 @@ class AnnotationCommands(Resource):
         at it.
         """
         if kind_of(kind) is not Kind.ANNOTATION:
-            raise NotFoundProblem(f"There are no commands for {kind}; only for annotations.", code="no-commands")
+            raise NotFoundProblem(f"Commands can be applied to annotations, not to {kind}.", code="no-commands")
         expected_rev = self.precondition.expected_rev
         for _ in range(MOST_TRIES):
             found = await self.look_up(items.find_annotation, project, item)
@@ -48,7 +48,9 @@ class AnnotationCommands(Resource):
             except PreconditionFailedProblem:
                 if expected_rev is not None:
                     raise
-        raise ConflictProblem("Others keep changing this annotation; try again.", code="changed-meanwhile")
+        raise ConflictProblem(
+            "Other requests changed this annotation at the same time; try again.", code="changed-meanwhile"
+        )
 
 
 class ClipAnnotations(Resource):

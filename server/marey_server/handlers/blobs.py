@@ -22,7 +22,7 @@ _DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
 def require_digest(text: str) -> str:
     """The text, if it can name a blob. Raises `NotFoundProblem`."""
     if not _DIGEST.fullmatch(text):
-        raise NotFoundProblem("Blobs are named sha256: and 64 hexadecimal digits.", code="no-blob")
+        raise NotFoundProblem("A blob is identified by sha256: and 64 hexadecimal digits.", code="no-blob")
     return text
 
 

@@ -59,7 +59,7 @@ class Events(Resource):
         if text is None:
             return query.after
         if not text.isascii() or not text.isdigit() or len(text) > 18:
-            raise BadRequestProblem("Last-Event-ID is the number of an event.", code="bad-event-id")
+            raise BadRequestProblem("Last-Event-ID must be the number of an event.", code="bad-event-id")
         return int(text)
 
     async def _follow(self, project: str, after: int, found: list[Event]) -> None:

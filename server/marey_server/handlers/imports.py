@@ -124,7 +124,7 @@ class ProjectImports(Resource):
             options = ImportOptions.model_validate(request.model_dump(exclude={"files"}, exclude_unset=True))
             self.files = await self.look_up(_stored_files, request)
         if not self.files:
-            raise BadRequestProblem("The request holds no files.", code="no-files")
+            raise BadRequestProblem("The request contains no files.", code="no-files")
         if self._is_large(self.files):
             return await self._submit(project, options)
         return Reply(ImportAnswer(entries=tuple(await self._import_now(project, options))))
@@ -206,7 +206,7 @@ def _form_options(form: dict[str, bytearray]) -> ImportOptions:
     try:
         values: dict[str, Any] = {name: value.decode() for name, value in form.items()}
     except UnicodeDecodeError:
-        raise BadRequestProblem("Form fields are UTF-8.", code="bad-multipart") from None
+        raise BadRequestProblem("Form fields must be UTF-8.", code="bad-multipart") from None
     if "tags" in values:
         values["tags"] = [tag for tag in values["tags"].split(",") if tag]
     try:

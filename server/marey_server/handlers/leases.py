@@ -110,7 +110,9 @@ class AttemptLog(Resource):
         """Append to the attempt's log at `Upload-Offset`; 409 with the true offset where it goes on elsewhere."""
         text = self.request.headers.get("Upload-Offset", "")
         if not (text.isascii() and text.isdigit() and len(text) <= 15):
-            raise BadRequestProblem("Upload-Offset says how many bytes the log has already.", code="bad-upload-offset")
+            raise BadRequestProblem(
+                "Upload-Offset must be the number of bytes that the log has already.", code="bad-upload-offset"
+            )
         policy = self.services.queue_policy
         return await self.answer(logs.append_log, job, fence, int(text), body or b"", policy)
 

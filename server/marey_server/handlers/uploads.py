@@ -56,7 +56,7 @@ class UploadResource(Resource):
         """Check where the piece belongs before it comes."""
         text = self.request.headers.get("Upload-Offset", "")
         if not text.isascii() or not text.isdigit() or len(text) > 12:
-            raise BadRequestProblem("Say in Upload-Offset where the piece starts.", code="bad-offset")
+            raise BadRequestProblem("Send Upload-Offset with the offset of the piece.", code="bad-offset")
         self.upload_id, self.offset, self.piece = upload, int(text), bytearray()
         await self._append()
 

@@ -58,7 +58,7 @@ def parse_tags(header: str) -> list[str]:
             raise BadRequestProblem(f"Entity tags are separated by commas: {header[:200]}")
         position += 1
     if not tags:
-        raise BadRequestProblem("The header names no entity tag.")
+        raise BadRequestProblem("The header contains no entity tag.")
     return tags
 
 
@@ -78,17 +78,17 @@ def write_precondition(if_match: str | None, if_none_match: str | None, *, may_c
     """
     if if_none_match is not None and may_create:
         if if_none_match.strip() != "*":
-            raise BadRequestProblem("If-None-Match of a change can only be *: create, never replace.")
+            raise BadRequestProblem("If-None-Match of a change must be *, which creates and never replaces.")
         return ABSENT
     if if_match is None:
         hint = "If-Match with the ETag you read, or *" + (", or If-None-Match: * to create" if may_create else "")
-        raise PreconditionRequiredProblem(f"Say which state you are changing: {hint}.")
+        raise PreconditionRequiredProblem(f"State which version you are changing: {hint}.")
     tags = parse_tags(if_match)
     if tags == ["*"]:
         return ANY_STATE
     revs = sorted({int(rev) for tag in tags if _REV.fullmatch(rev := tag.partition(".")[0])})
     if not revs:
-        raise PreconditionFailedProblem(f"{if_match[:200]} is no state of this; read it again.")
+        raise PreconditionFailedProblem(f"{if_match[:200]} is not a version of this resource; read it again.")
     if len(revs) > MOST_STATES:
-        raise BadRequestProblem(f"If-Match names {len(revs)} states; at most {MOST_STATES} are possible.")
+        raise BadRequestProblem(f"If-Match names {len(revs)} versions; at most {MOST_STATES} are possible.")
     return Precondition(revs[0] if len(revs) == 1 else frozenset(revs))

@@ -36,12 +36,12 @@ def boundary_of(content_type: str) -> bytes:
     media_type, parameters = parse_options_header(content_type)
     if media_type != b"multipart/form-data":
         raise UnsupportedMediaTypeProblem(
-            f"Files are sent as multipart/form-data, not {content_type or 'without a type'}."
+            f"Files must be sent as multipart/form-data, not {content_type or 'without a type'}."
         )
     boundary = parameters.get(b"boundary", b"")
     if not 0 < len(boundary) <= MAX_BOUNDARY_BYTES:
         raise BadRequestProblem(
-            f"The Content-Type names no boundary of 1 to {MAX_BOUNDARY_BYTES} bytes.", code="bad-multipart"
+            f"The Content-Type contains no boundary of 1 to {MAX_BOUNDARY_BYTES} bytes.", code="bad-multipart"
         )
     return boundary
 

@@ -70,7 +70,7 @@ def choose(accept: str | None, offers: tuple[MediaType, ...]) -> MediaType:
     if chosen is None:
         names = ", ".join(map(str, offers))
         raise NotAcceptableProblem(
-            f"This is offered as {names}.", context={"offered": [str(offer) for offer in offers]}
+            f"This resource is available as {names}.", context={"offered": [str(offer) for offer in offers]}
         )
     return chosen
 
@@ -134,7 +134,7 @@ def require_plain_encoding(content_encoding: str | None) -> None:
     """
     if content_encoding and content_encoding.strip().lower() not in ("", "identity"):
         raise UnsupportedMediaTypeProblem(
-            f"Bodies are read as they are; leave out Content-Encoding: {content_encoding}."
+            f"Compressed bodies are not accepted; leave out Content-Encoding: {content_encoding}."
         )
 
 

@@ -43,4 +43,4 @@ class Receiver:
         try:
             self.spool.write(batch)
         except OSError as error:
-            raise StorageFullProblem(f"There is no room to take this in: {error.strerror}.") from error
+            raise StorageFullProblem(f"There is no room to receive this: {error.strerror}.") from error

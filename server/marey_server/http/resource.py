@@ -229,7 +229,7 @@ class Resource(Exchange):
             return
         if self.declared_length() > body.max_bytes:
             raise TooLargeProblem(
-                f"The body has {self.declared_length()} bytes; at most {body.max_bytes} are taken here."
+                f"The body has {self.declared_length()} bytes; at most {body.max_bytes} are accepted here."
             )
         if body.content is not Bytes and not body.streamed:
             self.body_type = negotiation.body_type(self.request.headers.get("Content-Type"))
@@ -250,7 +250,7 @@ class Resource(Exchange):
         try:
             limit = body.max_bytes if body is not None else 0
             if self.received_bytes > limit:
-                raise TooLargeProblem(f"The body is longer than the {limit} bytes that are taken here.")
+                raise TooLargeProblem(f"The body is longer than the {limit} bytes that are accepted here.")
             if body is not None and body.streamed:
                 await self.receive(chunk)
             else:

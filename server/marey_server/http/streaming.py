@@ -42,7 +42,9 @@ class ByteRange:
             start, stop = self.first, size if self.last is None else min(self.last + 1, size)
         if start >= stop:
             headers = {"Content-Range": f"bytes */{size}"}
-            raise RangeNotSatisfiableProblem(f"It has {size} bytes; none of the range is among them.", headers=headers)
+            raise RangeNotSatisfiableProblem(
+                f"The resource has {size} bytes; the range is outside them.", headers=headers
+            )
         return start, stop
 
 

@@ -152,7 +152,7 @@ def _add_poses(online: OnlineCoverage, held: Stream, frames: CoverageFrames) -> 
     if held.rig is None:
         fault = _fault("/poses", "no-skeleton", "These need a skeleton.")
         raise InvalidProblem(
-            "The stream was made without a skeleton; send roots, or make one with it.",
+            "The stream was created without a skeleton; send roots, or create a stream with a skeleton.",
             code="no-skeleton",
             errors=[fault],
         )

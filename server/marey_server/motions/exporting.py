@@ -78,7 +78,9 @@ def find_original(
         info = items.read_part(tx, project, kind, item_id, "info", revision=revision, arrays="none").tree
         if (original := original_of_clip(item_id, info)) is not None:
             return original
-    raise NotFoundProblem("It was not made from a file; ask for another format, such as bvh.", code="no-original")
+    raise NotFoundProblem(
+        "The item was not imported from a file; request another format, such as bvh.", code="no-original"
+    )
 
 
 def write_file(
@@ -86,9 +88,7 @@ def write_file(
 ) -> ServedFile:
     """The file of an item. Raises `InvalidProblem` where the format cannot hold it."""
     if time == "source" and source.kind is not Kind.PROCESSED:
-        raise InvalidProblem(
-            "Only an aligned clip has a time of its own and that of its source.", code="no-such-export"
-        )
+        raise InvalidProblem("Only aligned clips can be exported in their source's time.", code="no-such-export")
     beside = source.kind is Kind.PROCESSED and options.part == "alignment"
     if file_format == "predecessor" and (beside or source.kind not in WITH_MOTION):
         name, data = write_predecessor(source.kind, source.name, source.parts, source.hierarchy, options)
@@ -96,7 +96,7 @@ def write_file(
     if file_format == "json":
         return ServedFile(f"{source.name}.json", codecs.JSON, item_as_json(source))
     if source.kind not in WITH_MOTION or source.hierarchy is None:
-        raise InvalidProblem(f"A {source.kind} is exported as json.", code="no-such-export")
+        raise InvalidProblem(f"An item of the kind {source.kind} can only be exported as json.", code="no-such-export")
     from marey_motion.errors import MotionError
     from marey_motion.exporting import write_motion_file
 

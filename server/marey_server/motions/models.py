@@ -59,7 +59,7 @@ class UsableModel:
 def find_model(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> FoundModel:
     """A model by its item. Raises `NotFoundProblem`."""
     if kind is not Kind.MODEL:
-        raise NotFoundProblem(f"A {kind} generates no motion; only models do.", code="not-a-model")
+        raise NotFoundProblem(f"An item of the kind {kind} generates no motion; only models do.", code="not-a-model")
     part = items.find_part(tx, project, kind, item_id, "model", revision=revision)
     return FoundModel(item_id, items.read_item(tx, project, kind, item_id).name, part)
 

@@ -101,7 +101,7 @@ def _written(
         if "tree" not in parts:
             raise NotFoundProblem("The model has no tree.", code="no-part")
         return "_cluster_tree.json", _tree(parts["model"], parts["tree"])
-    raise InvalidProblem(f"A {kind} is exported as json.", code="no-such-export")
+    raise InvalidProblem(f"An item of the kind {kind} can only be exported as json.", code="no-such-export")
 
 
 def _annotation(part: Mapping[str, Any], options: PredecessorOptions) -> bytes:

@@ -51,7 +51,7 @@ class PreviewSource:
 def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, request: EditPreviewRequest) -> PreviewSource:
     """Read what a preview needs. Raises `NotFoundProblem`, and `TooLargeProblem` for work that needs a job."""
     if kind is not Kind.CLIP:
-        raise NotFoundProblem(f"A {kind} is not edited; clips are.", code="not-a-clip")
+        raise NotFoundProblem(f"An item of the kind {kind} cannot be edited; clips can.", code="not-a-clip")
     edit = EditDocument(commands=request.commands) if request.edit is None else _read_edit(tx, project, request)
     motion = items.read_part(tx, project, Kind.CLIP, item_id, "motion", revision=request.revision).tree
     numbers = _size(motion)
@@ -99,7 +99,7 @@ def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
     shown = wanted.clip.sliced(start, stop)
     if shown.poses.size > MOST_SHOWN:
         raise TooLargeProblem(
-            f"{stop - start} frames are too many for one preview; ask for some of them.", code="preview-too-large"
+            f"{stop - start} frames are too many for one preview; request a shorter range.", code="preview-too-large"
         )
     skeleton = MotionDocument.model_validate(source.motion).skeleton
     return EditPreview(

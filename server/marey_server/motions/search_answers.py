@@ -92,7 +92,7 @@ def search(searchables: Sequence[Searchable], request: SearchRequest) -> SearchR
 def _require_quick(work: float) -> None:
     if work > MOST_WORK:
         raise TooLargeProblem(
-            f"This takes about {work / MOST_WORK:.1f} times as long as a search may; ask for fewer steps, constraints, "
+            f"This takes about {work / MOST_WORK:.1f} times as long as allowed; request fewer steps, constraints, "
             "candidates, passes or iterations.",
             code="search-too-large",
         )
@@ -104,7 +104,7 @@ def _require_room(steps: Sequence[Step], sequel: Sequel) -> None:
     size = frames * steps[0].primitive.spatial.mean.shape[1] * 4
     if not size <= LARGEST_ANSWER_BYTES:
         raise TooLargeProblem(
-            f"What was found lasts {frames:,.0f} frames, too many for an answer; ask for fewer steps.",
+            f"The motion found has {frames:,.0f} frames, too many for an answer; ask for fewer steps.",
             code="search-too-large",
         )
 

@@ -75,7 +75,7 @@ def find_searchables(
 ) -> list[FoundSearchable]:
     """The model of each step. Raises `NotFoundProblem`."""
     if kind is not Kind.MODEL:
-        raise NotFoundProblem(f"A {kind} cannot be searched; models can.", code="not-a-model")
+        raise NotFoundProblem(f"An item of the kind {kind} cannot be searched; models can.", code="not-a-model")
     wanted = [step.model or item_id for step in request.asked_steps]
     found = {item: _find(tx, project, item) for item in dict.fromkeys(wanted)}
     return [found[item] for item in wanted]

@@ -34,7 +34,9 @@ class WalkSource:
 def read_walks(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> WalkSource:
     """Read an evaluation and the ticks of its trials. Raises `NotFoundProblem`."""
     if kind is not Kind.EVALUATION:
-        raise NotFoundProblem(f"A {kind} has no walk graph; evaluations have one.", code="not-an-evaluation")
+        raise NotFoundProblem(
+            f"An item of the kind {kind} has no walk graph; evaluations have one.", code="not-an-evaluation"
+        )
     name = items.read_item(tx, project, kind, item_id).name
     evaluation, records = (
         items.read_part(tx, project, kind, item_id, part, revision=revision, arrays="decoded").tree

@@ -55,7 +55,7 @@ class ComputeThreads:
             await asyncio.wait_for(self._long_places.acquire(), LONGEST_WAIT_S)
         except TimeoutError:
             raise UnavailableProblem(
-                "Others are computing; try again in some seconds.",
+                "Other requests are using all computing threads; try again in a few seconds.",
                 code="computing",
                 headers={"Retry-After": str(ASK_AGAIN_S)},
             ) from None

@@ -55,7 +55,7 @@ class TryLimit:
         if left < 1:
             self._buckets.put(key, (left, now))
             wait_s = math.ceil((1 - left) * 60 / self._per_minute)
-            raise TooManyRequestsProblem(f"Too many tries; wait {wait_s} s.", headers={"Retry-After": str(wait_s)})
+            raise TooManyRequestsProblem(f"Too many attempts; wait {wait_s} s.", headers={"Retry-After": str(wait_s)})
         self._buckets.put(key, (left - 1, now))
 
 

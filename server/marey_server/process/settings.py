@@ -97,7 +97,9 @@ class Settings(BaseSettings):
     def _check_heartbeat(cls, heartbeat_s: float, others: ValidationInfo) -> float:
         lease_ttl_s = others.data.get("lease_ttl_s")  # absent where it was refused itself
         if lease_ttl_s is not None and heartbeat_s > lease_ttl_s / 2:
-            raise ValueError(f"at most half of lease_ttl_s, which is {lease_ttl_s:g}: jobs would be lost as they run")
+            raise ValueError(
+                f"at most half of lease_ttl_s, which is {lease_ttl_s:g}: otherwise running jobs would be lost"
+            )
         return heartbeat_s
 
     @classmethod

@@ -105,7 +105,7 @@ def put_blob(tx: Transaction, content: bytes | Spool, *, expected: str | None = 
     digest = digest_of(content) if isinstance(content, bytes) else content.digest
     if expected is not None and digest != expected:
         raise InvalidProblem(
-            f"The bytes are {digest}, not {expected}: they were changed on the way.", code="digest-mismatch"
+            f"The bytes are {digest}, not {expected}: they were changed in transit.", code="digest-mismatch"
         )
     store_blob(tx, digest, content)
     add_holder(tx, digest)

@@ -70,7 +70,7 @@ def prepare_document(tree: Any, *, schema: str | None = None) -> PreparedDocumen
     except (ValueError, TypeError, RecursionError) as error:
         raise InvalidProblem(f"This cannot be stored as a document: {error}", code="bad-document") from error
     if _NUL.search(canonical):
-        raise InvalidProblem("Text in documents must not hold the character U+0000.", code="bad-text")
+        raise InvalidProblem("Text in documents must not contain the character U+0000.", code="bad-text")
     body = json.loads(canonical)
     leaves, files = references_of(name, body)
     arrays = {
@@ -87,7 +87,7 @@ def prepared(content: Any, *, schema: str | None = None) -> PreparedDocument:
     if not isinstance(content, PreparedDocument):
         return prepare_document(content, schema=schema)
     if schema not in (None, OPEN_SCHEMA, content.schema):
-        raise InvalidProblem(f"This part holds {schema}, not {content.schema}.", code="bad-schema")
+        raise InvalidProblem(f"This part must have the schema {schema}, not {content.schema}.", code="bad-schema")
     return content
 
 
@@ -99,7 +99,7 @@ def with_body(content: PreparedDocument, body: Tree) -> PreparedDocument:
 
 def _check(tree: Any, schema: str | None) -> str:
     if not isinstance(tree, Mapping):
-        raise InvalidProblem("A document is an object.", code="bad-document")
+        raise InvalidProblem("A document must be an object.", code="bad-document")
     named = tree.get("schema", schema)
     if schema is not None and schema != OPEN_SCHEMA and named != schema:
         raise InvalidProblem(f"This part holds {schema}, not {named!r}.", code="bad-schema")
@@ -113,7 +113,7 @@ def _check(tree: Any, schema: str | None) -> str:
     except ValidationError as error:
         errors = field_errors(error, tree)
         raise InvalidProblem(
-            f"This is no valid {named}: {errors[0].pointer}: {errors[0].detail}", errors=errors
+            f"This is not a valid {named}: {errors[0].pointer}: {errors[0].detail}", errors=errors
         ) from error
     return str(named or OPEN_SCHEMA)
 

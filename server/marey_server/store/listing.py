@@ -54,9 +54,11 @@ def parse_order(text: str, keys: Mapping[str, ColumnElement[Any]], unique: str =
     names = [part.strip() for part in text.split(",") if part.strip()]
     bare = [name.removeprefix("-") for name in names]
     if unknown := [name for name in bare if name not in keys]:
-        raise BadRequestProblem(f"This cannot be sorted by {unknown[0]!r}; by {', '.join(keys)}.", code="bad-sort")
+        raise BadRequestProblem(
+            f"This list cannot be sorted by {unknown[0]!r}, but by {', '.join(keys)}.", code="bad-sort"
+        )
     if len(set(bare)) != len(bare):
-        raise BadRequestProblem("A sort key stands twice.", code="bad-sort")
+        raise BadRequestProblem("A sort key is repeated.", code="bad-sort")
     if unique in bare:
         names = names[: bare.index(unique) + 1]
     else:

@@ -102,7 +102,7 @@ def _require_owner(tx: Transaction, project_row: ProjectRow) -> None:
     owners = select(func.count()).where(member.c.project_id == project_row.id, member.c.role == Role.OWNER.value)
     if tx.execute(owners).scalar_one() == 0:
         raise ConflictProblem(
-            "A project keeps at least one owner; make somebody else an owner first.", code="last-owner"
+            "A project needs at least one owner; make somebody else an owner first.", code="last-owner"
         )
 
 

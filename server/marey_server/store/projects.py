@@ -98,7 +98,9 @@ def require(
             raise UnauthenticatedProblem(f"Sign in to do this in {name!r}.")
         raise ForbiddenProblem(f"This needs the role {need.value} in {name!r}.", code="insufficient-role")
     if not seen.guest and not scopes.allows(tx.principal.scopes, required.scope, name):
-        raise ForbiddenProblem(f"This token does not reach {required.scope!r} in {name!r}.", code="insufficient-scope")
+        raise ForbiddenProblem(
+            f"This token does not include the scope {required.scope!r} in {name!r}.", code="insufficient-scope"
+        )
     return seen
 
 

@@ -152,7 +152,7 @@ def _even(pieces: Iterator[bytes]) -> Iterator[bytes]:
 def _sender(tx: Transaction) -> str:
     blobs.require_sender(tx.principal)
     if tx.principal.user_id is None:
-        raise ForbiddenProblem("Only users and their jobs upload.", code="users-only")
+        raise ForbiddenProblem("Only users and their jobs can upload.", code="users-only")
     return tx.principal.user_id
 
 

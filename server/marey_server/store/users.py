@@ -90,7 +90,9 @@ def change_user(
     elif not scopes.allows(tx.principal.scopes, "write"):
         raise ForbiddenProblem("This token may not change the user.", code="insufficient-scope")
     if not administrates and (request.administrator is not None or request.disabled is not None):
-        raise ForbiddenProblem("Only administrators make administrators and disable users.", code="administrators-only")
+        raise ForbiddenProblem(
+            "Only administrators can make administrators and disable users.", code="administrators-only"
+        )
     which: tuple[ColumnElement[bool], ...] = (user.c.name == name,)
     if request.password is not None and itself:
         if verified_hash is None:
@@ -103,7 +105,7 @@ def change_user(
     except NotFoundProblem:
         if verified_hash is None:
             raise
-        raise PreconditionFailedProblem("The password was changed meanwhile.", code="wrong-password") from None
+        raise PreconditionFailedProblem("The password was changed by another request.", code="wrong-password") from None
     _require_some_administrator(tx)
     tx.emit("user.changed", row.id, name=name, fields=sorted(values))
     return _shown(row)
@@ -130,7 +132,7 @@ def delete_user(tx: Transaction, name: str, *, expected_rev: ExpectedRev) -> Non
 def _require_some_administrator(tx: Transaction) -> None:
     left = select(func.count()).where(user.c.administrator.is_(True), user.c.disabled.is_(False))
     if tx.execute(left).scalar_one() == 0:
-        raise ConflictProblem("Somebody must stay an administrator.", code="last-administrator")
+        raise ConflictProblem("At least one user must be an administrator.", code="last-administrator")
 
 
 # -- signing in -------------------------------------------------------------------------------------------------------
@@ -150,7 +152,7 @@ def verify_password(tx: Transaction, name: str, password: str) -> Principal:
     """
     row = tx.execute(select(user).where(user.c.name == name, user.c.disabled.is_(False))).first()
     if not passwords.password_matches(password, None if row is None else row.password_hash) or row is None:
-        raise UnauthenticatedProblem("Name or password is wrong.", code="wrong-password")
+        raise UnauthenticatedProblem("The name or the password is wrong.", code="wrong-password")
     return _principal(row)
 
 

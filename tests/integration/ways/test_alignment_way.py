@@ -91,7 +91,10 @@ def test_an_aligned_clip_is_given_back_in_its_own_time_where_it_stood(
     wanted = source.motion()
     assert read.frame_count == len(wanted.poses)
     np.testing.assert_allclose(read.poses[:, :3], wanted.root_translations, atol=0.02)
-    assert "time of its own" in run("download", "lab/walks/walk b", "--format", "npz", "--restored", status=1).stderr
+    assert (
+        "in their source's time"
+        in run("download", "lab/walks/walk b", "--format", "npz", "--restored", status=1).stderr
+    )
 
 
 def test_keyframes_of_annotations_are_matched_and_become_those_of_the_set(lab: ProjectHandle) -> None:

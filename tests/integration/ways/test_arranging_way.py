@@ -85,18 +85,18 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run, lab):
         (["mv", "lab/raw/a", "lab/raw/b"], 1, "lab/raw/a: There is a clip of that name there already."),
         (["mv", "lab/raw/a", "studio/a"], 2, "lab/raw/a cannot move to another project"),
         (["mv", "lab/raw/nobody", "lab/raw/b"], 2, "there is nothing at lab/raw/nobody"),
-        (["mv", "lab/raw/a"], 2, "say what moves, and where to"),
+        (["mv", "lab/raw/a"], 2, "give what to move and the destination"),
         (["mv", "lab", "lab/b"], 2, "'lab' is a whole project"),
         (["mv", "lab/raw", "lab/raw/below/"], 1, "'raw' cannot move into itself"),
         (["mv", "lab/raw/a", "lab/nobody", "lab/other/"], 2, "there is nothing at lab/nobody"),
-        (["rm", "lab/raw"], 2, "remove 3 items (lab/raw/)? there is no terminal to ask at: say --yes"),
+        (["rm", "lab/raw"], 2, "remove 3 items (lab/raw/)? there is no terminal to ask at: confirm with --yes"),
         (["rm", "lab/raw/a", "lab/raw", "--yes"], 2, "lab/raw/a is in lab/raw, which is named, too"),
         (["rm", "lab/raw/a", "lab/raw/a", "--yes"], 2, "lab/raw/a is named twice"),
         (["rm", "lab/raw/a/", "--yes"], 2, "there is nothing at lab/raw/a"),
         (["restore", "lab/raw/a"], 2, "there is nothing deleted at lab/raw/a; marey ls --deleted lab shows"),
-        (["tag", "lab/raw/a"], 2, "say which tags"),
-        (["tag", "lab/raw", "--add", "x"], 2, "lab/raw is a folder; folders have no tags"),
-        (["rm", "lab/raw/a", "--kind", "stone"], 2, "'stone' is no kind"),
+        (["tag", "lab/raw/a"], 2, "give tags with --add"),
+        (["tag", "lab/raw", "--add", "x"], 2, "lab/raw is a folder, and folders have no tags"),
+        (["rm", "lab/raw/a", "--kind", "stone"], 2, "'stone' is not a kind of item"),
     ],
 )
 def test_what_cannot_be_is_told_and_changes_nothing(run, lab, arguments, status, told):
@@ -177,7 +177,7 @@ def test_a_disabled_user_is_let_in_again_and_an_administrator_made(run, marey, l
     assert (marey.users.get("ada").administrator, marey.users.get("ada").display_name) == (True, "Ada L.")
     run("user", "change", "ada", "--no-administrator")
     assert not marey.users.get("ada").administrator
-    assert "say what changes" in run("user", "change", "ada", status=2).stderr
+    assert "give --display-name or --administrator" in run("user", "change", "ada", status=2).stderr
 
 
 def test_a_place_where_nothing_is_is_told_and_an_item_listed_by_its_name(run, lab):

@@ -135,20 +135,20 @@ BUILD = ("build-model", "lab/walks", "--name", "w")
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["pipeline", "binary.json", "--project", "lab"], "binary.json is no text in UTF-8"),
+        (["pipeline", "binary.json", "--project", "lab"], "binary.json is not text in UTF-8"),
         (["pipeline", "nowhere.json", "--project", "lab"], "nowhere.json cannot be read: No such file or directory"),
         (["pipeline", "half.json", "--project", "lab"], "/steps/a/params/x: a string contains half of a surrogate"),
-        (["edit", "apply", "lab/a", "--into", "x", "--file", "binary.json"], "binary.json is no text in UTF-8"),
+        (["edit", "apply", "lab/a", "--into", "x", "--file", "binary.json"], "binary.json is not text in UTF-8"),
         (["edit", "apply", "lab/a", "--into", "x", "--file", "source.json"], "source other/x must be in the project"),
         (["search", "lab/m", "--request", "search.json"], "constraints: Input should be a valid tuple"),
-        ([*BUILD, "--set", "align.window=5", "--set", "align.window.x=2"], "does not go with --set align.window=5"),
-        ([*BUILD, "--set", "annotate.proposal=steps", "--propose", "steps"], "--propose steps does not go with --set"),
+        ([*BUILD, "--set", "align.window=5", "--set", "align.window.x=2"], "conflicts with --set align.window=5"),
+        ([*BUILD, "--set", "annotate.proposal=steps", "--propose", "steps"], "--propose steps conflicts with --set"),
         (["evaluate", "lab/walks", "--speeds", "1:inf:1"], "'1:inf:1': all values must be finite"),
         (["annotation", "add", "lab/a", "l", "0:" + "9" * 5000], "write label=first:end, as in step_left=120:180"),
-        (["ls", "lab", "--server", "http://["], "'http://[' is no address of a server; write it as in http://"),
-        (["ls", "lab", "--server", "http://127.0.0.1:99999"], "99999' is no address of a server"),
-        (["ls", "lab", "--server", "nowhere"], "'nowhere' is no address of a server"),
-        (["job", "show", os.fsdecode(b"\xff")], "is no text in UTF-8"),
+        (["ls", "lab", "--server", "http://["], "'http://[' is not the address of a server; write it like http://"),
+        (["ls", "lab", "--server", "http://127.0.0.1:99999"], "99999' is not the address of a server"),
+        (["ls", "lab", "--server", "nowhere"], "'nowhere' is not the address of a server"),
+        (["job", "show", os.fsdecode(b"\xff")], "is not text in UTF-8"),
     ],
 )
 def test_what_makes_no_sense_is_told_in_one_line_with_exit_status_2(arguments, told, nowhere, tmp_path):
@@ -212,7 +212,7 @@ def test_addresses_have_a_project_a_path_and_perhaps_an_id():
 def test_a_format_that_cannot_be_written_is_refused_before_anything_is_asked(nowhere):
     done = marey("download", "lab/raw", "--format", "gltf", env=nowhere)
     assert done.returncode == 2
-    assert "there are original, bvh, npz" in done.stderr
+    assert "the formats are original, bvh, npz" in done.stderr
 
 
 def test_a_folder_is_shown_without_reading_those_below_it(script):

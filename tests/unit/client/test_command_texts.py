@@ -44,7 +44,7 @@ def test_a_line_becomes_a_command(text: str, command: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("wobble", "there is no command 'wobble'; there are trim"),
+        ("wobble", "there is no command 'wobble'; the commands are trim"),
         ("", "there is no command"),
         ("trim begin=3", "trim has no parameter 'begin'; it has start, stop"),
         ("mirror left=1", "mirror has no parameter 'left'; it has none"),

@@ -12,11 +12,11 @@ from marey_client.cli.typed_values import read_json
 @pytest.mark.parametrize(
     ("data", "told"),
     [
-        (b"\xff\xfe\x00", "given.json is no text in UTF-8"),
-        (b"", "given.json is no JSON: Expecting value"),
-        (b"{", "given.json is no JSON"),
-        (b"[" * 100_000, "given.json is no JSON"),
-        (b"9" * 5000, "given.json is no JSON"),
+        (b"\xff\xfe\x00", "given.json is not text in UTF-8"),
+        (b"", "given.json is not JSON: Expecting value"),
+        (b"{", "given.json is not JSON"),
+        (b"[" * 100_000, "given.json is not JSON"),
+        (b"9" * 5000, "given.json is not JSON"),
     ],
 )
 def test_what_is_no_json_is_refused_with_the_name_of_the_file(tmp_path, data, told):
@@ -41,7 +41,7 @@ def test_standard_input_is_read_as_utf_8_and_may_be_closed(monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO('"é"'.encode()), encoding="latin-1"))
     assert read_json("-") == "é"
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"\xff")))
-    with pytest.raises(WrongUsage, match="standard input is no text in UTF-8"):
+    with pytest.raises(WrongUsage, match="standard input is not text in UTF-8"):
         read_json("-")
     monkeypatch.setattr(sys, "stdin", None)
     with pytest.raises(WrongUsage, match="standard input is closed"):

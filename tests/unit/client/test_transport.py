@@ -256,7 +256,7 @@ def test_what_is_no_token_is_refused_before_it_is_sent_and_shown_nowhere(script,
 
 @pytest.mark.parametrize("url", ["127.0.0.1:8460", "marey.example.org", "ftp://marey.example.org", "http://"])
 def test_what_is_no_address_is_refused_before_anything_is_sent(url):
-    with pytest.raises(errors.BadAddress, match="no address of a server"):
+    with pytest.raises(errors.BadAddress, match="not the address of a server"):
         Marey(url, "marey_secret")
 
 

@@ -109,7 +109,7 @@ def valid_tree(aligned):
         ({"time_function": np.array([0.0, 2.0, 1.0])}, "increase strictly"),
         ({"time_function": np.array([0.0])}, "at least two canonical frames"),
         ({"source_frames": 61}, "from 0 to 60"),
-        ({"keyframes": {"down": 60}}, "keyframes.down: there are 60 canonical frames"),
+        ({"keyframes": {"down": 60}}, "keyframes.down: frame 60 is outside the 60 canonical frames"),
         ({"cost": -1.0}, "cost"),
         ({"stray": 1}, "stray"),
     ],

@@ -191,5 +191,5 @@ def test_bson_nested_beyond_the_limit_is_refused() -> None:
 def test_an_error_reads_as_a_place_and_a_reason() -> None:
     with pytest.raises(CodecError) as caught:
         encode_tree({"a": [1, float("nan")]}, JSON)
-    assert str(caught.value) == "/a/1: nan cannot travel; only finite numbers may"
+    assert str(caught.value) == "/a/1: nan cannot be encoded; only finite numbers can"
     assert codecs.CodecError("bad-syntax", "", "no").args == ("bad-syntax", "", "no")

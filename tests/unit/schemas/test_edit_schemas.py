@@ -70,7 +70,7 @@ def test_what_makes_no_sense_is_refused(commands: list[dict[str, Any]]) -> None:
 
 
 def test_results_in_place_have_no_suffix() -> None:
-    with pytest.raises(ValidationError, match="keep their names"):
+    with pytest.raises(ValidationError, match="keeps the names of the clips"):
         EditParams.model_validate({"commands": [{"command": "mirror"}], "in_place": True, "suffix": "-m"})
 
 

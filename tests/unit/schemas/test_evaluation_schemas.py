@@ -19,7 +19,7 @@ def test_the_defaults_are_the_published_suite() -> None:
         ({"speeds_m_s": []}, "at least 1"),
         ({"speeds_m_s": [0]}, "greater than 0"),
         ({"speeds_m_s": [float("nan")]}, "finite|greater"),
-        ({"speeds_m_s": [1, 1]}, "stands twice"),
+        ({"speeds_m_s": [1, 1]}, "a value is repeated"),
         ({"turn_rates_deg_s": [721]}, "less than or equal to 720"),
         ({"duration_s": 601}, "less than or equal to 600"),
         ({"speeds_m_s": [0.1 * n for n in range(1, 41)], "turn_rates_deg_s": list(range(40))}, "3200 trials"),

@@ -72,7 +72,7 @@ def changed(change):
                     {"action": "fall", "primitive": "down"}
                 )
             ),
-            "fall/down: no primitive to end in can be reached from it",
+            "fall/down: no primitive that ends a sequence can be reached from it",
         ),
         (lambda one: one["actions"]["walk"]["primitives"]["left"].update(type="turn"), "type"),
         (lambda one: one.update(actions={}), "actions"),
@@ -89,5 +89,7 @@ def test_a_graph_without_any_end_is_refused():
     for action in graph["actions"].values():
         for primitive in action["primitives"].values():
             primitive["type"] = "standard"
-    with pytest.raises(ValidationError, match="no primitive is of a type to end in: end, idle, single"):
+    with pytest.raises(
+        ValidationError, match="at least one primitive must have a type that ends a sequence: end, idle, single"
+    ):
         ModelGraph.model_validate(graph)

@@ -108,10 +108,10 @@ def test_a_model_can_do_without_a_tree() -> None:
     [
         ((), "either files"),
         ((FILES, CLIPS), "either files"),
-        ((FILES, LAYER), "that are there, or proposed"),
-        ((CLIPS, LAYER, STEPS), "that are there, or proposed"),
+        ((FILES, LAYER), "only if none are proposed"),
+        ((CLIPS, LAYER, STEPS), "only if none are proposed"),
         ((CLIPS, {"cut": {}}), "needs annotations"),
-        ((CLIPS, LAYER, GAME), "do not go over"),
+        ((CLIPS, LAYER, GAME), "cannot be used after retargeting"),
         ((CLIPS, {"align": {"window": 4}}), "odd"),
     ],
 )

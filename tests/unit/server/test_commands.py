@@ -86,8 +86,8 @@ def start(**settings):
 @pytest.mark.parametrize(
     ("url", "told"),
     [
-        ("nonsense", "names no database"),
-        ("mysql://u:sekret@h/x", "names no database"),
+        ("nonsense", "is not the URL of a supported database"),
+        ("mysql://u:sekret@h/x", "is not the URL of a supported database"),
         ("postgresql://u:sekret@127.0.0.1:1/x", r"postgresql://u:\*\*\*@127.0.0.1:1/x does not answer: .*refused"),
     ],
 )
@@ -121,7 +121,9 @@ def test_a_disk_without_room_for_the_tables_is_told(tmp_path, command, monkeypat
 def test_tables_of_a_newer_version_are_told_and_left_as_they_are(data, command):
     with closing(sqlite3.connect(data / "marey.db")) as database, database:
         database.execute("UPDATE alembic_version SET version_num = '9999'")
-    with pytest.raises((commands.CommandFailed, DatabaseUnusable), match="of another version of Marey"):
+    with pytest.raises(
+        (commands.CommandFailed, DatabaseUnusable), match="belong to another, perhaps newer, version of Marey"
+    ):
         command(data=data)
     with closing(sqlite3.connect(data / "marey.db")) as database:
         assert database.execute("SELECT version_num FROM alembic_version").fetchall() == [("9999",)]

@@ -32,7 +32,7 @@ def test_a_change_may_name_several_states():
 def test_more_states_than_a_statement_should_take_are_refused():
     tags = [f'"{number}.json"' for number in range(1, 102)]
     assert write_precondition(",".join(tags[:100]), None).expected_rev == frozenset(range(1, 101))
-    with pytest.raises(BadRequestProblem, match="101 states; at most 100"):
+    with pytest.raises(BadRequestProblem, match="101 versions; at most 100"):
         write_precondition(",".join(tags), None)
 
 

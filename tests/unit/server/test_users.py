@@ -78,7 +78,7 @@ def test_signing_in_needs_the_password(database, chief):
     for name, password in (("ann", "wrong horse"), ("nobody", "correct horse"), ("silent", ""), ("admin", "")):
         with pytest.raises(UnauthenticatedProblem) as refused:
             database.read(ANONYMOUS, users.verify_password, name, password)
-        assert refused.value.detail == "Name or password is wrong."
+        assert refused.value.detail == "The name or the password is wrong."
 
 
 def test_a_user_changes_the_password_with_the_current_one(database, chief):

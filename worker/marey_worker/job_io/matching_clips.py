@@ -108,7 +108,7 @@ def read_evaluated_clips(
 ) -> MatchingClips:
     """The clips of an evaluation as they were, under its normaliser. Raises `JobRefused` for one that names none."""
     if "clip_set" not in document:
-        raise JobRefused("clips-unknown", f"{evaluation.path} does not tell which clips it is of; evaluate them again")
+        raise JobRefused("clips-unknown", f"{evaluation.path} does not record its clips; evaluate them again")
     wanted = ClipSet.from_tree(document["clip_set"])
     normaliser = Normaliser.from_tree(document["normaliser"])
     with refusing_motion_errors():

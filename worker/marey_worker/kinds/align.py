@@ -175,7 +175,7 @@ class _Job:
         pins = self._context.inputs.get("annotations", ())
         if not pins:
             if self._params.layer is not None or self._params.labels:
-                raise JobRefused("no-annotations", "a layer or labels are named, but no annotations are given")
+                raise JobRefused("no-annotations", "layer and labels need annotations, but none are given")
             return None
         found: dict[str, list[_ClipAnnotation]] = {}
         for pin, tree in self._context.documents(pins, "annotation"):

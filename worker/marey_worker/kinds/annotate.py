@@ -108,7 +108,9 @@ def _joints(rigged: Rigged, names: Sequence[str]) -> tuple[int, ...]:
     for name in names:
         own = name if name in rigged.skeleton else rigged.mapping.joints.get(name)
         if own is None:
-            raise UnknownJoint("it is neither a joint of the skeleton nor a standard joint it has", where=name)
+            raise UnknownJoint(
+                "it is neither a joint of the skeleton nor a standard joint that the skeleton has", where=name
+            )
         found.append(rigged.skeleton.index_of(own))
     return tuple(found)
 

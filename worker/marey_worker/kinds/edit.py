@@ -100,7 +100,7 @@ class _Editing:
         clip = documents.clip_from_document(motion, body.skeleton)
         made = edit_clip(clip, self._commands, body=body, sources=sources)
         if self._params.in_place and len(made) > 1:
-            raise EditError("it was split, and several clips cannot take the place of one", code="several-clips")
+            raise EditError("the edit splits it, and several clips cannot replace one", code="several-clips")
         info = self._info(pin, known)
         names = [f"{pin.name}{self._params.suffix}" + "".join(f"-{n}" for n in one.pieces) for one in made]
         if self._params.in_place:

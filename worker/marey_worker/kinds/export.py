@@ -84,7 +84,7 @@ class _Exporting:
     def _original(self, pin: PinnedInput, info: dict[str, Any]) -> _File:
         original = original_of_clip(pin.item, info)
         if original is None:
-            raise MotionError("it was not made from a file", code="no-original")
+            raise MotionError("it was not imported from a file", code="no-original")
         ending = original.name.rpartition(".")[2] if "." in original.name else ""
         return _File(f"{_place(pin)}.{ending}" if ending else _place(pin), self._context.blob(original.digest))
 

@@ -156,7 +156,7 @@ class Database:
                 if (
                     error.connection_invalidated
                 ):  # nobody knows whether it was committed; doing it again could do it twice
-                    raise _no_answer("Whether this was written is not known; look before you try again.") from error
+                    raise _no_answer("It is unknown whether this was written; check before you try again.") from error
                 raise
         self._high_water_us = high_water_us
         if self.is_sqlite:

@@ -22,7 +22,7 @@ def opening(url: str) -> Iterator[None]:
         yield
     except (exc.ArgumentError, exc.NoSuchModuleError, ImportError):  # of a url no driver is known for
         raise DatabaseUnusable(
-            "the database_url names no database that Marey knows; write sqlite:////folder/file.db, "
+            "the database_url is not the URL of a supported database; write sqlite:////folder/file.db, "
             "or postgresql://user@host/name with the extra `postgres` installed"
         ) from None
     except UnavailableProblem as error:
@@ -33,7 +33,7 @@ def opening(url: str) -> Iterator[None]:
         raise DatabaseUnusable(f"the database {_shown(url)} cannot be used: {_reason(error)}") from error
     except CommandError as error:
         raise DatabaseUnusable(
-            f"the tables of the database {_shown(url)} are of another version of Marey, a newer one perhaps: {error}"
+            f"the tables of the database {_shown(url)} belong to another, perhaps newer, version of Marey: {error}"
         ) from error
 
 

@@ -47,7 +47,7 @@ def publish(
     """
     by_name = {draft.name_in_batch: draft for draft in drafts}
     if len(by_name) != len(drafts):
-        raise InvalidProblem("Two results of one write have the same name.", code="duplicate-output")
+        raise InvalidProblem("Two results of the request have the same name.", code="duplicate-output")
     loaded = {name: _load_parts(tx, draft) for name, draft in by_name.items()}
     refers = {
         name: [found for part in parts.values() for found in references.outputs_in(part.body)]
@@ -128,9 +128,7 @@ class _Publication:
             if published is not None:
                 self.done[draft.name_in_batch] = published
                 return
-        raise ConflictProblem(
-            f"{draft.item_name!r} is being changed by others at this moment; try again.", code="contended"
-        )
+        raise ConflictProblem(f"{draft.item_name!r} is being changed by other requests; try again.", code="contended")
 
     def _store(self, held: _Part, body: Tree) -> str:
         changed = body != held.body

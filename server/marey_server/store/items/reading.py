@@ -184,9 +184,9 @@ def load_part(
         return documents.load_document(tx, found.digest, arrays=arrays)
     tree = documents.load_document(tx, found.digest)
     if tree["schema"] != "marey/motion@1":
-        raise InvalidProblem("Only motions are cut by frames and joints.", code="not-a-motion")
+        raise InvalidProblem("frames and joints can only be selected from motions.", code="not-a-motion")
     if arrays == "none":
-        raise ValueError("references name whole arrays, which a cut has not")
+        raise ValueError("an array of which only a part was read cannot be replaced by a reference")
     return slice_motion(tree, frames, joints, encoded=arrays == "encoded")
 
 

@@ -124,7 +124,7 @@ class ReferenceCheck:
     def _referred(self, ref: Tree, kind: Kind, part: str, pointer: str) -> Tree:
         """Body of a part of the revision that `ref` names."""
         if "output" in ref:
-            raise _invalid(pointer, f"no-{kind.value}", f"There is no result {ref['output']!r} in this write.")
+            raise _invalid(pointer, f"no-{kind.value}", f"There is no result {ref['output']!r} in this request.")
         key = (ref["item"], ref["revision"], kind, part)
         if key not in self._seen:
             body = self._look_up(*key)

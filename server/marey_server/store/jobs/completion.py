@@ -200,7 +200,7 @@ def _result(
     place = (one.job, one.fence)
     try:
         if place not in own:
-            raise NotFoundProblem(f"There is no attempt {one.fence} of {one.job} that you claimed.")
+            raise NotFoundProblem(f"You have not claimed an attempt {one.fence} of {one.job}.")
         if place in refused:
             raise refused[place]
         answer = answers.get(place) or _same_answer(tx, place, one.write_id)

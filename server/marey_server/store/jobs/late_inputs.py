@@ -73,7 +73,7 @@ def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
         kind = find_kind(row.kind)
         params = kind.params.model_validate(row.params)
     except UnknownKindError as error:
-        raise LateInputError("unknown-kind", f"This server does not know the kind any more: {error}.") from error
+        raise LateInputError("unknown-kind", f"This server no longer knows the kind of the job: {error}.") from error
     except ValidationError as error:
         detail = f"{kind.name} does not take these parameters any more: {error.errors()[0]['msg']}"
         raise LateInputError("invalid-params", detail) from error

@@ -165,7 +165,7 @@ def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLIC
     propagate_ends(tx, [as_ended(one) for one in (*tasks, *whole) if one.state != "running"])
     document = job_documents(tx, [job_id])[0]
     if not whole and document.state != JobState.CANCELLED:
-        raise ConflictProblem(f"The job has {document.state} already; nothing can be cancelled.", code="job-ended")
+        raise ConflictProblem(f"The job has already {document.state} and cannot be cancelled.", code="job-ended")
     return document
 
 

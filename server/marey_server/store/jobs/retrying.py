@@ -38,10 +38,10 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
     require_own(tx, row, project, "retry")
     if row.state not in UNSUCCESSFUL:
         raise ConflictProblem(
-            f"Only a failed or cancelled job can be tried again; this one is {row.state}.", code="not-failed"
+            f"Only a failed or cancelled job can be retried; this one is {row.state}.", code="not-failed"
         )
     if row.parent_id is not None:
-        raise ConflictProblem(f"This is a task; try {row.parent_id} again, which it belongs to.", code="is-task")
+        raise ConflictProblem(f"This is a task of the job {row.parent_id}; retry that job.", code="is-task")
     family = _Family(tx, project)
     family.add_with_needed([job_id])
     family.add_dependants()
@@ -132,7 +132,9 @@ def _again(tx: Transaction, row: Row[Any], new: str, stand_ins: Mapping[str, str
     try:
         kind = find_kind(row.kind)
     except UnknownKindError as error:
-        raise ConflictProblem(f"This server does not know the kind any more: {error}.", code="unknown-kind") from error
+        raise ConflictProblem(
+            f"This server no longer knows the kind of the job: {error}.", code="unknown-kind"
+        ) from error
     return Submission(
         kind,
         request_of(row).model_copy(update={"concurrency_key": _concurrency_key(tx, row)}),

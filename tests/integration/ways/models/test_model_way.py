@@ -182,4 +182,4 @@ def test_from_the_command_line(lab: ProjectHandle, run: CommandLine, tmp_path: P
     assert run("report", "lab/models/walk", "--out", "walk.html", "--figures", "drawn").stdout == "walk.html\n"
     assert (tmp_path / "walk.html").read_bytes().startswith(b"<!DOCTYPE html>")
     assert (tmp_path / "drawn" / "component-1.svg").is_file()
-    assert "no format" in run("sample", "lab/models/cli", "--format", "fbx", status=2).stderr
+    assert "not a format" in run("sample", "lab/models/cli", "--format", "fbx", status=2).stderr
