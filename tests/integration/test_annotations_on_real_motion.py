@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 
 from marey_motion.editing.annotations.layers import Layer
-from marey_motion.editing.annotations.speed_proposals import ReachOptions, propose_reaches
+from marey_motion.editing.annotations.speed_proposals import propose_reaches
 from marey_motion.editing.annotations.step_proposals import propose_steps
 from marey_motion.formats import read_motion
 from marey_motion.importing.plan import pair_companions
 from marey_motion.matching.body import MatchingBody
 from marey_motion.rigs import map_joints
+from marey_schemas.options.annotations import WristContactProposal
 
 SUBJECTS = ("02", "05", "07", "09", "16")
 
@@ -63,7 +64,7 @@ def test_jumps_runs_and_punches_hold_no_steps_of_a_walk(walks):
 
 def test_each_raised_hand_is_one_reach_of_the_right_hand_with_a_contact(mocap):
     def propose(clip, body):
-        return propose_reaches(clip, body, ReachOptions(release=True))
+        return propose_reaches(clip, body, WristContactProposal(release=True))
 
     found = annotate(mocap, "bandai-namco-2/*raise-up-right-hand*.bvh", propose)
     assert len(found) == 24

@@ -7,11 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from marey_motion.arrays import Floats
-from marey_motion.editing.annotations.contacts import ContactOptions, Stance, find_stances
+from marey_motion.editing.annotations.contacts import Stance, find_stances
 from marey_motion.editing.placement import translate
 from marey_motion.editing.take import EditFinding, Take
 from marey_motion.importing.checks import sole_points
 from marey_motion.kinematics import forward_kinematics
+from marey_schemas.options.annotations import ContactOptions
 
 FEET = ("left_foot", "right_foot")
 LOWEST_SHARE = 0.05
@@ -84,7 +85,7 @@ def find_contacts(
     Parameters
     ----------
     take : Take    F frames
-    speed_m_s, shortest_swing_s, shortest_stance_s : float    see `contacts.ContactOptions`
+    speed_m_s, shortest_swing_s, shortest_stance_s : float    see `ContactOptions`
     height_limit_m : float, optional    a slow foot higher than this above the ground is not planted, metres; None to
         check only its speed
 
@@ -96,7 +97,10 @@ def find_contacts(
     ------
     MappingError    where the feet are not known
     """
-    stances = _stances(take, ContactOptions(speed_m_s, shortest_swing_s, shortest_stance_s))
+    options = ContactOptions(
+        speed_m_s=speed_m_s, shortest_swing_s=shortest_swing_s, shortest_stance_s=shortest_stance_s
+    )
+    stances = _stances(take, options)
     if height_limit_m is not None:
         heights = sole_heights(take)
         limit = _ground_of(heights, stances).height_m + height_limit_m

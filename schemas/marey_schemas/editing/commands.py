@@ -13,6 +13,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from marey_schemas.base import Request
 from marey_schemas.names import ItemId, JointName
+from marey_schemas.options.annotations import ContactOptions
 
 MOST_FRAME = 100_000_000
 MOST_LISTED = 4096
@@ -227,19 +228,10 @@ class FindGround(Request):
     command: Literal["find_ground"]
 
 
-class FindContacts(Request):
+class FindContacts(ContactOptions):
     """Find when the feet stand; changes nothing."""
 
     command: Literal["find_contacts"]
-    speed_m_s: float = Field(
-        0.5, gt=0, le=100, allow_inf_nan=False, description="Greatest speed of a foot in contact, in metres per second."
-    )
-    shortest_swing_s: float = Field(
-        0.1, gt=0, le=10, allow_inf_nan=False, description="Swing phases shorter than this are treated as noise."
-    )
-    shortest_stance_s: float = Field(
-        0.06, gt=0, le=10, allow_inf_nan=False, description="Stance phases shorter than this are treated as noise."
-    )
     height_limit_m: float | None = Field(
         0.1,
         gt=0,

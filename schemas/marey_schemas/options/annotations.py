@@ -1,4 +1,4 @@
-"""Options of proposals: which segments and keyframes an algorithm finds in a clip."""
+"""Options of foot contacts, and of proposals of segments and keyframes."""
 
 from __future__ import annotations
 
@@ -6,34 +6,70 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from marey_schemas.base import Request
+from marey_schemas.base import Options
 from marey_schemas.names import JointName
 
 Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
 Degrees = Annotated[float, Field(ge=0, le=360, allow_inf_nan=False)]
 
 
-class StepsProposal(Request):
+CONTACT_SPEED_M_S = 0.5
+OUT_OF_REST = 0.25
+"""Share of the farthest reach from which on a hand is on its way."""
+
+
+class ContactOptions(Options):
+    """Detection of the contacts of a foot with the ground."""
+
+    speed_m_s: float = Field(
+        CONTACT_SPEED_M_S,
+        gt=0,
+        le=100,
+        allow_inf_nan=False,
+        description="Greatest speed of a foot in contact, in metres per second.",
+    )
+    shortest_swing_s: float = Field(
+        0.1,
+        gt=0,
+        le=10,
+        allow_inf_nan=False,
+        description="Least duration of a swing phase, in seconds; shorter ones are treated as noise.",
+    )
+    shortest_stance_s: float = Field(
+        0.06,
+        gt=0,
+        le=10,
+        allow_inf_nan=False,
+        description="Least duration of a stance phase, in seconds; shorter ones are treated as noise.",
+    )
+
+
+class StepsProposal(Options):
     """Steps of a walk or run, from the contact of one foot to that of the other, named after the foot that swings."""
 
     method: Literal["steps"] = "steps"
     contact_speed_m_s: float = Field(
-        0.5,
+        CONTACT_SPEED_M_S,
         gt=0,
         le=10,
         allow_inf_nan=False,
         description="Speed in metres per second below which a foot is in contact.",
     )
-    shortest_s: Seconds = Field(0.2, description="Duration of the shortest step that is labelled.")
-    longest_s: Seconds = Field(1.5, description="Duration of the longest step that is labelled.")
+    shortest_s: Seconds = Field(0.2, description="Duration of the shortest step that is labelled, in seconds.")
+    longest_s: Seconds = Field(1.5, description="Duration of the longest step that is labelled, in seconds.")
     shortest_m: float = Field(
-        0.2, ge=0, le=10, allow_inf_nan=False, description="Least distance that the hips travel in a step."
+        0.2, ge=0, le=10, allow_inf_nan=False, description="Least distance that the hips travel in a step, in metres."
     )
-    most_turn_deg: Degrees = Field(45.0, description="Greatest turn of the body in a step that is labelled.")
+    most_turn_deg: Degrees = Field(
+        45.0, description="Greatest turn of the body in a step that is labelled, in degrees."
+    )
     most_aside_deg: Degrees = Field(
-        45.0, description="Greatest angle between the direction of a labelled step and the heading of the body."
+        45.0,
+        description="Greatest angle between the direction of a labelled step and the heading of the body, in degrees.",
     )
-    standing_s: Seconds = Field(0.6, description="Least time with both feet on the ground that is labelled `standing`.")
+    standing_s: Seconds = Field(
+        0.6, description="Least time with both feet on the ground that is labelled `standing`, in seconds."
+    )
 
     @model_validator(mode="after")
     def _check_durations(self) -> Self:
@@ -42,7 +78,7 @@ class StepsProposal(Request):
         return self
 
 
-class VelocityMinimaProposal(Request):
+class VelocityMinimaProposal(Options):
     """Movements from one minimum of the speed of joints to the next, with a keyframe `pause` at each minimum."""
 
     method: Literal["velocity_minima"] = "velocity_minima"
@@ -60,7 +96,7 @@ class VelocityMinimaProposal(Request):
     )
 
 
-class WristContactProposal(Request):
+class WristContactProposal(Options):
     """Reaches of a hand out of its rest and back, with a keyframe `contact` where it arrives at its far place."""
 
     method: Literal["wrist_contact"] = "wrist_contact"
@@ -71,7 +107,11 @@ class WristContactProposal(Request):
         0.2, gt=0, le=10, allow_inf_nan=False, description="Least distance of a reach, in metres."
     )
     arrived: float = Field(
-        0.95, gt=0.25, le=1, allow_inf_nan=False, description="Share of the distance at which a hand has arrived."
+        0.95,
+        gt=OUT_OF_REST,
+        le=1,
+        allow_inf_nan=False,
+        description="Share of the distance of its far place at which a hand has arrived.",
     )
     release: bool = Field(False, description="Also add a keyframe `release` at the last frame at the far place.")
 

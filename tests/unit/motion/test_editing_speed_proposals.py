@@ -4,14 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from marey_motion import kinematics, quaternions
 from marey_motion.editing.annotations.layers import Layer
-from marey_motion.editing.annotations.speed_proposals import PauseOptions, ReachOptions, propose_pauses, propose_reaches
-from marey_motion.errors import MappingError, MotionError
+from marey_motion.editing.annotations.speed_proposals import propose_pauses, propose_reaches
+from marey_motion.errors import MappingError
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.rigs import map_joints
+from marey_schemas.options.annotations import VelocityMinimaProposal, WristContactProposal
 
 RATE_HZ = 60.0
 RISE_S, HOLD_S = 1.0, 1.5
@@ -44,7 +46,7 @@ def body_of(clip):
 
 def test_each_raise_of_an_arm_is_a_reach_whose_contact_is_where_the_hand_arrives():
     clip = raised([1.0, 5.5])
-    found = propose_reaches(clip, body_of(clip), ReachOptions(release=True))
+    found = propose_reaches(clip, body_of(clip), WristContactProposal(release=True))
     assert [segment.label for segment in found.segments] == ["reach_right"] * 2
     for segment, start_s in zip(found.segments, (1.0, 5.5), strict=True):
         contact, release = [one for one in found.keyframes if segment.start <= one.frame < segment.end]
@@ -59,7 +61,7 @@ def test_the_hand_that_reaches_farther_is_found_and_the_other_on_request():
     clip = raised([2.0], joint="LeftArm")
     body = body_of(clip)
     assert [segment.label for segment in propose_reaches(clip, body).segments] == ["reach_left"]
-    assert propose_reaches(clip, body, ReachOptions(hand="right")) == Layer(clip.frame_count)
+    assert propose_reaches(clip, body, WristContactProposal(hand="right")) == Layer(clip.frame_count)
 
 
 def test_a_hand_that_stays_reaches_nothing():
@@ -69,7 +71,7 @@ def test_a_hand_that_stays_reaches_nothing():
 
 def test_walking_with_swinging_arms_is_no_reach():
     clip = generate_gait(1.2, 0.8, 8.0)
-    assert propose_reaches(clip, body_of(clip), ReachOptions(least_reach_m=0.7)) == Layer(clip.frame_count)
+    assert propose_reaches(clip, body_of(clip), WristContactProposal(least_reach_m=0.7)) == Layer(clip.frame_count)
 
 
 def test_a_skeleton_without_wrists_is_refused_by_the_joint():
@@ -93,8 +95,8 @@ def test_an_arm_pauses_where_it_is_held_and_movements_fill_the_clip():
 
 def test_pauses_keep_their_distance():
     clip = generate_gait(1.4, 0.0, 6.0)
-    near = propose_pauses(clip, options=PauseOptions(least_depth=0.001, least_apart_s=0.02))
-    far = propose_pauses(clip, options=PauseOptions(least_depth=0.001, least_apart_s=1.0))
+    near = propose_pauses(clip, options=VelocityMinimaProposal(least_depth=0.001, least_apart_s=0.02))
+    far = propose_pauses(clip, options=VelocityMinimaProposal(least_depth=0.001, least_apart_s=1.0))
     frames = [one.frame for one in far.keyframes]
     assert len(near.keyframes) > len(far.keyframes)
     assert np.diff(frames).min() >= 60
@@ -110,12 +112,11 @@ def test_what_does_not_move_does_not_pause():
 @pytest.mark.parametrize(
     ("options", "given", "where"),
     [
-        (PauseOptions, {"smoothing_s": 0.0}, "smoothing_s"),
-        (ReachOptions, {"least_reach_m": float("inf")}, "least_reach_m"),
-        (ReachOptions, {"arrived": 0.2}, "arrived"),
+        (VelocityMinimaProposal, {"smoothing_s": 0.0}, "smoothing_s"),
+        (WristContactProposal, {"least_reach_m": float("inf")}, "least_reach_m"),
+        (WristContactProposal, {"arrived": 0.2}, "arrived"),
     ],
 )
 def test_options_that_make_no_sense_are_refused_by_name(options, given, where):
-    with pytest.raises(MotionError) as refused:
+    with pytest.raises(ValidationError, match=where):
         options(**given)
-    assert (refused.value.code, refused.value.where) == ("option-invalid", where)

@@ -7,14 +7,15 @@ from math import radians
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
-from marey_motion.editing.annotations.contacts import ContactOptions, find_stances
-from marey_motion.editing.annotations.step_proposals import StepOptions, propose_steps
-from marey_motion.errors import MotionError
+from marey_motion.editing.annotations.contacts import find_stances
+from marey_motion.editing.annotations.step_proposals import propose_steps
 from marey_motion.gait import foot_motions, generate_along, generate_gait, start_and_stop, straight_or_arc
 from marey_motion.matching.body import MatchingBody
 from marey_motion.mirroring import mirror_clip
 from marey_motion.rigs import map_joints
+from marey_schemas.options.annotations import ContactOptions, StepsProposal
 
 
 def body_of(clip):
@@ -22,7 +23,7 @@ def body_of(clip):
 
 
 def steps(clip, **options):
-    return propose_steps(clip, body_of(clip), StepOptions(**options))
+    return propose_steps(clip, body_of(clip), StepsProposal(**options))
 
 
 def count(layer):
@@ -141,6 +142,5 @@ def test_stances_do_not_depend_on_flicker_shorter_than_a_swing():
     ],
 )
 def test_options_that_make_no_sense_are_refused_by_name(options, where):
-    with pytest.raises(MotionError) as refused:
-        StepOptions(**options)
-    assert (refused.value.code, refused.value.where) == ("option-invalid", where)
+    with pytest.raises(ValidationError, match=where):
+        StepsProposal(**options)

@@ -8,11 +8,10 @@ from typing import Any
 
 from marey_motion import documents
 from marey_motion.clip import Clip
-from marey_motion.editing.annotations.contacts import ContactOptions
 from marey_motion.editing.annotations.layers import Layer
-from marey_motion.editing.annotations.speed_proposals import PauseOptions, ReachOptions, propose_pauses, propose_reaches
-from marey_motion.editing.annotations.step_proposals import StepOptions, propose_steps
-from marey_motion.errors import AnnotationError, MotionError, UnknownJoint
+from marey_motion.editing.annotations.speed_proposals import propose_pauses, propose_reaches
+from marey_motion.editing.annotations.step_proposals import propose_steps
+from marey_motion.errors import AnnotationError, UnknownJoint
 from marey_motion.matching.body import MatchingBody
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
@@ -20,9 +19,9 @@ from marey_schemas.job_params import AnnotateParams
 from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
-from marey_schemas.options.annotations import StepsProposal, VelocityMinimaProposal, WristContactProposal
+from marey_schemas.options.annotations import StepsProposal, WristContactProposal
 from marey_schemas.worker_protocol import PinnedInput, StagedOutput
-from marey_worker.context import Context, JobRefused
+from marey_worker.context import Context
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import require_different
 from marey_worker.job_io.skeleton_cache import Rig, Rigged, read_rigged
@@ -78,28 +77,13 @@ def run(context: Context, params: AnnotateParams) -> dict[str, Any]:
 
 
 def _proposal(params: AnnotateParams) -> Propose:
-    """The function that makes a layer of a clip as the parameters say. Raises `JobRefused`."""
+    """Return the function that proposes a layer for a clip."""
     wanted = params.proposal
-    try:
-        if isinstance(wanted, StepsProposal):
-            steps = _step_options(wanted)
-            return lambda clip, rigged: propose_steps(clip, _body(rigged), steps)
-        if isinstance(wanted, WristContactProposal):
-            reaches = ReachOptions(**wanted.model_dump(exclude={"method"}))
-            return lambda clip, rigged: propose_reaches(clip, _body(rigged), reaches)
-        return _pauses(wanted)
-    except MotionError as error:
-        raise JobRefused(error.code, str(error)) from error
-
-
-def _step_options(wanted: StepsProposal) -> StepOptions:
-    contacts = ContactOptions(speed_m_s=wanted.contact_speed_m_s)
-    return StepOptions(contacts=contacts, **wanted.model_dump(exclude={"method", "contact_speed_m_s"}))
-
-
-def _pauses(wanted: VelocityMinimaProposal) -> Propose:
-    options = PauseOptions(**wanted.model_dump(exclude={"method", "joints"}))
-    return lambda clip, rigged: propose_pauses(clip, _joints(rigged, wanted.joints), options)
+    if isinstance(wanted, StepsProposal):
+        return lambda clip, rigged: propose_steps(clip, _body(rigged), wanted)
+    if isinstance(wanted, WristContactProposal):
+        return lambda clip, rigged: propose_reaches(clip, _body(rigged), wanted)
+    return lambda clip, rigged: propose_pauses(clip, _joints(rigged, wanted.joints), wanted)
 
 
 def _joints(rigged: Rigged, names: Sequence[str]) -> tuple[int, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,31 +11,12 @@ from scipy.ndimage import median_filter
 from marey_motion import kinematics
 from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
-from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
+from marey_schemas.options.annotations import ContactOptions
 
 LEAVING_FACTOR = 1.6
+"""A contact that has begun lasts until the foot is faster than this times its greatest speed in contact."""
 SMOOTHING_S = 0.045
-
-
-@dataclass(frozen=True)
-class ContactOptions:
-    """Limits of a foot contact.
-
-    Parameters
-    ----------
-    speed_m_s : a foot slower than this begins to stand; it leaves when it is faster than `LEAVING_FACTOR` times that
-    shortest_swing_s, shortest_stance_s : anything shorter is noise
-    """
-
-    speed_m_s: float = 0.5
-    shortest_swing_s: float = 0.1
-    shortest_stance_s: float = 0.06
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (np.isfinite(value) and value > 0):
-                raise MotionError(f"{value} must be a positive number", code="option-invalid", where=name)
 
 
 class Stance(NamedTuple):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
@@ -15,39 +14,18 @@ from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.editing.annotations.contacts import runs
 from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
-from marey_motion.errors import MappingError, MotionError
+from marey_motion.errors import MappingError
 from marey_motion.matching.body import SIDES, MatchingBody
+from marey_schemas.options.annotations import OUT_OF_REST, VelocityMinimaProposal, WristContactProposal
 
 PAUSE = "pause"
 MOVEMENT = "movement"
 CONTACT = "contact"
 RELEASE = "release"
 REST_S = 0.1
-OUT_OF_REST = 0.25
-"""Share of the farthest reach from which on a hand is on its way."""
 
 
-@dataclass(frozen=True)
-class PauseOptions:
-    """Limits of a pause.
-
-    Parameters
-    ----------
-    smoothing_s : deviation of the Gaussian that the speed is smoothed with, seconds
-    least_depth : how deep a minimum of the speed is below the lower of the maxima beside it, as a share of the highest
-        speed in the clip
-    least_apart_s : seconds between pauses; of nearer ones the deepest are kept
-    """
-
-    smoothing_s: float = 0.05
-    least_depth: float = 0.1
-    least_apart_s: float = 0.2
-
-    def __post_init__(self) -> None:
-        _require_positive(self, "smoothing_s", "least_depth", "least_apart_s")
-
-
-def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: PauseOptions | None = None) -> Layer:
+def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: VelocityMinimaProposal | None = None) -> Layer:
     """Propose a keyframe `pause` at each minimum of the joints' mean speed, and segments `movement` between them.
 
     The first segment starts and the last ends with the clip.
@@ -56,7 +34,7 @@ def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: PauseOptions
     ----------
     clip : Clip    F frames
     joints : sequence of int    indices of the joints; all when empty
-    options : PauseOptions, optional    limits
+    options : VelocityMinimaProposal, optional    limits
 
     Returns
     -------
@@ -64,7 +42,7 @@ def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: PauseOptions
     """
     from scipy.signal import find_peaks  # brings all of scipy's signals and statistics: only who needs it shall wait
 
-    options = options or PauseOptions()
+    options = options or VelocityMinimaProposal()
     positions = kinematics.global_positions(clip)
     moving = positions[:, list(joints)] if joints else positions
     speed = np.linalg.norm(kinematics.velocities(moving, clip.frame_rate_hz), axis=-1).mean(axis=1)
@@ -82,32 +60,7 @@ def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: PauseOptions
     return Layer(clip.frame_count, segments, tuple(Keyframe(PAUSE, frame) for frame in bounds[1:-1]))
 
 
-@dataclass(frozen=True)
-class ReachOptions:
-    """Limits of a reach of a hand.
-
-    Parameters
-    ----------
-    hand : which one, or the one of the two that reaches farther
-    least_reach_m : metres from the place of rest; less is no reach
-    arrived : share of the farthest place of a reach from which on the hand has arrived
-    release : mark the last frame at the far place, too
-    """
-
-    hand: Literal["left", "right", "either"] = "either"
-    least_reach_m: float = 0.2
-    arrived: float = 0.95
-    release: bool = False
-
-    def __post_init__(self) -> None:
-        _require_positive(self, "least_reach_m", "arrived")
-        if not OUT_OF_REST < self.arrived <= 1.0:
-            raise MotionError(
-                f"{self.arrived} must be above {OUT_OF_REST} and at most 1", code="option-invalid", where="arrived"
-            )
-
-
-def propose_reaches(clip: Clip, body: MatchingBody, options: ReachOptions | None = None) -> Layer:
+def propose_reaches(clip: Clip, body: MatchingBody, options: WristContactProposal | None = None) -> Layer:
     """Propose a segment `reach_left` or `reach_right` each time a wrist goes far from its place of rest and returns.
 
     The place of rest is the position of the wrist at the start of the clip, as seen from the hips in the direction of
@@ -119,7 +72,7 @@ def propose_reaches(clip: Clip, body: MatchingBody, options: ReachOptions | None
     ----------
     clip : Clip    F frames
     body : MatchingBody    joints of its skeleton
-    options : ReachOptions, optional    limits
+    options : WristContactProposal, optional    limits
 
     Returns
     -------
@@ -129,7 +82,7 @@ def propose_reaches(clip: Clip, body: MatchingBody, options: ReachOptions | None
     ------
     MotionError    where the body has no facing direction or lacks the wrist
     """
-    options = options or ReachOptions()
+    options = options or WristContactProposal()
     distances = {side: _distance_from_rest(clip, body, side) for side in SIDES if options.hand in (side, "either")}
     side = max(distances, key=lambda name: float(distances[name].max()))
     distance, farthest = distances[side], float(distances[side].max())
@@ -177,10 +130,3 @@ def _downhill(values: Floats, frame: int, step: Literal[-1, 1], last: int) -> in
 def _smooth(values: Floats, deviation_s: float, frame_rate_hz: float) -> Floats:
     smoothed = gaussian_filter1d(values.astype(np.float64), deviation_s * frame_rate_hz, axis=0, mode="nearest")
     return np.asarray(smoothed)
-
-
-def _require_positive(options: PauseOptions | ReachOptions, *names: str) -> None:
-    for name in names:
-        value = getattr(options, name)
-        if not (np.isfinite(value) and value > 0):
-            raise MotionError(f"{value} must be a positive number", code="option-invalid", where=name)

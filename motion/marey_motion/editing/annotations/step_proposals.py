@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from itertools import pairwise
 from math import cos, degrees, radians
 from typing import NamedTuple
@@ -12,52 +11,17 @@ from numpy.typing import NDArray
 
 from marey_motion import kinematics
 from marey_motion.clip import Clip
-from marey_motion.editing.annotations.contacts import ContactOptions, Stance, find_stances
+from marey_motion.editing.annotations.contacts import Stance, find_stances
 from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
-from marey_motion.errors import MotionError
 from marey_motion.matching.body import SIDES, MatchingBody
+from marey_schemas.options.annotations import ContactOptions, StepsProposal
 
 STANDING = "standing"
 PASSING = "passing"
 SHORTEST_FLIGHT_S = 0.04
 
 
-@dataclass(frozen=True)
-class StepOptions:
-    """Limits of a step.
-
-    Parameters
-    ----------
-    contacts : what counts as a foot's contact
-    shortest_s, longest_s : seconds of a step
-    shortest_m : way of the hips over the ground
-    most_turn_deg : change of heading; steps that turn more are steps of a turn, and get no label
-    most_aside_deg : between the way of the hips and the heading; steps aside and backward get no label
-    standing_s : both feet on the ground for so long are somebody who stands
-    """
-
-    contacts: ContactOptions = field(default_factory=ContactOptions)
-    shortest_s: float = 0.2
-    longest_s: float = 1.5
-    shortest_m: float = 0.2
-    most_turn_deg: float = 45.0
-    most_aside_deg: float = 45.0
-    standing_s: float = 0.6
-
-    def __post_init__(self) -> None:
-        for name in ("shortest_s", "longest_s", "shortest_m", "most_turn_deg", "most_aside_deg", "standing_s"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise MotionError(f"{value} must be a number and not negative", code="option-invalid", where=name)
-        if self.longest_s <= self.shortest_s:
-            raise MotionError(
-                f"{self.longest_s} s must be more than shortest_s, {self.shortest_s} s",
-                code="option-invalid",
-                where="longest_s",
-            )
-
-
-def propose_steps(clip: Clip, body: MatchingBody, options: StepOptions | None = None) -> Layer:
+def propose_steps(clip: Clip, body: MatchingBody, options: StepsProposal | None = None) -> Layer:
     """Propose segments from the contact of one foot to the next contact of the other, named after the foot that swings.
 
     `step_left` and `step_right` are steps of a walk, `run_left` and `run_right` those in which no foot touches the
@@ -70,14 +34,14 @@ def propose_steps(clip: Clip, body: MatchingBody, options: StepOptions | None = 
     ----------
     clip : Clip    F frames
     body : MatchingBody    joints of its skeleton
-    options : StepOptions, optional    limits
+    options : StepsProposal, optional    limits
 
     Returns
     -------
     Layer    the proposal
     """
-    options = options or StepOptions()
-    stances = find_stances(clip, body, options.contacts)
+    options = options or StepsProposal()
+    stances = find_stances(clip, body, ContactOptions(speed_m_s=options.contact_speed_m_s))
     standing = _standing(stances, clip, options.standing_s)
     travel = _Travel.of(clip, body)
     steps = [step for step in _steps(stances, standing) if travel.is_step(step, options)]
@@ -168,7 +132,7 @@ class _Travel(NamedTuple):
         heading = kinematics.headings(directions)
         return cls(ground[:, body.hips], ground[:, list(body.feet)], heading, clip.frame_rate_hz)
 
-    def is_step(self, step: _Step, options: StepOptions) -> bool:
+    def is_step(self, step: _Step, options: StepsProposal) -> bool:
         """Whether the movement is one step ahead and not a turn."""
         if not options.shortest_s <= (step.end - step.start) / self.frame_rate_hz <= options.longest_s:
             return False
