@@ -47,7 +47,7 @@ class ContactOptions(Options):
 class StepsProposal(Options):
     """Steps of a walk or run, from the contact of one foot to that of the other, named after the foot that swings."""
 
-    method: Literal["steps"] = "steps"
+    method: Literal["steps"] = Field("steps", description="Name of the method that proposes segments and keyframes.")
     contact_speed_m_s: float = Field(
         CONTACT_SPEED_M_S,
         gt=0,
@@ -81,7 +81,9 @@ class StepsProposal(Options):
 class VelocityMinimaProposal(Options):
     """Movements from one minimum of the speed of joints to the next, with a keyframe `pause` at each minimum."""
 
-    method: Literal["velocity_minima"] = "velocity_minima"
+    method: Literal["velocity_minima"] = Field(
+        "velocity_minima", description="Name of the method that proposes segments and keyframes."
+    )
     joints: tuple[JointName, ...] = Field(
         (), max_length=256, description="Joints whose mean speed is used, by their own or their standard names."
     )
@@ -99,7 +101,9 @@ class VelocityMinimaProposal(Options):
 class WristContactProposal(Options):
     """Reaches of a hand out of its rest and back, with a keyframe `contact` where it arrives at its far place."""
 
-    method: Literal["wrist_contact"] = "wrist_contact"
+    method: Literal["wrist_contact"] = Field(
+        "wrist_contact", description="Name of the method that proposes segments and keyframes."
+    )
     hand: Literal["left", "right", "either"] = Field(
         "either", description="Hand that reaches; either: the one that reaches farther."
     )

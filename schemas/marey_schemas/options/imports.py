@@ -43,7 +43,7 @@ class ImportOptions(Options):
         False, description="Shift each clip vertically, so that its feet are on the ground at height 0."
     )
     frame_rate_hz: float | None = Field(
-        None, gt=0, le=100_000, description="Frame rate in frames per second. Absent: the rate in the files."
+        None, gt=0, le=100_000, description="Frame rate of the clips, in hertz. Absent: the rate in the files."
     )
     trim_rest_pose: bool = Field(False, description="Remove rest poses at both ends.")
     tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags that every clip gets.")
