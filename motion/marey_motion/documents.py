@@ -259,7 +259,7 @@ def mapping_from_document(
     """
     for standard, name in document.joints.items():
         if standard not in STANDARD_JOINTS:
-            raise MappingError(f"{standard!r} is no standard joint", where=f"joints.{standard}")
+            raise MappingError(f"{standard!r} is not a standard joint", where=f"joints.{standard}")
         if name not in skeleton:
             raise MappingError(f"the skeleton has no joint {name!r}", where=f"joints.{standard}")
     for name in document.axes:

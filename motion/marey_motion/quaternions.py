@@ -575,13 +575,13 @@ def _check_orthonormal(m: Floats) -> None:
     if np.any(wrong):
         index = tuple(int(i) for i in np.argwhere(wrong)[0])
         kind = "mirrors" if error[index] <= 1e-3 else "scales or shears"
-        raise RotationError(f"the matrix at {index} {kind}, so it is no rotation", where="matrix")
+        raise RotationError(f"the matrix at {index} {kind}, so it is not a rotation", where="matrix")
 
 
 def _euler_axes(order: str) -> tuple[int, ...]:
     axes = tuple("xyz".find(letter) for letter in order.lower())
     if not 1 <= len(axes) <= 3 or -1 in axes or any(a == b for a, b in pairwise(axes)):
         raise RotationError(
-            f"{order!r} is no order of axes; write such as 'zxy', no axis twice in a row", where="order"
+            f"{order!r} is not an order of axes; write it as in 'zxy', with no axis twice in a row", where="order"
         )
     return axes

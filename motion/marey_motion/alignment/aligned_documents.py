@@ -116,7 +116,7 @@ def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
         _require_same_set(first, one)
     for before, after in pairwise(clips):
         if before.uid == after.uid:
-            raise MotionError("it stands twice among the aligned clips", code="sets-differ", where=after.name)
+            raise MotionError("it is among the aligned clips twice", code="sets-differ", where=after.name)
     reference = first.info.get("reference")
     return AlignedSet(
         skeleton=first.clip.skeleton,
@@ -180,7 +180,7 @@ def _example(stored: StoredExample) -> AlignedClip:
 def _require_same_set(first: StoredExample, one: StoredExample) -> None:
     name = str(one.info.get("name") or one.uid)
     if one.clip.skeleton.joint_names != first.clip.skeleton.joint_names:
-        raise MotionError("it moves another skeleton than the other clips", code="skeleton-mismatch", where=name)
+        raise MotionError("its skeleton is not that of the other clips", code="skeleton-mismatch", where=name)
     same_frames = (one.clip.frame_count, one.clip.frame_rate_hz) == (first.clip.frame_count, first.clip.frame_rate_hz)
     if not same_frames or any(one.info.get(key) != first.info.get(key) for key in SHARED):
         raise MotionError(

@@ -185,7 +185,7 @@ class _Aligning:
             raise MotionError("two examples have this uid", where=repeated[0])
         wanted = self._options.reference
         if wanted not in (MEDOID, NEAREST_MEAN_LENGTH) and wanted not in {one.uid for one in clips}:
-            raise MotionError("the reference is none of the clips", code="unknown-reference", where=wanted)
+            raise MotionError("the reference is not one of the clips", code="unknown-reference", where=wanted)
 
     def _require_size(self, clips: Sequence[SourceExample], rate_hz: float) -> None:
         frames = sum(one.clip.frame_count / one.clip.frame_rate_hz * rate_hz for one in clips)

@@ -74,7 +74,9 @@ def cuts_of(layer: Layer) -> tuple[Cut, ...]:
     cuts = tuple(Cut(tuple(sorted(labels)), frame) for frame, labels in sorted(frames.items()))
     repeated = [label for label, count in Counter(label for cut in cuts for label in cut.labels).items() if count > 1]
     if repeated:
-        raise AnnotationError("stands twice once labels are numbered", code="label-repeats", where=repeated[0])
+        raise AnnotationError(
+            "two labels get this name when repeated labels are numbered", code="label-repeats", where=repeated[0]
+        )
     return cuts
 
 

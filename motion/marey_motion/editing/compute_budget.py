@@ -45,4 +45,4 @@ class ComputeBudget:
         """
         self.left -= work
         if self.left < 0.0:
-            raise EditError("the edit takes longer than it may", code="edit-too-long")
+            raise EditError("the edit takes more computing time than allowed", code="edit-too-long")

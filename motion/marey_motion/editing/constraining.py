@@ -139,7 +139,7 @@ def _check_range(constraint: Constraint, number: int, frames: int) -> None:
     start, stop = constraint.start, constraint.stop
     if not 0 <= start < stop <= frames:
         raise EditError(
-            f"the frames {start}:{stop} are not there; there are {frames}",
+            f"the frames {start}:{stop} are outside the clip, which has {frames}",
             code="frames-missing",
             where=f"constraints[{number}]",
         )

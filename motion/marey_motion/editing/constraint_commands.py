@@ -155,7 +155,7 @@ class _Rig:
         """Axes of a joint. Raises `MappingError` where it is not mapped."""
         name = self.take.skeleton.joint_names[joint]
         if name not in self.axes:
-            raise MappingError("the mapping does not say what this joint is, so that it has no axes", where=name)
+            raise MappingError("the mapping does not name this joint, so its axes are unknown", where=name)
         return self.axes[name]
 
     def axes_if_known(self) -> dict[str, JointAxes] | None:
@@ -252,7 +252,7 @@ def _foot(rig: _Rig, side: str) -> Foot:
     *_, ankle = mapping.indices(skeleton, (f"{side}_hip", f"{side}_knee", f"{side}_ankle"))
     leg = limb_ending_at(skeleton, mapping, ankle, rig.axes_if_known())
     if leg is None:
-        raise MappingError("hip, knee and ankle are not one leg", where=f"{side}_ankle")
+        raise MappingError("hip, knee and ankle do not form one leg", where=f"{side}_ankle")
     toe = f"{side}_toe"
     return Foot(leg, mapping.indices(skeleton, (toe,))[0] if toe in mapping.joints else ankle)
 
@@ -267,7 +267,7 @@ def _given_contacts(
         toe = np.zeros(take.frame_count, dtype=np.bool_)
         for one in given:
             if one["foot"] not in ("left", "right"):
-                raise EditError(f"{one['foot']!r} is no foot; there are left and right", where="contacts")
+                raise EditError(f"{one['foot']!r} is not a foot; choose left or right", where="contacts")
             if one["foot"] == side:
                 start, stop = take.frames(one["frames"])
                 toe[start:stop] = True

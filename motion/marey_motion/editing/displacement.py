@@ -117,7 +117,7 @@ def _check_windows(frames: AnyInts, windows: Sequence[Window]) -> None:
             raise EditError(f"the window {window.start}:{window.stop} holds no given frame", where="windows")
         inside |= held
     if not inside.all():
-        raise EditError(f"frame {int(frames[~inside][0])} is not inside of a window", where="windows")
+        raise EditError(f"frame {int(frames[~inside][0])} is not inside any window", where="windows")
 
 
 def spread_displacements(frames: AnyInts, values: Floats, window: Window) -> Floats:

@@ -131,7 +131,9 @@ def plant_feet(
     contacts = contacts or tuple(find_contacts(positions, foot, frame_rate_hz, options) for foot in feet)
     for one in contacts:
         if len(one.toe) != motion.frame_count or len(one.heel) != motion.frame_count:
-            raise EditError(f"flags for {len(one.toe)} of {motion.frame_count} frames", where="contacts")
+            raise EditError(
+                f"there are flags for {len(one.toe)} frames, the motion has {motion.frame_count}", where="contacts"
+            )
     blend = max(1, round(options.blend_s * frame_rate_hz))
     spins = np.asarray(kinematics.as_global_rotations(skeleton, motion.rotations), dtype=np.float64)
     plans = [_plan(positions, spins, foot, touching, blend) for foot, touching in zip(feet, contacts, strict=True)]

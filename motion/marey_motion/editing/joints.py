@@ -77,7 +77,7 @@ def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> l
     odd = np.flatnonzero(apart > SAME_AXES_RAD)
     if odd.size:
         raise EditError(
-            "the joint stands otherwise in the rest pose of the source's skeleton; retarget the source first",
+            "the joint has another orientation in the rest pose of the source's skeleton; retarget the source first",
             code="other-axes",
             where=f"joint {target.joint_names[joints[int(odd[0])]]}",
         )
@@ -85,7 +85,7 @@ def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> l
 
 
 def _stretched(take: Take, clip: Clip, frames: tuple[int, int | None] | None, count: int) -> Motion:
-    """A range of frames of a clip, stretched to `count` of them. Raises `EditError` where they are not there."""
+    """Take a range of frames of a clip, stretched to `count` of them. Raises `EditError` where the clip lacks them."""
     try:
         start, stop = take.moved(motion_of(clip)).frames(frames)
     except EditError as error:

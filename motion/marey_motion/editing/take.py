@@ -190,7 +190,7 @@ class Take:
         stop = self.frame_count if stop is None else stop
         if not 0 <= start < stop <= self.frame_count:
             raise EditError(
-                f"the frames {start}:{stop} are not there; there are {self.frame_count}", code="frames-missing"
+                f"the frames {start}:{stop} are outside the clip, which has {self.frame_count}", code="frames-missing"
             )
         return start, stop
 
@@ -239,7 +239,7 @@ class Take:
         most = self.most_numbers // width
         if frames > most:
             raise EditError(
-                f"the result would have {frames:,} frames; of this skeleton {most:,} are possible",
+                f"the result would have {frames:,} frames; with this skeleton {most:,} are possible",
                 code="edit-too-large",
             )
         self.budget.spend(PER_NUMBER * width * frames)

@@ -56,7 +56,7 @@ def read_amc(
     degrees, declared_rate_hz = _read_amc_header(lines, skeleton.degrees)
     values, gaps = scan_frames(lines, skeleton)
     if gaps:
-        message = f"the frames' numbers jump {gaps} times; the frames are taken as they follow each other"
+        message = f"frame numbers jump {gaps} times; frames were read in the order of the file"
         source.warnings.append(CheckWarning("frame-number-gap", message, values={"gaps": gaps}))
     source.frame_rate_hz = frame_rate_hz or declared_rate_hz
     if source.frame_rate_hz is None:

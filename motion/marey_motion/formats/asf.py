@@ -273,7 +273,7 @@ class _AsfReader:
             words
         ):
             raise self.lines.error(
-                f"{excerpt(b' '.join(words))!r} are no different ones of TX TY TZ RX RY RZ", joint=joint
+                f"{excerpt(b' '.join(words))!r} must be different ones of TX TY TZ RX RY RZ", joint=joint
             )
         return channels
 

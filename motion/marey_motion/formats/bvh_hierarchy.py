@@ -139,7 +139,7 @@ class _HierarchyReader:
             self._read_channels(rest.split())
         else:
             raise self.lines.error(
-                f"{excerpt(piece)!r} stands where ROOT, JOINT, End Site, OFFSET, CHANNELS or a brace is needed",
+                f"{excerpt(piece)!r} is not what belongs here: ROOT, JOINT, End Site, OFFSET, CHANNELS or a brace",
                 joint=self._joint_name(),
             )
 
@@ -191,7 +191,7 @@ class _HierarchyReader:
         names = [_CHANNEL_BY_KEY.get(word.lower(), "") for word in words[1:]]
         if "" in names:
             unknown = excerpt(words[1 + names.index("")])
-            raise self.lines.error(f"channel {unknown!r} is none of {', '.join(CHANNELS)}", joint=joint)
+            raise self.lines.error(f"channel {unknown!r} is not one of {', '.join(CHANNELS)}", joint=joint)
         if len(words[0]) > 3 or int(words[0]) != len(names):
             raise self.lines.error(f"CHANNELS says {excerpt(words[0])} and names {len(names)}", joint=joint)
         if len(set(names)) != len(names):

@@ -57,7 +57,7 @@ def _axes_of(skeleton: Skeleton, joint: int, rotation_order: str, source: Source
         if len(turns) == 3:
             rotation_order = "".join(turns)
     if sorted(rotation_order.lower()) != ["x", "y", "z"]:
-        raise FormatError(f"the rotation order {rotation_order!r} is no order of x, y and z", code="rotation-order")
+        raise FormatError(f"the rotation order {rotation_order!r} is not an order of x, y and z", code="rotation-order")
     return ["xyz".index(axis) for axis in rotation_order.lower()]
 
 

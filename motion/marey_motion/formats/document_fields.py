@@ -109,7 +109,7 @@ def number_array(values: Any, file: str, name: str, joint: str | None = None) ->
     try:
         array = np.array(values)
         if array.dtype.kind not in "iuf":
-            raise ValueError(f"{array.dtype} is no number")
+            raise ValueError(f"{array.dtype} is not a type of number")
         numbers = array.astype(np.float64)
     except (ValueError, TypeError, OverflowError) as error:
         message = f"field {name!r} must hold numbers in rows of equal length"

@@ -44,10 +44,10 @@ def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWar
     if frame_time_s is None:
         raise _no_rate("the file has no Frame Time", file)
     if LONGEST_FRAME_TIME_S < frame_time_s < float("inf"):
-        reason = f"a Frame Time of {frame_time_s:g} s gives no rate of a motion; it looks like a rate or milliseconds"
+        reason = f"a Frame Time of {frame_time_s:g} s is too long; it looks like a frame rate, or like milliseconds"
         raise _no_rate(reason, file)
     if not 1.0 / HIGHEST_RATE_HZ <= frame_time_s < float("inf"):
-        raise _no_rate(f"a Frame Time of {frame_time_s} s gives no frame rate", file)
+        raise _no_rate(f"a Frame Time of {frame_time_s} s is not a valid time between frames", file)
     declared_hz = 1.0 / frame_time_s
     nearest_hz = min(KNOWN_RATES_HZ, key=lambda rate_hz: abs(rate_hz - declared_hz))
     deviation = abs(nearest_hz - declared_hz) / nearest_hz

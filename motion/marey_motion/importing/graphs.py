@@ -65,7 +65,7 @@ def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         pointer = "".join(f"/{step}" for step in first["loc"])
-        detail = f"This is no valid {SCHEMA}: {pointer}: {first['msg'].removeprefix('Value error, ')}"
+        detail = f"This is not a valid {SCHEMA}: {pointer}: {first['msg'].removeprefix('Value error, ')}"
         raise FormatError(detail, code="invalid") from error
     return ImportedItem(graph.file, Kind.GRAPH, graph.name, graph.collection, {"graph": document}, graph.tags)
 

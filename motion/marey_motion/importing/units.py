@@ -54,7 +54,7 @@ def unit_in_metres(unit: str | float) -> float:
     metres = UNITS_M.get(unit.lower()) if isinstance(unit, str) else float(unit)
     if metres is None or not (np.isfinite(metres) and metres > 0):
         raise MotionError(
-            f"the unit {unit!r} is none of {', '.join(UNITS_M)} nor a size in metres", code="unit-unknown"
+            f"the unit {unit!r} is not one of {', '.join(UNITS_M)}, nor a size in metres", code="unit-unknown"
         )
     return metres
 

@@ -131,7 +131,7 @@ def union_normaliser(databases: Sequence[MatchingDatabase]) -> Normaliser:
         ]
         if other.layout.names != layout.names or not same_groups:
             raise MotionError(
-                "the databases match different joints or horizons, or with different weights; build them alike",
+                "the databases differ in joints, horizons or weights; build them with the same options",
                 code="normaliser-mismatch",
             )
     features = np.concatenate([database.features for database in ordered])

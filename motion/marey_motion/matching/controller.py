@@ -162,7 +162,7 @@ def controller_constants(options: ControllerOptions, rate_hz: float) -> Controll
     MotionError    where searches are less than a tick apart
     """
     if options.search_every_s * rate_hz < 0.5:
-        raise MotionError("a search period is one tick or longer", where="search_every_s")
+        raise MotionError("the period of searches must be at least one tick", where="search_every_s")
     return ControllerConstants(
         follow=("time", "path", "open_loop").index(options.follow),
         by_distance=options.selection == "pose_distance",

@@ -19,11 +19,11 @@ NOTES = {
     "rest-pose-dropped": "The clip begins or ends with a rest pose, which was left out.",
     "only-a-rest-pose": "The clip is a rest pose from beginning to end; it was kept.",
     "in-place-gait": "The clip walks without travelling; leave it out of speed coverage.",
-    "too-short": "The clip is shorter than what may not be chosen at its end: it can never be.",
+    "too-short": "The clip is too short to be chosen: it has only frames near its end, which searches may not choose.",
     "loop-end-repeated": "The loop's last frame repeats its first one and was left out.",
-    "loop-does-not-close": "The loop's last frame is far from its first one: it will jump there.",
-    "many-joints": "So many matched joints drown the trajectory.",
-    "scale-floored": "A group of features hardly varies; its scale was raised to the least one.",
+    "loop-does-not-close": "The loop's last frame is far from its first one: the motion will jump between them.",
+    "many-joints": "Many joints are matched, so the trajectory has little influence on searches.",
+    "scale-floored": "A group of features hardly varies; its scale was raised to the least allowed one.",
 }
 
 

@@ -108,10 +108,10 @@ def explain_choice(
     if record.rows.max(initial=0) >= database.row_count:
         raise MotionError("the record is of another database: it shows rows that this one does not have")
     if not 0 <= tick < len(record.rows):
-        raise MotionError(f"tick {tick} is none of the trial's {len(record.rows)}", where="tick")
+        raise MotionError(f"the trial has {len(record.rows)} ticks and no tick {tick}", where="tick")
     for row in others:
         if not 0 <= row < database.row_count:
-            raise MotionError(f"row {row} is none of the database's {database.row_count}", where="others")
+            raise MotionError(f"the database has {database.row_count} rows and no row {row}", where="others")
     wish, rules, playback = (
         trajectory_arrays(guide),
         controller_constants(options, guide.rate_hz),

@@ -127,7 +127,7 @@ class Normaliser:
             fitted_on, digest = str(tree["fitted_on"]), str(tree["digest"])
         except (KeyError, TypeError, ValueError) as error:
             raise MotionError(
-                f"this is no normaliser: {error}", code="normaliser-invalid", where="normaliser"
+                f"this is not a normaliser: {error}", code="normaliser-invalid", where="normaliser"
             ) from error
         if offset.ndim != 1 or scale.shape != offset.shape or len(names) not in (0, len(offset)):
             raise MotionError(

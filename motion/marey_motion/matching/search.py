@@ -120,7 +120,7 @@ def _check(rows: NDArray[np.float64], starts: NDArray[np.int64], selectable: NDA
         raise MotionError(f"the first rows of the clips must ascend from 0 to the number of rows, {len(rows)}")
     if not selectable.any():
         raise MotionError(
-            "no row can be chosen: every clip is shorter than what its last rows need to look ahead; add longer clips",
+            "no row can be chosen: every clip is shorter than the look-ahead of its rows; add longer clips",
             code="nothing-selectable",
         )
     if not (rows.max() <= LARGEST and rows.min() >= -LARGEST):

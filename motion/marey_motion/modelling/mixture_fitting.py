@@ -114,7 +114,7 @@ def fit_mixture(latents: Floats, options: MixtureOptions | None = None, *, seed:
     # In units of the mean deviation, everything below is independent of the scale of the data.
     unit = float(np.sqrt(latents.var(axis=0).mean()))
     if not unit > 0.0:
-        raise ModelError("latent vectors that do not vary have no dimensions", where="latents")
+        raise ModelError("the latent vectors do not vary, so no mixture can be fitted", where="latents")
     with one_thread():
         mixture, candidates, held_out = _Fitting(latents / unit, wanted, seed).choose()
     shift = dimensions * float(np.log(unit))

@@ -132,7 +132,7 @@ class MotionPrimitive:
             raise MotionError("the temporal weight is a positive number", where="temporal_weight")
         least, most = self.log_slope_bounds
         if not -MOST_LOG_SLOPE <= least <= most <= MOST_LOG_SLOPE:
-            message = f"{least:g} to {most:g} is no range within {-MOST_LOG_SLOPE:g} to {MOST_LOG_SLOPE:g}"
+            message = f"{least:g} to {most:g} is not a range within {-MOST_LOG_SLOPE:g} to {MOST_LOG_SLOPE:g}"
             raise MotionError(message, where="log_slope_range")
 
     @property
@@ -258,7 +258,7 @@ class MotionPrimitive:
             passed = self.time_functions(latent[None])[0]
             if passed[-1] > MOST_FRAMES:
                 raise MotionError(
-                    f"the motion would last {passed[-1] / self.frame_rate_hz:.3g} s, far out of what the model knows",
+                    f"the motion would last {passed[-1] / self.frame_rate_hz:.3g} s, far beyond those of the model",
                     code="motion-too-long",
                 )
             steps = max(1, round(float(passed[-1])))

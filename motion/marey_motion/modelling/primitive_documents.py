@@ -100,7 +100,7 @@ def primitive_from_tree(tree: Mapping[str, Any], skeleton: Skeleton) -> MotionPr
     ModelError    where the joints differ, and where the numbers describe no model
     """
     if tree.get("schema") != PRIMITIVE_SCHEMA:
-        raise ModelError(f"a document of the schema {tree.get('schema')!r}, not {PRIMITIVE_SCHEMA!r}")
+        raise ModelError(f"the document has the schema {tree.get('schema')!r}, not {PRIMITIVE_SCHEMA!r}")
     return MotionPrimitive(
         name=tree["name"],
         skeleton=skeleton,
@@ -141,7 +141,7 @@ def _columns(joints: list[str], skeleton: Skeleton) -> NDArray[np.int64] | None:
     if tuple(joints) == skeleton.joint_names:
         return None
     if sorted(joints) != sorted(skeleton.joint_names) or joints[0] != skeleton.joint_names[0]:
-        odd = sorted(set(joints) ^ set(skeleton.joint_names)) or ["the root, or a name that stands twice"]
+        odd = sorted(set(joints) ^ set(skeleton.joint_names)) or ["the root, or a name that appears twice"]
         raise ModelError(f"the model's joints are not the skeleton's: {', '.join(odd[:5])}", where="joints")
     places = {name: place for place, name in enumerate(joints)}
     order = np.array([places[name] for name in skeleton.joint_names])

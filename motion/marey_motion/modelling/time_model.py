@@ -31,7 +31,9 @@ def fit_log_slopes(basis: SplineBasis, time_functions: Floats) -> Floats:
     slopes = np.diff(time_functions, axis=1)
     if not (np.isfinite(slopes).all() and (slopes > 0.0).all()):
         worst = int(np.argwhere(~(slopes > 0.0))[0, 0])
-        raise MotionError("a time function must rise strictly", code="time-function-invalid", where=f"example {worst}")
+        raise MotionError(
+            "a time function must be strictly increasing", code="time-function-invalid", where=f"example {worst}"
+        )
     coefficients = basis.fit(np.log(slopes)[..., None])
     lasting = np.exp(basis.at_frames @ coefficients).sum(axis=1, keepdims=True)
     # B-splines add up to 1 everywhere: what is added to all coefficients is added to the function.

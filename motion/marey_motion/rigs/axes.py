@@ -164,13 +164,15 @@ def rest_pose_doubts(skeleton: Skeleton, mapping: JointMapping) -> tuple[str, ..
 def _resting_body(skeleton: Skeleton, mapping: JointMapping) -> _PosedBody:
     joints = {standard: skeleton.index_of(name) for standard, name in mapping.joints.items()}
     if not any({f"{side}_{joint}" for side in SIDES} <= joints.keys() for joint in ("hip", "shoulder")):
-        raise MappingError("axes need both hips or both shoulders in the mapping", where="left_hip")
+        raise MappingError(
+            "the mapping needs both hips or both shoulders, from which axes are computed", where="left_hip"
+        )
     return _PosedBody(skeleton, joints, skeleton.rest_global_positions[None], skeleton.rest_global_rotations[None])
 
 
 def _moving_body(skeleton: Skeleton, motion: Clip, joints: Mapping[str, int]) -> _PosedBody:
     if not same_hierarchy(skeleton, motion.skeleton):
-        raise ClipError("the motion to read axes from is of another skeleton", where="motion")
+        raise ClipError("the motion to compute axes from has another skeleton", where="motion")
     count = min(motion.frame_count, FRAMES_READ)
     frames = np.linspace(0, motion.frame_count - 1, count).round().astype(np.intp)
     seen = replace(
@@ -227,7 +229,10 @@ class _PosedBody:
         """From the pelvis to the middle of the shoulders, or what comes next to that, perpendicular to the hips."""
         levels = [level for level in map(self._level, _LEVELS) if level is not None]
         if len(levels) < 2:
-            raise MappingError("axes need hips and a joint above or below them in the mapping", where="pelvis")
+            raise MappingError(
+                "the mapping needs the hips and a joint above or below them, from which axes are computed",
+                where="pelvis",
+            )
         trunk = levels[0] - levels[1]
         return _unit(trunk - _dot(trunk, self.hips_left) * self.hips_left)
 

@@ -253,7 +253,7 @@ def short(frames):
             "cut: contact, frame 60: it has the frames 0:60",
         ),
         (short(8), TO_FIRST, "alignment-impossible", "short: .*60 frames cannot be aligned with 8"),
-        (short(20), AlignOptions(reference="nobody"), "unknown-reference", "nobody: the reference is none"),
+        (short(20), AlignOptions(reference="nobody"), "unknown-reference", "nobody: the reference is not one"),
         (short(20), AlignOptions(weights={"tail": 2.0}), "unknown-joint", "tail"),
         (SourceExample("clip_a@1", "twin", walk()), None, "motion-invalid", "clip_a@1: two examples have this uid"),
     ],

@@ -86,7 +86,7 @@ def changed(aligned, **info):
         ({"keyframes": {"down": 31}}, "not aligned together"),
         ({"reference": {"item": "clip_b", "revision": 1, "mirrored": False}}, "not aligned together"),
         ({"frame_rate_hz": 30.0}, "60 frames at 60 Hz, but a time function of 60 at 30 Hz"),
-        ({"clip": {"item": "clip_c", "revision": 1, "mirrored": True}}, "stands twice"),
+        ({"clip": {"item": "clip_c", "revision": 1, "mirrored": True}}, "among the aligned clips twice"),
     ],
 )
 def test_examples_that_were_not_aligned_together_are_told_apart(aligned, info, said):

@@ -95,7 +95,7 @@ def test_a_neighbour_across_a_gap_gives_way_only_where_it_must():
 
 
 def test_a_boundary_does_not_pass_the_other_end_of_its_segment():
-    with pytest.raises(AnnotationError, match="with its start at 18 nothing is left of it"):
+    with pytest.raises(AnnotationError, match="with its start at 18 it would have no frames"):
         annotations.move_boundary(WALK, 15, "start", 18)
 
 

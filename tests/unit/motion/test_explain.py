@@ -148,7 +148,7 @@ def test_rows_one_asks_about_are_listed_with_why_they_could_not_be_chosen():
 def test_ticks_and_rows_that_there_are_not_are_refused():
     made = played()
 
-    with pytest.raises(MotionError, match="tick 780 is none of the trial's 780"):
+    with pytest.raises(MotionError, match="the trial has 780 ticks and no tick 780"):
         explained(made, 780)
     with pytest.raises(MotionError, match="row -1"):
         explained(made, 0, others=(-1,))

@@ -85,7 +85,7 @@ def test_a_compressed_archive_of_the_same_arrays_is_read(archive: dict[str, byte
         ("offsets", member(np.full((22, 3), np.nan)), "not finite"),
         ("parents", member(np.zeros(22)), "integers"),
         ("parents", member(np.full(22, 40, np.int32)), "root"),
-        ("poses", member(np.zeros((70, 91), np.float32)), "no rotation"),
+        ("poses", member(np.zeros((70, 91), np.float32)), "not a rotation"),
         ("poses", member(np.zeros((70, 90), np.float32)), "shape (70, 91)"),
         ("frame_rate_hz", member(-1.0), "positive"),
         ("joint_names", member(np.array([object()], object)), "damaged"),

@@ -163,7 +163,7 @@ def test_a_clip_without_its_skeleton_is_refused_with_the_reason() -> None:
         ({"poses": [[1, 2]]}, "rows of 11"),
         ({"poses": [[1, 2], [3]]}, "equal length"),
         ({"poses": [["a"] * 11]}, "numbers"),
-        ({"poses": [[0] * 11]}, "no rotation"),
+        ({"poses": [[0] * 11]}, "not a rotation"),
         ({"poses": [[*TWO_POSES["poses"][0], 1, 0, 0, 0]]}, "15 columns"),
         ({"frame_time": 0}, "Frame Time"),
         ({"frame_time": "fast"}, "frame_time"),

@@ -58,7 +58,10 @@ def test_where_the_stair_stands_time_goes_on_evenly():
         ({"time_function": [0, 0.5]}, "list of two frames"),
         ({"time_function": [0, 1e308]}, "names frame 1e.308, which no source has"),
         ({"time_function": [0, 5, 4]}, "goes back at canonical frame 2"),
-        ({"time_function": [0, 1], "sections": [{"start_idx": 0, "end_idx": 3}]}, "section 0:3 is none of the 2"),
+        (
+            {"time_function": [0, 1], "sections": [{"start_idx": 0, "end_idx": 3}]},
+            "section 0:3 is not a range of the 2",
+        ),
     ],
 )
 def test_damaged_alignments_are_refused_by_the_field(document, told):

@@ -66,7 +66,7 @@ def test_a_graph_without_a_start_is_refused_by_the_field_that_is_missing():
         (["nodes", "walk"], [], "'walk' must be dict"),
         (["nodes", "walk", "12", "name"], 3, "'name' must be str"),
         (["nodes", "walk", "12", "name"], "end", "walk: two nodes are called 'end'"),
-        (["nodes", "walk", "12", "type"], "begin", "walk/begin: 'begin' is no type"),
+        (["nodes", "walk", "12", "type"], "begin", "walk/begin: 'begin' is not a type"),
         (["nodes", "walk", "12", "transitions"], [], "walk/begin: 'transitions' must be an object"),
         (["nodes", "walk", "12", "transitions"], {"walk:99": {}}, "walk/begin: there is no node 'walk:99'"),
         (["start_node"], "idle", "'start_node' must be an action and a model"),

@@ -220,7 +220,7 @@ def changed(path, value):
 @pytest.mark.parametrize(
     ("document", "told"),
     [
-        ({"poses": []}, "no model"),
+        ({"poses": []}, "not a model"),
         (changed(["sspm", "mean"], [1.0, 2.0]), "space: a mean of 2 numbers for 9 coefficients"),
         (changed(["sspm", "n_coeffs"], 7), "n_coeffs is 7"),
         (changed(["sspm", "n_dims"], 7), "n_dims is 7"),

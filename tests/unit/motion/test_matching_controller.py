@@ -396,7 +396,7 @@ def test_options_that_make_no_sense_are_named(options, where):
 def test_a_search_period_of_less_than_a_tick_is_refused():
     database = synthetic_database([arc_track(1.0, 0.0, 5.0)])
 
-    with pytest.raises(MotionError, match="search_every_s: a search period is one tick"):
+    with pytest.raises(MotionError, match="search_every_s: the period of searches"):
         play(database, circle(1.0, 0.0), EXACT.replace(search_every_s=0.004))
 
 

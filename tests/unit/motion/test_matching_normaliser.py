@@ -76,8 +76,8 @@ def test_a_normaliser_survives_being_kept_as_a_tree() -> None:
         ({"scale": np.zeros(27)}, "scales positive"),
         ({"scale": np.ones(3)}, "do not match"),
         ({"offset": np.full(27, np.nan)}, "must be finite"),
-        ({"names": None}, "no normaliser"),
-        ({"offset": "abc"}, "no normaliser"),
+        ({"names": None}, "not a normaliser"),
+        ({"offset": "abc"}, "not a normaliser"),
     ],
 )
 def test_a_tree_that_is_no_normaliser_is_refused(change, message) -> None:
@@ -121,7 +121,7 @@ def test_databases_of_other_dimensions_or_weights_have_no_union() -> None:
         DatabaseOptions(extra_joints=("head",)),
         DatabaseOptions(weights=FeatureWeights(hip_velocity=2.0)),
     ):
-        with pytest.raises(MotionError, match="build them alike") as caught:
+        with pytest.raises(MotionError, match="build them with the same options") as caught:
             union_normaliser([database_of(1.0), database_of(1.0, options=options)])
         assert caught.value.code == "normaliser-mismatch"
 

@@ -169,7 +169,11 @@ def test_a_left_turn_in_the_mirror_is_a_right_turn() -> None:
 
 @pytest.mark.parametrize(
     ("partners", "message"),
-    [([0, 1], "one partner of its own"), ([0, 2, 2], "one partner of its own"), ([1, 0, 2], "root its own")],
+    [
+        ([0, 1], "one partner that no other joint has"),
+        ([0, 2, 2], "one partner that no other joint has"),
+        ([1, 0, 2], "the root is its own partner"),
+    ],
 )
 def test_what_is_no_pairing_is_refused(partners, message) -> None:
     skeleton = Skeleton(("a", "b", "c"), [-1, 0, 0], np.zeros((3, 3)), np.tile([1.0, 0, 0, 0], (3, 1)))

@@ -316,7 +316,7 @@ def test_examples_that_make_no_model_are_refused_by_name():
         ({"motion": holes}, "not finite"),
         ({"motion": loose}, "bone_1 moves against its parent"),
         ({"motion": odd.motion.at_frames(np.arange(20))}, "20 frames"),
-        ({"time_function": back}, "does not rise"),
+        ({"time_function": back}, "is not strictly increasing"),
     ):
         with pytest.raises(MotionError, match=f"clip 2: .*{told}"):
             train_primitive(changed(aligned, 2, **members))

@@ -182,7 +182,7 @@ def refusal(project, **params):
 @pytest.mark.parametrize(
     ("params", "code", "said"),
     [
-        ({"reference": "clip_z"}, "unknown-reference", "clip_z is none of the clips"),
+        ({"reference": "clip_z"}, "unknown-reference", "clip_z is not one of the clips"),
         ({"weights": {"Tail": 1.0}}, "unknown-joint", "Tail"),
         ({"layer": "steps"}, "no-annotations", "no annotations are given"),
     ],

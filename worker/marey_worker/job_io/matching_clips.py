@@ -202,7 +202,9 @@ def _trim(pin: PinnedInput, motion: MotionDocument, trims: Mapping[str, tuple[in
     trim = trims.get(pin.item)
     if trim is not None and trim[1] > len(motion.poses):
         frames = len(motion.poses)
-        raise JobRefused("bad-trim", f"{pin.path}: the frames {trim[0]}:{trim[1]} are not there; it has {frames}")
+        raise JobRefused(
+            "bad-trim", f"{pin.path}: the frames {trim[0]}:{trim[1]} are outside the clip, which has {frames}"
+        )
     return trim
 
 

@@ -225,7 +225,7 @@ class _Job:
             return options
         named = [pin for pin in self._pins.values() if pin.item == options.reference]
         if not named:
-            raise JobRefused("unknown-reference", f"the reference {options.reference} is none of the clips")
+            raise JobRefused("unknown-reference", f"the reference {options.reference} is not one of the clips")
         return options.replace(reference=_uid(max(named, key=lambda pin: pin.revision)))
 
     def _digest(self, clips: Sequence[_Clip], examples: Sequence[SourceExample], rig: Rig) -> str:

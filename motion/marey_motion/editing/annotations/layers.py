@@ -206,7 +206,7 @@ def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", 
         neighbour = "previous" if previous else "next"
     other = previous if neighbour == "previous" else following
     if other is None:
-        raise _wrong(segment, "no-neighbour", f"there is no {neighbour} segment to merge with")
+        raise _wrong(segment, "no-neighbour", f"it has no {neighbour} segment to merge with")
     merged = Segment(segment.label, min(segment.start, other.start), max(segment.end, other.end))
     first = index if neighbour == "next" else index - 1
     return layer._with(first, first + 2, merged)
@@ -236,7 +236,7 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
     segment = layer.segments[index]
     moved = segment._replace(start=to) if edge == "start" else segment._replace(end=to)
     if moved.end <= moved.start:
-        raise _wrong(segment, "empty-segment", f"with its {edge} at {to} nothing is left of it")
+        raise _wrong(segment, "empty-segment", f"with its {edge} at {to} it would have no frames")
     beside = index - 1 if edge == "start" else index + 1
     if not 0 <= beside < len(layer.segments):
         return layer._with(index, index + 1, moved)
@@ -246,7 +246,9 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
     elif edge == "end" and (other.start == segment.end or other.start < to):
         changed = other._replace(start=to)
     if changed.end <= changed.start:
-        raise _wrong(other, "neighbour-in-the-way", f"moving the {edge} of {segment} to {to} leaves nothing of it")
+        raise _wrong(
+            other, "neighbour-in-the-way", f"moving the {edge} of {segment} to {to} would leave it without frames"
+        )
     first = min(index, beside)
     return layer._with(first, first + 2, *((changed, moved) if edge == "start" else (moved, changed)))
 
@@ -338,7 +340,7 @@ def remove_keyframe(layer: Layer, label: str, frame: int) -> Layer:
     gone = Keyframe(label, frame)
     place = layer._place_of(gone)
     if gone not in layer.keyframes[place : place + 1]:
-        raise AnnotationError("there is none", code="no-keyframe", where=str(gone))
+        raise AnnotationError("the layer has no such keyframe", code="no-keyframe", where=str(gone))
     return layer._with_keyframes(place, place + 1)
 
 

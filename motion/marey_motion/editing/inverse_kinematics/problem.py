@@ -205,7 +205,9 @@ def pose_problem(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], 
     """
     for number, target in enumerate(targets):
         if not 0 <= target.joint < skeleton.joint_count:
-            raise EditError(f"joint {target.joint} of {skeleton.joint_count}", where=f"targets[{number}]")
+            raise EditError(
+                f"there is no joint {target.joint}, the skeleton has {skeleton.joint_count}", where=f"targets[{number}]"
+            )
     if not targets:
         raise EditError("at least one target is needed", where="targets")
     paths = [set(skeleton.path_to_root(target.joint)) for target in targets]
@@ -224,7 +226,7 @@ def _body(skeleton: Skeleton, motion: Motion, joints: list[int], carries: Flags,
     may_turn = set(joints if freedom.joints is None else freedom.joints)
     movable = np.array([joint in may_turn for joint in joints], dtype=np.bool_)
     if not movable.any() and not freedom.root_moves:
-        raise EditError("none of the joints that may move carries a target", code="chain-invalid", where="joints")
+        raise EditError("no target moves with any of the joints that may move", code="chain-invalid", where="joints")
     limits, limited, stiffness = np.zeros((count, 14)), np.zeros(count, np.bool_), np.zeros(count)
     for k, joint in enumerate(joints):
         stiffness[k] = freedom.stiffness.get(joint, 0.0)
@@ -264,7 +266,7 @@ def _targets(joints: list[int], targets: Sequence[Target], frames: int) -> Targe
             axis = _vector(target.axis, f"targets[{number}].axis")
             length = float(np.linalg.norm(axis))
             if length < 1e-9:
-                raise EditError("a direction of length zero looks nowhere", where=f"targets[{number}].axis")
+                raise EditError("a direction must not have length zero", where=f"targets[{number}].axis")
             packed.directions[number] = axis / length
     return packed
 
@@ -277,7 +279,7 @@ def _checked_values(target: Target, number: int, frames: int) -> Floats:
     if len(values) not in (1, frames):
         raise EditError(f"{len(values)} values for {frames} frames", where=f"targets[{number}]")
     if isinstance(target, PositionTarget) and (not target.axes or set(target.axes) - set("xyz")):
-        raise EditError(f"{target.axes!r} are no axes; write such as 'xz'", where=f"targets[{number}].axes")
+        raise EditError(f"{target.axes!r} are not axes; write them as in 'xz'", where=f"targets[{number}].axes")
     return values
 
 

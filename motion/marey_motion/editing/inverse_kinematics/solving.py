@@ -155,7 +155,7 @@ def solve(
     if solver == "two_bone" or (solver == "auto" and asked is not None and not freedom.limits):
         if asked is None or limb is None:
             raise EditError(
-                "two bones reach one position in all axes, and one orientation, of the end of a limb",
+                "the two-bone solver takes one position in all axes, and at most one orientation, of the end of a limb",
                 code="solver-unfit",
                 where="solver",
             )

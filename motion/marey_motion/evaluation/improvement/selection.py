@@ -179,5 +179,5 @@ def require_same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> 
     """
     if not same_skeleton(first, second):
         raise MotionError(
-            "the clips are of another skeleton; retarget them first", code="skeleton-mismatch", where="skeleton"
+            "the clips have another skeleton; retarget them first", code="skeleton-mismatch", where="skeleton"
         )

@@ -144,7 +144,7 @@ def _redundancy(
 
 def _require_same(database: MatchingDatabase, result: EvaluationResult) -> None:
     if len(result.records) != len(result.trials):
-        raise MotionError("the evaluation is needed with the records of all its trials", code="records-missing")
+        raise MotionError("suggestions need the evaluation with the records of all its trials", code="records-missing")
     own = provenance_of(database, result.options, [trial.trial for trial in result.trials])
     different = [name for name in ("dataset", "normaliser") if getattr(own, name) != getattr(result.provenance, name)]
     if different:

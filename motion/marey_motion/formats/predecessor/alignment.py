@@ -71,7 +71,7 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
     ]
     for start, end in sections:
         if not 0 <= start < end <= len(frames):
-            message = f"section {start}:{end} is none of the {len(frames)} canonical frames"
+            message = f"section {start}:{end} is not a range of the {len(frames)} canonical frames"
             raise FormatError(message, file=file)
     return PredecessorAlignment(frames.astype(np.int64), tuple(sections))
 

@@ -128,7 +128,7 @@ def write_predecessor_graph(graph: PredecessorGraph, *, encoding: Encoding = "js
 def _type(node: Mapping[str, Any], place: Place, file: str) -> str:
     kind = node.get("type", "standard")
     if kind not in TYPES:
-        raise FormatError(f"{'/'.join(place)}: {kind!r} is no type; there are {', '.join(TYPES)}", file=file)
+        raise FormatError(f"{'/'.join(place)}: {kind!r} is not a type; choose from {', '.join(TYPES)}", file=file)
     return str(kind)
 
 

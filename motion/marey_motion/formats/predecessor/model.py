@@ -122,7 +122,7 @@ def model_of_document(document: Document, file: str, *, skeleton: Skeleton | Non
     """
     layout = layout_of(document)
     if layout is None:
-        message = "the document is no model: it has neither 'sspm', 'eigen_vectors_spatial' nor 'spatial_coeffs'"
+        message = "the document is not a model: it has neither 'sspm', 'eigen_vectors_spatial' nor 'spatial_coeffs'"
         raise FormatError(message, code="document-unknown", file=file)
     own = _skeleton(document, file) or skeleton
     if own is None:

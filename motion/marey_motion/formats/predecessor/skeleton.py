@@ -95,7 +95,7 @@ def _listed_nodes(document: Document, file: str) -> list[tuple[str, str | None, 
     roots = [name for name in listed if name not in parents]
     if unknown is not None or len(roots) != 1:
         problem = f"jointDescs lacks the child {unknown!r}" if unknown else f"{len(roots)} joints have no parent"
-        raise FormatError(f"the joints are no tree: {problem}", file=file)
+        raise FormatError(f"the joints are not a tree: {problem}", file=file)
     nodes: list[tuple[str, str | None, Document]] = []
     waiting = [roots[0]]
     while waiting:
@@ -103,7 +103,7 @@ def _listed_nodes(document: Document, file: str) -> list[tuple[str, str | None, 
         nodes.append((name, parents.get(name), listed[name]))
         waiting.extend(reversed(text_list(listed[name], "children", file)))
     if len(nodes) != len(listed):
-        raise FormatError("the joints are no tree: some are not connected to the root", file=file)
+        raise FormatError("the joints are not a tree: some are not connected to the root", file=file)
     return nodes
 
 
@@ -117,7 +117,7 @@ def _nested_nodes(root: Document, file: str) -> list[tuple[str, str | None, Docu
         nodes.append((name, parent, node))
         children = node.get("children") or []
         if not isinstance(children, list):
-            raise FormatError("'children' is no list", file=file, joint=name)
+            raise FormatError("'children' is not a list", file=file, joint=name)
         waiting.extend((child, name) for child in reversed(children))
     return nodes
 

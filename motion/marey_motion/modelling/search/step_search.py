@@ -96,7 +96,7 @@ def search_steps(
 def _require_finite(*found: Floats) -> None:
     if not all(np.isfinite(numbers).all() for numbers in found):
         raise MotionError(
-            "what is asked for leads to numbers that are not finite; ask for places nearer to what the model does",
+            "the constraints lead to numbers that are not finite; move them closer to the motions of the model",
             code="search-not-finite",
         )
 

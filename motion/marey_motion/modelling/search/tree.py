@@ -50,7 +50,7 @@ class SampleTree:
         nodes = len(self.sizes)
         sound = nodes > 0 and self.samples.ndim == 2 and self.sizes.shape == self.children.shape == (nodes,)
         if not sound or self.sizes[0] != len(self.samples) or self.sizes.min() < 1 or self.children.min() < 0:
-            raise MotionError("samples, sizes and children of the tree do not belong together", code="tree-invalid")
+            raise MotionError("samples, sizes and children of the tree do not fit each other", code="tree-invalid")
         if 1 + int(self.children.sum()) != nodes or (self.first_children > nodes).any():
             raise MotionError("a node of the tree has no parent, or two", code="tree-invalid")
         inner = np.flatnonzero(self.children)
