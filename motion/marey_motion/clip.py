@@ -144,7 +144,7 @@ class Clip:
 
 
 def _frozen(values: NDArray[np.generic], field: str, ndim: int) -> NDArray[np.float32]:
-    """A read-only float32 view of `values`; the caller's own array keeps its flags."""
+    """Make a read-only float32 view of `values`; the caller's own array keeps its flags."""
     array = np.asarray(values)
     if array.ndim != ndim or array.shape[0] == 0:
         raise ClipError(f"shape {array.shape} where {ndim} axes and at least one frame are needed", where=field)

@@ -120,7 +120,7 @@ def _mirror_of(skeleton: Skeleton, pairing: tuple[int, ...]) -> _Mirror:
 
 
 def _frame(skeleton: Skeleton, sources: NDArray[np.int64], carried: NDArray[np.bool_], joint: int) -> Floats:
-    """The improper matrix (3, 3) that takes the local axes of the partner to those of the joint."""
+    """Make the improper matrix (3, 3) that takes the local axes of the partner to those of the joint."""
     source = sources[joint]
     rest = quaternions.as_matrix(skeleton.rest_global_rotations[[joint, source]])
     by_rest = rest[0].T @ REFLECTION @ rest[1]
@@ -134,7 +134,7 @@ def _frame(skeleton: Skeleton, sources: NDArray[np.int64], carried: NDArray[np.b
 
 
 def _frame_of_bones(by_rest: Floats, bones: Floats, partners: Floats) -> Floats:
-    """The improper matrix nearest to `by_rest` that takes the partner's bones (n, 3) to the joint's own."""
+    """Find the improper matrix nearest to `by_rest` that takes the partner's bones (n, 3) to the joint's own."""
     seen = partners @ by_rest.T
     lengths = np.linalg.norm(bones, axis=1) * np.linalg.norm(seen, axis=1)
     if np.all(np.sum(bones * seen, axis=1) >= np.cos(SAME_DIRECTION_RAD) * lengths):
@@ -156,7 +156,7 @@ def _turns(skeleton: Skeleton, frames: Floats, carried: NDArray[np.bool_]) -> tu
 
 
 def _mirrored_translations(skeleton: Skeleton, mirror: _Mirror, motion: Motion) -> tuple[Floats, tuple[int, ...]]:
-    """Translations of the joints that have any and of their partners: the partner's, in the axes of their parent."""
+    """Mirror translations: a joint gets those of its partner, in the axes of its parent."""
     if not motion.translated_joints:
         return motion.translations, ()
     moving = np.array(motion.translated_joints)

@@ -90,7 +90,7 @@ def follow_moved_bones(clip: Clip, joints: Mapping[str, int]) -> FollowedBones:
 
 
 def _turns(rigid: AnyFloats, moved: AnyFloats) -> AnyFloats:
-    """The shortest rotations (F, 4) between bones (F, 3); none where one of them has no length."""
+    """Compute the shortest rotations (F, 4) between bones (F, 3); none where one of them has no length."""
     turns = quaternions.identity(len(rigid)).astype(np.float64)
     lengths = [np.linalg.norm(bones, axis=1) for bones in (rigid, moved)]
     known = np.minimum(*lengths) > SHORTEST_BONE_M

@@ -479,7 +479,7 @@ def rate_from_steps(steps: Floats, frame_count: int) -> Floats:
 
 
 def _widened(*arguments: tuple[ArrayLike, int]) -> tuple[list[Floats], np.dtype[Any]]:
-    """The arguments as float64, their last axis checked, and the floating type the result should have."""
+    """Convert arguments to float64, check their last axis, and choose the floating type of the result."""
     arrays = [np.asarray(values) for values, _ in arguments]
     for array, (_, size) in zip(arrays, arguments, strict=True):
         if array.ndim == 0 or array.shape[-1] != size:

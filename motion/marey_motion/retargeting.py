@@ -251,7 +251,7 @@ def moved_bones(clip: Clip, plan: RetargetPlan) -> FollowedBones:
 def _paired(
     source: Skeleton, source_mapping: JointMapping, target: Skeleton, target_mapping: JointMapping
 ) -> tuple[JointPair, ...]:
-    """Joints of both skeletons that play the same standard joint, each target joint once.
+    """Pair the joints of both skeletons with the same standard joint, each target joint once.
 
     Not the root: where it is not the pelvis as well, it is a handle on the floor that no bone gives a direction to.
     """
@@ -360,7 +360,7 @@ def _are_same_rig(source: Skeleton, target: Skeleton) -> bool:
 
 
 def _position_in_world(clip: Clip, joint: int) -> AnyFloats:
-    """Positions (F, 3) of one joint of a clip, metres."""
+    """Compute positions (F, 3) of one joint of a clip, metres."""
     moved = _offsets_by_joint(clip.translations, clip.translated_joints)
     return clip.root_translations + _position_from_root(clip.skeleton, clip.rotations, joint, moved)
 

@@ -247,7 +247,7 @@ def _checked_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _frozen(values: ArrayLike, dtype: DTypeLike, shape: tuple[int, ...], field: str) -> NDArray[np.generic]:
-    """A read-only view of `values` as `dtype`; the caller's own array keeps its flags."""
+    """Make a read-only view of `values` as `dtype`; the caller's own array keeps its flags."""
     array = np.asarray(values)
     if array.shape != shape:
         raise SkeletonError(f"shape {array.shape} where {shape} is needed", where=field)

@@ -81,7 +81,7 @@ def discard_outdated_kernels() -> None:
 
 
 def _origin() -> str:
-    """Digest of the compiler's version and of every source of kernels."""
+    """Compute the digest of the compiler's version and of every source of kernels."""
     digest = hashlib.sha256(version("numba").encode())
     for source in sorted(kernel_sources()):
         digest.update(b"\0" + source.relative_to(PACKAGE).as_posix().encode() + b"\0" + source.read_bytes())

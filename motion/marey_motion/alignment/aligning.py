@@ -330,7 +330,7 @@ def joint_weights(body: MatchingBody, given: Mapping[str, float]) -> Floats:
 
 
 def _with_signs_of(motion: Motion, reference: Motion) -> Motion:
-    """The motion with each joint's quaternions, over the whole clip, on the reference's side."""
+    """Flip signs of quaternions, per joint over the whole clip, to the side of the reference."""
     return motion._replace(rotations=consistent_signs(motion.rotations[None], reference.rotations)[0])
 
 

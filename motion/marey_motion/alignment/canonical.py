@@ -76,6 +76,6 @@ def _turn(angle_rad: float) -> Floats:
 
 
 def _carried(motion: Motion, skeleton: Skeleton, carrier: int, turn: Floats, places: AnyFloats) -> Motion:
-    """The motion with the joint `carrier` at `places` (F, 3), and turned in the world by `turn`."""
+    """Place the joint `carrier` of a motion at `places` (F, 3), turned in the world by `turn`."""
     spins = quaternions.multiply(turn, spins_of(motion, skeleton, carrier))
     return carried_at(motion, skeleton, carrier, np.asarray(places, np.float64), np.asarray(spins, np.float64))

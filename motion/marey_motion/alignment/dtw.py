@@ -205,7 +205,7 @@ class RangeBounds:
 
 
 def _box_costs(a: Floats, b: NDArray[np.floating], frames_per_box: int) -> Floats:
-    """Mean distance (n,) of the points of each frame of `a` from the nearest box about frames of `b`."""
+    """Compute the mean distance (n,) of the points of each frame of `a` from the nearest box about frames of `b`."""
     from marey_motion.alignment import dtw_kernels as kernels
 
     starts = np.arange(0, len(b), frames_per_box)
@@ -219,7 +219,7 @@ def _box_costs(a: Floats, b: NDArray[np.floating], frames_per_box: int) -> Float
 
 
 def _points(a: NDArray[np.floating], b: NDArray[np.floating]) -> tuple[Floats, Floats]:
-    """Frames first for the one, last for the other: the inner loop runs along the other's frames."""
+    """Lay out points with frames first for one, last for the other: the inner loop runs along the latter."""
     if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
         raise MotionError(f"points must be (frames, points, 3), the same points in both, not {a.shape} and {b.shape}")
     return np.ascontiguousarray(a, dtype=np.float64), np.ascontiguousarray(b.transpose(1, 2, 0), dtype=np.float64)

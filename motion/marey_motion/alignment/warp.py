@@ -47,7 +47,7 @@ def time_function(path: NDArray[np.integer]) -> Floats:
 
 
 def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
-    """The middle of every run of cells that share a frame of either motion; for the first and last run, the ends."""
+    """Find the middle of every run of cells that share a frame of a motion; for the first and last run, the ends."""
     steps = np.diff(path, axis=0)
     side = steps[:, 0] - steps[:, 1]  # 0 for a step in both, else which motion steps alone
     before = np.concatenate(([0], side[:-1]))
@@ -59,7 +59,7 @@ def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
 
 
 def _with_least_slope(times: Floats) -> Floats:
-    """The nearest times, by the squares of their steps, with the same ends and no step under the least slope."""
+    """Find the nearest times in least squares of their steps, with the same ends and no step below the least slope."""
     steps, least = np.diff(times), LEAST_SLOPE + _SLACK
     if steps.min() >= LEAST_SLOPE:
         return times

@@ -185,7 +185,7 @@ class _Cluster:
     budget: ComputeBudget
 
     def constrained(self, motion: Motion, blend_frames: int) -> Motion:
-        """The motion with these constraints met and blended in and out.
+        """Solve the constraints and blend the motion in and out of the solution.
 
         Those of different ranges are first met in turn, each blended in and out on its own, until they hardly disturb
         each other: what is left for solving them together changes little from where one is active to where it is not.
@@ -244,7 +244,7 @@ class _Cluster:
 
 
 def _target_at(constraint: Constraint, frames: Ints) -> Target:
-    """A constraint's target with its values for some of its frames."""
+    """Select the values of a constraint's target for some of its frames."""
     values = constraint.target.values
     return constraint.target if len(values) == 1 else _with_values(constraint.target, values[frames - constraint.start])
 

@@ -137,7 +137,7 @@ class _Rig:
         self._axes: dict[str, JointAxes] | None = None
 
     def joint(self, name: str) -> int:
-        """Index of a joint by its own or its standard name."""
+        """Find the index of a joint by its own or its standard name."""
         skeleton = self.take.skeleton
         standard = None if name in skeleton else self.take.body.mapping.joints.get(name)
         return skeleton.index_of(standard or name)
@@ -212,7 +212,7 @@ def _target(rig: _Rig, joint: int, tree: Tree, start: int, stop: int) -> Target:
 
 
 def _looking_axis(rig: _Rig, joint: int) -> NDArray[np.float64]:
-    """The front of head and trunk, the direction of other bones, in the joint's frame."""
+    """Choose the axis that looks: the front of head and trunk, the direction of other bones, in the joint's frame."""
     try:
         axes = rig.axes_of(joint)
     except MappingError as error:

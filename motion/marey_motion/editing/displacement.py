@@ -72,7 +72,7 @@ def windows_around(frames: AnyInts, blend_frames: int, frame_count: int) -> tupl
 
 
 def displace(motion: Motion, frames: AnyInts, changed: Motion, windows: Sequence[Window]) -> Motion:
-    """Change some frames and spread the change over windows; outside of them not a bit changes.
+    """Change some frames and spread the change over windows; frames outside the windows keep their bits.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def displace(motion: Motion, frames: AnyInts, changed: Motion, windows: Sequence
 
 
 def _check_windows(frames: AnyInts, windows: Sequence[Window]) -> None:
-    """Each window must hold frames, and each frame must be in one, where it is smooth not at its very ends."""
+    """Check that each window holds frames, and that each frame is inside a window, not at its smooth ends."""
     inside = np.zeros(len(frames), dtype=np.bool_)
     for window in windows:
         start, stop = window.start + window.smooth_start, window.stop - window.smooth_stop
@@ -146,7 +146,7 @@ def spread_displacements(frames: AnyInts, values: Floats, window: Window) -> Flo
 
 
 def _evened(frames: AnyInts, values: Floats, reach: float) -> Floats:
-    """Values (n, c) smoothed along frames (n,) in a row; constant ones stay, and slopes at the ends become less."""
+    """Smooth values (n, c) along frames (n,) in a row; constant ones stay, and slopes at the ends are reduced."""
     from scipy.ndimage import gaussian_filter1d
 
     rows = np.split(values, np.flatnonzero(np.diff(frames) > 1) + 1)
@@ -154,7 +154,7 @@ def _evened(frames: AnyInts, values: Floats, reach: float) -> Floats:
 
 
 def _curve(frames: AnyInts, values: Floats, window: Window, swing: float) -> Floats:
-    """The curve (stop - start, c) of least bending through `values` (n, c) at `frames` (n,).
+    """Compute the curve (stop - start, c) of least bending through `values` (n, c) at `frames` (n,).
 
     Tension keeps it from swinging beyond them over more than about `swing` frames.
     """
@@ -211,7 +211,7 @@ def _rotation_vectors(before: Floats, after: Floats) -> Floats:
 
 
 def _continued(values: Floats, joints: int) -> Floats:
-    """Values (n, 3·joints + 3) whose rotation vectors go on beyond half a turn where their neighbours' do."""
+    """Continue rotation vectors (n, 3·joints + 3) beyond half a turn where their neighbours are beyond it."""
     vectors = values[:, : 3 * joints].reshape(len(values), joints, 3)
     if np.linalg.norm(vectors, axis=-1).max(initial=0.0) < 0.5 * np.pi:
         return values

@@ -221,7 +221,7 @@ def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, 
 
 
 def _standing_heels(contacts: FootContacts, blend: int) -> Flags:
-    """Frames (F,) in which the heel keeps a place: not in the last before the toe of a standing heel takes a new one.
+    """Find the frames (F,) in which a heel stays in place, up to the last one before its toe takes a new place.
 
     The ankle goes with the toe, so that it has a place of its own for each contact of the toe; a heel that stands
     through several would otherwise be in the one until a frame, and in the next one after it.
@@ -234,7 +234,7 @@ def _standing_heels(contacts: FootContacts, blend: int) -> Flags:
 
 
 def _blended(flags: Flags, values: Floats, blend: int) -> Floats:
-    """Values (F, c) where flags (F,) are set, and smoothly from and to zero within `blend` frames around them."""
+    """Keep values (F, c) where flags (F,) are set, and blend from and to zero within `blend` frames around them."""
     frames = np.flatnonzero(flags)
     blended = np.zeros_like(values)
     for window in windows_around(frames, blend, len(flags)):
@@ -244,7 +244,7 @@ def _blended(flags: Flags, values: Floats, blend: int) -> Floats:
 
 
 def _at_distance(points: Floats, centres: Floats, lengths: Floats) -> Floats:
-    """The points (..., 3) moved towards or away from centres until they are `lengths` (..., 1) away."""
+    """Move points (..., 3) towards or away from centres to a distance of `lengths` (..., 1)."""
     ways = points - centres
     far = np.linalg.norm(ways, axis=-1, keepdims=True)
     return np.asarray(centres + ways * (lengths / np.maximum(far, 1e-9)), dtype=np.float64)
@@ -276,7 +276,7 @@ def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], z
 
 
 def _enveloped(values: Floats, blend: int) -> Floats:
-    """A smooth curve (F,) that is nowhere below the values and zero farther than 2·`blend` frames from them.
+    """Compute a smooth curve (F,) not below the values, and zero farther than 2·`blend` frames from them.
 
     Values are wanted up to `blend` frames beyond contacts; it is as slow as it is so that the body does not bob.
     """
@@ -288,7 +288,7 @@ def _enveloped(values: Floats, blend: int) -> Floats:
 def _with_leg(
     skeleton: Skeleton, planted: Motion, motion: Motion, foot: Foot, plan: _Plan, lowering: Floats, zone: float
 ) -> Motion:
-    """The leg brought to its plan in the frames in which the plan or the root differs from the motion."""
+    """Pose the leg by its plan in the frames in which the plan or the root differs from the motion."""
     ankle = foot.leg.end
     now = motion.positions(skeleton)[:, ankle]
     frames = np.flatnonzero((np.abs(plan.ankle - now).max(axis=1) > 0.0) | (lowering > 0.0))

@@ -124,7 +124,7 @@ def concatenate(
 
 
 def _same_rate(take: Take, source: str) -> Take:
-    """The source clip as a take at the rate of this one. Raises `EditError`."""
+    """Resample the source clip to the rate of this one. Raises `EditError`."""
     clip = take.source(source)
     if not same_hierarchy(clip.skeleton, take.skeleton, tolerance_m=SAME_SKELETON_M):
         raise EditError(
@@ -136,7 +136,7 @@ def _same_rate(take: Take, source: str) -> Take:
 
 
 def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
-    """The move on the ground that lets one go on where the other ends; in the middle of an overlap they meet."""
+    """Find the move on the ground by which one clip continues the other; in an overlap their middles meet."""
     if overlap:
         there, here = before.frame_count - overlap + overlap // 2, overlap // 2
         (target,), (wanted,) = body_track(before, there, there + 1)
@@ -158,7 +158,7 @@ def _joined(first: Motion, second: Motion, overlap: int, count: int, frame_rate_
 
 
 def _inertialised(first: Motion, second: Motion, count: int, frame_rate_hz: float) -> Motion:
-    """The second motion, starting with the pose and velocity that the first one ends with."""
+    """Make the second motion start with the pose and velocity in which the first one ends."""
     difference, velocity = seam_offset(first, second)
     ages = np.arange(min(count, second.frame_count), dtype=np.float64)
     velocity_life = min(float(count), max(1.0, VELOCITY_S * frame_rate_hz))

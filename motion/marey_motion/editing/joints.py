@@ -71,7 +71,7 @@ def paste(
 
 
 def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> list[int]:
-    """Indices in `source` of the target's `joints`, by name. Raises `UnknownJoint`, `EditError`."""
+    """Find the indices in `source` of the target's `joints`, by name. Raises `UnknownJoint`, `EditError`."""
     origins = [source.index_of(target.joint_names[joint]) for joint in joints]
     apart = quaternions.angle_between(target.rest_rotations[list(joints)], source.rest_rotations[origins])
     odd = np.flatnonzero(apart > SAME_AXES_RAD)
@@ -96,14 +96,14 @@ def _stretched(take: Take, clip: Clip, frames: tuple[int, int | None] | None, co
 
 
 def _with_more_translations(take: Take, targets: Sequence[int], origins: Sequence[int], copied: Motion) -> Motion:
-    """The take's motion, with translations of all joints that have any here or are pasted from one that has."""
+    """Add translations for joints that have none here, but have some in the source."""
     added = (target for target, origin in zip(targets, origins, strict=True) if origin in copied.translated_joints)
     joints = tuple(sorted({*take.motion.translated_joints, *added}))
     return translated(take.motion, take.skeleton, joints)
 
 
 def _translations_of(motion: Motion, joint: int, offset: Floats) -> Floats:
-    """Translations (n, 3) of a joint, or its offset (3,) where it has none."""
+    """Return translations (n, 3) of a joint, or its offset (3,) where it has none."""
     if joint not in motion.translated_joints:
         return offset
     return motion.translations[:, motion.translated_joints.index(joint)]

@@ -250,7 +250,7 @@ def _positions(take: Take, start: int, stop: int) -> Floats:
 
 
 def _direction(axis: str) -> Floats:
-    """The unit vector of an axis such as -y."""
+    """Make the unit vector of an axis such as -y."""
     if len(axis) != 2 or axis[0] not in "+-" or axis[1] not in "xyz":
         raise EditError(f"{axis!r} is not an axis; write it as in +z or -y", code="command-invalid")
     return np.asarray((-1.0 if axis[0] == "-" else 1.0) * np.eye(3)["xyz".index(axis[1])], dtype=np.float64)

@@ -179,13 +179,13 @@ def apply_command(take: Take, name: str, parameters: Mapping[str, Any]) -> tuple
 
 
 def _size_for(take: Take, parameters: Mapping[str, Any]) -> int:
-    """The numbers that a command works on: of the take, and of the clip that it names."""
+    """Count the numbers that a command works on: of the take, and of the clip that it names."""
     other = take.sources.get(parameters.get("source", ""))
     return take.size + (0 if other is None else other.poses.size)
 
 
 def _settled(take: Take, before: Motion) -> Take:
-    """The take with rotations of unit length and of continuous sign; what the command left alone is so already."""
+    """Normalise rotations to unit length and continuous sign; frames that the command left alone are so already."""
     motion = take.motion
     if motion.root_translations is not before.root_translations:
         require_finite(motion.root_translations)

@@ -126,7 +126,7 @@ def _smooth_rotations(take: Take, rotations: Floats, weights: Floats, joints: Se
 
 
 def _reflected(end: Floats, rotations: Floats) -> Floats:
-    """Rotations (n, J, 4) reflected through those of an end frame (J, 4): as far from it, the other way."""
+    """Reflect rotations (n, J, 4) at those of an end frame (J, 4): the same angle in the opposite direction."""
     back = quaternions.multiply(end, quaternions.multiply(quaternions.conjugate(rotations), end))
     return np.asarray(back, dtype=np.float64)
 

@@ -222,7 +222,7 @@ class Hole:
 
 
 def _sums(values: Floats, span: int) -> Floats:
-    """Sum of every `span` consecutive values."""
+    """Sum every `span` consecutive values."""
     if len(values) < span:
         return np.empty(0)
     totals = np.concatenate(([0.0], np.cumsum(values)))

@@ -198,5 +198,5 @@ def smoother(window: int) -> Floats:
 
 
 def _shortened(matrix: Floats, frame_count: int) -> Floats:
-    """The smoother of a take that is shorter than the window, over the largest odd number of frames it has."""
+    """Make the smoother of a take shorter than the window, over the largest odd number of its frames."""
     return matrix if frame_count >= len(matrix) else smoother(frame_count - (frame_count + 1) % 2)

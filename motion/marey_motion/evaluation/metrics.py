@@ -144,7 +144,7 @@ def _pieces(trial: Trial, times_s: Floats) -> NDArray[np.int64]:
 
 
 def _travel_turn_rates(steps: Floats, speeds: Floats, pieces: NDArray[np.int64], rate: float) -> Floats:
-    """Change of direction from the step before; NaN where either is too short or the two have different demands."""
+    """Compute the change of direction since the step before; NaN if either is too short or their demands differ."""
     turned = np.diff(np.arctan2(steps[:, 0], steps[:, 1]))
     turned -= 2.0 * np.pi * np.round(turned / (2.0 * np.pi))
     moving = speeds >= LEAST_TRAVEL_M_S
@@ -209,7 +209,7 @@ def _offset_metrics(series: TrialSeries, window: Flags) -> dict[str, float | Non
 
 
 def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None]:
-    """Mean time to answer a switch, None when none was answered, and how many were not."""
+    """Compute the mean time to answer a switch, None without any answer, and count those without an answer."""
     times = [
         _response_s(series, first, stop)
         for first, stop in _stretches(series.pieces)
@@ -233,7 +233,7 @@ def _hold_steps(series: TrialSeries) -> int:
 
 
 def _response_s(series: TrialSeries, first: int, stop: int) -> float | None:
-    """Seconds from a switch to where the speed is right and stays so; None if that never comes before the next."""
+    """Compute the seconds from a switch until the speed stays right; None if the next switch comes first."""
     wanted = series.wanted_speeds_m_s[first:stop]
     right = np.abs(series.speeds_m_s[first:stop] - wanted) < RESPONSE_SHARE * wanted
     hold = _hold_steps(series)
@@ -253,7 +253,7 @@ def _switch_metrics(record: TrialRecord, window: Flags) -> dict[str, float | Non
 
 
 def _cost_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]:
-    """A step's costs are those of the tick it starts from: what was searched and chosen there is displayed after it."""
+    """Pool the costs of steps; those of a step belong to its first tick, whose choice is displayed after it."""
     entered = window & (record.status[1:] == Status.REPLACING)
     series = {
         "pose_cost": record.pose_cost[:-1][window],
@@ -293,7 +293,7 @@ def _literal_metrics(series: TrialSeries, window: Flags, grid: Grid) -> Metrics:
 
 
 def _of(measure: Callable[[Floats], np.float64 | float], values: Floats) -> float | None:
-    """The measure of the values, None where there are none."""
+    """Apply the measure to the values; None where there are none."""
     return float(measure(values)) if len(values) else None
 
 

@@ -78,7 +78,7 @@ _CONDITIONS = {
 
 
 def _rows_digest(database: MatchingDatabase, clip: DatabaseClip) -> str:
-    """Digest of what a clip contributes: its rows as they are matched and played."""
+    """Compute the digest of a clip's rows as they are matched and played."""
     rows = slice(clip.start, clip.stop)
     digest = hashlib.sha256()
     for array in (

@@ -128,7 +128,7 @@ def options_from_tree(tree: Mapping[str, Any]) -> EvaluationOptions:
 
 
 def _options_to_tree(options: EvaluationOptions) -> Tree:
-    """Options with the speeds and turn rates of the trials under `grid`."""
+    """Convert options, with the speeds and turn rates of the trials under `grid`."""
     tree = _plain(options.model_dump())
     return {"grid": {name: tree.pop(name) for name in Grid.model_fields}, **tree}
 

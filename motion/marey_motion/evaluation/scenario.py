@@ -191,7 +191,7 @@ def _pieces(trial: Trial, end_s: float) -> tuple[Floats, Floats, Floats]:
 
 
 def _piece_origins(starts: Floats, speeds: Floats, turn_rates: Floats) -> tuple[Floats, Floats]:
-    """Position (P, 2) and heading (P,) where each piece begins: the ends of all earlier ones, added up."""
+    """Compute position (P, 2) and heading (P,) at the start of each piece from the ends of all earlier ones."""
     durations = np.diff(starts)
     headings = np.concatenate(([0.0], np.cumsum(turn_rates[:-1] * durations)))
     steps, _ = _arc(speeds[:-1], turn_rates[:-1], headings[:-1], durations)

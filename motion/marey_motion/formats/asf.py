@@ -285,7 +285,7 @@ class _AsfReader:
         return order
 
     def _frame(self, angles: list[float], order: str) -> NDArray[np.float64]:
-        """The quaternion of three turns about fixed axes, the first named being made first."""
+        """Make the quaternion of three turns about fixed axes, applied in the order of their names."""
         radians = np.radians(angles) if self.degrees else np.array(angles)
         frame = np.array([1.0, 0.0, 0.0, 0.0])
         for axis, angle in zip(order, radians, strict=True):

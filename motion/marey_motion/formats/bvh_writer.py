@@ -62,7 +62,7 @@ def _axes_of(skeleton: Skeleton, joint: int, rotation_order: str, source: Source
 
 
 def _depth_first(skeleton: Skeleton) -> list[int]:
-    """Joint indices in the order a nested file lists them; their own order wherever that is one."""
+    """List joints in depth-first order; the order of the skeleton where that is one."""
     order, waiting = [], [0]
     while waiting:
         joint = waiting.pop()
@@ -100,7 +100,7 @@ def _hierarchy(clip: Clip, order: list[int], axes: NDArray[np.int64], scale: flo
 
 
 def _written_name(name: str) -> str:
-    """The name without what would end it in the file."""
+    """Remove the characters that would end a name in the file."""
     return "".join("_" if character in "{}\n\r" else character for character in name)
 
 

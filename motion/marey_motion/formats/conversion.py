@@ -121,13 +121,13 @@ def _converted_clip(source: SourceMotion, skeleton: Skeleton, axes: NDArray[np.f
 
 
 def _moved(vectors: NDArray[np.float64], axes: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
-    """The same vectors (..., 3) in other axes and metres; to the bit where nothing changes."""
+    """Convert vectors (..., 3) to other axes and to metres; bits stay where nothing changes."""
     turned = vectors if np.array_equal(axes, np.eye(3)) else vectors @ axes.T
     return turned if scale == 1.0 else turned * scale
 
 
 def _turned(rotations: NDArray[Real], axes: NDArray[np.float64]) -> NDArray[Real]:
-    """The same rotations in other axes. A mirrored axis also turns the sense of rotation, so signs are exact."""
+    """Convert rotations to other axes. A mirrored axis also reverses the sense of rotation, so signs are exact."""
     if np.array_equal(axes, np.eye(3)):
         return rotations
     sense = np.rint(np.linalg.det(axes))

@@ -198,7 +198,7 @@ def _read_members(data: bytes, file: str) -> dict[str, NDArray[Any]]:
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    """One array, whose header must announce exactly the bytes that follow it."""
+    """Read one array, whose header must announce exactly the bytes that follow it."""
     content = archive.read(info)
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)

@@ -41,7 +41,7 @@ def as_rotations(
     if wrong.any():
         frame, joint = (int(index) for index in np.argwhere(wrong)[0])
         raise FormatError(
-            f"frame {frame} holds no rotation but {values[frame, joint].tolist()}",
+            f"frame {frame} has {values[frame, joint].tolist()}, which is not a rotation",
             code="bad-number",
             file=file,
             joint=joint_names[joint],

@@ -150,14 +150,14 @@ def _shank_m(skeleton: Skeleton) -> float:
 
 
 def _pelvis(style: GaitStyle, moments: GaitMoments) -> AnyFloats:
-    """The heading, exactly, and a tilt that drops the side of the swinging leg; it leaves forward and left in place."""
+    """Rotate the pelvis to the heading, with a tilt that drops the side of the swinging leg."""
     speeds = moments.settled(moments.root.speeds)
     tilts = style.bounce * 0.06 * eased(speeds / 1.4) * np.cos(2.0 * np.pi * moments.phases)
     return quaternions.from_euler("yz", np.stack((moments.root.headings, tilts), axis=-1))
 
 
 def _ankle(skeleton: Skeleton, side: str, foot: FootMotion, rotations: dict[str, AnyFloats]) -> AnyFloats:
-    """Position (n, 3) of the ankle; notes the rotations of foot and toes."""
+    """Compute the position (n, 3) of the ankle, and store the rotations of foot and toes."""
     name, toes = side + "Foot", side + "ToeBase"
     rotations[name] = quaternions.from_euler("yx", np.stack((foot.yaws, -foot.pitches), axis=-1))
     rotations[toes] = quaternions.from_euler("yx", np.stack((foot.yaws, -foot.toe_pitches), axis=-1))
@@ -172,7 +172,7 @@ def _pelvis_heights(
     ankles: Mapping[str, AnyFloats],
     loaded: Mapping[str, NDArray[np.bool_]],
 ) -> AnyFloats:
-    """Heights (n,) of the root: the gait's rise and fall, as far as the legs that stand reach the floor."""
+    """Compute heights (n,) of the root: the gait's rise and fall, limited by the reach of the stance legs."""
     speeds = moments.settled(moments.root.speeds)
     leg = _thigh_m(skeleton) + _shank_m(skeleton)
     moving = eased(speeds / 1.2)
@@ -203,7 +203,7 @@ def _bend_leg(
     freedom: AnyFloats,
     rotations: dict[str, AnyFloats],
 ) -> None:
-    """Two-bone inverse kinematics: knees bend to where pelvis and foot face, `facing` (n,) radians.
+    """Solve a leg by two-bone inverse kinematics; knees bend towards `facing` (n,), radians, of pelvis and foot.
 
     A swinging foot that trails out of reach is drawn along by the leg, the more softly the higher `freedom` (n,).
     """

@@ -112,7 +112,7 @@ class _Tracks:
         return np.stack([self.positions[:, sole, 1].min(axis=1) for sole in self.soles], axis=1)
 
     def floor_height(self) -> float:
-        """The height the lower foot rests at."""
+        """Measure the height at which the lower foot rests."""
         return float(np.quantile(self.sole_heights().min(axis=1), 0.05))
 
 

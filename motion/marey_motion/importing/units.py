@@ -189,13 +189,13 @@ def _settle_up_axis(body: _Measurements, axis: UpAxis, cosine: float, flat: tupl
 
 
 def _likely_axes(*axes: tuple[UpAxis, float]) -> str:
-    """The axes that something speaks for, in words, and the usual ones where those leave no choice."""
+    """List the axes with evidence, in words, and the usual ones if none has any."""
     likely = list(dict.fromkeys(axis for axis, cosine in axes if cosine > 0.0))
     return " or ".join(likely if len(likely) > 1 else dict.fromkeys((*likely, "y", "z")))
 
 
 def _body_axis(positions: NDArray[np.float64], landmarks: Landmarks) -> tuple[UpAxis, float]:
-    """The signed axis nearest to the mean direction from the feet to the head (or hips), and its cosine.
+    """Find the signed axis nearest to the mean direction from the feet to the head (or hips), and its cosine.
 
     The cosine is 0 where legs and trunk are folded onto each other, as by a rest pose with all bones on one line.
     """
@@ -212,14 +212,14 @@ def _body_axis(positions: NDArray[np.float64], landmarks: Landmarks) -> tuple[Up
 
 
 def _mean_direction(ways: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean (3,) of the directions of (F, 3) vectors; those without length count as none."""
+    """Compute the mean direction (3,) of vectors (F, 3); those of length zero are ignored."""
     lengths = np.linalg.norm(ways, axis=1)
     mean: NDArray[np.float64] = (ways[lengths > 0] / lengths[lengths > 0, None]).sum(axis=0) / len(ways)
     return mean
 
 
 def _flat_axis(body: _Measurements) -> tuple[UpAxis, str] | None:
-    """The axis along which the lowest of feet and hands hardly moves while along the others it does."""
+    """Find the axis along which the lowest of feet and hands hardly moves, while it moves along the others."""
     limbs = [*body.landmarks.ground_joints, *(body.landmarks.hands or ())]
     assert body.leg is not None
     below = body.positions[:, limbs]
@@ -394,7 +394,7 @@ def _look_for_mirroring(source: SourceMotion, body: _Measurements, options: Impo
 
 
 def _leg_joints(parents: NDArray[np.int32], landmarks: Landmarks, foot: int) -> list[int]:
-    """The joints from a foot up to, but without, the hips."""
+    """List the joints from a foot up to the hips, without the hips."""
     joints = [foot]
     while int(parents[joints[-1]]) != landmarks.hips:
         joints.append(int(parents[joints[-1]]))

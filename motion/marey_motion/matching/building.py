@@ -252,7 +252,7 @@ def _normaliser_notes(normaliser: Normaliser) -> tuple[DatabaseNote, ...]:
 def _joined_translations(
     built: Sequence[_Built], body: MatchingBody
 ) -> tuple[NDArray[np.float32] | None, tuple[int, ...]]:
-    """Translations of all joints that any clip translates; a clip that does not has their offsets."""
+    """Collect translations of all joints that any clip translates; a clip without some has their offsets."""
     joints = np.array(sorted({joint for row in built for joint in row[1].translated_joints}), dtype=np.int64)
     if not len(joints):
         return None, ()

@@ -162,7 +162,7 @@ def _chosen(
     record: TrialRecord,
     tick: int,
 ) -> tuple[int, float, Reason]:
-    """The row that was chosen, its cost, and the reason."""
+    """Find the row that was chosen, its cost, and the reason."""
     from marey_motion.matching import controller_kernels as kernels
 
     shown = int(record.rows[tick])

@@ -117,7 +117,7 @@ def mirror_prepared(clip: PreparedClip, body: MatchingBody, *, keep_notes: bool)
 def _wanted_frames(
     source: SourceClip, body: MatchingBody, options: DatabaseOptions, landmarks: Landmarks, tell: _Tell
 ) -> tuple[Clip, int, bool]:
-    """The clip within its range and without rest poses at its ends, its first frame, and whether it walks in place."""
+    """Cut a clip to its range without rest poses at its ends; return it, its first frame, and if it walks in place."""
     clip, first = source.clip, 0
     if not _moves(clip, body.skeleton):
         raise MotionError(
@@ -149,7 +149,7 @@ def _moves(clip: Clip, skeleton: Skeleton) -> bool:
 
 
 def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], tell: _Tell) -> tuple[int, int]:
-    """The range of frames between the rest poses at a clip's ends."""
+    """Find the range of frames between the rest poses at a clip's ends."""
     start, stop = 0, clip.frame_count
     for warning in warnings:
         if warning.code == "rest-pose-frame" and warning.frames is not None:
@@ -167,7 +167,7 @@ def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], tell: _T
 
 
 def _closed(motion: Motion, tell: _Tell) -> Motion:
-    """A loop without a last frame that repeats the first one."""
+    """Drop the last frame of a loop where it repeats the first one."""
     if motion.frame_count < 3 or motion.rotations.shape[1] < 2:
         return motion
     inner = motion.rotations[:, 1:]

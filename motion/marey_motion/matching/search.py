@@ -134,7 +134,7 @@ def _check(rows: NDArray[np.float64], starts: NDArray[np.int64], selectable: NDA
 def _arranged(
     starts: NDArray[np.int64], selectable: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """Rows of each block (B, 16), block of each row (N,), and first block of each group (G + 1,)."""
+    """Arrange rows of each block (B, 16), block of each row (N,), and first block of each group (G + 1,)."""
     chosen = np.flatnonzero(selectable)
     bounds = np.searchsorted(chosen, starts)
     blocks_per_clip = -(-np.diff(bounds) // _SIXTEEN)

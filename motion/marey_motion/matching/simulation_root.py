@@ -144,7 +144,7 @@ def window_frames(window_s: float, rate_hz: float) -> int:
 
 
 def _smoothed(values: Floats, window: int) -> Floats:
-    """Values (F, C) filtered over `window` frames, or the largest odd number that a shorter clip has."""
+    """Filter values (F, C) over `window` frames, or the largest odd number that a shorter clip has."""
     from scipy.signal import savgol_filter
 
     window = min(window, len(values) - (len(values) + 1) % 2)

@@ -135,7 +135,7 @@ class _Fitting:
     seed: int
 
     def choose(self) -> tuple[LatentMixture, list[MixtureCandidate], Floats | None]:
-        """The mixture, what was tried, and the held-out likelihood of the examples."""
+        """Choose the mixture; also return all candidates and the held-out likelihood of the examples."""
         examples, dimensions = self.latents.shape
         if examples <= dimensions + 1:
             return _fitted(self.latents, 1, self.options, self.seed)[0], [], self._held_out(1)
@@ -164,7 +164,7 @@ class _Fitting:
         )
 
     def _best(self, candidates: dict[int, MixtureCandidate]) -> tuple[int, Floats | None]:
-        """The number of components with the best criterion that nothing speaks against; refusals are noted."""
+        """Choose the number of components with the best criterion and no refusal; record refusals."""
         single = self._held_out(1)
         falling = sorted(candidates.values(), key=lambda one: getattr(one, self.options.criterion))
         for candidate in falling:
@@ -194,7 +194,7 @@ class _Fitting:
 
 
 def _fitted(latents: Floats, count: int, options: MixtureOptions, seed: int) -> tuple[LatentMixture, bool]:
-    """A mixture of so many components, and whether its fit came to a stand."""
+    """Fit a mixture of so many components; also return whether the fit converged."""
     examples, dimensions = latents.shape
     if count == 1:
         return _normal(latents, options.regularisation, shrink=examples <= dimensions + 1), True
@@ -219,7 +219,7 @@ def _fitted(latents: Floats, count: int, options: MixtureOptions, seed: int) -> 
 
 
 def _normal(latents: Floats, regularisation: float, *, shrink: bool) -> LatentMixture:
-    """One component: maximum likelihood, or shrunk towards a sphere."""
+    """Fit one component by maximum likelihood, or shrunk towards a sphere."""
     if shrink:
         from sklearn.covariance import ledoit_wolf
 

@@ -132,7 +132,7 @@ class _Comparison:
     directions: Floats
 
     def distances(self, scores: Floats, poses: Floats) -> Floats:
-        """Mean distances (c,) of the joints of motions with scores (c, r) from those of poses (T, D), metres."""
+        """Compute the mean distances (c,) of the joints of motions with scores (c, r) to poses (T, D), metres."""
         from marey_motion import kinematics
         from marey_motion.modelling import reconstruction_kernels
 

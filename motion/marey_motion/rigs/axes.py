@@ -209,7 +209,7 @@ class _PosedBody:
         )
 
     def in_joint(self, standard: str, vectors: Floats) -> Floats:
-        """Mean (3,) of global vectors (K, 3) seen from a joint."""
+        """Compute the mean (3,) of global vectors (K, 3) in the frame of a joint."""
         inverse = quaternions.conjugate(self.rotations[:, self.joints[standard]])
         mean: Floats = quaternions.rotate_vectors(inverse, vectors).astype(np.float64).mean(axis=0)
         return mean
@@ -237,7 +237,7 @@ class _PosedBody:
         return _unit(trunk - _dot(trunk, self.hips_left) * self.hips_left)
 
     def _level(self, names: tuple[str, ...]) -> Floats | None:
-        """Positions (K, 3) of the first of these that is mapped; both sides of it where it has sides."""
+        """Find positions (K, 3) of the first of these joints that is mapped; the middle of left and right joints."""
         for name in names:
             joints = (name,) if name in CENTRE_JOINTS else tuple(f"{side}_{name}" for side in SIDES)
             if all(joint in self.joints for joint in joints):
@@ -261,7 +261,7 @@ class _PosedBody:
         return frozenset(parts)
 
     def foot(self, side: str) -> Floats | None:
-        """Directions (K, 3) from ankle to toe; to the tip of the toe where its joint lies straight below the ankle."""
+        """Compute directions (K, 3) from ankle to toe; to the toe's tip where its joint is straight below the ankle."""
         shank, foot = self.way(f"{side}_knee", f"{side}_ankle"), self.way(f"{side}_ankle", f"{side}_toe")
         if foot is None or shank is None or float(np.mean(np.sum(foot * shank, axis=-1))) < ALONG:
             return foot
@@ -343,7 +343,7 @@ def _swing(standard: str, body: _PosedBody) -> Floats:
 
 
 def _leg_hinge(side: str, body: _PosedBody) -> Floats:
-    """The axis a knee bends about, which turns the shank backwards; the body's left where it does not bend."""
+    """Find the axis a knee bends about, which turns the shank backwards; the body's left where it does not bend."""
     thigh, shank = body.way(f"{side}_hip", f"{side}_knee"), body.way(f"{side}_knee", f"{side}_ankle")
     if len(body.positions) > 1 and thigh is not None and shank is not None:
         bend = np.cross(thigh, shank)
@@ -353,7 +353,7 @@ def _leg_hinge(side: str, body: _PosedBody) -> Floats:
 
 
 def _arm_hinge(side: str, joint: str, body: _PosedBody) -> Floats:
-    """The axis an elbow stretches about; where it does not bend, left, carried along as the arm is raised."""
+    """Find the axis an elbow stretches about; the body's left, turned with the raised arm, where it does not bend."""
     upper, fore = body.way(f"{side}_shoulder", f"{side}_elbow"), body.way(f"{side}_elbow", f"{side}_wrist")
     if len(body.positions) > 1 and upper is not None and fore is not None:
         bend = np.cross(fore, upper)
@@ -371,7 +371,7 @@ def _arm_hinge(side: str, joint: str, body: _PosedBody) -> Floats:
 
 
 def _across(swing: Floats, twist: Floats) -> Floats:
-    """The unit part of a swing axis perpendicular to the twist axis; any perpendicular where nothing is left of it."""
+    """Compute the unit part of a swing axis perpendicular to the twist axis; any perpendicular where that is zero."""
     across = swing - (swing @ twist) * twist
     if np.linalg.norm(across) < 1e-6:
         across = np.cross(twist, np.eye(3)[int(np.argmin(np.abs(twist)))])

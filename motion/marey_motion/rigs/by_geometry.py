@@ -119,7 +119,7 @@ def _neck(tree: BoneTree, plan: BodyPlan) -> tuple[float, list[int]]:
 
 
 def _neck_chain(tree: BoneTree, start: int) -> list[int]:
-    """Joints from one on up to where the chain branches, ends, or turns as hair does at the back of a head."""
+    """List joints upwards to where the chain branches, ends, or turns as hair does at the back of a head."""
     skeleton = tree.skeleton
     chain = [start]
     while len(following := _branches(tree, chain[-1])) == 1 and tree.lengths[following[0]] > SHORTEST_BONE_M:
@@ -180,7 +180,7 @@ def _foot(skeleton: Skeleton, ankle: int | None, toe: int | None) -> Floats:
 
 
 def _left_and_right(skeleton: Skeleton, reading: LimbReading, left: Floats) -> tuple[tuple[int, int], bool]:
-    """The sides of a pair of limbs, left one first, and whether their names say so."""
+    """Sort a pair of limbs, left one first; also return whether their names show the sides."""
     first, second = reading.pair.limbs
     sides = [
         {parse_name(skeleton.display_names[joint]).side for joint in limb.chain} - {""} for limb in (first, second)

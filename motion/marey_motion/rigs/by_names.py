@@ -71,7 +71,7 @@ def best_match(skeleton: Skeleton) -> NameMatch | None:
 
 
 def _by_name(names: Names) -> dict[JointName, int]:
-    """Joints by what their names say; of "UpLeg_L" and its helper "__UpLeg_L", the plainer name is the joint."""
+    """Find joints by their names; of "UpLeg_L" and its helper "__UpLeg_L", the plainer name is the joint."""
     joints: dict[JointName, int] = {}
     for index in sorted(range(len(names)), key=lambda joint: len(names[joint])):
         joints.setdefault(parse_name(names[index]), index)
@@ -118,7 +118,7 @@ def _first(alternatives: tuple[JointName, ...], prefix: str, joints: dict[JointN
 
 
 def _signature_share(rig: KnownRig, prefix: str, names: Names, joints: dict[JointName, int]) -> float:
-    """Share of the signature that is there; 0 for rigs without one."""
+    """Compute the share of the signature that is present; 0 for rigs without one."""
     there = 0
     for mark in rig.signature:
         if mark.endswith("*"):

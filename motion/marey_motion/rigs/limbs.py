@@ -174,7 +174,7 @@ class BoneTree:
 
 
 def _paired(parent: int, first: Limb, second: Limb) -> LimbPair | None:
-    """Two limbs of equal build, or what they have in common before one of them goes on into what it holds."""
+    """Match two limbs of equal build, or the part they share before one of them continues into an object it holds."""
     shorter = min(len(first.chain), len(second.chain)) - 1
     for a, b in ((first, second), *((first.cut(k), second.cut(k)) for k in range(shorter, LEAST_COMMON_BONES - 1, -1))):
         asymmetry = _asymmetry(a, b)
@@ -184,7 +184,7 @@ def _paired(parent: int, first: Limb, second: Limb) -> LimbPair | None:
 
 
 def _asymmetry(first: Limb, second: Limb) -> float:
-    """Difference of two chains' bones as a share of their length; infinite where they differ in build."""
+    """Compute the difference of two chains' bones as a share of their length; infinite where they differ in build."""
     if len(first.bones) != len(second.bones):
         return float("inf")
     a, b = np.array(first.bones), np.array(second.bones)

@@ -184,7 +184,7 @@ def symmetric_joints(skeleton: Skeleton, mapping: JointMapping) -> NDArray[np.in
 
 
 def _spine(skeleton: Skeleton, joints: Mapping[str, int]) -> dict[str, int]:
-    """The joints between pelvis and arms: the lowest, the middle and the one that carries the arms.
+    """Find the joints between pelvis and arms: the lowest, the middle and the one that carries the arms.
 
     Rigs have one to six of them under all kinds of names; a single one is the chest, because the arms hang on it.
     """

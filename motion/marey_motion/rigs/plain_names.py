@@ -46,7 +46,7 @@ def readings(names: Sequence[str]) -> tuple[Names, ...]:
 
 
 def _marked(names: Names) -> Names:
-    """The names that must share a mark: all but the root's, which exporters often make themselves."""
+    """List the names that must share a mark: all but the root's, which exporters often make themselves."""
     return names[1:]
 
 

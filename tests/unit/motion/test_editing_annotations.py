@@ -64,7 +64,7 @@ def test_merging_takes_the_gap_along_and_the_label_of_the_one_that_was_named():
     assert annotations.merge_segment(WALK, 12, "previous").segments[0] == Segment("right", 5, 18)
     assert annotations.merge_segment(WALK, 12, "nearest").segments[0] == Segment("right", 5, 18)
     assert annotations.merge_segment(WALK, 29, "nearest").segments[-1] == Segment("stand", 10, 30)
-    with pytest.raises(AnnotationError, match="'left' 5:10: there is no previous segment") as refused:
+    with pytest.raises(AnnotationError, match="'left' 5:10: it has no previous segment") as refused:
         annotations.merge_segment(WALK, 5, "previous")
     assert refused.value.code == "no-neighbour"
 

@@ -554,7 +554,7 @@ def test_the_solver_that_fits_is_chosen(body: Skeleton) -> None:
 @pytest.mark.parametrize(
     ("target", "says"),
     [
-        (PositionTarget(99, (0, 0, 0)), "joint 99 of 22"),
+        (PositionTarget(99, (0, 0, 0)), "there is no joint 99, the skeleton has 22"),
         (PositionTarget(3, (0, np.nan, 0)), "finite"),
         (PositionTarget(3, (0, 0)), "shape"),
         (PositionTarget(3, np.zeros((7, 3))), "7 values for 2 frames"),

@@ -75,7 +75,7 @@ class Layer:
         return first, max(first, bisect_left(self.segments, end, key=_start))
 
     def _with(self, first: int, stop: int, *segments: Segment) -> Layer:
-        """The layer with others, in order, in place of a range of segments."""
+        """Replace a range of segments by others, which must be in order."""
         _require_segments(
             (*self.segments[max(0, first - 1) : first], *segments, *self.segments[stop : stop + 1]), self.frame_count
         )
@@ -86,14 +86,14 @@ class Layer:
         return bisect_left(self.keyframes, _moment(keyframe), key=_moment)
 
     def _with_keyframes(self, first: int, stop: int, *keyframes: Keyframe) -> Layer:
-        """The layer with others, in order, in place of a range of keyframes."""
+        """Replace a range of keyframes by others, which must be in order."""
         _require_keyframes(
             (*self.keyframes[max(0, first - 1) : first], *keyframes, *self.keyframes[stop : stop + 1]), self.frame_count
         )
         return self._changed(self.segments, (*self.keyframes[:first], *keyframes, *self.keyframes[stop:]))
 
     def _changed(self, segments: tuple[Segment, ...], keyframes: tuple[Keyframe, ...]) -> Layer:
-        """The layer with what is known to be in order."""
+        """Replace fields by values that are known to be valid."""
         made = object.__new__(Layer)
         for name, value in (("frame_count", self.frame_count), ("segments", segments), ("keyframes", keyframes)):
             object.__setattr__(made, name, value)

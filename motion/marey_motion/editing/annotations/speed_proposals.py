@@ -105,7 +105,7 @@ def propose_reaches(clip: Clip, body: MatchingBody, options: WristContactProposa
 
 
 def _distance_from_rest(clip: Clip, body: MatchingBody, side: str) -> Floats:
-    """Distance (F,) of a wrist from its position at the start of the clip, in metres."""
+    """Compute the distance (F,) of a wrist from its position at the start of the clip, in metres."""
     wrist = body.standard_joints.get(f"{side}_wrist")
     if wrist is None:
         raise MappingError("the skeleton's mapping has no such joint", where=f"{side}_wrist")
@@ -121,7 +121,7 @@ def _distance_from_rest(clip: Clip, body: MatchingBody, side: str) -> Floats:
 
 
 def _downhill(values: Floats, frame: int, step: Literal[-1, 1], last: int) -> int:
-    """The frame at which the values stop to fall, looked for from `frame` on up to `last`."""
+    """Find the frame from `frame` to `last` at which the values stop falling."""
     way = values[last : frame + 1][::-1] if step == -1 else values[frame : last + 1]
     rising = np.diff(way) >= 0.0
     return frame + step * (int(np.argmax(rising)) if rising.any() else len(way) - 1)

@@ -147,7 +147,7 @@ class _Travel(NamedTuple):
         return ahead >= cos(radians(options.most_aside_deg)) and turned <= options.most_turn_deg
 
     def passing(self, step: _Step) -> int | None:
-        """The first frame at which the swinging foot has passed the other; None where it is ahead before or stays."""
+        """Find the first frame in which the swinging foot passes the other; None if it begins ahead or never passes."""
         swing, stand = (self.ankles[step.start : step.end, side] for side in (step.side, 1 - step.side))
         ahead = (swing - stand) @ (self.hips[step.end] - self.hips[step.start]) > 0.0
         if ahead[0] or not ahead.any():

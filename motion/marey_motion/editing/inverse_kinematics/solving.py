@@ -333,7 +333,7 @@ def _kernel_limb(
 
 
 def _keep_better(problem: IkProblem, before: Floats, found: SolverResult) -> None:
-    """Frames that the closed form made worse, such as for an orientation that pulls a tool out of reach, stay."""
+    """Undo frames that the closed form made worse, such as by an orientation that moves a tool out of reach."""
     squares = problem.targets.scales**2
     worse = (found.after**2) @ squares > (found.before**2) @ squares + 1e-18
     problem.rotations[worse] = before[worse]

@@ -152,7 +152,7 @@ class _Search:
         self.spent = False
 
     def best_step(self, last: OptimisationStep, progress: ProgressCallback | None) -> OptimisationStep | None:
-        """The candidate that lowers the objective most; None when none gains enough or the budget is spent."""
+        """Choose the candidate that lowers the objective most; None when none gains enough or the budget is spent."""
         candidates = self._candidates(frozenset(last.absent))
         best: tuple[float, Action, tuple[str, ...], Sources] | None = None
         for done, (action, sources, absent) in enumerate(candidates):

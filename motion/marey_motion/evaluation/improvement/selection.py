@@ -91,7 +91,7 @@ def rows_of_sources(clips: Sequence[DatabaseClip], sources: Collection[str]) -> 
 
 
 def _by_row(database: MatchingDatabase) -> dict[str, Any]:
-    """The arrays that have one entry per row."""
+    """List the arrays that have one entry per row."""
     values = {field.name: getattr(database, field.name) for field in fields(database)}
     return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
@@ -133,7 +133,7 @@ def joined(first: MatchingDatabase, second: MatchingDatabase) -> MatchingDatabas
 
 
 def _translating(database: MatchingDatabase, joints: tuple[int, ...]) -> MatchingDatabase:
-    """The database with local translations of these joints, the joints' offsets where it had none."""
+    """Add local translations of these joints to a database, from their offsets where it has none."""
     if joints == database.translated_joints:
         return database
     translations = np.empty((database.row_count, len(joints), 3), np.float32)

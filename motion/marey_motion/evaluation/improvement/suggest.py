@@ -165,7 +165,7 @@ class _Stages:
         self._cancelled = cancelled
 
     def within(self, stage: str) -> ProgressCallback:
-        """The progress callback of a stage."""
+        """Make the progress callback of a stage."""
         before = 1000 * self.NAMES.index(stage)
 
         def tell(done: int, total: int, note: str) -> None:
@@ -174,5 +174,5 @@ class _Stages:
         return tell
 
     def watch(self, stage: str) -> dict[str, Any]:
-        """The callbacks of a stage as keywords."""
+        """Make the callbacks of a stage, as keyword arguments."""
         return {"progress": self.within(stage), "cancelled": self._cancelled}

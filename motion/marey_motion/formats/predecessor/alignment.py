@@ -129,7 +129,7 @@ def as_increasing(frames: NDArray[np.int64], source_frames: int) -> Floats:
 
 
 def _list(document: Mapping[str, Any], name: str, file: str) -> list[Any]:
-    """A list that may stand as a text of JSON, even as one in another."""
+    """Read a list that may be given as a text of JSON, even as one inside another."""
     value = document.get(name)
     for _ in range(2):
         if isinstance(value, str):

@@ -136,7 +136,7 @@ def write_predecessor_skeleton(
 
 
 def _clip_fields(document: dict[str, Any], file: str) -> tuple[list[str], NDArray[np.float64], float]:
-    """Joint names, (F, 3 + 4·J) rows in the order w, x, y, z, and the frame time, of either form of a clip."""
+    """Read joint names, rows (F, 3 + 4·J) with quaternions w, x, y, z, and the frame time, from either form of clip."""
     if "poses" in document:
         names = text_list(document, "joint_sequence", file)
         poses = number_array(document["poses"], file, "poses")

@@ -225,7 +225,7 @@ def _renamed(document: Document, names: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _time_part(time: Document | None, layout: Layout, file: str) -> tuple[Document | None, TimeForm]:
-    """The time of a model, None where it has none, and how it is meant.
+    """Read the time of a model, None where it has none, and which form it has.
 
     Layout 2 was written by two trainers. The first one puts a component into each column of its vectors and means
     increments; the later one puts it into each row, and means coefficients as layout 3 does.
@@ -278,7 +278,7 @@ def _read(parts: _Parts, layout: Layout, skeleton: Skeleton, file: str) -> Prede
 
 
 def _constant_speed(frames: int) -> PredecessorTime:
-    """A frame of the example for each canonical frame."""
+    """Make the time function with one frame of the example for each canonical frame."""
     basis = SplineBasis.clamped(frames, DEGREE + 1)
     return PredecessorTime("increments", basis, np.zeros(basis.count), np.zeros((0, basis.count)))
 
@@ -335,7 +335,7 @@ def _check_size(frames: int, coefficients: int, what: str, file: str) -> None:
 
 
 def _animated(parts: _Parts, basis: SplineBasis, mean: Floats, skeleton: Skeleton, file: str) -> list[str]:
-    """Joints that the model has rotations of. Raises `FormatError` where they are none of the skeleton's."""
+    """List the joints that the model rotates. Raises `FormatError` if the skeleton lacks them."""
     animated = parts.animated_joints or list(skeleton.joint_names)
     if mean.shape[1] != 3 + 4 * len(animated):
         message = f"{mean.shape[1]} channels, but {len(animated)} joints need {3 + 4 * len(animated)}"
@@ -353,7 +353,7 @@ def _animated(parts: _Parts, basis: SplineBasis, mean: Floats, skeleton: Skeleto
 def _on_skeleton(
     mean: Floats, vectors: Floats, maxima: Floats, animated: list[str], skeleton: Skeleton
 ) -> tuple[Floats, Floats]:
-    """Mean (n, 3 + 4·J) and components (k, n, 3 + 4·J) in metres, of all joints; those not animated rest."""
+    """Extend mean (n, 3 + 4·J) and components (k, n, 3 + 4·J) to all joints, in metres; those not animated rest."""
     rest = np.concatenate((np.zeros(3), skeleton.rest_rotations.ravel()))
     columns = columns_of(animated, skeleton)
     whole = np.tile(rest, (len(mean), 1))
@@ -383,7 +383,7 @@ def columns_of(animated: list[str] | tuple[str, ...], skeleton: Skeleton) -> NDA
 
 
 def _time(parts: _Parts, frames: int, file: str) -> PredecessorTime:
-    """The time function; where it has channels for semantics beside time, time is the first."""
+    """Read the time function: the first channel, where others hold semantics."""
     assert parts.time is not None
     basis, mean, vectors = _functions(parts.time, "time", file)
     if basis.frame_count != frames:
@@ -393,7 +393,7 @@ def _time(parts: _Parts, frames: int, file: str) -> PredecessorTime:
 
 
 def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> tuple[LatentMixture, int]:
-    """The mixture, and how many temporal components it covers: some models have a mixture of space alone."""
+    """Read the mixture and its number of temporal components: some models have a mixture of space alone."""
     if part is None:
         dimensions = spatial + temporal
         return LatentMixture(np.ones(1), np.zeros((1, dimensions)), np.eye(dimensions)[None]), temporal

@@ -87,7 +87,7 @@ def model_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...])
 
 
 def _flat_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...]) -> dict[str, Any]:
-    """The primitive in layout 2, by its first trainer's conventions of time."""
+    """Write the primitive in layout 2, with the time convention of its first trainer."""
     mean, vectors = _space(primitive, animated_joints)
     time = as_increments(primitive)
     mixture = {f"gmm_{name}": values for name, values in _mixture(primitive).items()}
@@ -113,7 +113,7 @@ def _flat_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...])
 
 
 def _space(primitive: MotionPrimitive, animated_joints: tuple[str, ...]) -> tuple[Floats, Floats]:
-    """Mean (n, D) and components (k, n, D) of these joints, centimetres from the root's offset."""
+    """Convert mean (n, D) and components (k, n, D) of these joints to centimetres from the root's offset."""
     columns = columns_of(animated_joints, primitive.skeleton)
     mean = primitive.spatial.mean[:, columns].copy()
     vectors = primitive.spatial.directions[..., columns].copy()

@@ -239,7 +239,7 @@ def _nested_document(skeleton: Skeleton, tips: list[tuple[str, int, NDArray[np.f
 def _nested_node(
     name: str, index: int, above: Document | None, offset: NDArray[np.float64], rotation: NDArray[np.float64]
 ) -> Document:
-    """A node, put below the one above it."""
+    """Make a node and add it below its parent."""
     node: Document = {
         "name": name,
         "parent": above["name"] if above else None,

@@ -181,7 +181,7 @@ def _drawn(primitive: MotionPrimitive) -> tuple[Floats, Floats]:
 
 
 def _linear_fit(scores: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Mean (n,) and directions (k, n) of the best linear function of scores (m, k) with values (m, n)."""
+    """Fit mean (n,) and directions (k, n) of the best linear function of scores (m, k) with values (m, n)."""
     columns = np.concatenate((np.ones((len(scores), 1)), scores), axis=1)
     solution = np.linalg.lstsq(columns, values, rcond=None)[0]
     return np.asarray(solution[0]), np.asarray(solution[1:])

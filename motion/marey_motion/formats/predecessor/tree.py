@@ -127,7 +127,7 @@ def write_predecessor_tree(tree: SampleTree, spatial: int, branching: int, *, en
 
 
 def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]]:
-    """Samples and number of children of each node, level by level; a child's samples are some of its parent's."""
+    """Find samples and number of children of each node, level by level; a parent has all samples of its children."""
     indices: list[Ints] = []
     children: list[int] = []
     waiting: deque[tuple[Node, str, int]] = deque([(root, "root", 0)])
@@ -152,7 +152,7 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]
 
 
 def _in_tree_order(indices: list[Ints], children: list[int]) -> Ints:
-    """Samples so that those of each node stand side by side: those of the leaves, from the first to the last."""
+    """Sort samples so that those of each node are consecutive: those of the leaves, from the first to the last."""
     first = np.concatenate(([1], 1 + np.cumsum(children)[:-1]))
     order: list[Ints] = []
     path = [0]

@@ -87,7 +87,7 @@ def _constrained(
     mapping: JointMapping,
     axes: Mapping[str, JointAxes] | None,
 ) -> Constrained | None:
-    """A constraint as inverse kinematics has it; None for one that it has no say in."""
+    """Convert a constraint for inverse kinematics; None for a kind that it cannot meet."""
     if not isinstance(constraint, JointPosition | JointOrientation | LookDirection):
         return None
     joint = joint_index(step.primitive, constraint.joint, step.standard_joints)
@@ -100,7 +100,7 @@ def _constrained(
 
 
 def _chain(found: FoundMotion, joint: int, pelvis: int) -> tuple[int, ...]:
-    """The joints from one up to below the pelvis, which moves the whole body."""
+    """List the joints from one up to below the pelvis, which moves the whole body."""
     path = found.skeleton.path_to_root(joint)
     return path[: path.index(pelvis)] if pelvis in path else path[:-1]
 

@@ -57,7 +57,7 @@ class FoundMotion:
         return self.starts[step] + length
 
     def _length(self, step: int) -> int:
-        """Frames from the first to the last of a step."""
+        """Count the frames from the first to the last of a step."""
         ends = (*self.starts[1:], self.motion.frame_count - 1)
         return ends[step] - self.starts[step]
 
@@ -103,7 +103,7 @@ def found_motion(steps: Sequence[Step], sequel: Sequel) -> FoundMotion:
 
 
 def _placed(motion: Motion, placement: Placement) -> Motion:
-    """A motion of the canonical frame in the world, turned and shifted as a whole."""
+    """Place a motion of the canonical frame in the world, turned and shifted as a whole."""
     turn = quaternions.from_axis_angle((0.0, 1.0, 0.0), placement.heading_rad)
     origin = np.array((placement.x, placement.y, placement.z))
     roots = quaternions.rotate_vectors(turn, motion.root_translations) + origin
@@ -113,7 +113,7 @@ def _placed(motion: Motion, placement: Placement) -> Motion:
 
 
 def _in_a_row(motions: Sequence[Motion]) -> Motion:
-    """One after the other; a rotation and its negative are the same, and the nearer one goes on."""
+    """Concatenate motions; of a rotation and its negative, the one nearer to the frame before is taken."""
     rotations = [motions[0].rotations]
     for motion in motions[1:]:
         agreeing = np.einsum("jc,jc->j", rotations[-1][-1], motion.rotations[0]) >= 0.0

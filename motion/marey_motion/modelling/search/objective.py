@@ -233,7 +233,7 @@ def _row(
     tracked: dict[Tracked, int],
     moments: dict[float, int],
 ) -> _ResidualRow:
-    """A constraint in numbers; what it looks at is added to what is tracked, each thing once."""
+    """Convert a constraint to numbers, and add the points it needs to the tracked ones, each once."""
     frame = frame_at(primitive, constraint.at)
 
     def place(one: Tracked) -> int:

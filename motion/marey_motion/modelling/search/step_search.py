@@ -104,7 +104,7 @@ def _require_finite(*found: Floats) -> None:
 def _search_step(
     step: Step, tree: SampleTree, begun: CarriedOn, candidates: int, passes: int, transitions: TransitionOptions
 ) -> FoundSamples:
-    """The best motion of a tree for a step that goes on where another ended."""
+    """Find the best motion of a tree for a step that continues another."""
     going_on = tuple(
         JointPosition(name, START, (x, y, z), transitions.tolerance_m, transitions.weight)
         for name, (x, y, z) in ((name, point.tolist()) for name, point in begun.joints.items())

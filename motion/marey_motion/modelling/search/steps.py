@@ -238,7 +238,7 @@ class SeveralSteps:
         return float(np.sqrt(self.transitions.weight) / self.transitions.tolerance_m)
 
     def _walk(self, stacked: Floats, count: int) -> Iterator[_Walked]:
-        """The first `count` steps, each placed where the one before it ended."""
+        """Place the first `count` steps, each at the end of the one before."""
         ends = 2 + len(self.joints)
         jumping = [0, *range(2, ends)]
         placement, moved = as_row(self.start), np.zeros((3, len(stacked)))
@@ -275,7 +275,7 @@ def _link(step: Step, ends: Sequence[Tracked], first: int) -> _Link:
 
 
 def _carry_on(points: Floats, slopes: Floats, link: _Link, stacked: Floats) -> tuple[Floats, Floats]:
-    """The placement (3,) that lets a step begin where root and facing (2, 3) ended, and its derivatives (3, W)."""
+    """Compute the placement (3,) at which a step continues root and facing (2, 3), and its derivatives (3, W)."""
     width = len(stacked)
     begun, begun_slopes = np.empty((2, 3)), np.empty((2, 3, width))
     still = np.zeros((3, width))

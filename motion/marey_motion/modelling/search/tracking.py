@@ -188,7 +188,7 @@ def track_times(primitive: MotionPrimitive, moments: Sequence[float]) -> Clocks:
 
 
 def _nodes(primitive: MotionPrimitive, tracked: Sequence[Tracked]) -> list[tuple[float, int]]:
-    """Every joint at every frame that must be known, in the skeleton's order within a frame."""
+    """List every joint at every frame that is needed, in the skeleton's order within a frame."""
     found = {
         (one.frame, carrier)
         for one in tracked
